@@ -1,0 +1,1 @@
+"""The other side: simulated PLCs, pure state machines that answer bytes with bytes."""

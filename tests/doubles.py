@@ -1,0 +1,53 @@
+"""The two doubles that serve all tests: a script of a conversation, a wire of bytes."""
+
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+from gateway.errors import Garbled, NoReply
+from gateway.protocols.driver import AnyDriver
+
+T = TypeVar("T")
+
+
+def octets(text: str) -> bytes:
+    """Hex with spaces, as manuals and vectors print frames."""
+    return bytes.fromhex(text)
+
+
+class Script:
+    """A `Talk` that follows a script: ("> 02 30 …", "< 06 30 …"), bytes in hex.
+
+    What the driver sends must be the next `>` line; the `<` lines after it are then heard,
+    one piece each. Silence is a `>` with no `<` after it.
+    """
+
+    def __init__(self, driver: AnyDriver, *lines: str) -> None:
+        self._codec: Any = driver.codec()
+        self._lines = list(lines)
+        self.replies: list[int] = []  # the reply lengths the driver announced
+
+    async def tell(self, frame: Any) -> None:
+        sent = self._codec.encode(frame)
+        assert self._lines, f"nothing more was to be sent, but {sent.hex(' ')} was"
+        line = self._lines.pop(0)
+        assert line.startswith(">"), f"the driver spoke when it should hear {line}"
+        assert sent.hex(" ") == octets(line[1:]).hex(" ")
+
+    async def ask(self, frame: Any, reply: int, answers: Callable[[Any], T | None]) -> T:
+        await self.tell(frame)
+        self.replies.append(reply)
+        heard = b""
+        while self._lines and self._lines[0].startswith("<"):
+            data = octets(self._lines.pop(0)[1:])
+            heard += data
+            for got in self._codec.feed(data):
+                answer = answers(got)
+                if answer is not None:
+                    return answer
+        if heard:
+            raise Garbled("no answer among what was heard", heard)
+        raise NoReply("no answer")
+
+    def done(self) -> None:
+        """The whole script was played."""
+        assert not self._lines, f"not played: {self._lines}"
