@@ -3,6 +3,8 @@
 GatewayError
 ├── ConfigError          fix the file; nothing has been sent
 ├── BadValue             refuse the write; nothing has been sent
+├── Busy                 ask again later; nothing has been sent
+├── Offline              the device does not answer; nothing has been sent
 ├── LineDown             reopen the port; pending writes fail at once
 └── DeviceError          one device, one conversation
     ├── Refused          it answered "no", with its code: report it, do not repeat
@@ -24,6 +26,14 @@ class ConfigError(GatewayError, ValueError):
 
 class BadValue(GatewayError, ValueError):
     """The value cannot be written to this tag; nothing has been sent."""
+
+
+class Busy(GatewayError):
+    """The write could not be sent in time; nothing has been sent."""
+
+
+class Offline(GatewayError):
+    """The device is silent, so the write was not sent at all."""
 
 
 class LineDown(GatewayError):
@@ -69,10 +79,13 @@ class Evidence(StrEnum):
     STATION = "station"  # a good frame from another station
     SHAPE = "shape"  # a good frame that answers some other question
     TRUNCATED = "truncated"  # a frame that began and did not end
+    SLOW = "slow"  # the right answer, after the time-out
 
 
 class NoReply(Unclear):
     """Silence until the time-out."""
+
+    evidence = Evidence.SILENCE
 
 
 class Garbled(Unclear):

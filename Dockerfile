@@ -1,0 +1,23 @@
+# Two stages: the first builds a virtual environment, the second runs it as nobody in particular.
+FROM python:3.12-slim AS build
+WORKDIR /src
+COPY pyproject.toml constraints.txt README.md ./
+COPY gateway gateway
+RUN python -m venv /opt/gateway \
+    && /opt/gateway/bin/pip install --no-cache-dir --constraint constraints.txt .
+
+FROM python:3.12-slim
+# Serial ports belong to dialout: docker run --device /dev/ttyUSB0 --group-add dialout ...
+RUN useradd --system --uid 10001 --groups dialout --home-dir /data --create-home gateway
+COPY --from=build /opt/gateway /opt/gateway
+COPY config.example.yaml /etc/plc-gateway/config.yaml
+ENV PATH=/opt/gateway/bin:$PATH PYTHONUNBUFFERED=1 PYTHONDONTWRITEBYTECODE=1
+USER gateway
+WORKDIR /data
+VOLUME /data
+EXPOSE 7447
+# Nothing is written outside /data: run with --read-only --tmpfs /tmp.
+HEALTHCHECK --interval=30s --timeout=10s --start-period=15s \
+    CMD ["plc-gateway", "health", "/etc/plc-gateway/config.yaml"]
+ENTRYPOINT ["plc-gateway"]
+CMD ["run", "/etc/plc-gateway/config.yaml", "--log-format", "json"]

@@ -1,0 +1,218 @@
+"""From a configuration to a running gateway: lines, mirror and Zenoh in one task group."""
+
+import asyncio
+import signal
+import time
+from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
+
+import structlog
+
+from gateway import __version__
+from gateway.config import Config, DeviceConfig, LineConfig
+from gateway.device import Device
+from gateway.errors import BadValue, GatewayError
+from gateway.forecast import LineForecast, forecast
+from gateway.line import Line
+from gateway.mirror import Mirror
+from gateway.northbound import Mode, Northbound, ZenohSettings
+from gateway.payload import rfc3339
+from gateway.simulation import station_for
+from gateway.status import Document, device_document, line_document
+from gateway.tags import Quality, Reason, Sample, Tag, Written, bad
+from gateway.transport import Ear, Port, SimulatorAddress, open_port, open_simulator
+from gateway.values import Value
+
+log = structlog.get_logger("gateway")
+FRESH_WITHIN = 5.0  # seconds a read-through may take before what is known is answered
+
+
+def device_of(config: DeviceConfig, line: LineConfig) -> Device:
+    return Device(
+        name=config.name,
+        driver=config.driver,
+        wire=line.wire,
+        timing=config.timing,
+        tags=config.tags,
+        late_guard=config.late_guard,
+        turnaround=config.turnaround_configured,
+    )
+
+
+def opener(line: LineConfig) -> Callable[[Ear], Awaitable[Port]]:
+    """What opens the line's port: the real one, or its devices simulated in memory."""
+    if isinstance(line.port, SimulatorAddress):
+        stations = [station_for(device.driver, device.tags) for device in line.devices]
+        return lambda ear: open_simulator(stations, line.wire, ear)
+    return lambda ear: open_port(line.port, line.serial, ear)
+
+
+class Gateway:
+    """Everything below Zenoh: the lines, and what is known of every tag."""
+
+    def __init__(self, config: Config, wall: Callable[[], int] = time.time_ns) -> None:
+        """`wall`: nanoseconds since 1970."""
+        self.config = config
+        self.lines: list[Line] = []
+        self.mirror = Mirror((tag for device in config.devices for tag in device.tags), wall())
+        self.publish: Callable[[Sequence[Sample]], None] = lambda samples: None
+        self.show_alive: Callable[[str, bool], None] = lambda device, alive: None
+        self._wall = wall
+        self._started = wall()
+        self._tags = {tag.key: tag for device in config.devices for tag in device.tags}
+        self._places: dict[str, tuple[Line, Device]] = {}
+        self._forecasts: dict[str, LineForecast] = {}
+        self._waiting: dict[Tag, list[asyncio.Future[Sample]]] = {}
+        for seed, line in enumerate(config.lines):
+            self._add_line(line, seed)
+        for device in config.devices:
+            if not device.enabled:
+                self.mirror.update(bad(tag, Reason.DISABLED, wall()) for tag in device.tags)
+
+    def _add_line(self, config: LineConfig, seed: int) -> None:
+        devices = [device_of(device, config) for device in config.devices if device.enabled]
+        line = Line(
+            config.name,
+            devices,
+            config.wire,
+            opener(config),
+            self,
+            self._wall,
+            echo=config.echo,
+            seed=seed,
+        )
+        self.lines.append(line)
+        self._forecasts[config.name] = forecast(config.name, devices, config.wire)
+        for device in devices:
+            self._places[device.name] = (line, device)
+
+    # What the lines tell
+
+    def samples(self, samples: Sequence[Sample]) -> None:
+        news = self.mirror.update(samples)
+        if self._waiting:
+            for sample in samples:
+                for waiting in self._waiting.pop(sample.tag, ()):
+                    if not waiting.done():
+                        waiting.set_result(self.mirror[sample.tag])
+        if news:
+            self.publish(news)
+
+    def alive(self, device: Device, alive: bool) -> None:
+        self.show_alive(device.name, alive)
+
+    # What Zenoh asks
+
+    def devices(self) -> Iterable[DeviceConfig]:
+        return self.config.devices
+
+    def tag(self, key: str) -> Tag | None:
+        return self._tags.get(key)
+
+    def sample(self, tag: Tag) -> Sample:
+        return self.mirror[tag]
+
+    async def write(self, tag: Tag, value: Value) -> Written:
+        """Returns when the device has acknowledged. Raises `GatewayError`, `BadValue` first."""
+        if tag.device not in self._places:
+            raise BadValue(f"device {tag.device} is disabled")
+        units = tag.encode(value)
+        line, device = self._places[tag.device]
+        outcome: asyncio.Future[Written] = asyncio.get_running_loop().create_future()
+
+        def done(result: Written | GatewayError) -> None:
+            if outcome.done():
+                return
+            if isinstance(result, GatewayError):
+                outcome.set_exception(result)
+            else:
+                outcome.set_result(result)
+
+        line.submit(device, tag, units, done)
+        return await outcome
+
+    async def fresh(self, tag: Tag, max_age: float) -> Sample:
+        """A sample at most `max_age` seconds old; simultaneous askers share one exchange."""
+        known = self.mirror[tag]
+        young = self._wall() - known.time <= max_age * 1e9
+        if tag.device not in self._places or (known.quality is Quality.GOOD and young):
+            return known
+        line, device = self._places[tag.device]
+        if not line.is_open:
+            return known
+        asked: asyncio.Future[Sample] = asyncio.get_running_loop().create_future()
+        self._waiting.setdefault(tag, []).append(asked)
+        line.refresh(device, tag)
+        try:
+            async with asyncio.timeout(FRESH_WITHIN):
+                return await asked
+        except TimeoutError:
+            return self.mirror[tag]
+
+    def status(self) -> Mapping[str, Document]:
+        """Documents by path: `status`, `lines/<line>`, `devices/<device>`."""
+        now = asyncio.get_running_loop().time()
+        documents: dict[str, Document] = {
+            "status": {
+                "name": self.config.name,
+                "version": __version__,
+                "time": rfc3339(self._wall()),
+                "up": round((self._wall() - self._started) / 1e9, 1),
+                "tags": len(self._tags),
+                "lines": {line.name: line.is_open for line in self.lines},
+                "devices": {name: d.standing.value for name, (_, d) in self._places.items()},
+            }
+        }
+        for line in self.lines:
+            documents[f"lines/{line.name}"] = line_document(line, self._forecasts[line.name], now)
+        for name, (_, device) in self._places.items():
+            documents[f"devices/{name}"] = device_document(device, device.driver.protocol)
+        return documents
+
+
+def zenoh_settings(config: Config) -> ZenohSettings:
+    zenoh = config.zenoh
+    return ZenohSettings(
+        prefix=zenoh.prefix,
+        mode=Mode(zenoh.mode),
+        listen=zenoh.listen,
+        connect=zenoh.connect,
+        config_file=zenoh.config_file,
+    )
+
+
+async def run(config: Config, started: Callable[[], None] = lambda: None) -> None:
+    """The service, until SIGTERM or SIGINT. Raises `GatewayError` when it cannot start.
+
+    `started` is called once when everything is open on Zenoh.
+    """
+    gateway = Gateway(config)
+    northbound = Northbound(zenoh_settings(config), config.name, gateway)
+    gateway.publish = northbound.publish
+    gateway.show_alive = northbound.alive
+    stop = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, stop.set)
+    face = asyncio.create_task(northbound.run(), name="zenoh")
+    lines = [asyncio.create_task(line.run(), name=line.name) for line in gateway.lines]
+    opened = asyncio.create_task(northbound.opened.wait())
+    stopping = asyncio.create_task(stop.wait())
+    try:
+        await asyncio.wait([opened, face, stopping], return_when=asyncio.FIRST_COMPLETED)
+        if opened.done():
+            started()
+        await asyncio.wait([face, stopping, *lines], return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        opened.cancel()
+        stopping.cancel()
+        await _ended(lines)  # the wire first, so that the last outcomes still go out
+        await _ended([face])
+
+
+async def _ended(tasks: Sequence[asyncio.Task[None]]) -> None:
+    """Cancel and await; what a task failed with by itself is raised here."""
+    for task in tasks:
+        task.cancel()
+    for outcome in await asyncio.gather(*tasks, return_exceptions=True):
+        if isinstance(outcome, Exception):
+            raise outcome

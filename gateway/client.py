@@ -1,0 +1,148 @@
+"""The command line as a Zenoh client of a running gateway."""
+
+import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from typing import NamedTuple
+
+import orjson
+import zenoh
+
+from gateway.config import Config
+from gateway.errors import GatewayError
+from gateway.keys import Keys
+from gateway.northbound import Mode, ZenohSettings
+from gateway.northbound.session import configure
+from gateway.values import Value
+
+PATIENCE = 10.0  # seconds a question may take
+
+
+class Shown(NamedTuple):
+    """A sample as it arrived: `document` is the decoded payload."""
+
+    tag: str  # device/name
+    document: dict[str, object]
+
+
+class Client:
+    """One session to the gateway of a configuration. Blocking calls, for the command line only."""
+
+    def __init__(self, session: zenoh.Session, keys: Keys) -> None:
+        self._session = session
+        self._keys = keys
+
+    def values(self, wanted: str, max_age: str | None = None) -> list[Shown]:
+        """The current values of the tags a key expression (without the prefix) names."""
+        selector = self._keys.value(wanted) + (f"?max_age={max_age}" if max_age else "")
+        found = []
+        for reply in self._ask(selector, None):
+            if reply.err is not None:
+                raise GatewayError(_reason(reply.err.payload.to_bytes()))
+            if reply.ok is not None and (shown := self._shown(reply.ok)) is not None:
+                found.append(shown)
+        return sorted(found)
+
+    def status(self, path: str = "status") -> dict[str, object]:
+        """`status`, `lines/<line>` or `devices/<device>` of the gateway."""
+        for reply in self._ask(self._keys.status(path), None):
+            if reply.ok is not None:
+                return _document(reply.ok.payload.to_bytes())
+        raise GatewayError("the gateway does not answer")
+
+    def write(self, tag: str, value: Value) -> dict[str, object]:
+        """The outcome as the gateway told it: `value ...` or `error ...`.
+
+        Raises `GatewayError` when nobody answered: then nobody knows whether it was done.
+        """
+        replies = self._ask(self._keys.set(tag), orjson.dumps(value))
+        for reply in replies:
+            answer = reply.ok or reply.err
+            if answer is not None:
+                return _document(answer.payload.to_bytes())
+        raise GatewayError(f"no gateway answered for {tag}: is it running?")
+
+    @contextmanager
+    def watching(self, wanted: str, shown: Callable[[Shown], None]) -> Iterator[None]:
+        """While inside, every sample that arrives is handed to `shown`, on another thread."""
+
+        def arrived(sample: zenoh.Sample) -> None:
+            got = self._shown(sample)
+            if got is not None:
+                shown(got)
+
+        with self._session.declare_subscriber(self._keys.value(wanted), arrived):
+            yield
+
+    def _ask(self, selector: str, payload: bytes | None) -> list[zenoh.Reply]:
+        try:
+            return list(
+                self._session.get(
+                    selector,
+                    payload=payload,
+                    timeout=PATIENCE,
+                    consolidation=zenoh.ConsolidationMode.NONE,
+                )
+            )
+        except zenoh.ZError as error:
+            raise GatewayError(f"{selector}: {error}") from None
+
+    def _shown(self, sample: zenoh.Sample) -> Shown | None:
+        tag = self._keys.tag(str(sample.key_expr))
+        with suppress(orjson.JSONDecodeError):
+            if tag is not None and sample.kind == zenoh.SampleKind.PUT:
+                return Shown(tag, _document(sample.payload.to_bytes()))
+        return None
+
+
+@contextmanager
+def connected(config: Config) -> Iterator[Client]:
+    """A client of the gateway that `config` describes. Raises `GatewayError` when none is there."""
+    own = config.zenoh
+    endpoints = own.connect if own.mode == "client" else own.listen or own.connect
+    if not endpoints:
+        raise GatewayError("zenoh.listen and zenoh.connect are empty: no way to the gateway")
+    settings = ZenohSettings(
+        prefix=own.prefix,
+        mode=Mode.CLIENT,
+        connect=tuple(_reachable(endpoint) for endpoint in endpoints),
+        config_file=own.config_file,
+    )
+    setup = configure(settings)
+    setup.insert_json5("listen/endpoints", "[]")
+    try:
+        session = zenoh.open(setup)
+    except zenoh.ZError:
+        raise GatewayError(
+            f"no gateway at {', '.join(settings.connect)}: start it with `plc-gateway run`, "
+            "or use --direct"
+        ) from None
+    try:
+        yield Client(session, Keys(own.prefix, config.name))
+    finally:
+        session.close()  # type: ignore[no-untyped-call]  # Zenoh's stub lacks it
+
+
+def parse_value(text: str) -> Value:
+    """A value as typed in a shell: a JSON scalar (`true`, `12.5`, `"AB"`), or else text."""
+    try:
+        value = json.loads(text)
+    except ValueError:
+        return text
+    return value if isinstance(value, (bool, int, float, str)) else text
+
+
+def _reachable(endpoint: str) -> str:
+    """An endpoint that listens everywhere is reached on this machine."""
+    return endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
+
+
+def _document(data: bytes) -> dict[str, object]:
+    found = orjson.loads(data)
+    return found if isinstance(found, dict) else {"value": found}
+
+
+def _reason(data: bytes) -> str:
+    with suppress(orjson.JSONDecodeError):
+        return str(_document(data).get("reason", data.decode("utf-8", "replace")))
+    return data.decode("utf-8", "replace")

@@ -1,0 +1,61 @@
+"""The configuration: one YAML file, checked as a whole, every mistake named with its line."""
+
+import gc
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from gateway.config.build import Builder
+from gateway.config.messages import ConfigErrors
+from gateway.config.plain import (
+    Config,
+    DeviceConfig,
+    HistoryConfig,
+    LineConfig,
+    WebConfig,
+    ZenohConfig,
+)
+from gateway.config.schema import schema
+from gateway.config.yaml_file import read_yaml
+
+__all__ = [
+    "Config",
+    "ConfigErrors",
+    "DeviceConfig",
+    "HistoryConfig",
+    "LineConfig",
+    "WebConfig",
+    "ZenohConfig",
+    "load",
+    "schema",
+]
+
+# Settings whose values are texts even where YAML sees a number: `7E1`, `40101`, `unit: 1`.
+_TEXTS = frozenset({"address", "description", "format", "name", "port", "prefix", "unit"})
+
+
+def load(path: str | Path) -> Config:
+    """The file, checked and complete. Paths in it are relative to its folder.
+
+    Raises `ConfigErrors` with every mistake there is.
+    """
+    with _uncollected():
+        file, mistakes = read_yaml(Path(path), _TEXTS)
+        config = Builder(mistakes, Path(path).parent).config(file.data)
+    mistakes.tell()
+    if config is None:
+        raise AssertionError(f"{path}: no configuration, and no mistake either")
+    return config
+
+
+@contextmanager
+def _uncollected() -> Iterator[None]:
+    """No garbage collection meanwhile: walking the growing tree again and again costs two thirds
+    of the time that a large file takes, and there is no garbage in it."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()

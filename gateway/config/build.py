@@ -1,0 +1,244 @@
+"""From the file to the plant: lines, devices and tags, with every mistake found on the way."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path as FilePath
+from typing import Any
+
+from gateway.config import written
+from gateway.config.line_rules import check_line, line_wire
+from gateway.config.messages import Mistakes, Path, meant, shown
+from gateway.config.model import (
+    DeviceSection,
+    FileSection,
+    LineSection,
+    TagDefaults,
+    TagSection,
+)
+from gateway.config.plain import (
+    Config,
+    DeviceConfig,
+    HistoryConfig,
+    LineConfig,
+    WebConfig,
+    ZenohConfig,
+)
+from gateway.config.tag_rules import TagSource, build_tag, inherit
+from gateway.config.validate import (
+    DRIVERS,
+    driver_of,
+    driver_settings,
+    protocols,
+    section,
+    unknown,
+)
+from gateway.errors import ConfigError
+from gateway.protocols.driver import AnyDriver, Timing
+from gateway.tags import Tag
+
+
+@dataclass(slots=True)
+class Builder:
+    """Builds one `Config`; `folder` is where relative paths in the file start."""
+
+    mistakes: Mistakes
+    folder: FilePath
+    _devices: dict[str, str] = field(default_factory=dict)  # name -> line it is on
+
+    def config(self, data: Mapping[str, Any]) -> Config | None:
+        """The whole file; None (and mistakes) where not even a stand-in could be made."""
+        top = section(FileSection, data, (), self.mistakes, "the file")
+        raw_lines = data.get("lines")
+        defaults = self._defaults(data, (), TagDefaults())
+        lines = []
+        for name, raw in _mapping(raw_lines):
+            path: Path = ("lines", name)
+            line = self._line(self._name(name, path), raw, path, defaults)
+            if line is not None:
+                lines.append(line)
+        if raw_lines == {}:
+            self.mistakes.add(("lines",), "no lines: a gateway has at least one")
+        self._check_ports(lines, raw_lines)
+        if top is None:
+            return None
+        self._check_history(top, lines)
+        return Config(
+            name=top.gateway.name,
+            zenoh=self._zenoh(top),
+            history=self._history(top),
+            web=WebConfig(host=top.web.listen[0], port=top.web.listen[1]) if top.web else None,
+            lines=tuple(lines),
+        )
+
+    def _line(self, name: str, raw: object, path: Path, outer: TagDefaults) -> LineConfig | None:
+        line = section(LineSection, raw, path, self.mistakes, "a line")
+        if not isinstance(raw, dict):
+            return None
+        defaults = self._defaults(raw, path, outer)
+        devices = []
+        for device_name, raw_device in _mapping(raw.get("devices")):
+            place: Path = (*path, "devices", device_name)
+            checked = self._name(device_name, place)
+            if checked in self._devices:
+                self.mistakes.add(
+                    place,
+                    f"a device {checked} is already on line {self._devices[checked]}: "
+                    "a name is used once in the file, it is the key of the values",
+                )
+            self._devices.setdefault(checked, name)
+            device = self._device(checked, raw_device, place, defaults)
+            if device is not None:
+                devices.append(device)
+        if raw.get("devices") == {}:
+            self.mistakes.add((*path, "devices"), "no devices: a line has at least one")
+        if line is None:
+            return None
+        check_line(line, devices, path, self.mistakes)
+        serial, wire = line_wire(line, devices, path, self.mistakes)
+        return LineConfig(
+            name=name,
+            port=line.port,
+            serial=serial,
+            wire=wire,
+            echo=line.echo,
+            devices=tuple(devices),
+        )
+
+    def _device(
+        self, name: str, raw: object, path: Path, outer: TagDefaults
+    ) -> DeviceConfig | None:
+        if not isinstance(raw, dict):
+            section(DeviceSection, raw, path, self.mistakes, "a device")
+            return None
+        common = {key: value for key, value in raw.items() if key in DeviceSection.model_fields}
+        own = {k: v for k, v in raw.items() if k not in common and k != "protocol"}
+        settings = section(DeviceSection, common, path, self.mistakes, "a device")
+        driver = self._driver(raw.get("protocol"), own, path)
+        defaults = self._defaults(raw, path, outer)
+        tags = tuple(self._tags(name, raw.get("tags"), (*path, "tags"), defaults, driver))
+        if settings is None or driver is None:
+            return None
+        usual = driver.timing
+        timing = Timing(
+            reply_timeout=_either(settings.reply_timeout, usual.reply_timeout),
+            turnaround=_either(settings.turnaround, usual.turnaround),
+            silence=_either(settings.silence, usual.silence),
+            silence_chars=usual.silence_chars,
+            retries=usual.retries if settings.retries is None else settings.retries,
+        )
+        return DeviceConfig(
+            name=name,
+            driver=driver,
+            timing=timing,
+            turnaround_configured=settings.turnaround,
+            late_guard=_either(settings.late_guard, timing.reply_timeout),
+            blocks=settings.blocks,
+            control=settings.control,
+            enabled=settings.enabled,
+            tags=tags,
+        )
+
+    def _driver(self, protocol: object, own: dict[str, Any], path: Path) -> AnyDriver | None:
+        place = (*path, "protocol")
+        if protocol is None:
+            self.mistakes.add(place, f"missing: a device needs its protocol: {protocols()}")
+            return None
+        if not isinstance(protocol, str) or protocol not in DRIVERS:
+            hint = meant(str(protocol), DRIVERS)
+            self.mistakes.add(place, f"{shown(protocol)} is no protocol: {hint}")
+            return None
+        known = driver_settings(protocol)
+        for key in own.keys() - known:
+            every = sorted((known | set(DeviceSection.model_fields)) - {"protocol"})
+            self.mistakes.add((*path, key), unknown(key, f"a {protocol} device", every))
+        return driver_of(
+            protocol, {k: v for k, v in own.items() if k in known}, path, self.mistakes
+        )
+
+    def _tags(
+        self,
+        device: str,
+        raw_tags: object,
+        path: Path,
+        defaults: TagDefaults,
+        driver: AnyDriver | None,
+    ) -> Iterator[Tag]:
+        seen: set[str] = set()
+        for raw_name, raw in _mapping(raw_tags):
+            place = (*path, raw_name)
+            name = self._name(raw_name, place, tag=True)
+            if name in seen:
+                self.mistakes.add(place, f"{name} is there twice, typed in two ways")
+            seen.add(name)
+            own = section(TagSection, raw, place, self.mistakes, "a tag")
+            if own is None or driver is None:
+                continue
+            doubt = isinstance(raw, dict) and "type" in raw and own.type is None
+            source = TagSource(device, name, own, defaults, place, type_unknown=doubt)
+            tag = build_tag(source, driver, self.mistakes)
+            if tag is not None:
+                yield tag
+
+    def _defaults(self, raw: Mapping[str, Any], path: Path, outer: TagDefaults) -> TagDefaults:
+        found = raw.get("defaults")
+        if not isinstance(found, dict):
+            return outer
+        inner = section(TagDefaults, found, (*path, "defaults"), self.mistakes, "defaults")
+        return outer if inner is None else inherit(outer, inner)
+
+    def _name(self, text: str, path: Path, *, tag: bool = False) -> str:
+        try:
+            return written.tag_name(text) if tag else written.name(text)
+        except ConfigError as error:
+            self.mistakes.add(path, str(error))
+            return text
+
+    def _check_ports(self, lines: list[LineConfig], raw_lines: object) -> None:
+        ports: dict[object, str] = {}
+        for line in lines:
+            if line.simulated:
+                continue
+            other = ports.setdefault(line.port, line.name)
+            if other != line.name:
+                self.mistakes.add(
+                    ("lines", line.name, "port"),
+                    f"line {other} has this port already: one port is one line, "
+                    "with all its devices",
+                )
+
+    def _check_history(self, top: FileSection, lines: list[LineConfig]) -> None:
+        kept = next((tag for line in lines for tag in line.tags if tag.history), None)
+        if kept is not None and top.history is None:
+            self.mistakes.add(
+                (), f"tag {kept.key} has `history: true`, but the file has no `history:` section"
+            )
+
+    def _zenoh(self, top: FileSection) -> ZenohConfig:
+        found = top.zenoh
+        file = self.folder / found.config_file if found.config_file else None
+        if file is not None and not file.is_file():
+            self.mistakes.add(("zenoh", "config_file"), f"there is no file {file}")
+        return ZenohConfig(
+            prefix=found.prefix,
+            mode=found.mode,
+            listen=tuple(found.listen),
+            connect=tuple(found.connect),
+            config_file=file,
+        )
+
+    def _history(self, top: FileSection) -> HistoryConfig | None:
+        if top.history is None:
+            return None
+        return HistoryConfig(
+            path=self.folder / top.history.path,
+            keep=top.history.keep,
+            max_size=top.history.max_size,
+        )
+
+
+def _mapping(raw: object) -> list[tuple[str, object]]:
+    return list(raw.items()) if isinstance(raw, dict) else []
+
+
+def _either(own: float | None, usual: float) -> float:
+    return usual if own is None else own

@@ -1,0 +1,78 @@
+"""What must agree among the devices that share a wire: station numbers, speed, format."""
+
+from collections.abc import Sequence
+
+from gateway.config.customs import custom
+from gateway.config.messages import Mistakes, Path
+from gateway.config.model import LineSection
+from gateway.config.plain import DeviceConfig
+from gateway.transport.port import SerialSettings, SimulatorAddress, TcpAddress
+from gateway.wiretime import NETWORK_BAUD, Wire, character_bits
+
+
+def check_line(
+    line: LineSection, devices: Sequence[DeviceConfig], path: Path, mistakes: Mistakes
+) -> None:
+    """Note what cannot live together on this line."""
+    stations: dict[int, str] = {}
+    for device in devices:
+        place = (*path, "devices", device.name)
+        number = device.driver.station
+        other = stations.setdefault(number, device.name)
+        if other != device.name:
+            mistakes.add(
+                (*place, "station"),
+                f"{other} on this line is station {number} already: both would answer at once",
+            )
+        if custom(device.driver).baudrate is None:
+            _check_network(line, devices, device, place, mistakes)
+        elif custom(device.driver).eight_bits and line.format and line.format[0] == "7":
+            mistakes.add(
+                (*path, "format"),
+                f"{line.format} has 7 data bits, but {device.name} speaks "
+                f"{device.driver.protocol}, which needs 8, such as 8{line.format[1:]}",
+            )
+
+
+def _check_network(
+    line: LineSection,
+    devices: Sequence[DeviceConfig],
+    device: DeviceConfig,
+    path: Path,
+    mistakes: Mistakes,
+) -> None:
+    protocol = device.driver.protocol
+    if not isinstance(line.port, (TcpAddress, SimulatorAddress)):
+        mistakes.add(
+            (*path, "protocol"), f"{protocol} needs a port tcp://host:port, it has no wire"
+        )
+    wired = [other for other in devices if custom(other.driver).baudrate is not None]
+    if wired:
+        mistakes.add(
+            (*path, "protocol"),
+            f"{protocol} cannot share a line with {wired[0].name}, "
+            f"which speaks {wired[0].driver.protocol}: give it a line of its own",
+        )
+
+
+def line_wire(
+    line: LineSection, devices: Sequence[DeviceConfig], path: Path, mistakes: Mistakes
+) -> tuple[SerialSettings, Wire]:
+    """Speed and format, as written or as all protocols of the line are used to."""
+    customs = {device.driver.protocol: custom(device.driver) for device in devices}
+    rates = {name: habit.baudrate for name, habit in customs.items()}
+    formats = {name: habit.format for name, habit in customs.items()}
+    if line.baudrate is None and set(rates.values()) == {None}:
+        return SerialSettings(), Wire(NETWORK_BAUD, 10)
+    for setting, given, usual in (
+        ("baudrate", line.baudrate, rates),
+        ("format", line.format, formats),
+    ):
+        if given is None and len(set(usual.values())) > 1:
+            habits = ", ".join(f"{name} {value}" for name, value in usual.items())
+            mistakes.add(
+                (*path, setting), f"missing: the devices of this line differ in it ({habits})"
+            )
+    baudrate = line.baudrate or next(filter(None, rates.values()), 9600)
+    serial = SerialSettings(baudrate, line.format or next(iter(formats.values()), "8N1"))
+    return serial, Wire(serial.baudrate, character_bits(serial.format))

@@ -1,0 +1,257 @@
+"""The sections of the file as pydantic sees them: name, type and meaning of every setting.
+
+The descriptions are what an editor shows. What one setting alone cannot tell (an address its
+device does not have, two stations of one number) is found in `gateway.config.build`.
+"""
+
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    Field,
+    PlainValidator,
+    WithJsonSchema,
+    model_validator,
+)
+from pydantic import Tag as Choice
+
+from gateway.config import written
+from gateway.tags import Deadband, Publish
+from gateway.transport.port import PortAddress
+from gateway.values import Kind, Order, ValueType
+
+DURATION_SCHEMA: dict[str, Any] = {
+    "type": "string",
+    "pattern": r"^[0-9]+(\.[0-9]+)? ?(ms|s|min|h|d)$",
+    "examples": ["500ms", "2s", "15min", "1h", "7d"],
+}
+# `40101` as an address and `7E1` as a format look like numbers to an editor.
+_TEXT_SCHEMA = {"type": ["string", "number"]}
+_FORMAT_SCHEMA = {
+    "anyOf": [
+        {"type": "string", "enum": [f"{d}{p}{s}" for d in "78" for p in "NEO" for s in "12"]},
+        {"type": "number", "enum": [70, 700, 80, 800]},
+    ]
+}
+_KINDS = [kind.value for kind in Kind if kind is not Kind.STRING]
+_TYPE_SCHEMA = {
+    "anyOf": [
+        {"type": "string", "enum": _KINDS},
+        {"type": "string", "pattern": r"^string\[[0-9]+\]$"},
+    ]
+}
+_DEADBAND_SCHEMA = {
+    "anyOf": [
+        {"type": "number", "minimum": 0},
+        {"type": "string", "pattern": r"^[0-9]+(\.[0-9]+)? ?%$"},
+    ]
+}
+_ENDPOINT_SCHEMA = {"type": "string", "examples": ["tcp/127.0.0.1:7447"]}
+_ORDER_SCHEMA = {"type": "string", "enum": [order.value for order in Order]}
+_PORT_SCHEMA = {
+    "type": "string",
+    "examples": ["/dev/ttyUSB0", "COM3", "tcp://10.0.0.7:4001", "rfc2217://host:port", "simulator"],
+}
+
+Duration = Annotated[float, PlainValidator(written.duration), WithJsonSchema(DURATION_SCHEMA)]
+Interval = Annotated[float, PlainValidator(written.interval), WithJsonSchema(DURATION_SCHEMA)]
+Text = Annotated[str, Field(strict=True), WithJsonSchema(_TEXT_SCHEMA)]
+Name = Annotated[str, PlainValidator(written.name), WithJsonSchema(_TEXT_SCHEMA)]
+FilePath = Annotated[Path, PlainValidator(written.path), WithJsonSchema({"type": "string"})]
+OrderName = Annotated[Order, PlainValidator(written.order), WithJsonSchema(_ORDER_SCHEMA)]
+Endpoint = Annotated[str, PlainValidator(written.endpoint), WithJsonSchema(_ENDPOINT_SCHEMA)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+
+
+class Section(BaseModel):
+    """Settings of one kind; a setting that is not listed is a mistake."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        frozen=True,
+        strict=True,
+        arbitrary_types_allowed=True,
+        use_attribute_docstrings=True,
+    )
+
+
+class GatewaySection(Section):
+    """This gateway."""
+
+    name: Name = "gateway"
+    """This gateway's own chunk in the key space."""
+
+
+class ZenohSection(Section):
+    """How to join the Zenoh network."""
+
+    prefix: Annotated[str, PlainValidator(written.prefix), WithJsonSchema(_TEXT_SCHEMA)] = "plant"
+    """Every key starts with it."""
+    mode: Literal["peer", "client", "router"] = "peer"
+    """How this session takes part in the network."""
+    listen: list[Endpoint] = ["tcp/127.0.0.1:7447"]
+    """Endpoints to listen at; loopback unless you say otherwise."""
+    connect: list[Endpoint] = []
+    """Endpoints to connect to."""
+    config_file: FilePath | None = None
+    """A Zenoh JSON5 file for everything else, laid under these settings."""
+
+
+class HistorySection(Section):
+    """Samples kept on disk, for tags with `history: true`."""
+
+    path: FilePath = Path("history.db")
+    """The SQLite file, relative to this file's folder."""
+    keep: Interval = 7 * 86400.0
+    """Older samples are deleted."""
+    max_size: Annotated[
+        int,
+        PlainValidator(written.size),
+        WithJsonSchema({"type": "string", "pattern": r"^[0-9]+(\.[0-9]+)? ?([kKMGT]B)$"}),
+    ] = 10**9
+    """The oldest samples are deleted when the file grows beyond it."""
+
+
+class WebSection(Section):
+    """The status page and /metrics."""
+
+    listen: Annotated[
+        tuple[str, int], PlainValidator(written.web_address), WithJsonSchema({"type": "string"})
+    ] = ("127.0.0.1", 8080)
+    """Where the page is served."""
+
+
+class WriteSection(Section):
+    """What may be written, and how."""
+
+    min: Finite | None = None
+    """The least value, in the tag's own unit."""
+    max: Finite | None = None
+    """The greatest value, in the tag's own unit."""
+    verify: bool = False
+    """Read back after the acknowledgement and compare."""
+    repeat: bool = False
+    """May be sent again when nobody knows whether it was done."""
+    latest: bool = False
+    """Of several waiting writes only the last is sent."""
+
+    @model_validator(mode="after")
+    def _order(self) -> Self:
+        if self.min is not None and self.max is not None and self.min > self.max:
+            raise ValueError(f"min {self.min:g} is above max {self.max:g}")
+        return self
+
+
+def _write_shape(value: object) -> str:
+    return "rule" if isinstance(value, (dict, WriteSection)) else "flag"
+
+
+class TagDefaults(Section):
+    """Tag settings for a whole file, line or device."""
+
+    type: Annotated[
+        ValueType | None, PlainValidator(written.value_type), WithJsonSchema(_TYPE_SCHEMA)
+    ] = None
+    """What the words mean; left out: bool for a bit, a whole number otherwise."""
+    every: Interval = 1.0
+    """How often the tag is read."""
+    scale: Annotated[Finite, AfterValidator(written.scale)] = 1.0
+    """value = raw x scale + offset"""
+    offset: Finite = 0.0
+    """value = raw x scale + offset"""
+    unit: Text = ""
+    """The unit of the value, for people: rpm, °C."""
+    description: Text = ""
+    """What it is, for people."""
+    deadband: Annotated[
+        Deadband | None, PlainValidator(written.deadband), WithJsonSchema(_DEADBAND_SCHEMA)
+    ] = None
+    """A smaller change is not published: 0.5 (in the tag's unit) or 2%."""
+    word_order: OrderName = Order.LOW_FIRST
+    """Which word of a 32- or 64-bit value has the lower address."""
+    byte_order: OrderName | None = None
+    """Which byte of each word comes first."""
+    publish: Annotated[
+        Publish,
+        PlainValidator(written.publish),
+        WithJsonSchema({"type": "string", "enum": ["change", "always"]}),
+    ] = Publish.CHANGE
+    """Publish when the value changes, or every value that is read."""
+    heartbeat: Interval | None = None
+    """Publish at least so often, changed or not."""
+    history: bool = False
+    """Keep the values on disk."""
+    write: Annotated[
+        Annotated[bool, Choice("flag")] | Annotated[WriteSection, Choice("rule")],
+        Discriminator(_write_shape),
+    ] = False
+    """Whether and how it may be written."""
+
+
+class TagSection(TagDefaults):
+    """One value of a device."""
+
+    address: Text
+    """As the maker writes it: D100, X17, D7.3, holding:100."""
+
+
+class DeviceSection(Section):
+    """A device's settings that do not depend on its protocol."""
+
+    reply_timeout: Interval | None = None
+    """How long it may take to answer, beyond the characters' own time on the wire."""
+    turnaround: Duration | None = None
+    """What it usually takes to answer; measured when left out."""
+    silence: Duration | None = None
+    """Quiet kept on the wire before it is spoken to."""
+    retries: Annotated[int, Field(ge=0, le=10)] | None = None
+    """How often a read that went wrong is asked again; writes never are."""
+    late_guard: Duration | None = None
+    """How long a late reply is waited for before anyone speaks again."""
+    blocks: bool = False
+    """Also one put per scan with all changed tags, at <device>/@block."""
+    control: bool = False
+    """The device may be told to run, to stop and the like."""
+    enabled: bool = True
+    """false: the device stays in the file but is not spoken to."""
+    defaults: dict[str, Any] = {}
+    tags: dict[str, Any] = {}
+    """What is read, by name."""
+
+
+class LineSection(Section):
+    """One wire and the devices on it."""
+
+    port: Annotated[PortAddress, PlainValidator(written.port), WithJsonSchema(_PORT_SCHEMA)]
+    """A serial port, tcp://host:port, rfc2217://host:port, or simulator."""
+    baudrate: Annotated[
+        int | None,
+        PlainValidator(written.baudrate),
+        WithJsonSchema({"type": "integer", "examples": [9600, 19200]}),
+    ] = None
+    """Of the wire, also of the one behind a device server; the protocol's custom if left out."""
+    format: Annotated[
+        str | None, PlainValidator(written.serial_format), WithJsonSchema(_FORMAT_SCHEMA)
+    ] = None
+    """Data bits, parity, stop bits: 7E1, 8N1; the protocol's custom if left out."""
+    echo: bool = False
+    """true: the port hears what it says itself, as some two-wire RS-485 converters do."""
+    defaults: dict[str, Any] = {}
+    devices: dict[str, Any]
+    """The stations on this wire, by name."""
+
+
+class FileSection(Section):
+    """A gateway between PLCs and Zenoh."""
+
+    gateway: GatewaySection = GatewaySection()
+    zenoh: ZenohSection = ZenohSection()
+    history: HistorySection | None = None
+    web: WebSection | None = None
+    defaults: dict[str, Any] = {}
+    lines: dict[str, Any]
+    """The wires, by name."""

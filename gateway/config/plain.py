@@ -1,0 +1,87 @@
+"""What the file says, checked and complete: plain data for the rest of the gateway."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from gateway.protocols.driver import AnyDriver, Timing
+from gateway.tags import Tag
+from gateway.transport.port import PortAddress, SerialSettings, SimulatorAddress
+from gateway.wiretime import Wire
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ZenohConfig:
+    """How to join the Zenoh network. `config_file` lies under these settings."""
+
+    prefix: str = "plant"
+    mode: str = "peer"  # peer, client or router
+    listen: tuple[str, ...] = ()
+    connect: tuple[str, ...] = ()
+    config_file: Path | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HistoryConfig:
+    """Where samples of tags with `history: true` are kept, how long (seconds), how many bytes."""
+
+    path: Path
+    keep: float
+    max_size: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WebConfig:
+    """Where the status page listens."""
+
+    host: str
+    port: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DeviceConfig:
+    """One station on a line. Times are seconds."""
+
+    name: str
+    driver: AnyDriver
+    timing: Timing  # the protocol's, with what the file says of this device
+    turnaround_configured: float | None  # None: measured
+    late_guard: float  # how long a late reply is waited for before anyone speaks again
+    blocks: bool  # also one put per scan with all changed tags
+    control: bool  # may be told to run, stop ...
+    enabled: bool
+    tags: tuple[Tag, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LineConfig:
+    """One wire and the devices on it."""
+
+    name: str
+    port: PortAddress
+    serial: SerialSettings
+    wire: Wire
+    echo: bool  # the port hears what it says
+    devices: tuple[DeviceConfig, ...]
+
+    @property
+    def simulated(self) -> bool:
+        return isinstance(self.port, SimulatorAddress)
+
+    @property
+    def tags(self) -> tuple[Tag, ...]:
+        return tuple(tag for device in self.devices for tag in device.tags)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Config:
+    """One whole file. `history` and `web` are None where the file has no such section."""
+
+    name: str
+    zenoh: ZenohConfig
+    history: HistoryConfig | None
+    web: WebConfig | None
+    lines: tuple[LineConfig, ...]
+
+    @property
+    def devices(self) -> tuple[DeviceConfig, ...]:
+        return tuple(device for line in self.lines for device in line.devices)

@@ -1,0 +1,77 @@
+"""The JSON schema of the file, for editors that complete and check."""
+
+from typing import Any, get_type_hints
+
+from pydantic import TypeAdapter
+
+from gateway.config.model import (
+    DURATION_SCHEMA,
+    DeviceSection,
+    FileSection,
+    LineSection,
+    Section,
+    TagDefaults,
+    TagSection,
+)
+from gateway.config.validate import DRIVERS
+
+_PARTS: dict[str, type[Section]] = {"Line": LineSection, "Tag": TagSection, "Defaults": TagDefaults}
+
+
+def schema() -> dict[str, Any]:
+    """A device is one of its protocols' shapes, with the settings of all devices in each."""
+    root = FileSection.model_json_schema()
+    shared: dict[str, Any] = root.setdefault("$defs", {})
+    for name, part in _PARTS.items():
+        shared[name] = _hoisted(part.model_json_schema(), shared)
+    for protocol in DRIVERS:
+        shared[protocol] = _device(protocol, shared)
+    shared["Device"] = {
+        "type": "object",
+        "required": ["protocol"],
+        "properties": {"protocol": {"enum": list(DRIVERS)}},
+        "allOf": [
+            {
+                "if": {"properties": {"protocol": {"const": name}}, "required": ["protocol"]},
+                "then": _ref(name),
+            }
+            for name in DRIVERS
+        ],
+    }
+    root["properties"]["lines"] |= {"additionalProperties": _ref("Line"), "minProperties": 1}
+    root["properties"]["defaults"] = _defaults("file")
+    line = shared["Line"]["properties"]
+    line["devices"] |= {"additionalProperties": _ref("Device"), "minProperties": 1}
+    line["defaults"] = _defaults("line")
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema"} | root
+
+
+def _device(protocol: str, shared: dict[str, Any]) -> dict[str, Any]:
+    driver = DRIVERS[protocol]
+    settings = _hoisted(TypeAdapter(driver).json_schema(), shared)["properties"]
+    for name, hint in get_type_hints(driver).items():
+        if hint is float and name in settings:  # every float among them is a time
+            settings[name] = dict(DURATION_SCHEMA)
+    common = _hoisted(DeviceSection.model_json_schema(), shared)["properties"]
+    common["tags"] |= {"additionalProperties": _ref("Tag")}
+    common["defaults"] = _defaults("device")
+    return {
+        "type": "object",
+        "description": (driver.__doc__ or "").partition("\n")[0],
+        "properties": settings | common,
+        "required": ["protocol"],
+        "additionalProperties": False,
+    }
+
+
+def _hoisted(part: dict[str, Any], shared: dict[str, Any]) -> dict[str, Any]:
+    shared.update(part.pop("$defs", {}))
+    return part
+
+
+def _ref(name: str) -> dict[str, Any]:
+    return {"$ref": f"#/$defs/{name}"}
+
+
+def _defaults(where: str) -> dict[str, Any]:
+    return _ref("Defaults") | {"description": f"Tag settings for every tag of this {where}."}

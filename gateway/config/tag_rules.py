@@ -1,0 +1,195 @@
+"""From what the file says of a tag to the tag: does its device have it, and does all of it fit?"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from gateway.config.customs import byte_order, default_type
+from gateway.config.messages import Mistakes, Path
+from gateway.config.model import TagDefaults, TagSection, WriteSection
+from gateway.errors import BadValue, ConfigError
+from gateway.protocols.driver import Address, AnyDriver, Area, Span, Unit
+from gateway.tags import Tag, WriteRule
+from gateway.values import Kind, Layout, ValueType
+
+_WIDE = (Kind.INT32, Kind.UINT32, Kind.FLOAT32, Kind.BCD32)
+
+
+@dataclass(frozen=True, slots=True)
+class TagSource:
+    """One tag as the file has it: its own settings, and those it inherits.
+
+    What is inherited and does not suit the tag is passed over (a scale for a bit, `write` for
+    an input); what the tag says itself must suit it.
+    """
+
+    device: str
+    name: str
+    own: TagSection
+    inherited: TagDefaults
+    path: Path
+    type_unknown: bool = False  # its `type` was a mistake, so nothing can be said of what fits
+
+    def says(self, setting: str) -> bool:
+        return setting in self.own.model_fields_set
+
+
+def inherit(outer: TagDefaults, inner: TagDefaults) -> TagDefaults:
+    """The settings of `outer`, with those that `inner` says itself laid over them."""
+    if not inner.model_fields_set:
+        return outer
+    return outer.model_copy(update={name: getattr(inner, name) for name in inner.model_fields_set})
+
+
+def build_tag(source: TagSource, driver: AnyDriver, mistakes: Mistakes) -> Tag | None:
+    """The tag, or None after its mistakes were noted."""
+    before = len(mistakes)
+    try:
+        address = driver.address(source.own.address)
+    except ConfigError as error:
+        mistakes.add((*source.path, "address"), str(error))
+        return None
+    area = driver.areas.get(address.area)
+    if area is None:  # a broadcast has no areas that can only be read
+        problem = f"{source.own.address} can only be read, and station {driver.station} never is"
+        mistakes.add((*source.path, "address"), problem)
+        return None
+    if source.type_unknown:
+        return None
+    settings = inherit(source.inherited, source.own)
+    kind = _type(source, settings, driver, address, mistakes)
+    units = 1 if address.bit is not None else kind.words // (2 if area.unit is Unit.DWORD else 1)
+    span = Span(area.name, address.number, units)
+    write = _write(source, settings, driver, span, kind, mistakes)
+    for place, problem in _misfits(source, driver, span, kind, write):
+        mistakes.add((*source.path, place), problem)
+    if len(mistakes) > before:
+        return None
+    order = settings.byte_order or byte_order(driver, kind.kind)
+    number = kind.is_number
+    tag = Tag(
+        device=source.device,
+        name=source.name,
+        text=source.own.address,
+        address=address,
+        span=span,
+        unit_kind=area.unit,
+        layout=Layout(kind, settings.word_order, order),
+        every=settings.every,
+        scale=settings.scale if number else 1.0,
+        offset=settings.offset if number else 0.0,
+        unit=settings.unit,
+        description=settings.description,
+        deadband=settings.deadband if number else None,
+        publish=settings.publish,
+        heartbeat=settings.heartbeat,
+        history=settings.history,
+        write=write,
+    )
+    _check_bounds(source, tag, mistakes)
+    return tag
+
+
+def _type(
+    source: TagSource,
+    settings: TagDefaults,
+    driver: AnyDriver,
+    address: Address,
+    mistakes: Mistakes,
+) -> ValueType:
+    area = driver.areas[address.area]
+    custom = default_type(driver, Unit.BIT if address.bit is not None else area.unit)
+    if settings.type is None:
+        return custom
+    misfit = _type_misfit(settings.type, area, address, driver)
+    if misfit is None:
+        return settings.type
+    if source.says("type"):
+        mistakes.add((*source.path, "type"), misfit)
+    return custom
+
+
+def _type_misfit(kind: ValueType, area: Area, address: Address, driver: AnyDriver) -> str | None:
+    spelt = driver.spell(address)
+    if area.unit is Unit.BIT or address.bit is not None:
+        what = "is a bit" if address.bit is None else "is one bit of a word"
+        return None if kind.kind is Kind.BOOL else f"{spelt} {what}: it can only be bool"
+    if area.unit is Unit.DWORD:
+        wide = ", ".join(_WIDE)
+        return None if kind.kind in _WIDE else f"{spelt} has 32 bits, no {kind}: use one of {wide}"
+    if kind.kind is Kind.BOOL:
+        bit = driver.spell(address._replace(bit=0))
+        return f"{spelt} is a word: for one of its bits write {bit}, or name a type for the word"
+    return None
+
+
+def _misfits(
+    source: TagSource, driver: AnyDriver, span: Span, kind: ValueType, write: WriteRule | None
+) -> Iterator[tuple[str, str]]:
+    """(setting, what is wrong with it)."""
+    area = driver.areas[span.area]
+    first = driver.spell(Address(area.name, span.start))
+    cost = driver.cost(span) if area.readable else driver.write_cost(span)
+    if span.start + span.size - 1 > area.last:
+        last = driver.spell(Address(area.name, area.last))
+        yield "address", f"a {kind} at {first} takes {span.size} words, but the last is {last}"
+    elif cost is None:
+        yield "type", f"a {kind} is {span.size} words, more than one exchange can carry"
+    if not area.readable and write is None:
+        yield "write", f"{first} is never read at station {driver.station}: it needs write: true"
+    if not area.readable and write is not None and write.verify:
+        yield "write", f"{first} is never read at station {driver.station}: verify cannot work"
+    if not kind.is_number:
+        for setting in ("scale", "offset", "deadband"):
+            if source.says(setting):
+                yield setting, f"a {kind} has no {setting}: only numbers have"
+
+
+def _write(
+    source: TagSource,
+    settings: TagDefaults,
+    driver: AnyDriver,
+    span: Span,
+    kind: ValueType,
+    mistakes: Mistakes,
+) -> WriteRule | None:
+    """The rule for writing; None where nothing may be written."""
+    setting, path = settings.write, (*source.path, "write")
+    if setting is False:
+        return None
+    own, spelt = source.says("write"), source.own.address
+    area = driver.areas[span.area]
+    if not area.writable:
+        if own:
+            mistakes.add(path, f"{spelt} can only be read: nothing can be written to {area.name}")
+        return None
+    if area.readable and driver.cost(span) is not None and driver.write_cost(span) is None:
+        if own:
+            mistakes.add(path, f"{spelt} cannot be written in one exchange")
+        return None
+    if not isinstance(setting, WriteSection):
+        return WriteRule()
+    bounded = setting.min is not None or setting.max is not None
+    if bounded and not kind.is_number and own:
+        mistakes.add(path, f"a {kind} has no min and max: only numbers have")
+    number = kind.is_number
+    return WriteRule(
+        min=setting.min if number else None,
+        max=setting.max if number else None,
+        verify=setting.verify,
+        repeat=setting.repeat,
+        latest=setting.latest,
+    )
+
+
+def _check_bounds(source: TagSource, tag: Tag, mistakes: Mistakes) -> None:
+    """A bound that the device cannot hold would be refused at the first write: say so now."""
+    if tag.write is None or not source.says("write"):
+        return
+    for setting in ("min", "max"):
+        bound = getattr(tag.write, setting)
+        if bound is None:
+            continue
+        try:
+            tag.encode(int(bound) if bound == int(bound) else bound)
+        except BadValue as error:
+            mistakes.add((*source.path, "write", setting), str(error))

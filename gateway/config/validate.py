@@ -1,0 +1,157 @@
+"""Pydantic's findings, in the words of somebody who stands before the machine."""
+
+import dataclasses
+import json
+from collections.abc import Collection, Mapping
+from typing import Any, TypeVar, get_args, get_type_hints
+
+from pydantic import TypeAdapter, ValidationError
+from pydantic_core import ErrorDetails
+
+from gateway.config import written
+from gateway.config.messages import Mistakes, Path, meant, one_of, shown
+from gateway.config.model import Section
+from gateway.errors import ConfigError
+from gateway.protocols import PlcDriver
+from gateway.protocols.driver import AnyDriver
+
+S = TypeVar("S", bound=Section)
+
+DRIVERS: dict[str, type[AnyDriver]] = {
+    get_args(get_type_hints(driver)["protocol"])[0]: driver for driver in get_args(PlcDriver)
+}
+_ADAPTERS = {name: TypeAdapter(driver) for name, driver in DRIVERS.items()}
+# The branches of `write:`, which pydantic names in its places but the file does not.
+_BRANCHES = ("flag", "rule")
+
+
+def section(kind: type[S], raw: object, path: Path, mistakes: Mistakes, called: str) -> S | None:
+    """The section, or what is left of it without its mistakes; None if that is nothing."""
+    try:
+        return kind.model_validate(raw)
+    except ValidationError as error:
+        rest = raw
+        for detail in error.errors():
+            place = tuple(chunk for chunk in detail["loc"] if chunk not in _BRANCHES)
+            mistakes.add((*path, *place), _sentence(detail, called, _known(kind, place[:-1])))
+            rest = _without(rest, place)
+    try:
+        return kind.model_validate(rest)
+    except ValidationError:
+        return None
+
+
+def _without(raw: Any, place: Path) -> Any:
+    """A copy of the settings without the one at `place`; a list with a mistake goes as a whole."""
+    if not isinstance(raw, dict) or not place or place[0] not in raw:
+        return raw
+    rest = dict(raw)
+    inner = rest.pop(str(place[0]))
+    if len(place) > 1 and isinstance(inner, dict):
+        rest[str(place[0])] = _without(inner, place[1:])
+    return rest
+
+
+def driver_of(
+    protocol: str, settings: Mapping[str, Any], path: Path, mistakes: Mistakes
+) -> AnyDriver | None:
+    """The driver with these settings; one with the settings that are right if some are wrong."""
+    values: dict[str, Any] = {}
+    hints = get_type_hints(DRIVERS[protocol])
+    for name, value in settings.items():
+        try:
+            # Every float among a driver's settings is a time.
+            values[name] = written.duration(value) if hints[name] is float else value
+        except ConfigError as error:
+            mistakes.add((*path, name), str(error))
+    try:
+        return _driver(protocol, values)
+    except ValidationError as error:
+        for detail in error.errors():
+            place = detail["loc"]
+            text = _sentence(detail, f"a {protocol} device", ())
+            first = text.split(maxsplit=1)[0].rstrip(":,")
+            place = (first,) if not place and first in values else place
+            mistakes.add((*path, *place), text)
+            values.pop(str(place[0]) if place else "station", None)
+    try:
+        return _driver(protocol, values)
+    except ValidationError:
+        return None
+
+
+def driver_settings(protocol: str) -> set[str]:
+    """The names of its own settings in the file."""
+    # mypy: that drivers are dataclasses is more than a Protocol can say.
+    fields = dataclasses.fields(DRIVERS[protocol])  # type: ignore[arg-type]
+    return {field.name for field in fields if field.init}
+
+
+def _driver(protocol: str, values: Mapping[str, Any]) -> AnyDriver:
+    # As JSON, because pydantic is strict there (true is no number) and still builds dataclasses.
+    text = json.dumps({"protocol": protocol, **values}, default=str)
+    driver: AnyDriver = _ADAPTERS[protocol].validate_json(text, strict=True)
+    return driver
+
+
+def _known(kind: type[Section], place: Path) -> Collection[str]:
+    """The settings there are at a place inside a section."""
+    for chunk in place:
+        inner = _inner(kind.model_fields[str(chunk)].annotation)
+        if inner is None:
+            return ()
+        kind = inner
+    return kind.model_fields
+
+
+def _inner(annotation: Any) -> type[Section] | None:
+    if isinstance(annotation, type):
+        return annotation if issubclass(annotation, Section) else None
+    return next(filter(None, map(_inner, get_args(annotation))), None)
+
+
+_NOT = {
+    "bool_type": "is neither true nor false",
+    "int_type": "is no whole number",
+    "int_from_float": "is no whole number",
+    "float_type": "is no number",
+    "finite_number": "is no number that can be used",
+    "string_type": "is no text: put it in quotes",
+    "list_type": "is no list: write it as [first, second]",
+    "tuple_type": "is no list: write it as [first, second]",
+    "dict_type": "stands where settings are expected, each as `name: value`",
+    "model_type": "stands where settings are expected, each as `name: value`",
+}
+
+
+def _sentence(detail: ErrorDetails, called: str, known: Collection[str]) -> str:
+    value, context = shown(detail["input"]), detail.get("ctx", {})
+    match detail["type"]:
+        case "missing":
+            return f"missing: {called} needs it"
+        case "extra_forbidden":
+            place = [chunk for chunk in detail["loc"] if chunk not in _BRANCHES]
+            owner = str(place[-2]) if len(place) > 1 else called
+            return unknown(str(place[-1]), owner, known)
+        case "value_error":
+            return str(context["error"])
+        case "bool_type" if "flag" in detail["loc"]:
+            return f"{value}: write true, false or {{min: 0, max: 100, verify: true}}"
+        case "literal_error" | "enum":
+            choices = str(context["expected"]).replace("'", "")
+            return f"{value} is not known: use {choices}"
+        case "greater_than_equal":
+            return f"{value} is below {context['ge']}"
+        case "less_than_equal":
+            return f"{value} is above {context['le']}"
+        case other if other in _NOT:
+            return f"{value} {_NOT[other]}"
+    return f"{value}: {detail['msg']}"
+
+
+def unknown(name: str, owner: str, known: Collection[str]) -> str:
+    return f"no setting of {owner}: {meant(name, known)}" if known else f"no setting of {owner}"
+
+
+def protocols() -> str:
+    return one_of(DRIVERS)

@@ -1,0 +1,205 @@
+"""How single settings are written: `500ms`, `1GB`, `2%`, `7E1`, names, key prefixes.
+
+Every function takes what the file has, of any type, and raises `ConfigError` saying what
+would be right.
+"""
+
+import math
+import re
+import unicodedata
+from pathlib import Path
+
+from gateway.config.messages import one_of, shown
+from gateway.errors import ConfigError
+from gateway.tags import Deadband, Publish
+from gateway.transport.port import PortAddress, parse_port
+from gateway.values import Order, ValueType, parse_type
+
+_DURATION = re.compile(r"([0-9]+(?:\.[0-9]+)?) ?([A-Za-zµ]+)\Z")
+_SECONDS = {"ms": 0.001, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
+_SIZE = re.compile(r"([0-9]+(?:\.[0-9]+)?) ?([kKMGT]B)\Z")
+_BYTES = {"kB": 10**3, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
+_PERCENT = re.compile(r"([0-9]+(?:\.[0-9]+)?) ?%\Z")
+_WEB = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[^\[\]/:\s]+):([0-9]{1,5})\Z")
+_ENDPOINT = re.compile(r"[a-z][a-z0-9_-]*/[^\s/]\S*\Z")
+_FORMAT = re.compile(r"[78][NEO][12]\Z")
+# Rates that serial ports and PLCs know; a slip of the keyboard is rarely one of them.
+BAUDRATES = (
+    *(110, 300, 600, 1200, 2400, 4800, 9600, 14400, 19200, 28800, 31250, 38400, 56000, 57600),
+    *(76800, 115200, 128000, 187500, 230400, 250000, 256000, 460800, 500000, 576000, 921600),
+    *(1000000, 1152000, 1500000, 2000000, 2500000, 3000000, 3500000, 4000000),
+)
+_LONGEST_TIME = 3650 * 86400.0  # ten years; more is a slip, and clocks overflow
+
+DURATIONS = "500ms, 2s, 15min, 1h or 7d"
+
+
+def duration(text: object) -> float:
+    """`500ms` -> 0.5 seconds. A number without its unit is refused."""
+    if isinstance(text, (int, float)) and not isinstance(text, bool):
+        number = shown(text)
+        raise ConfigError(f"{number} has no unit: write {number}s or {number}ms")
+    match = _DURATION.match(text) if isinstance(text, str) else None
+    if match is None:
+        raise ConfigError(f"{shown(text)} is no duration: write it as {DURATIONS}")
+    if match[2] not in _SECONDS:
+        hint = f"{match[1]}min for minutes" if match[2] in "mM" else one_of(_SECONDS)
+        raise ConfigError(f"{text}: {match[2]} is no unit of time: use {hint}")
+    # By tenths of a millisecond, so that 1.1s is the number a person would write.
+    seconds = round(float(match[1]) * _SECONDS[match[2]], 7)
+    if seconds > _LONGEST_TIME:
+        raise ConfigError(f"{text} is longer than ten years")
+    return seconds
+
+
+def interval(text: object) -> float:
+    """A duration that is not zero."""
+    seconds = duration(text)
+    if seconds == 0:
+        raise ConfigError(f"{text}: an interval is longer than zero, such as 500ms")
+    return seconds
+
+
+def size(text: object) -> int:
+    """`1GB` -> 1000000000 bytes."""
+    match = _SIZE.match(text) if isinstance(text, str) else None
+    if match is None:
+        raise ConfigError(f"{shown(text)} is no size: write it as 500MB or 1GB")
+    octets = int(float(match[1]) * _BYTES[match[2]])
+    if octets < 10**6:
+        raise ConfigError(f"{text} is too little: use at least 1MB")
+    return octets
+
+
+def deadband(text: object) -> Deadband:
+    """`0.5` in the tag's unit, `2%` of the last published value."""
+    if isinstance(text, (int, float)) and not isinstance(text, bool):
+        if not 0 <= text < math.inf:
+            raise ConfigError(f"{text:g}: a deadband is 0 or more")
+        return Deadband(float(text))
+    match = _PERCENT.match(text) if isinstance(text, str) else None
+    if match is None:
+        raise ConfigError(f"{shown(text)} is no deadband: write 0.5 (in the tag's unit) or 2%")
+    if float(match[1]) > 100:
+        raise ConfigError(f"{text}: more than 100% would publish next to nothing")
+    return Deadband(float(match[1]), percent=True)
+
+
+def name(text: object, *, slashes: bool = False) -> str:
+    """Letters and digits of any script, `_`, `-` and `.`.
+
+    It comes out in composed form (NFC), so that it is one key however it was typed.
+    """
+    text = unicodedata.normalize("NFC", _text(text))
+    if not text:
+        raise ConfigError("a name has at least one character")
+    for letter in text:
+        if not (letter in "_-." or (slashes and letter == "/") or _lettered(letter)):
+            also = ", `/`" if slashes else ""
+            raise ConfigError(
+                f"{text!r} has {_spelt(letter)}: names are letters and digits, `_`, `-`, `.`{also}"
+            )
+    if slashes and ("" in text.split("/")):
+        raise ConfigError(f"{text!r}: a `/` stands between two parts of a name, not at its end")
+    return text
+
+
+def tag_name(text: object) -> str:
+    """As `name`; a `/` may stand inside."""
+    return name(text, slashes=True)
+
+
+def prefix(text: object) -> str:
+    """A Zenoh key prefix of one or more chunks: `plant/site-1`."""
+    text = _text(text)
+    for chunk in text.split("/"):
+        if not chunk:
+            raise ConfigError(f"{text!r}: a prefix is chunks with one `/` between two of them")
+        if chunk.startswith("@"):
+            raise ConfigError(f"{text!r}: chunks with @ are the gateway's own: leave the @ out")
+        if wild := next((letter for letter in "*$?#" if letter in chunk), None):
+            raise ConfigError(f"{text!r} has {wild}, a wildcard of Zenoh: leave it out")
+        if not chunk.isprintable():
+            raise ConfigError(f"{text!r} has a character that cannot be seen: leave it out")
+    return text
+
+
+def endpoint(text: object) -> str:
+    """A Zenoh endpoint: `tcp/127.0.0.1:7447`."""
+    if not isinstance(text, str) or not _ENDPOINT.match(text):
+        raise ConfigError(f"{shown(text)} is no Zenoh endpoint: write it as tcp/127.0.0.1:7447")
+    return text
+
+
+def web_address(text: object) -> tuple[str, int]:
+    """`127.0.0.1:8080` -> host and port."""
+    match = _WEB.match(text) if isinstance(text, str) else None
+    if match is None or not 1 <= int(match[2]) <= 65535:
+        raise ConfigError(f"{shown(text)} is no address to listen at: write it as 127.0.0.1:8080")
+    return match[1].strip("[]"), int(match[2])
+
+
+def scale(factor: float) -> float:
+    if factor == 0:
+        raise ConfigError("a scale of 0 would make every value the same")
+    return factor
+
+
+def port(text: object) -> PortAddress:
+    return parse_port(_text(text))
+
+
+def baudrate(value: object) -> int:
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise ConfigError(f"{shown(value)} is no baud rate: write a number such as 9600")
+    if value not in BAUDRATES:
+        near = min(BAUDRATES, key=lambda rate: abs(rate - value))
+        raise ConfigError(f"{value} is no baud rate of serial ports; the nearest is {near}")
+    return value
+
+
+def serial_format(text: object) -> str:
+    """`7E1`: data bits, parity, stop bits."""
+    if not isinstance(text, str) or not _FORMAT.match(text):
+        raise ConfigError(
+            f"{shown(text)} is no character format: write data bits (7 or 8), parity (N, E or O) "
+            "and stop bits (1 or 2), such as 7E1"
+        )
+    return text
+
+
+def value_type(text: object) -> ValueType:
+    return parse_type(_text(text))
+
+
+def order(text: object) -> Order:
+    if text not in list(Order):
+        raise ConfigError(f"{shown(text)} is no order: use {one_of(Order)}")
+    return Order(str(text))
+
+
+def publish(text: object) -> Publish:
+    if text not in list(Publish):
+        raise ConfigError(f"{shown(text)} is not known: use {one_of(Publish)}")
+    return Publish(str(text))
+
+
+def path(text: object) -> Path:
+    if not isinstance(text, str) or not text.strip() or "\0" in text:
+        raise ConfigError(f"{shown(text)} is no file name")
+    return Path(text)
+
+
+def _text(value: object) -> str:
+    if not isinstance(value, str):
+        raise ConfigError(f"{shown(value)} is no text")
+    return value
+
+
+def _lettered(letter: str) -> bool:
+    # Marks (M) are part of letters in many scripts: Thai, Hindi, Arabic.
+    return letter.isalnum() or unicodedata.category(letter).startswith("M")
+
+
+def _spelt(letter: str) -> str:
+    return {" ": "a space", "\t": "a tab", "/": "a `/`"}.get(letter, repr(letter))

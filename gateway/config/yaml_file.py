@@ -1,0 +1,233 @@
+"""The YAML file as plain data that remembers the line of everything in it.
+
+The rules are those of YAML 1.2, which editors check by: `010` is ten, `yes` and `on` are
+texts, `1e-3` is a number. A key is always a text. A key written twice is a mistake, and so is
+anything that only makes sense to a Python program.
+"""
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path as FilePath
+from typing import Any
+
+import yaml
+
+from gateway.config.messages import ConfigErrors, Mistakes, Path
+
+Entries = dict[str, tuple[yaml.Node, yaml.Node]]
+
+_KINDS = {yaml.ScalarNode: "str", yaml.SequenceNode: "seq", yaml.MappingNode: "map"}
+_TAGS = {kind: f"tag:yaml.org,2002:{name}" for kind, name in _KINDS.items()}
+# libyaml is ten times faster; PyYAML's own reader serves where it was built without. What a
+# scalar means is decided here, so PyYAML's own search for it (half of its time) is left out.
+_LOADER: Any = type(
+    "_Loader",
+    (yaml.CBaseLoader if yaml.__with_libyaml__ else yaml.BaseLoader,),
+    {
+        "resolve": lambda _self, kind, _value, _implicit: _TAGS[kind],
+        "descend_resolver": lambda _self, _node, _index: None,
+        "ascend_resolver": lambda _self: None,
+    },
+)
+
+_INT = re.compile(r"[-+]?[0-9]+\Z")
+_BASED = re.compile(r"0o[0-7]+\Z|0x[0-9A-Fa-f]+\Z")
+_FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?\Z")
+_WORDS: dict[str, object] = {
+    "": None,
+    "~": None,
+    **dict.fromkeys(("null", "Null", "NULL"), None),
+    **dict.fromkeys(("true", "True", "TRUE"), True),
+    **dict.fromkeys(("false", "False", "FALSE"), False),
+    **dict.fromkeys((".inf", "+.inf", ".Inf", "+.Inf"), float("inf")),
+    **dict.fromkeys(("-.inf", "-.Inf"), float("-inf")),
+    **dict.fromkeys((".nan", ".NaN"), float("nan")),
+}
+# What an alias may blow a small file up to; ten times a gateway of 10,000 tags.
+_MOST_NODES = 2_000_000
+_PLAIN_TAGS = set(_TAGS.values())
+_NUMERIC = frozenset("+-.0123456789")
+
+
+@dataclass(slots=True)
+class YamlFile:
+    """One file that has been read; `data` is dicts, lists, texts, numbers, booleans and None."""
+
+    name: str
+    root: yaml.MappingNode
+    texts: frozenset[str]
+    data: dict[str, Any] = field(default_factory=dict)
+    _entries: dict[int, Entries] = field(default_factory=dict)
+    _open: set[int] = field(default_factory=set)
+    _nodes: int = 0
+
+    def line(self, path: Path) -> int:
+        """The line, from 1, of the deepest part of `path` that the file has."""
+        node: yaml.Node = self.root
+        mark = node.start_mark
+        for chunk in path:
+            if isinstance(node, yaml.MappingNode) and chunk in (entries := self._of(node)):
+                key, node = entries[str(chunk)]
+                mark = key.start_mark
+            elif isinstance(node, yaml.SequenceNode) and chunk in range(len(node.value)):
+                node = node.value[chunk]
+                mark = node.start_mark
+            else:
+                break
+        return _line(mark)
+
+    def read(self, mistakes: Mistakes) -> None:
+        """Fill `data`, and find what YAML allows but a configuration does not."""
+        found = self._plain(self.root, (), mistakes)
+        self.data = found if isinstance(found, dict) else {}
+
+    def _plain(self, node: yaml.Node, path: Path, mistakes: Mistakes) -> Any:
+        self._nodes += 1
+        if self._nodes > _MOST_NODES or id(node) in self._open or len(path) > 50:
+            raise ConfigErrors(
+                [f"{self.name}:{_line(node.start_mark)}: its anchors repeat without end"]
+            )
+        if node.tag not in _PLAIN_TAGS:
+            mistakes.add(path, f"{node.tag!r} cannot be used here: write the value alone")
+            return None
+        if isinstance(node, yaml.ScalarNode):
+            text = str(node.value)
+            if node.style not in (None, "") or (path and path[-1] in self.texts and text):
+                return text
+            return _scalar(text)
+        self._open.add(id(node))
+        if isinstance(node, yaml.SequenceNode):
+            result: Any = [
+                self._plain(item, (*path, i), mistakes) for i, item in enumerate(node.value)
+            ]
+        else:
+            assert isinstance(node, yaml.MappingNode)  # noqa: S101  YAML has no fourth kind
+            self._check_keys(node, path, mistakes)
+            result = {
+                name: self._plain(value, (*path, name), mistakes)
+                for name, (_, value) in self._of(node).items()
+            }
+        self._open.discard(id(node))
+        return result
+
+    def _check_keys(self, node: yaml.MappingNode, path: Path, mistakes: Mistakes) -> None:
+        first: dict[str, int] = {}
+        for key, _ in node.value:
+            line = _line(key.start_mark)
+            if not isinstance(key, yaml.ScalarNode):
+                mistakes.add(path, f"the key in line {line} is no plain name")
+            elif key.value in first and key.value != "<<":
+                both = "in one line" if first[key.value] == line else f"in line {line}"
+                mistakes.add(
+                    (*path, key.value),
+                    f"written twice, here and again {both}: only one of them can be meant",
+                )
+            else:
+                first[key.value] = line
+
+    def _of(self, node: yaml.MappingNode) -> Entries:
+        """The entries by name, first key first; what `<<` brings in gives way to the rest."""
+        if id(node) not in self._entries:
+            self._entries[id(node)] = {}  # a mapping merged into itself brings nothing
+            own: Entries = {}
+            for key, value in node.value:
+                if isinstance(key, yaml.ScalarNode) and not _is_merge(key):
+                    own.setdefault(str(key.value), (key, value))
+            for merged in _merged(node):
+                for name, entry in self._of(merged).items():
+                    own.setdefault(name, entry)
+            self._entries[id(node)] = own
+        return self._entries[id(node)]
+
+
+def read_yaml(path: FilePath, texts: frozenset[str]) -> tuple[YamlFile, Mistakes]:
+    """The file, and what was wrong in it so far.
+
+    `texts` are the keys whose values are texts even where they look like numbers (`7E1`).
+    Raises `ConfigErrors` where nothing can be read at all.
+    """
+    text = _text(path)
+    try:
+        root = yaml.compose(text.encode(), Loader=_LOADER)
+    except yaml.MarkedYAMLError as error:
+        raise ConfigErrors([_syntax(str(path), text, error)]) from None
+    except yaml.reader.ReaderError as error:
+        line = text.encode()[: error.position].count(b"\n") + 1
+        raise ConfigErrors([f"{path}:{line}: a control character: delete it"]) from None
+    if root is None:
+        raise ConfigErrors([f"{path}:1: the file is empty: it needs at least `lines:`"])
+    if not isinstance(root, yaml.MappingNode):
+        begin = "a file begins with names such as `gateway:` and `lines:`, each with a colon"
+        raise ConfigErrors([f"{path}:{_line(root.start_mark)}: no settings: {begin}"])
+    file = YamlFile(str(path), root, texts)
+    mistakes = Mistakes(file)
+    file.read(mistakes)
+    return file, mistakes
+
+
+def _text(path: FilePath) -> str:
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        raise ConfigErrors([f"{path}: there is no such file"]) from None
+    except IsADirectoryError:
+        raise ConfigErrors([f"{path}: this is a folder: name the file in it"]) from None
+    except OSError as error:
+        raise ConfigErrors([f"{path}: cannot be read: {error.strerror}"]) from None
+    if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        raise ConfigErrors([f"{path}:1: the file is UTF-16: save it as UTF-8"])
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        raise ConfigErrors(
+            [f"{path}:{line}: byte 0x{data[error.start]:02x} is no UTF-8: save the file as UTF-8"]
+        ) from None
+
+
+def _syntax(name: str, text: str, error: yaml.MarkedYAMLError) -> str:
+    mark = error.problem_mark or error.context_mark
+    line = _line(mark) if mark else 1
+    problem = error.problem or "not understood"
+    rows = text.splitlines()
+    row = rows[line - 1] if line <= len(rows) else ""
+    if "\t" in row[: len(row) - len(row.lstrip())]:
+        return f"{name}:{line}: a tab: YAML is indented with spaces"
+    if problem == "but found another document":
+        return f"{name}:{line}: a second document (`---`): a configuration is one document"
+    if problem == "found undefined alias":
+        return f"{name}:{line}: an alias (*) without its anchor (&) before it"
+    context = f" {error.context}" if error.context else ""
+    begun = ""
+    if error.context_mark and _line(error.context_mark) != line:
+        begun = f" that begins in line {_line(error.context_mark)}"
+    return f"{name}:{line}: no YAML:{context}{begun}{',' if context else ''} {problem}"
+
+
+def _line(mark: Any) -> int:
+    return int(mark.line) + 1
+
+
+def _scalar(text: str) -> object:
+    if text in _WORDS:
+        return _WORDS[text]
+    if text[0] not in _NUMERIC:
+        return text
+    if _INT.match(text):
+        return int(text)
+    if _BASED.match(text):
+        return int(text, 0)
+    return float(text) if _FLOAT.match(text) else text
+
+
+def _is_merge(key: yaml.ScalarNode) -> bool:
+    return key.value == "<<" and key.style in (None, "")
+
+
+def _merged(node: yaml.MappingNode) -> Iterator[yaml.MappingNode]:
+    for key, value in node.value:
+        if isinstance(key, yaml.ScalarNode) and _is_merge(key):
+            for one in value.value if isinstance(value, yaml.SequenceNode) else [value]:
+                if isinstance(one, yaml.MappingNode):
+                    yield one

@@ -1,0 +1,181 @@
+"""What follows from how a conversation went: for the device, the schedule, and those who watch."""
+
+import asyncio
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import structlog
+
+from gateway.device import Device, Standing
+from gateway.errors import Evidence, Garbled, Refusal, Refused, Unclear
+from gateway.schedule import Poll, Schedule
+from gateway.tags import Reason, Sample, Tag, bad
+
+log = structlog.get_logger("gateway.line")
+
+
+class Upstairs(Protocol):
+    """What a line hands its news to. Called on the event loop."""
+
+    def samples(self, samples: Sequence[Sample]) -> None: ...
+
+    def alive(self, device: Device, alive: bool) -> None: ...
+
+
+@dataclass(slots=True)
+class Consequences:
+    """Draws them. Never waits, never speaks on the wire."""
+
+    line: str
+    schedule: Schedule
+    upstairs: Upstairs
+    wall: Callable[[], int]  # ns since 1970
+    _stale_timers: dict[Device, asyncio.TimerHandle] = field(default_factory=dict)
+
+    def read(self, poll: Poll, units: Sequence[int]) -> None:
+        """A block was read well."""
+        device, block = poll.device, poll.block
+        now = _now()
+        poll.last_good = now
+        self.upstairs.samples(block.decode(units, self.wall()))
+        self.schedule.polled(poll, now)
+        refusals = device.refusals
+        if refusals.searching or refusals.bad:
+            if refusals.read(block):
+                log.info("address is there now", device=device.name, block=_spell(poll))
+                self._replan(device)
+            self._settle(device)
+
+    def answered(self, device: Device) -> None:
+        """The device said something to the point, good or bad news."""
+        if device.standing is Standing.UP and not device.doubtful:
+            return
+        before = device.standing
+        device.answered()
+        if before in (Standing.STARTING, Standing.SILENT):
+            self.upstairs.alive(device, True)
+            log.info("device answers", line=self.line, device=device.name)
+        if before is Standing.SILENT:
+            self.schedule.woke(device, _now())
+
+    def doubt(self, device: Device, error: Unclear, poll: Poll | None) -> Standing:
+        """A conversation ended unclear. Returns the device's standing before."""
+        before = device.standing
+        device.failed(error, None if poll is None else poll.block.span)
+        log.info("no good reply", line=self.line, device=device.name, why=str(error))
+        self._watch_stale(device)
+        return before
+
+    def unclear(self, device: Device, before: Standing, took: float, late: float | None) -> None:
+        """The quiet after an unclear conversation is over; it took `took` seconds in all.
+
+        `late`: how long after the time-out the right answer came, if it came.
+        """
+        if late is not None:
+            device.record.late += 1
+            device.doubtful = False
+            total = device.timing.reply_timeout + late
+            device.trouble = Garbled(
+                f"it took {total:.2f} s, reply_timeout is {device.timing.reply_timeout:g} s",
+                evidence=Evidence.SLOW,
+            )
+        unknown = before in (Standing.STARTING, Standing.SILENT)
+        if not unknown and device.failures <= device.timing.retries:
+            return
+        self.schedule.silent(device, _now(), took)
+        self.bad(device.tags, device.reason, device.diagnosis())
+        if before is not Standing.SILENT:
+            self.upstairs.alive(device, False)
+            log.warning("device silent", device=device.name, why=device.diagnosis())
+
+    def unread(self, poll: Poll, error: Unclear) -> None:
+        """A poll ended unclear: again in its turn, or its tags are bad."""
+        device = poll.device
+        if device.standing is Standing.SILENT:
+            return
+        if poll.tries < device.timing.retries:
+            self.schedule.again(poll)
+            return
+        self.bad(poll.block.tags, device.reason, str(error))
+        self.schedule.polled(poll, _now())
+
+    def refused(self, poll: Poll, error: Refused) -> None:
+        """A poll was refused: asked again, halved to find the culprit, or its tags are bad."""
+        device, block = poll.device, poll.block
+        device.record.refusals[error.code] += 1
+        if error.refusal is Refusal.DAMAGED and poll.tries < device.timing.retries:
+            self.schedule.again(poll)
+            return
+        if error.refusal is Refusal.ADDRESS:
+            halves = device.refusals.refused(block, self.wall(), error.code)
+            if halves:
+                self.schedule.replace(poll, halves, _now())
+                return
+            log.warning("address refused", device=device.name, block=_spell(poll), why=str(error))
+        self.bad(block.tags, Reason.REFUSED, str(error))
+        self.schedule.polled(poll, _now())
+        self._settle(device)
+
+    def hasten(self, device: Device, tag: Tag) -> None:
+        """Read the tag's block before all other polls."""
+        for poll in self.schedule.polls(device):
+            if tag in poll.block.tags:
+                self.schedule.hasten(poll)
+
+    def bad(self, tags: Sequence[Tag], reason: Reason, detail: str) -> None:
+        now = self.wall()
+        self.upstairs.samples([bad(tag, reason, now, detail) for tag in tags])
+
+    def line_down(self, why: str) -> None:
+        for device in self.schedule.devices:
+            self._forget_stale_timer(device)
+            self.upstairs.alive(device, False)
+            self.bad(device.tags, Reason.LINE_DOWN, why)
+
+    def line_up(self) -> None:
+        """Everything is asked at once; a doubt from before the loss stays."""
+        for device in self.schedule.devices:
+            device.standing = Standing.STARTING
+            self.schedule.woke(device, _now())
+
+    def _settle(self, device: Device) -> None:
+        if device.refusals.settle():
+            self._replan(device)
+
+    def _replan(self, device: Device) -> None:
+        device.plan()
+        self.schedule.plan(device, _now())
+
+    def _watch_stale(self, device: Device) -> None:
+        """While a device fails, each value turns bad once it is two intervals old."""
+        self._forget_stale_timer(device)
+        if device.standing not in (Standing.FAILING, Standing.SILENT):
+            return
+        now, later = _now(), []
+        for poll in self.schedule.polls(device):
+            if poll.last_good is None:
+                continue
+            ends = poll.last_good + 2 * poll.block.every
+            if ends > now:
+                later.append(ends)
+            else:
+                poll.last_good = None
+                self.bad(poll.block.tags, device.reason, device.diagnosis())
+        if later:
+            loop = asyncio.get_running_loop()
+            self._stale_timers[device] = loop.call_at(min(later), self._watch_stale, device)
+
+    def _forget_stale_timer(self, device: Device) -> None:
+        timer = self._stale_timers.pop(device, None)
+        if timer is not None:
+            timer.cancel()
+
+
+def _now() -> float:
+    return asyncio.get_running_loop().time()
+
+
+def _spell(poll: Poll) -> str:
+    first, last = poll.block.tags[0].text, poll.block.tags[-1].text
+    return first if first == last else f"{first}..{last}"

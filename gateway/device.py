@@ -1,0 +1,159 @@
+"""One device on a line as the gateway knows it: its plan, its standing, its record."""
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+from gateway.errors import DeviceError, Evidence, Garbled, GatewayError, NoReply
+from gateway.planner import Block, plan
+from gateway.protocols.driver import AnyDriver, Cost, Span, Timing
+from gateway.refusals import RETRY, Refusals
+from gateway.tags import Reason, Tag, Written
+from gateway.wiretime import Wire
+
+
+class Standing(StrEnum):
+    """How far a device can be trusted to answer."""
+
+    STARTING = "starting"  # not asked yet
+    UP = "up"
+    FAILING = "failing"  # its last conversation did not end well
+    SILENT = "silent"  # left alone but for a probe now and then
+
+
+@dataclass(slots=True)
+class Record:
+    """What has been counted since the start. Times in seconds."""
+
+    exchanges: int = 0
+    writes: int = 0
+    wire_time: float = 0.0
+    late: int = 0  # replies that came after the time-out
+    unasked: int = 0  # frames that answered nothing
+    overruns: int = 0  # polls left out because the one before was late
+    failures: Counter[str] = field(default_factory=Counter)  # by evidence
+    refusals: Counter[str] = field(default_factory=Counter)  # by the maker's code
+    turnaround: float | None = None  # what the station takes, measured
+    slowest_write: float = 0.0
+
+
+@dataclass(slots=True, eq=False)
+class Device:
+    """Settings, plan and state of one device; belongs to one line and to nobody else."""
+
+    name: str
+    driver: AnyDriver
+    wire: Wire
+    timing: Timing
+    tags: tuple[Tag, ...]
+    late_guard: float
+    turnaround: float | None = None  # set in the file; measured when None
+    blocks: tuple[Block, ...] = ()
+    standing: Standing = Standing.STARTING
+    failures: int = 0  # conversations in a row that ended unclear
+    doubt: Span | None = None  # the question whose answer may still come
+    doubtful: bool = False
+    salt: int = 0
+    pause: float = 0.0
+    next_probe: float = 0.0
+    trouble: DeviceError | None = None
+    record: Record = field(default_factory=Record)
+    refusals: Refusals = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.refusals = Refusals(self.driver.cost)
+        self.plan()
+
+    @property
+    def broadcast(self) -> bool:
+        """Nobody answers at this station number: it is written to, never asked."""
+        return not self.tags or all(
+            not self.driver.areas[tag.span.area].readable for tag in self.tags
+        )
+
+    def seconds(self, cost: Cost) -> float:
+        """One exchange on this line with this station."""
+        return self.wire.exchange(cost, self.timing, self.turnaround)
+
+    def plan(self) -> None:
+        """Decide anew what to ask, around what the device has refused."""
+        self.blocks = plan(self.tags, self.driver, self.seconds, self.refusals.cuts)
+
+    def interval(self, block: Block) -> float:
+        """How often the block is asked: refused addresses only rarely."""
+        if block.span in self.refusals.bad:
+            return max(RETRY, block.every)
+        return block.every
+
+    def answered(self) -> None:
+        """A conversation ended well."""
+        self.standing = Standing.UP
+        self.failures = 0
+        self.doubtful = False
+        self.doubt = None
+        self.trouble = None
+
+    def failed(self, error: DeviceError, doubt: Span | None) -> None:
+        """A conversation ended unclear; its answer may still be on the way."""
+        self.failures += 1
+        self.trouble = error
+        self.doubtful = True
+        self.doubt = doubt
+        if self.standing is not Standing.SILENT:
+            self.standing = Standing.FAILING
+        match error:
+            case NoReply() | Garbled():
+                self.record.failures[error.evidence] += 1
+            case _:
+                self.record.failures["other"] += 1
+
+    def measured(self, turnaround: float) -> None:
+        """A station's own time in one exchange, smoothed over about ten."""
+        known = self.record.turnaround
+        self.record.turnaround = turnaround if known is None else known + 0.1 * (turnaround - known)
+
+    @property
+    def reason(self) -> Reason:
+        """Why its values are not known."""
+        return Reason.GARBLED if isinstance(self.trouble, Garbled) else Reason.NO_REPLY
+
+    def diagnosis(self) -> str:
+        """What is the matter, in one sentence for people; empty when nothing is."""
+        match self.trouble:
+            case None:
+                return ""
+            case Garbled() as error:
+                return f"{_ADVICE.get(error.evidence, 'not understood')} ({error})"
+            case NoReply():
+                return (
+                    "No byte came back: check power, wiring (A and B), station number, "
+                    "baud rate and that no other master is on the line."
+                )
+            case error:
+                return str(error)
+
+
+_ADVICE = {
+    Evidence.ECHO: "Only our own request came back: the adapter echoes; set `echo: true`, "
+    "and the station itself is silent",
+    Evidence.NOISE: "Bytes came that are no frame: check baud rate, parity and data bits",
+    Evidence.CHECKSUM: "Frames come with a wrong sum: noise, missing termination, or sum check "
+    "set differently on both sides",
+    Evidence.STATION: "Another station answered: check the station numbers",
+    Evidence.SHAPE: "The answer was to some other question, or in another format",
+    Evidence.SLOW: "It answers, but too late: raise reply_timeout",
+    Evidence.TRUNCATED: "Answers break off: noise, or a device server that cuts packets",
+}
+
+
+@dataclass(slots=True, eq=False)
+class Write:
+    """A write on its way to the device; `done` is called exactly once."""
+
+    device: Device
+    tag: Tag
+    units: Sequence[int]
+    submitted: float
+    expires: float  # not sent any more after this: whoever asked has given up
+    done: Callable[[Written | GatewayError], None]

@@ -1,0 +1,298 @@
+"""One wire, one task: whatever is said on a wire is said from here."""
+
+import asyncio
+import random
+from collections.abc import Awaitable, Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import structlog
+
+from gateway.consequences import Consequences, Upstairs
+from gateway.device import Device, Standing, Write
+from gateway.errors import Busy, GatewayError, LineDown, Offline, Refused, Unclear
+from gateway.recorder import Recorder
+from gateway.schedule import Idle, Poll, Probe, Schedule
+from gateway.tags import Tag, Written
+from gateway.transport import Ear, Port
+from gateway.turn import Clock, Turn
+from gateway.wiretime import Wire
+from gateway.writing import Differs, carry_out, look_again
+
+log = structlog.get_logger("gateway.line")
+REOPEN_FIRST, REOPEN_LONGEST = 0.2, 10.0
+PATIENCE = 5.0  # a write that waited so long is not sent any more
+FAST = 19200  # above this baud rate the millisecond of an event loop counts
+GAP = 0.02  # quiet that ends a run of bytes nobody understood
+BROADCAST_PAUSE = 0.1
+
+Done = Callable[[Written | GatewayError], None]
+
+
+@dataclass(slots=True)
+class LineRecord:
+    """What has been counted on a line since the start. Times in seconds."""
+
+    opened: int = 0
+    since: float = 0.0  # when it was opened last, by the loop's clock
+    busy: float = 0.0  # characters on the wire, both ways
+    turnarounds: float = 0.0  # waiting for stations that answered
+    unasked: int = 0  # bytes that nobody had asked for
+    trouble: str = ""  # why the port is not open
+
+
+class Line:
+    """A port, the devices behind it, and the one task that talks to them."""
+
+    def __init__(
+        self,
+        name: str,
+        devices: Sequence[Device],
+        wire: Wire,
+        open_port: Callable[[Ear], Awaitable[Port]],
+        upstairs: Upstairs,
+        wall: Callable[[], int],
+        *,
+        echo: bool = False,
+        seed: int = 0,
+    ) -> None:
+        """`wall`: nanoseconds since 1970, for the samples' time stamps."""
+        self.name = name
+        self.devices = devices
+        self.wire = wire
+        self.record = LineRecord()
+        self.recorder = Recorder(name)
+        self.is_open = False
+        self._open_port = open_port
+        self._wall = wall
+        self._echo = echo
+        self._random = random.Random(seed)  # noqa: S311  (jitter, not a secret)
+        self._clock = Clock(spin=0.001 if wire.baudrate > FAST else 0.0)
+        self._schedule = Schedule(devices, 0.0, seed)
+        self._then = Consequences(name, self._schedule, upstairs, wall)
+        self._port: Port | None = None
+        self._turn: Turn | None = None
+        self._down: LineDown | None = None
+        self._wake = asyncio.Event()
+
+    # What others may ask of it
+
+    def submit(self, device: Device, tag: Tag, units: Sequence[int], done: Done) -> None:
+        """Write as soon as the current exchange ends. `done` gets the outcome, exactly once."""
+        now = _now()
+        write = Write(device, tag, units, now, now + PATIENCE, done)
+        if not self.is_open:
+            done(LineDown(self.record.trouble or f"line {self.name} is not open"))
+        elif not self._schedule.submit(write):
+            done(Busy(f"line {self.name}: too many writes are waiting; not sent"))
+        else:
+            self._wake.set()
+
+    def refresh(self, device: Device, tag: Tag) -> None:
+        """Poll the tag's block before all other polls."""
+        self._then.hasten(device, tag)
+        self._wake.set()
+
+    # The ear of the port
+
+    def received(self, data: bytes) -> None:
+        self.recorder.heard(data)
+        if self._turn is not None:
+            self._turn.received(data)
+        else:
+            self._clock.quiet_since = _now()
+            self.record.unasked += len(data)
+
+    def lost(self, error: Exception) -> None:
+        self._down = error if isinstance(error, LineDown) else LineDown(str(error))
+        if self._turn is not None:
+            self._turn.lost(self._down)
+        self._wake.set()
+
+    # The task
+
+    async def run(self) -> None:
+        """Serve the line until cancelled; what goes wrong on it stays on it."""
+        pause = REOPEN_FIRST
+        while True:
+            try:
+                await self._open_and_serve()
+            except LineDown as error:
+                trouble = str(error)
+                log.warning("line down", line=self.name, why=trouble)
+            except Exception as error:  # the bulkhead: lines must not sink together
+                trouble = f"internal error: {error!r}"
+                log.exception("line failed", line=self.name)
+            if self.record.opened and _now() - self.record.since > REOPEN_LONGEST:
+                pause = REOPEN_FIRST
+            self.record.trouble = trouble
+            self._then.line_down(trouble)
+            await asyncio.sleep(pause * self._random.uniform(0.8, 1.2))
+            pause = min(2 * pause, REOPEN_LONGEST)
+
+    async def _open_and_serve(self) -> None:
+        self._down = None
+        self._port = await self._open_port(self)
+        try:
+            self.is_open = True
+            self.record.opened += 1
+            self.record.since = _now()
+            self.record.trouble = ""
+            log.info("line open", line=self.name)
+            self._then.line_up()
+            await self._serve()
+        finally:
+            self.is_open = False
+            for write in self._schedule.withdraw():
+                write.done(LineDown(f"line {self.name} went down; not sent"))
+            await self._port.close()
+            self._port = None
+
+    async def _serve(self) -> None:
+        while self._down is None:
+            now = _now()
+            for write in self._schedule.expired(now):
+                write.done(Busy(f"waited {now - write.submitted:.1f} s for the line; not sent"))
+            match self._schedule.next(now):
+                case Poll() as poll:
+                    await self._poll(poll)
+                case Write() as write:
+                    await self._write(write)
+                case Probe(device):
+                    await self._probe(device)
+                case Idle(until):
+                    await self._idle(until)
+        raise self._down
+
+    async def _idle(self, until: float) -> None:
+        self._wake.clear()
+        timer = None
+        if until != float("inf"):
+            timer = asyncio.get_running_loop().call_at(until, self._wake.set)
+        try:
+            await self._wake.wait()
+        finally:
+            if timer is not None:
+                timer.cancel()
+
+    # Conversations
+
+    @contextmanager
+    def _turn_with(self, device: Device) -> Iterator[Turn]:
+        if self._port is None or self._down is not None:
+            raise self._down or LineDown(f"line {self.name} is not open")
+        turn = self._turn = Turn(
+            self._port,
+            device.driver.codec(),
+            self.wire,
+            self.wire.silence(device.timing),
+            device.timing.reply_timeout,
+            self._clock,
+            self.recorder,
+            device.driver.station,
+            self._echo,
+        )
+        try:
+            yield turn
+        finally:
+            self._turn = None
+            characters = (turn.sent + turn.heard) * self.wire.character
+            self.record.busy += characters
+            self.record.turnarounds += turn.turnaround
+            device.record.exchanges += turn.exchanges
+            device.record.unasked += turn.passed
+            device.record.wire_time += characters + turn.turnaround
+            if turn.exchanges:
+                device.measured(turn.turnaround / turn.exchanges)
+
+    async def _poll(self, poll: Poll) -> None:
+        device = poll.device
+        with self._turn_with(device) as turn:
+            try:
+                units = await device.driver.read(turn, poll.block.span)
+            except Refused as error:
+                self._then.answered(device)
+                self._then.refused(poll, error)
+            except Unclear as error:
+                await self._unclear(device, turn, error, poll)
+                self._then.unread(poll, error)
+            except LineDown:
+                device.doubtful = True
+                raise
+            else:
+                self._then.answered(device)
+                self._then.read(poll, units)
+
+    async def _probe(self, device: Device) -> None:
+        with self._turn_with(device) as turn:
+            device.salt += 1
+            try:
+                await device.driver.resync(turn, device.doubt, device.salt)
+            except Unclear as error:
+                await self._unclear(device, turn, error, None)
+                for write in self._schedule.withdraw(device):
+                    write.done(Offline(f"{device.name} does not answer; nothing was sent"))
+            else:
+                self._then.answered(device)
+
+    async def _write(self, write: Write) -> None:
+        device = write.device
+        outcome: Written | GatewayError = Unclear(
+            "the gateway stopped before the acknowledgement came; it may have been done"
+        )
+        try:
+            outcome = await self._try_to_write(write)
+        except LineDown as error:
+            outcome = Unclear(f"{error}; nobody knows whether the write was done")
+            device.doubtful = True
+            raise
+        finally:
+            device.record.writes += 1
+            device.record.slowest_write = max(device.record.slowest_write, _now() - write.submitted)
+            write.done(outcome)
+        self._then.hasten(device, write.tag)
+
+    async def _try_to_write(self, write: Write) -> Written | GatewayError:
+        """Never simply sent again: what may follow an unclear end is the tag's own rule."""
+        device = write.device
+        try:
+            with self._turn_with(device) as turn:
+                try:
+                    return self._noted(device, await carry_out(turn, write, self._wall))
+                except Differs as error:
+                    self._then.answered(device)
+                    return error
+                except Unclear as error:
+                    unclear = error
+                    await self._unclear(device, turn, error, None)
+            with self._turn_with(device) as turn:
+                try:
+                    settled = await look_again(turn, write, self._wall)
+                    return unclear if settled is None else self._noted(device, settled)
+                except Unclear as error:
+                    await self._unclear(device, turn, error, None)
+                    return error if isinstance(error, Differs) else unclear
+        except Refused as error:
+            self._then.answered(device)
+            device.record.refusals[error.code] += 1
+            return error
+
+    def _noted(self, device: Device, done: Written) -> Written:
+        if done.acknowledged:
+            self._then.answered(device)
+        else:  # a broadcast: stations need time to take it in
+            self._clock.quiet_since += device.turnaround or BROADCAST_PAUSE
+        return done
+
+    async def _unclear(self, device: Device, turn: Turn, error: Unclear, poll: Poll | None) -> None:
+        """Note what was heard and keep quiet until nothing of it can disturb what comes next."""
+        started = _now()
+        before = self._then.doubt(device, error, poll)
+        guard = 0.0 if before is Standing.SILENT else device.late_guard
+        late = await turn.settle(guard, max(GAP, 4 * self.wire.character))
+        took = device.timing.reply_timeout + _now() - started
+        self._then.unclear(device, before, took, late)
+
+
+def _now() -> float:
+    return asyncio.get_running_loop().time()

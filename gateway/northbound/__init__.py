@@ -1,0 +1,11 @@
+"""The Zenoh side of the gateway: one session, one publishing thread, bounded queues.
+
+`Northbound` is made with `ZenohSettings` and the `Plant` it speaks for, and `run`s until it is
+cancelled. Nothing it does holds the event loop, and nothing below it knows Zenoh.
+"""
+
+from gateway.northbound.northbound import Northbound
+from gateway.northbound.plant import Device, History, Plant
+from gateway.northbound.session import Mode, ZenohSettings
+
+__all__ = ["Device", "History", "Mode", "Northbound", "Plant", "ZenohSettings"]

@@ -1,0 +1,55 @@
+"""What the Zenoh side needs from the rest of the gateway, and nothing more."""
+
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Protocol
+
+from gateway.tags import Sample, Tag, Written
+from gateway.values import Value
+
+
+class Device(Protocol):
+    """One device and its tags."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def tags(self) -> Iterable[Tag]: ...
+
+    @property
+    def blocks(self) -> bool:
+        """Whether each scan is also published as one `@block`."""
+
+
+class Plant(Protocol):
+    """The gateway below: what it knows, and who writes. All but `sample` on the event loop."""
+
+    def devices(self) -> Iterable[Device]: ...
+
+    def tag(self, key: str) -> Tag | None:
+        """By `device/name`."""
+
+    def sample(self, tag: Tag) -> Sample:
+        """What is known now. Also called from the answering threads: one look-up, nothing else.
+
+        It must be updated before `Northbound.publish` is called, or a reader could keep the
+        older of two values.
+        """
+
+    async def write(self, tag: Tag, value: Value) -> Written:
+        """Returns when the device has acknowledged. Raises `GatewayError`; `Busy` and `BadValue`
+        only when nothing was sent. Cancelled when nobody waits any more."""
+
+    async def fresh(self, tag: Tag, max_age: float) -> Sample:
+        """A sample not older than `max_age` seconds, read from the device if need be."""
+
+    def status(self) -> Mapping[str, Mapping[str, object]]:
+        """Documents by path: `status`, `lines/<line>`, `devices/<device>`."""
+
+
+class History(Protocol):
+    """Samples of the past, by Zenoh's own time ranges."""
+
+    def samples(self, tag: Tag, time_range: str, limit: int | None) -> Iterator[Sample]:
+        """In the order of time; called from an answering thread. Raises `BadValue` for a range
+        that cannot be understood."""

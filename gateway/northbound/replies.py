@@ -1,0 +1,99 @@
+"""What is said to a question, on an answering thread: values, descriptions, status, outcomes."""
+
+from collections.abc import Callable, Iterable
+
+import zenoh
+
+from gateway import payload
+from gateway.keys import Asked, Family, Keys
+from gateway.northbound.directory import Directory
+from gateway.northbound.plant import History, Plant
+from gateway.payload import Failure, Problem
+from gateway.tags import Sample, Tag, Written
+
+_NO_HISTORY = Failure(Problem.NO_HISTORY, "no history is kept here: ask without _time")
+
+
+class Replies:
+    """Every method replies to one query and may block while the asker does not listen.
+
+    `stamp` gives the session's time stamps. Each reply has its own, for an AdvancedSubscriber
+    keeps only one of those that are equal.
+    """
+
+    def __init__(
+        self,
+        keys: Keys,
+        plant: Plant,
+        directory: Directory,
+        stamp: Callable[[], zenoh.Timestamp],
+        history: History | None = None,
+    ) -> None:
+        self._keys = keys
+        self._plant = plant
+        self._directory = directory
+        self._stamp = stamp
+        self._history = history
+        self._ended = False
+
+    def end(self) -> None:
+        """A long answer stops at the next tag."""
+        self._ended = True
+
+    def current(self, wanted: Asked, query: zenoh.Query) -> None:
+        if wanted.family is Family.BLOCK:
+            for device in self._directory.devices_under(wanted.of):
+                if device.blocks:
+                    stamp = self._stamp()
+                    block = payload.block(self._plant.sample(tag) for tag in device.tags)
+                    self._reply(query, self._keys.block(device.name), block, stamp)
+            return
+        for tag in self._directory.find(wanted.of):
+            if self._ended:
+                return
+            if wanted.family is Family.META:
+                self._reply(query, self._keys.meta(tag.key), payload.meta(tag), self._stamp())
+            else:
+                self._value(query, tag)
+
+    def _value(self, query: zenoh.Query, tag: Tag) -> None:
+        # Stamped before it is looked up: a newer value that is put meanwhile has the newer stamp.
+        stamp = self._stamp()
+        sample = self._plant.sample(tag)
+        self._reply(query, self._keys.value(tag.key), payload.value(sample), stamp)
+
+    def samples(self, samples: Iterable[Sample], query: zenoh.Query) -> None:
+        for sample in samples:
+            key = self._keys.value(sample.tag.key)
+            self._reply(query, key, payload.value(sample), self._stamp())
+
+    def history(self, wanted: Asked, query: zenoh.Query) -> None:
+        tags = self._directory.find(wanted.of)
+        if self._history is None:
+            if tags:  # else another gateway's, which may keep one
+                self.outcome(_NO_HISTORY, query)
+            return
+        try:
+            limit = query.parameters.get("limit")
+            for tag in tags:
+                for sample in self._history.samples(
+                    tag, query.parameters.get("_time") or "", None if limit is None else int(limit)
+                ):
+                    self.samples((sample,), query)
+        except ValueError as error:
+            self.outcome(Failure(Problem.BAD_QUERY, str(error)), query)
+
+    def status(self, documents: dict[str, bytes], query: zenoh.Query) -> None:
+        for key, document in documents.items():
+            if query.key_expr.intersects(key):
+                self._reply(query, key, document, self._stamp())
+
+    def outcome(self, result: Written | Failure, query: zenoh.Query) -> None:
+        data = payload.outcome(result)
+        if isinstance(result, Failure):
+            query.reply_err(data, encoding=zenoh.Encoding.APPLICATION_JSON)
+        else:
+            self._reply(query, str(query.key_expr), data, self._stamp())
+
+    def _reply(self, query: zenoh.Query, key: str, data: bytes, stamp: zenoh.Timestamp) -> None:
+        query.reply(key, data, encoding=zenoh.Encoding.APPLICATION_JSON, timestamp=stamp)

@@ -1,0 +1,167 @@
+"""The one Zenoh session: configured, opened and closed without ever holding the event loop."""
+
+import asyncio
+import json
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import TypeVar
+
+import structlog
+import zenoh
+
+from gateway.errors import ConfigError, GatewayError
+
+log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
+
+T = TypeVar("T")
+CLOSE_WITHIN = 2.0  # seconds
+_LONGEST_RETRY = 5.0  # seconds between two attempts of a client
+
+
+class Mode(StrEnum):
+    PEER = "peer"
+    CLIENT = "client"
+    ROUTER = "router"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ZenohSettings:
+    """`zenoh:` of the configuration file.
+
+    `config_file` is a Zenoh JSON5 file for everything else. `mode` here always counts; `listen`
+    and `connect` here replace the file's unless they are empty.
+    """
+
+    prefix: str = "plant"
+    mode: Mode = Mode.PEER
+    listen: tuple[str, ...] = ()
+    connect: tuple[str, ...] = ()
+    config_file: Path | None = None
+
+
+# What a gateway needs other than Zenoh's own defaults. A value that the user's file sets wins.
+_GATEWAY: dict[str, object] = {
+    "listen/endpoints": [],  # Zenoh's default is every interface
+    "connect/retry": {"period_init_ms": 500, "period_max_ms": 4000, "period_increase_factor": 2},
+    "open/return_conditions/connect_scouted": False,  # open returns in 1 ms, not in 500
+    "scouting/multicast/enabled": False,
+    "scouting/gossip/autoconnect": [],  # no links around the router and its access control
+    "timestamping/enabled": True,
+    "transport/shared_memory/enabled": False,
+    "transport/link/tx/lease": 3000,  # ms until a frozen gateway is taken for gone
+    # µs. The default of 1 ms loses a share of every burst without a word.
+    "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 50_000,
+    # µs that a frozen client may hold an answering thread before its link is closed.
+    "transport/link/tx/queue/congestion_control/block/wait_before_close": 1_000_000,
+}
+# A router carries the messages of others; any other gateway is sent writes, which are short.
+_LONGEST_MESSAGE = {"transport/link/rx/max_message_size": 1024 * 1024}
+
+
+def configure(settings: ZenohSettings) -> zenoh.Config:
+    """The session's configuration. Raises `ConfigError` for a bad file or endpoint."""
+    config = zenoh.Config() if settings.config_file is None else _from_file(settings.config_file)
+    untouched = zenoh.Config()
+    wanted = _GATEWAY if settings.mode is Mode.ROUTER else _GATEWAY | _LONGEST_MESSAGE
+    for path, setting in wanted.items():
+        if config.get_json(path) == untouched.get_json(path):
+            config.insert_json5(path, json.dumps(setting))
+    config.insert_json5("mode", json.dumps(settings.mode.value))
+    if settings.mode is Mode.CLIENT:
+        # It would wait for ever in a thread that nobody can stop: `opened` tries again instead.
+        config.insert_json5("connect/timeout_ms", "1000")
+    for side, endpoints in (("listen", settings.listen), ("connect", settings.connect)):
+        for endpoint in endpoints:
+            _check(side, endpoint)
+        if endpoints:
+            config.insert_json5(f"{side}/endpoints", json.dumps(endpoints))
+    return config
+
+
+def _from_file(path: Path) -> zenoh.Config:
+    try:
+        return zenoh.Config.from_json5(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"zenoh config_file {path}: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise ConfigError(f"zenoh config_file {path} is no UTF-8 text") from None
+    except zenoh.ZError as error:
+        raise ConfigError(f"zenoh config_file {path}: {error}") from None
+
+
+_WITH_PORT = ("tcp", "udp", "tls", "quic", "ws")
+
+
+def _check(side: str, endpoint: str) -> None:
+    protocol, slash, address = endpoint.partition("/")
+    if not slash or not address:
+        raise ConfigError(f"zenoh {side} {endpoint!r}: write it as tcp/127.0.0.1:7447")
+    if protocol not in (*_WITH_PORT, "unixsock-stream"):
+        raise ConfigError(
+            f"zenoh {side} {endpoint!r}: {protocol} is none of {', '.join(_WITH_PORT)}"
+        )
+    if protocol == "unixsock-stream":
+        return
+    host, _, port = address.partition("?")[0].partition("#")[0].rpartition(":")
+    if not host or not port.isdecimal() or int(port) > 65535:
+        raise ConfigError(f"zenoh {side} {endpoint!r}: write it as {protocol}/host:port")
+
+
+async def opened(config: zenoh.Config, *, retry: bool) -> zenoh.Session:
+    """The open session. With `retry` (a client) it tries until there is a router.
+
+    Raises `GatewayError` when it cannot be opened, a port in use for instance.
+    """
+    pause = 0.5
+    while True:
+        opening = asyncio.ensure_future(off_loop(zenoh.open, config))
+        try:
+            return await asyncio.shield(opening)
+        except asyncio.CancelledError:
+            with suppress(zenoh.ZError):
+                await off_loop((await opening).close)  # it was opened for nobody
+            raise
+        except zenoh.ZError as error:
+            if not retry:
+                raise GatewayError(f"Zenoh cannot be opened: {_plain(error)}") from None
+            log.warning("no Zenoh router yet", error=_plain(error), again_in=pause)
+        await asyncio.sleep(pause)
+        pause = min(pause * 2, _LONGEST_RETRY)
+
+
+def _plain(error: zenoh.ZError) -> str:
+    """Zenoh's sentence without the place in its source."""
+    return str(error).partition(" at /")[0]
+
+
+async def off_loop(function: Callable[..., T], *arguments: object) -> T:
+    """Runs a call that blocks on a thread of its own, which holds up neither loop nor exit."""
+    loop = asyncio.get_running_loop()
+    done: asyncio.Future[T] = loop.create_future()
+
+    def settle(result: T | None, error: Exception | None) -> None:
+        if done.cancelled():
+            return
+        if error is not None:
+            done.set_exception(error)
+        else:
+            done.set_result(result)  # type: ignore[arg-type]  # T itself may be None
+
+    def run() -> None:
+        result: T | None = None
+        error: Exception | None = GatewayError(f"{function.__name__} ended in an unforeseen way")
+        try:
+            result = function(*arguments)
+            error = None
+        except (zenoh.ZError, OSError) as foreseen:
+            error = foreseen
+        finally:
+            with suppress(RuntimeError):  # the loop was closed meanwhile
+                loop.call_soon_threadsafe(settle, result, error)
+
+    threading.Thread(target=run, name=f"zenoh {function.__name__}", daemon=True).start()
+    return await done

@@ -1,0 +1,25 @@
+"""Liyan EX and Mitsubishi FX: the Computer Link of the Liyan manual Lylink-edoc0307."""
+
+from gateway.protocols.computer_link.codec import (
+    Ack,
+    Enquiry,
+    Frame,
+    LinkCodec,
+    Nak,
+    Reset,
+    Text,
+)
+from gateway.protocols.computer_link.driver import ComputerLink
+from gateway.protocols.computer_link.refusals import SILENT_CAUSES
+
+__all__ = [
+    "SILENT_CAUSES",
+    "Ack",
+    "ComputerLink",
+    "Enquiry",
+    "Frame",
+    "LinkCodec",
+    "Nak",
+    "Reset",
+    "Text",
+]

@@ -1,0 +1,298 @@
+"""Liyan EX and Mitsubishi FX over the Computer Link, also called dedicated protocol or FX links.
+
+Liyan Computer Link manual (Lylink-edoc0307), section numbers below are its own.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal, TypeVar
+
+from gateway.errors import BadValue, ConfigError
+from gateway.protocols.computer_link.codec import (
+    ALL_STATIONS,
+    PC,
+    PC_ON_DEMAND,
+    Ack,
+    Enquiry,
+    Frame,
+    FrameFormat,
+    LinkCodec,
+    Nak,
+    Text,
+)
+from gateway.protocols.computer_link.devices import DEVICE, PROFILES, Profile, ProfileName
+from gateway.protocols.computer_link.lists import (
+    data_characters,
+    decode_all,
+    listed_characters,
+    monitored_ways,
+    scattered_ways,
+)
+from gateway.protocols.computer_link.refusals import model_name, refused
+from gateway.protocols.computer_link.ways import Way, read_way, write_way
+from gateway.protocols.devices import parse_device, spell_device
+from gateway.protocols.driver import Address, Area, Cost, Span, Talk, Timing
+
+LinkTalk = Talk[Frame]
+T = TypeVar("T")
+W = TypeVar("W")
+
+_COUNT, _CODE = 2, 2  # characters of a count, of an error code
+_SWITCH = {"1": "1", "on": "1", "true": "1", "0": "0", "off": "0", "false": "0"}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ComputerLink:
+    """A device that speaks the Computer Link; the fields are its settings in the file.
+
+    `message_wait` is seconds in steps of 10 ms: the PLC answers no sooner. `send_area_c`
+    acknowledges each data reply. `monitor` lets scattered addresses be registered in the PLC.
+    """
+
+    protocol: Literal["computer-link"] = "computer-link"
+    station: int = 0
+    profile: ProfileName = "liyan"
+    frame_format: FrameFormat = 1
+    sum_check: bool = True
+    message_wait: float = 0.0
+    send_area_c: bool = False
+    monitor: bool = False
+    monitor_word_command: Literal["MN", "MW"] = "MN"
+
+    def __post_init__(self) -> None:
+        if self.profile not in PROFILES:
+            raise ConfigError(f"profile {self.profile!r} is not one of {', '.join(PROFILES)}")
+        if not 0 <= self.station <= self._limits.last_station:
+            raise ConfigError(
+                f"station {self.station} is not 0..{self._limits.last_station} "
+                f"(profile {self.profile})"
+            )
+        if self.frame_format not in (1, 4):
+            raise ConfigError(f"frame_format {self.frame_format} is not 1 or 4")
+        steps = self.message_wait * 100
+        if not 0 <= steps <= 15.0001 or abs(steps - round(steps)) > 0.0001:
+            raise ConfigError("message_wait is 0ms to 150ms in steps of 10ms")
+        if self.monitor and not self._limits.monitored:
+            raise ConfigError(f"monitor: a PLC of profile {self.profile} has no monitor commands")
+        if self.monitor_word_command not in ("MN", "MW"):
+            raise ConfigError(f"monitor_word_command {self.monitor_word_command!r} is not MN or MW")
+
+    @property
+    def areas(self) -> Mapping[str, Area]:
+        return self._limits.areas
+
+    @property
+    def timing(self) -> Timing:
+        return Timing(
+            reply_timeout=1.0 + self.message_wait,
+            turnaround=max(0.02, self.message_wait),
+            silence=0.02,  # about two scans between an exchange and the next ENQ
+            retries=2,
+        )
+
+    def address(self, text: str) -> Address:
+        """`D100`, `D0100`, `X17` (octal), `TN5` or `T5`, `D7.3`. Raises `ConfigError`."""
+        letters = text[:2].upper()
+        if letters in ("TC", "CC") and text[2:3].isdigit():
+            contact, value = f"{letters[0]}S{text[2:]}", f"{letters[0]}{text[2:]}"
+            raise ConfigError(
+                f"{text}: timer and counter coils cannot be reached over the Computer Link; "
+                f"the contact is {contact}, the current value {value}"
+            )
+        return parse_device(text, self._limits.table)
+
+    def spell(self, address: Address) -> str:
+        return spell_device(address, self._limits.table)
+
+    def codec(self) -> LinkCodec:
+        return LinkCodec(self.frame_format, self.sum_check)
+
+    # Batch read and write (2-1 to 2-4)
+
+    def cost(self, span: Span) -> Cost | None:
+        way = read_way(self._limits, span)
+        return None if way is None else self._text_cost(DEVICE + _COUNT, way.characters)
+
+    def write_cost(self, span: Span) -> Cost | None:
+        way = write_way(self._limits, span)
+        return None if way is None else self._ack_cost(DEVICE + _COUNT + way.characters)
+
+    async def read(self, talk: LinkTalk, span: Span) -> Sequence[int]:
+        way = _possible(read_way(self._limits, span), span)
+        command = "WR" if way.in_words else "BR"
+        return await self._ask_text(talk, command, way.batch, way.characters, way.decode)
+
+    async def write(self, talk: LinkTalk, span: Span, units: Sequence[int]) -> bool:
+        way = _possible(write_way(self._limits, span), span)
+        command = "WW" if way.in_words else "BW"
+        return await self._ask_ack(talk, command, way.batch + "".join(way.encode(units)))
+
+    # Scattered writes (2-5, 2-6)
+
+    def scattered_write_cost(self, spans: Sequence[Span]) -> Cost | None:
+        """One BT for points, one WT for words and whole sixteens of points.
+
+        None also where two spans meet: the first value would be acknowledged and never seen.
+        """
+        ways = scattered_ways(self._limits, spans)
+        return None if ways is None else self._ack_cost(_COUNT + listed_characters(ways))
+
+    async def write_scattered(
+        self, talk: LinkTalk, parts: Sequence[tuple[Span, Sequence[int]]]
+    ) -> bool:
+        spans = [span for span, _ in parts]
+        ways = _possible(scattered_ways(self._limits, spans), spans)
+        pieces = [
+            device + piece
+            for way, (_, units) in zip(ways, parts, strict=True)
+            for device, piece in zip(way.devices(), way.encode(units), strict=True)
+        ]
+        command = "WT" if ways[0].in_words else "BT"
+        return await self._ask_ack(talk, command, f"{len(pieces):02X}{''.join(pieces)}")
+
+    # Registered reads (2-7 to 2-10)
+
+    def monitor_cost(self, spans: Sequence[Span]) -> Cost | None:
+        """One MB for up to ten points, one MN for up to ten words or sixteens of points."""
+        ways = self._registered(spans)
+        return None if ways is None else self._text_cost(0, data_characters(ways))
+
+    async def register(self, talk: LinkTalk, spans: Sequence[Span]) -> None:
+        """The PLC has one list of points and one of words; each replaces the one before."""
+        ways = _possible(self._registered(spans), spans)
+        devices = [device for way in ways for device in way.devices()]
+        command = "WM" if ways[0].in_words else "BM"
+        await self._ask_ack(talk, command, f"{len(devices):02X}{''.join(devices)}")
+
+    async def read_registered(self, talk: LinkTalk, spans: Sequence[Span]) -> list[Sequence[int]]:
+        ways = _possible(self._registered(spans), spans)
+        command = self.monitor_word_command if ways[0].in_words else "MB"
+        characters = data_characters(ways)
+        return await self._ask_text(
+            talk, command, "", characters, lambda data: decode_all(ways, data)
+        )
+
+    # Control (2-11 to 2-13) and the question that cannot be mistaken
+
+    @property
+    def controls(self) -> frozenset[str]:
+        return frozenset({"run", "stop", "loopback", "model", "global"})
+
+    async def control(self, talk: LinkTalk, command: str, argument: str) -> str:
+        """`run`, `stop`, `model`; `loopback` with the text to send; `global` with on or off.
+
+        `global` goes to every station of the line, and none answers.
+        """
+        if command not in self.controls:
+            raise BadValue(f"{command!r} is none of {', '.join(sorted(self.controls))}")
+        if argument and command in ("run", "stop", "model"):
+            raise BadValue(f"{command} takes no argument")
+        match command:
+            case "run" | "stop":
+                await self._ask_ack(talk, "RR" if command == "run" else "RS", "")
+                return "acknowledged"
+            case "loopback":
+                return await self._loopback(talk, argument or "ABCDE")
+            case "model":
+                return await self._ask_text(talk, "PC", "", 2, model_name)
+        if argument.lower() not in _SWITCH:
+            raise BadValue(f"global takes on or off, not {argument!r}")
+        await talk.tell(self._enquiry("GW", _SWITCH[argument.lower()], ALL_STATIONS))
+        return "sent to all stations, none answers"
+
+    async def resync(self, talk: LinkTalk, doubt: Span | None, salt: int) -> None:
+        """A loopback: its text has a letter that no data reply has, and changes with `salt`."""
+        await self._loopback(talk, f"Z{salt & 0xFFFF:04X}")
+
+    def unasked(self, frame: Frame) -> str | None:
+        """What to say of a block that answers no question: on-demand data, an echo."""
+        match frame:
+            case Text(station, data, pc) if pc == PC_ON_DEMAND:
+                return f"on-demand data of station {station}: {data}"
+            case Enquiry(_, command, area):
+                return f"echo of {command} {area}"
+        return None
+
+    @property
+    def _limits(self) -> Profile:
+        return PROFILES[self.profile]
+
+    def _registered(self, spans: Sequence[Span]) -> list[Way] | None:
+        return monitored_ways(self._limits, spans) if self.monitor else None
+
+    async def _loopback(self, talk: LinkTalk, text: str) -> str:
+        most = self._limits.loopback
+        if not 1 <= len(text) <= most or not (text.isascii() and text.isprintable()):
+            raise BadValue(f"loopback takes 1 to {most} printable ASCII characters")
+        said = f"{len(text):02X}{text}"
+        return await self._ask_text(
+            talk, "TT", said, len(said), lambda data: text if data == said else None
+        )
+
+    def _enquiry(self, command: str, area: str, station: int | None = None) -> Enquiry:
+        to = self.station if station is None else station
+        return Enquiry(to, command, area, round(self.message_wait * 100))
+
+    async def _ask_text(
+        self,
+        talk: LinkTalk,
+        command: str,
+        area: str,
+        characters: int,
+        decode: Callable[[str], T | None],
+    ) -> T:
+        """Ask for data; `decode` says None to what cannot be the data asked for."""
+
+        def answers(frame: Frame) -> T | None:
+            match frame:
+                case Text(self.station, data, pc) if pc == PC:
+                    return decode(data)
+                case Nak(self.station, code, pc) if pc == PC:
+                    raise refused(self.station, code)
+            return None
+
+        reply = self._text_cost(len(area), characters).reply
+        answer = await talk.ask(self._enquiry(command, area), reply, answers)
+        if self.send_area_c:
+            await talk.tell(Ack(self.station))
+        return answer
+
+    async def _ask_ack(self, talk: LinkTalk, command: str, area: str) -> bool:
+        def answers(frame: Frame) -> bool | None:
+            match frame:
+                case Ack(self.station, pc) if pc == PC:
+                    return True
+                case Nak(self.station, code, pc) if pc == PC:
+                    raise refused(self.station, code)
+            return None
+
+        refusal = self._ack_cost(len(area)).reply + _CODE
+        return await talk.ask(self._enquiry(command, area), refusal, answers)
+
+    def _text_cost(self, area: int, characters: int) -> Cost:
+        """An exchange with `area` characters in the request and `characters` of data in the reply.
+
+        Request: ENQ, station, PC number, command, wait, area; reply: STX, station, PC number,
+        data, ETX; both with sum and CR LF where set. Area C counts as ours.
+        """
+        tail = self._sum + self._end
+        confirm = 5 + self._end if self.send_area_c else 0
+        return Cost(8 + area + tail + confirm, 6 + characters + tail)
+
+    def _ack_cost(self, area: int) -> Cost:
+        return Cost(8 + area + self._sum + self._end, 5 + self._end)
+
+    @property
+    def _sum(self) -> int:
+        return 2 if self.sum_check else 0
+
+    @property
+    def _end(self) -> int:
+        return 2 if self.frame_format == 4 else 0
+
+
+def _possible(way: W | None, asked: object) -> W:
+    """The plan is made with the costs, so nothing impossible is ever asked for."""
+    if way is None:
+        raise ValueError(f"{asked} does not fit one exchange")
+    return way

@@ -1,0 +1,263 @@
+"""Bytes to frames and back for devices without a protocol, whatever arrives, in bounded memory.
+
+A frame here is its data: header, terminator, sum, CR and LF are taken off, conversion is undone.
+"""
+
+from functools import lru_cache
+
+from gateway.errors import Evidence, Garbled
+from gateway.protocols.frames.bytetext import octets
+from gateway.protocols.frames.framing import Framing
+from gateway.protocols.frames.presets import written_out
+
+_PIECE = 1024  # bytes looked at in one go: the buffer never holds more than this and one frame
+_HEX = frozenset(b"0123456789ABCDEFabcdef")
+
+
+class FrameReader:
+    """The receiving side of a framing. It goes on after damage, so it can listen for years.
+
+    A frame is complete by its length, its terminator, or a gap. What lies before a header is
+    skipped, also a frame that was begun and never ended. Where there is no header, a frame can
+    begin only where another has ended or the line was quiet: with `quiet=False`, and after
+    damage, everything up to there is thrown away.
+    """
+
+    def __init__(self, framing: Framing, *, quiet: bool = True) -> None:
+        self._framing = framing = written_out(framing)
+        self._header = octets(framing.header)
+        self._mark = framing.mark
+        self._unit = 2 if framing.conversion else 1
+        self._after = (2 if framing.sum_check else 0) + len(framing.tail)
+        self._buffer = bytearray()
+        self._aligned = quiet or bool(self._header)
+
+    @property
+    def gap_timeout(self) -> float | None:
+        """Seconds without a byte after which `expire` is to be called; None: never."""
+        return self._framing.gap_timeout
+
+    @property
+    def pending(self) -> int:
+        """The bytes kept: part of a frame, or nothing known yet."""
+        return len(self._buffer)
+
+    def feed(self, data: bytes) -> list[bytes | Garbled]:
+        """The frames completed by `data`, and what was damaged among them, in order.
+
+        Damage upon damage is told once.
+        """
+        found: list[bytes | Garbled] = []
+        for start in range(0, len(data), _PIECE):
+            self._buffer += data[start : start + _PIECE]
+            while (cut := self._cut()) is not None:
+                _append(found, cut)
+        return found
+
+    def expire(self) -> list[bytes | Garbled]:
+        """What the gap has ended: a frame that only a gap can end, or one cut short."""
+        found: list[bytes | Garbled] = []
+        while self._hunt():
+            _append(found, self._ended_by_gap())
+            while (cut := self._cut()) is not None:  # a whole frame behind a false header
+                _append(found, cut)
+        self._buffer.clear()
+        self._aligned = True
+        return found
+
+    def settle(self) -> None:
+        """The line was quiet for so long that whatever comes now begins a frame."""
+        if not self._aligned:
+            self._buffer.clear()
+            self._aligned = True
+
+    def _ended_by_gap(self) -> bytes | Garbled:
+        framing, body = self._framing, len(self._header)
+        if not self._mark and framing.length is None:
+            data = bytes(self._buffer[body:])
+            self._buffer.clear()
+            return self._data(data)
+        damage = Garbled(
+            f"cut short: {self._missing()}", bytes(self._buffer), evidence=Evidence.TRUNCATED
+        )
+        self._drop(1 if self._header else len(self._buffer))
+        return damage
+
+    def _missing(self) -> str:
+        framing, body = self._framing, len(self._header)
+        if framing.length is not None and len(self._buffer) - body < framing.length * self._unit:
+            return f"fewer than {framing.length} bytes of data"
+        at = self._end_of_data(len(self._buffer))
+        if at is None:
+            return self._no_mark()
+        missing = self._after - (len(self._buffer) - at - len(self._mark))
+        if missing > len(framing.tail):
+            return "error 4, sum missing"
+        return "error 8, LF missing" if missing == 1 and framing.ending == "CR LF" else _NO_CR
+
+    def _no_mark(self) -> str:
+        return "error 10, terminator missing" if self._framing.terminator else _NO_CR
+
+    def _cut(self) -> bytes | Garbled | None:
+        """One frame, or one stretch of damage, off the buffer; None when it is not all there."""
+        if not self._hunt():
+            return None
+        framing, body = self._framing, len(self._header)
+        most = body + framing.longest * self._unit
+        if not self._mark:
+            return self._finish(most) if len(self._buffer) >= most else None
+        at = self._end_of_data(most)
+        if at is None:
+            if len(self._buffer) < most + len(self._mark):
+                return None
+            return self._endless(most)
+        if framing.length is None and self._header:
+            # The data cannot hold a header: this one begins the frame, the one before was noise.
+            again = self._buffer.rfind(self._header, 1, at)
+            if again > 0:
+                self._drop(again)
+                return self._cut()
+        return self._finish(at)
+
+    def _endless(self, most: int) -> Garbled:
+        why = f"{self._no_mark()} after {self._framing.longest} bytes of data"
+        again = -1
+        if self._header and self._framing.length is None:
+            again = self._buffer.rfind(self._header, 1, most + len(self._mark))
+        if again < 0:
+            return self._damage(why, most)
+        damage = Garbled(why, bytes(self._buffer), evidence=Evidence.TRUNCATED)
+        self._drop(again)
+        return damage
+
+    def _end_of_data(self, most: int) -> int | None:
+        """Where the mark stands, the data being at most up to `most`; None: not there (yet)."""
+        if self._framing.length is not None:
+            at = len(self._header) + self._framing.length * self._unit
+            return at if self._buffer.startswith(self._mark, at) else None
+        at = self._buffer.find(self._mark, len(self._header), most + len(self._mark))
+        return at if at >= 0 else None
+
+    def _finish(self, at: int) -> bytes | Garbled | None:
+        """Check what follows the data, which ends at `at`, and cut the frame off."""
+        framing, body = self._framing, len(self._header)
+        data = bytes(self._buffer[body:at])
+        end = at + len(self._mark)
+        if framing.sum_check:
+            end += 2
+            if len(self._buffer) < end:
+                return None
+            wanted, got = framing.sum_of(self._header, data), bytes(self._buffer[end - 2 : end])
+            if got.upper() != wanted:
+                why = f"error 4, sum {got!r} is not {wanted!r}"
+                return self._damage(why, end, evidence=Evidence.CHECKSUM, aligned=True)
+        for wanted_byte, why in zip(framing.tail, _tail_errors(framing.tail), strict=True):
+            if len(self._buffer) == end:
+                return None
+            if self._buffer[end] != wanted_byte:
+                return self._damage(why, end)
+            end += 1
+        result = self._data(data)
+        if isinstance(result, Garbled):
+            return self._damage(str(result), end, aligned=bool(self._mark))
+        self._drop(end)
+        return result + self._mark if framing.keep_terminator else result
+
+    def _data(self, data: bytes) -> bytes | Garbled:
+        if not self._framing.conversion:
+            return data
+        if len(data) % 2 or not _HEX.issuperset(data):
+            return Garbled("error 3, a character that is no hex digit", data)
+        return bytes.fromhex(data.decode("ascii"))
+
+    def _damage(
+        self,
+        why: str,
+        end: int,
+        *,
+        evidence: Evidence = Evidence.NOISE,
+        aligned: bool = False,
+    ) -> Garbled:
+        """Throw away what was damaged; behind a header only that, for a good frame may follow."""
+        damage = Garbled(why, bytes(self._buffer), evidence=evidence)
+        if self._header:
+            self._drop(1)
+        else:
+            self._drop(end)
+            self._aligned = aligned
+        return damage
+
+    def _hunt(self) -> bool:
+        """Whether the buffer now begins where a frame begins."""
+        if self._header:
+            self._drop_to(self._buffer.find(self._header), keep=len(self._header) - 1)
+            return self._buffer.startswith(self._header)
+        if not self._aligned:
+            self._align()
+        return self._aligned and bool(self._buffer)
+
+    def _align(self) -> None:
+        if not self._mark:
+            self._buffer.clear()  # only a gap can tell where a frame begins
+            return
+        self._drop_to(self._buffer.find(self._mark), keep=len(self._mark) - 1)
+        end = len(self._mark) + self._after
+        if self._buffer.startswith(self._mark) and len(self._buffer) >= end:
+            self._drop(end)
+            self._aligned = True
+
+    def _drop_to(self, at: int, keep: int) -> None:
+        self._drop(at if at >= 0 else max(0, len(self._buffer) - keep))
+
+    def _drop(self, count: int) -> None:
+        del self._buffer[:count]
+
+
+class FrameCodec:
+    """The codec of one turn: what a device answers, read strictly."""
+
+    def __init__(self, receive: Framing, send: Framing | None = None) -> None:
+        self._reader = FrameReader(receive)
+        self._send = written_out(receive if send is None else send)
+        self._damage: Garbled | None = None
+
+    @property
+    def gap_timeout(self) -> float | None:
+        """Seconds without a byte after which `expire` is to be called; None: never."""
+        return self._reader.gap_timeout
+
+    def encode(self, frame: bytes) -> bytes:
+        """Raises `BadValue` for data that this framing cannot carry."""
+        return self._send.encode(frame)
+
+    def feed(self, data: bytes) -> list[bytes]:
+        """The frames completed by `data`. Raises `Garbled`, but hands out first what came first."""
+        return self._strictly(self._reader.feed(data))
+
+    def expire(self) -> list[bytes]:
+        """The frame that a gap of `gap_timeout` has ended, if any. Raises `Garbled`."""
+        return self._strictly(self._reader.expire())
+
+    def _strictly(self, found: list[bytes | Garbled]) -> list[bytes]:
+        frames: list[bytes] = []
+        for item in found:
+            if isinstance(item, Garbled):
+                self._damage = self._damage or item
+            elif self._damage is None:
+                frames.append(item)
+        if self._damage is not None and not frames:
+            raise self._damage
+        return frames
+
+
+_NO_CR = "error 7, CR missing"
+
+
+@lru_cache(maxsize=8)
+def _tail_errors(tail: bytes) -> tuple[str, ...]:
+    return tuple(_NO_CR if byte == 0x0D else "error 8, LF missing" for byte in tail)
+
+
+def _append(found: list[bytes | Garbled], item: bytes | Garbled) -> None:
+    if not (isinstance(item, Garbled) and found and isinstance(found[-1], Garbled)):
+        found.append(item)

@@ -1,0 +1,165 @@
+"""Where a frame of a no-protocol device begins and ends: header, terminator, length, gap, sum.
+
+The framing of the Vigor VB-1COM (manual B-4: BFM#0 and #2 to #11, error numbers of BFM#29),
+which is general enough for scales, barcode readers and inverters of any make:
+
+    [header 0..4] data [terminator 0..4] [sum 2] [CR] [LF]
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from gateway.errors import BadValue, ConfigError
+from gateway.protocols.checksums import byte_sum
+from gateway.protocols.frames.bytetext import octets
+
+Preset = Literal["vb-1com", "vigor-rs", "ex485lnk-user", "k120s-drcv", "k120s-dsnd"]
+
+DEFAULT_GAP = 0.1  # s; ends a frame that neither a terminator nor its length can end
+
+
+# Which of several header bytes the sum leaves out; the manuals say the first, nothing confirms it.
+SumHeaderRule = Literal["first_byte_only", "whole_header"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Framing:
+    """One framing as the file writes it. With a `preset`, `presets.written_out` completes it.
+
+    `length` counts exactly so many data bytes, whatever they are; `max_length` ends a frame that
+    nothing else has ended. Both count data before conversion. `gap` in seconds, in steps of 10 ms.
+    """
+
+    preset: Preset | None = None
+    format: int | None = None  # vb-1com: 1..9
+    header: str = ""
+    terminator: str = ""
+    keep_terminator: bool = False  # the terminator belongs to the data (K120S DRCV)
+    ending: Literal["", "CR", "CR LF"] = ""
+    sum_check: bool = False
+    sum_header_rule: SumHeaderRule = "first_byte_only"
+    conversion: bool = False  # every data byte travels as two hex characters
+    buffer: Literal[16, 8] = 16  # bits of a buffer word; 8 halves the longest frame
+    length: int | None = None
+    max_length: int | None = None
+    gap: float | None = None
+
+    def __post_init__(self) -> None:
+        for name, text in (("header", self.header), ("terminator", self.terminator)):
+            if len(octets(text)) > 4:
+                raise ConfigError(f"{name} {text!r} is longer than 4 bytes")
+        if self.preset is None:
+            self._check_by_hand()
+        if self.keep_terminator and not self.terminator:
+            raise ConfigError("keep_terminator needs a terminator")
+        if self.keep_terminator and (self.sum_check or self.ending):
+            raise ConfigError("keep_terminator: a sum, CR or LF cannot follow")
+        for name, count in (("length", self.length), ("max_length", self.max_length)):
+            if count is not None and not 1 <= count <= self.capacity:
+                raise ConfigError(f"{name} {count} is not 1..{self.capacity}")
+        if self.length is not None and self.max_length is not None:
+            raise ConfigError("length is exact, max_length is not: write one of them")
+        self._check_gap()
+
+    def _check_by_hand(self) -> None:
+        if self.format is not None:
+            raise ConfigError("format belongs to preset vb-1com")
+        if self.sum_check and not self.terminator:
+            raise ConfigError("sum_check needs a terminator: the sum stands behind it")
+
+    def _check_gap(self) -> None:
+        if self.gap is None:
+            return
+        steps = self.gap * 100
+        if not 1 <= steps <= 32767 or abs(steps - round(steps)) > 1e-6:
+            raise ConfigError(f"gap {self.gap:g} s is not 10 ms to 327.67 s in steps of 10 ms")
+
+    @property
+    def capacity(self) -> int:
+        """The data bytes that the longest frame can hold."""
+        return 512 if self.buffer == 16 else 256
+
+    @property
+    def longest(self) -> int:
+        """The most data bytes of a frame."""
+        return self.length or self.max_length or self.capacity
+
+    @property
+    def mark(self) -> bytes:
+        """What ends the data: the terminator, or the CR where there is no terminator."""
+        return octets(self.terminator) or self._ending[:1]
+
+    @property
+    def tail(self) -> bytes:
+        """The CR and LF that follow mark and sum."""
+        return self._ending if self.terminator else self._ending[1:]
+
+    @property
+    def _ending(self) -> bytes:
+        return {"": b"", "CR": b"\r", "CR LF": b"\r\n"}[self.ending]
+
+    @property
+    def gap_timeout(self) -> float | None:
+        """Seconds of silence that end a frame; None where silence ends nothing."""
+        if self.gap is None and not self.mark:
+            return DEFAULT_GAP
+        return self.gap
+
+    @property
+    def longest_on_line(self) -> int:
+        """The characters of the longest frame, everything included."""
+        data = self.longest * (2 if self.conversion else 1)
+        around = octets(self.header) + self.mark + self.tail
+        return data + len(around) + (2 if self.sum_check else 0)
+
+    def sum_of(self, header: bytes, data: bytes) -> bytes:
+        """The sum over what is on the line, from behind the header through the terminator."""
+        left_out = 1 if self.sum_header_rule == "first_byte_only" else len(header)
+        return byte_sum(header[left_out:] + data + octets(self.terminator))
+
+    def encode(self, payload: bytes) -> bytes:
+        """The whole frame around `payload`. Raises `BadValue` for data it cannot carry."""
+        if len(payload) > self.capacity:
+            raise BadValue(f"{len(payload)} bytes of data, a frame holds {self.capacity}")
+        if self.keep_terminator:
+            return payload
+        header, terminator = octets(self.header), octets(self.terminator)
+        data = payload.hex().upper().encode() if self.conversion else payload
+        if self.length is None:
+            self._refuse_marks(data)
+        total = self.sum_of(header, data) if self.sum_check else b""
+        return header + data + terminator + total + self._ending
+
+    def _refuse_marks(self, data: bytes) -> None:
+        """Data that holds header, terminator or CR would be cut at the wrong place (B-4)."""
+        header, mark = octets(self.header), self.mark
+        if not mark:
+            return
+        line, at = header + data + mark, len(header) + len(data)
+        if line.find(mark, len(header)) != at or (self.ending and b"\r" in data):
+            raise BadValue(f"the data {data!r} holds what ends the frame")
+        if header and line.rfind(header, 1, at) > 0:
+            raise BadValue(f"the data {data!r} holds the header")
+
+
+def to_words(data: bytes, buffer: Literal[16, 8] = 16, *, high_first: bool = False) -> list[int]:
+    """The buffer words that `data` fills: low byte first, or one byte a word (`buffer` 8).
+
+    A lone last byte leaves the other half of its word 0. `high_first`: the other packing of K120S.
+    """
+    if buffer == 8:
+        return list(data)
+    order: Literal["big", "little"] = "big" if high_first else "little"
+    even = data + bytes(len(data) % 2)
+    return [int.from_bytes(even[i : i + 2], order) for i in range(0, len(even), 2)]
+
+
+def from_words(
+    words: Sequence[int], count: int, buffer: Literal[16, 8] = 16, *, high_first: bool = False
+) -> bytes:
+    """The first `count` bytes of buffer words; an odd count drops the last word's other byte."""
+    if buffer == 8:
+        return bytes(word & 0xFF for word in words)[:count]
+    order: Literal["big", "little"] = "big" if high_first else "little"
+    return b"".join(word.to_bytes(2, order) for word in words)[:count]

@@ -1,0 +1,215 @@
+"""What is said between the gateway and one Modbus device, whatever the frames are wrapped in."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from itertools import cycle, repeat
+from typing import NamedTuple
+
+from gateway.errors import BadValue, Refused
+from gateway.protocols.driver import Area, Cost, Span, Talk, Unit
+from gateway.protocols.modbus import pdu
+from gateway.protocols.modbus.addressing import Dialect, Limits, Place
+from gateway.protocols.modbus.frame import READ_BITS, Frame, answer_length
+
+_REMEMBERED = 1024  # spans whose question is kept ready
+_RESYNC_SIZES = 4
+
+
+class Question(NamedTuple):
+    """A read, ready to be asked."""
+
+    request: bytes
+    head: bytes  # function and byte count of the answer
+    length: int  # of the answer's PDU
+    chars: int  # of the whole answer
+    units: Callable[[bytes], Sequence[int]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Dialogue:
+    """One device as its settings describe it. Everything but the conversation is decided."""
+
+    station: int
+    chars: Callable[[int], int]  # of a frame, by the length of its PDU
+    dialect: Dialect
+    limits: Limits
+    write_single: bool
+    diagnostics: bool
+    low_first: bool
+    broadcast: bool = False  # everybody listens, nobody answers
+    numbered: bool = False  # questions carry a number
+    areas: Mapping[str, Area] = field(init=False)
+    _numbers: Iterator[int] = field(init=False)
+    _questions: dict[Span, Question] = field(init=False, default_factory=dict)
+
+    def __post_init__(self) -> None:
+        numbers = cycle(range(1, 65536)) if self.numbered else repeat(0)
+        object.__setattr__(self, "_numbers", numbers)
+        areas = [place.area for place in self.dialect.places.values()]
+        if self.broadcast:
+            areas = [replace(area, readable=False) for area in areas if area.writable]
+        object.__setattr__(self, "areas", {area.name: area for area in areas})
+
+    def cost(self, span: Span) -> Cost | None:
+        place = self._place(span)
+        if place is None or self.broadcast:
+            return None
+        if span.size * place.registers > self._most(place, reading=True):
+            return None
+        data = (span.size + 7) // 8 if _is_bits(place) else 2 * span.size * place.registers
+        return Cost(self.chars(5), self.chars(2 + data))
+
+    def write_cost(self, span: Span) -> Cost | None:
+        place = self._place(span)
+        if place is None or not place.area.writable:
+            return None
+        if span.size * place.registers > self._most(place, reading=False):
+            return None
+        data = (span.size + 7) // 8 if _is_bits(place) else 2 * span.size * place.registers
+        request = 5 if self._single(place, span) else 6 + data
+        return Cost(self.chars(request), 0 if self.broadcast else self.chars(5))
+
+    def _place(self, span: Span) -> Place | None:
+        place = self.dialect.places.get(span.area)
+        if place is None or span.size < 1:
+            return None
+        area = place.area
+        whole = area.first <= span.start and span.start + span.size - 1 <= area.last
+        return place if whole else None
+
+    def _most(self, place: Place, *, reading: bool) -> int:
+        limits = self.limits
+        if _is_bits(place):
+            return limits.read_bits if reading else limits.write_bits
+        return limits.read_words if reading else limits.write_words
+
+    def _single(self, place: Place, span: Span) -> bool:
+        return self.write_single and span.size == 1 and place.registers == 1
+
+    async def read(self, talk: Talk[Frame], span: Span) -> Sequence[int]:
+        question = self._questions.get(span) or self._prepare(span)
+        request, head, length, chars, units = question
+        station, number = self.station, next(self._numbers)
+        function = head[0]
+
+        def answers(frame: Frame) -> Sequence[int] | None:
+            heard = frame.pdu
+            if frame.station != station or frame.transaction != number:
+                return None
+            # An echoed question can look like an answer: 24 coils from wire address 0300h.
+            if len(heard) == length and heard[:2] == head and heard != request:
+                return units(heard)
+            pdu.raise_refusal(heard, function)
+            return None
+
+        return await talk.ask(Frame(station, request, number), chars, answers)
+
+    def _prepare(self, span: Span) -> Question:
+        place = self._place(span)
+        if place is None or self.cost(span) is None:
+            raise BadValue(f"{span} cannot be read in one exchange")
+        count = span.size * place.registers
+        request = pdu.read_request(place.function, place.at(span.start), count)
+        length = answer_length(request)
+        if _is_bits(place):
+            units = pdu.bits_in(count)
+        elif place.area.unit is Unit.DWORD:
+            units = pdu.dwords_in(span.size, low_first=self.low_first)
+        else:
+            units = pdu.words_in(count)
+        head = bytes((place.function, length - 2))
+        question = Question(request, head, length, self.chars(length), units)
+        if len(self._questions) >= _REMEMBERED:
+            self._questions.clear()
+        self._questions[span] = question
+        return question
+
+    async def write(self, talk: Talk[Frame], span: Span, units: Sequence[int]) -> bool:
+        request = self._write_request(span, units)
+        number = next(self._numbers)
+        frame = Frame(self.station, request, number)
+        if self.broadcast:
+            await talk.tell(frame)
+            return False
+        good = {request[:5]}  # 05 and 06 repeat the request, 15 and 16 its address and count
+        if self.dialect.forgets_address and request[0] == 6:
+            good.add(request[:1] + bytes(2) + request[3:])
+
+        def answers(heard: Frame) -> bool | None:
+            if heard.station != frame.station or heard.transaction != number:
+                return None
+            if heard.pdu in good:
+                return True
+            pdu.raise_refusal(heard.pdu, request[0])
+            return None
+
+        return await talk.ask(frame, self.chars(5), answers)
+
+    def _write_request(self, span: Span, units: Sequence[int]) -> bytes:
+        place = self._place(span)
+        if place is None or self.write_cost(span) is None or len(units) != span.size:
+            raise BadValue(f"{len(units)} units for {span} cannot be written in one exchange")
+        largest = {Unit.BIT: 1, Unit.WORD: 0xFFFF, Unit.DWORD: 0xFFFF_FFFF}[place.area.unit]
+        if not all(0 <= unit <= largest for unit in units):
+            raise BadValue(f"units of {span.area} are 0 to {largest}")
+        wire, single = place.at(span.start), self._single(place, span)
+        if _is_bits(place):
+            return pdu.write_bits_request(wire, units, single=single)
+        if place.area.unit is Unit.DWORD:
+            units = pdu.words_of(units, low_first=self.low_first)
+        return pdu.write_words_request(wire, units, single=single)
+
+    async def resync(self, talk: Talk[Frame], doubt: Span | None, salt: int) -> None:
+        """Read another byte count than `doubt` has, or ask function 08 to repeat a token.
+
+        An exception is a sign of life too. It names no address, though: it may be the late
+        answer to `doubt`, and the answer to our question still to come. So another size is asked
+        then, for which that one is no answer, unless questions carry a number.
+        """
+        try:
+            if self.diagnostics:
+                await self._loopback(talk, salt & 0xFFFF)
+            else:
+                await self.read(talk, self._harmless(doubt, salt))
+        except Refused:
+            if self.numbered or self.diagnostics:
+                return
+            with suppress(Refused):
+                await self.read(talk, self._harmless(doubt, salt + 1))
+
+    def _harmless(self, doubt: Span | None, salt: int) -> Span:
+        """A short read near `doubt` whose byte count is neither its own nor that of `salt - 1`."""
+        places = self.dialect.places
+        if doubt is None or self._place(doubt) is None:
+            first = (places.get("D") or next(iter(places.values()))).area
+            doubt = Span(first.name, first.first, 0)
+        place = places[doubt.area]
+        area, step = place.area, 8 if _is_bits(place) else 1
+        steps = (doubt.size + step - 1) // step
+        room = min(self._most(place, reading=True) // place.registers, area.last - area.first + 1)
+        # Small ones come first: they lie within what was asked, where the device has something.
+        sizes = [n * step for n in range(1, _RESYNC_SIZES + 2) if n != steps and n * step <= room]
+        if not sizes:  # limited to one unit: the answer to another function differs as well
+            other = next(p for p in places.values() if p.function != place.function).area
+            return Span(other.name, other.first, 1)
+        size = sizes[:_RESYNC_SIZES][salt % len(sizes[:_RESYNC_SIZES])]
+        return Span(area.name, min(doubt.start, area.last + 1 - size), size)
+
+    async def _loopback(self, talk: Talk[Frame], token: int) -> None:
+        request = pdu.loopback_request(token)
+        number = next(self._numbers)
+
+        def answers(heard: Frame) -> bool | None:
+            if heard.station != self.station or heard.transaction != number:
+                return None
+            if heard.pdu == request:
+                return True
+            pdu.raise_refusal(heard.pdu, request[0])
+            return None
+
+        await talk.ask(Frame(self.station, request, number), self.chars(5), answers)
+
+
+def _is_bits(place: Place) -> bool:
+    return place.function in READ_BITS

@@ -1,0 +1,240 @@
+"""The Modbus drivers: RTU, ASCII and TCP, each a list of settings over the same dialogue."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+from gateway.errors import ConfigError
+from gateway.protocols.driver import Address, Area, Codec, Cost, Span, Talk, Timing
+from gateway.protocols.modbus import ascii as ascii_
+from gateway.protocols.modbus import mbap, rtu
+from gateway.protocols.modbus.addressing import (
+    EX485LNK,
+    K120S,
+    MODICON,
+    PLAIN,
+    VIGOR,
+    Limits,
+)
+from gateway.protocols.modbus.ascii import AsciiCodec
+from gateway.protocols.modbus.dialogue import Dialogue
+from gateway.protocols.modbus.frame import Frame
+from gateway.protocols.modbus.mbap import MbapCodec
+from gateway.protocols.modbus.rtu import RtuCodec
+
+Addressing = Literal["plain", "vigor", "k120s", "ex485lnk"]
+Numbering = Literal["zero_based", "modicon"]
+WordOrder = Literal["low_first", "high_first"]
+
+_DIALECTS = {"plain": PLAIN, "vigor": VIGOR, "k120s": K120S, "ex485lnk": EX485LNK}
+_FASTEST_SILENCE = 0.00175  # seconds; above 19200 baud 3.5 characters would be shorter
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ModbusRtu:
+    """Modbus RTU (serial line guide V1.02). Station 0 is everybody: written to, never read."""
+
+    protocol: Literal["modbus-rtu"] = "modbus-rtu"
+    station: int
+    addressing: Addressing = "plain"
+    numbering: Numbering = "zero_based"  # plain only: how registers are written in the file
+    write_single: bool = True  # one unit by function 05 or 06; false: by 15 or 16
+    diagnostics: bool = False  # the device has function 08, sub-function 0
+    counter_word_order: WordOrder = "low_first"  # of Vigor's C200 to C255
+    max_read_words: int | None = None
+    max_read_bits: int | None = None
+    max_write_words: int | None = None
+    max_write_bits: int | None = None
+    _dialogue: Dialogue = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "_dialogue", _dialogue(self))
+
+    @property
+    def areas(self) -> Mapping[str, Area]:
+        return self._dialogue.areas
+
+    @property
+    def timing(self) -> Timing:
+        silence = max(_FASTEST_SILENCE, self._dialogue.dialect.rtu_silence)
+        return Timing(silence=silence, silence_chars=3.5)
+
+    def address(self, text: str) -> Address:
+        return self._dialogue.dialect.address(text)
+
+    def spell(self, address: Address) -> str:
+        return self._dialogue.dialect.spell(address)
+
+    def cost(self, span: Span) -> Cost | None:
+        return self._dialogue.cost(span)
+
+    def write_cost(self, span: Span) -> Cost | None:
+        return self._dialogue.write_cost(span)
+
+    def codec(self) -> Codec[Frame]:
+        return RtuCodec()
+
+    async def read(self, talk: Talk[Frame], span: Span) -> Sequence[int]:
+        return await self._dialogue.read(talk, span)
+
+    async def write(self, talk: Talk[Frame], span: Span, units: Sequence[int]) -> bool:
+        return await self._dialogue.write(talk, span, units)
+
+    async def resync(self, talk: Talk[Frame], doubt: Span | None, salt: int) -> None:
+        await self._dialogue.resync(talk, doubt, salt)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ModbusAscii:
+    """Modbus ASCII (serial line guide V1.02). Station 0 is everybody: written to, never read."""
+
+    protocol: Literal["modbus-ascii"] = "modbus-ascii"
+    station: int
+    addressing: Addressing = "plain"
+    numbering: Numbering = "zero_based"  # plain only: how registers are written in the file
+    write_single: bool = True  # one unit by function 05 or 06; false: by 15 or 16
+    diagnostics: bool = False  # the device has function 08, sub-function 0
+    counter_word_order: WordOrder = "low_first"  # of Vigor's C200 to C255
+    max_read_words: int | None = None
+    max_read_bits: int | None = None
+    max_write_words: int | None = None
+    max_write_bits: int | None = None
+    _dialogue: Dialogue = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "_dialogue", _dialogue(self))
+
+    @property
+    def areas(self) -> Mapping[str, Area]:
+        return self._dialogue.areas
+
+    @property
+    def timing(self) -> Timing:
+        return Timing()
+
+    def address(self, text: str) -> Address:
+        return self._dialogue.dialect.address(text)
+
+    def spell(self, address: Address) -> str:
+        return self._dialogue.dialect.spell(address)
+
+    def cost(self, span: Span) -> Cost | None:
+        return self._dialogue.cost(span)
+
+    def write_cost(self, span: Span) -> Cost | None:
+        return self._dialogue.write_cost(span)
+
+    def codec(self) -> Codec[Frame]:
+        return AsciiCodec()
+
+    async def read(self, talk: Talk[Frame], span: Span) -> Sequence[int]:
+        return await self._dialogue.read(talk, span)
+
+    async def write(self, talk: Talk[Frame], span: Span, units: Sequence[int]) -> bool:
+        return await self._dialogue.write(talk, span, units)
+
+    async def resync(self, talk: Talk[Frame], doubt: Span | None, salt: int) -> None:
+        await self._dialogue.resync(talk, doubt, salt)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ModbusTcp:
+    """Modbus TCP (messaging guide V1.0b). `station` is the unit identifier, 0 as good as any."""
+
+    protocol: Literal["modbus-tcp"] = "modbus-tcp"
+    station: int = 1
+    addressing: Addressing = "plain"
+    numbering: Numbering = "zero_based"  # plain only: how registers are written in the file
+    write_single: bool = True  # one unit by function 05 or 06; false: by 15 or 16
+    diagnostics: bool = False  # the device has function 08, sub-function 0
+    counter_word_order: WordOrder = "low_first"  # of Vigor's C200 to C255
+    max_read_words: int | None = None
+    max_read_bits: int | None = None
+    max_write_words: int | None = None
+    max_write_bits: int | None = None
+    window: int = 1  # questions the device lets be open at once
+    _dialogue: Dialogue = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "_dialogue", _dialogue(self))
+
+    @property
+    def areas(self) -> Mapping[str, Area]:
+        return self._dialogue.areas
+
+    @property
+    def timing(self) -> Timing:
+        return Timing(turnaround=0.001, silence=0.0)
+
+    def address(self, text: str) -> Address:
+        return self._dialogue.dialect.address(text)
+
+    def spell(self, address: Address) -> str:
+        return self._dialogue.dialect.spell(address)
+
+    def cost(self, span: Span) -> Cost | None:
+        return self._dialogue.cost(span)
+
+    def write_cost(self, span: Span) -> Cost | None:
+        return self._dialogue.write_cost(span)
+
+    def codec(self) -> Codec[Frame]:
+        return MbapCodec()
+
+    async def read(self, talk: Talk[Frame], span: Span) -> Sequence[int]:
+        return await self._dialogue.read(talk, span)
+
+    async def write(self, talk: Talk[Frame], span: Span, units: Sequence[int]) -> bool:
+        return await self._dialogue.write(talk, span, units)
+
+    async def resync(self, talk: Talk[Frame], doubt: Span | None, salt: int) -> None:
+        await self._dialogue.resync(talk, doubt, salt)
+
+
+def _dialogue(device: ModbusRtu | ModbusAscii | ModbusTcp) -> Dialogue:
+    """What the settings come to. Raises `ConfigError`."""
+    dialect = _DIALECTS[device.addressing]
+    if device.numbering == "modicon":
+        if dialect is not PLAIN:
+            raise ConfigError("numbering: modicon goes with addressing: plain only")
+        dialect = MODICON
+    stations, limits, chars = dialect.stations, dialect.limits, rtu.chars
+    match device:
+        case ModbusAscii():
+            limits, chars = dialect.ascii_limits, ascii_.chars
+        case ModbusTcp():
+            chars = mbap.chars
+            if dialect.any_unit:
+                stations = range(256)
+            if not 1 <= device.window <= 16:
+                raise ConfigError(f"window {device.window} is not 1..16")
+    if device.station not in stations:
+        raise ConfigError(f"station {device.station} is not {stations[0]}..{stations[-1]}")
+    return Dialogue(
+        station=device.station,
+        chars=chars,
+        dialect=dialect,
+        limits=_limits(device, limits),
+        write_single=device.write_single and dialect.single_writes,
+        diagnostics=device.diagnostics,
+        low_first=device.counter_word_order == "low_first",
+        broadcast=device.station == 0 and not isinstance(device, ModbusTcp),
+        numbered=isinstance(device, ModbusTcp),
+    )
+
+
+def _limits(device: ModbusRtu | ModbusAscii | ModbusTcp, usual: Limits) -> Limits:
+    """The dialect's limits, where the file does not say otherwise."""
+    said = (
+        device.max_read_words,
+        device.max_read_bits,
+        device.max_write_words,
+        device.max_write_bits,
+    )
+    wanted = Limits(
+        *(own if limit is None else limit for limit, own in zip(said, usual, strict=True))
+    )
+    for name, limit, most in zip(Limits._fields, wanted, Limits(), strict=True):
+        if not 1 <= limit <= most:
+            raise ConfigError(f"max_{name} {limit} is not 1..{most}")
+    return wanted

@@ -1,0 +1,47 @@
+"""Modbus TCP frames (messaging guide V1.0b, 3.1): the MBAP header numbers each question."""
+
+from struct import Struct
+
+from gateway.errors import Evidence, Garbled
+from gateway.protocols.modbus.frame import Frame
+
+_HEADER = Struct(">HHHB")  # transaction, protocol (0), length from here on, unit
+_UNIT_AND_PDU = range(2, 255)
+
+
+def chars(pdu_length: int) -> int:
+    """The bytes of a frame with a PDU of that length."""
+    return pdu_length + _HEADER.size
+
+
+class MbapCodec:
+    """Bytes <-> frames, on either side of the connection.
+
+    TCP loses and invents nothing, so bytes that are no frame mean that the other side is no
+    Modbus TCP device, or out of step for good.
+    """
+
+    def __init__(self) -> None:
+        self._heard = b""
+
+    def encode(self, frame: Frame) -> bytes:
+        header = _HEADER.pack(frame.transaction, 0, len(frame.pdu) + 1, frame.station)
+        return header + frame.pdu
+
+    def feed(self, data: bytes) -> list[Frame]:
+        """The frames completed by `data`. Raises `Garbled`, after the frames before it."""
+        heard = self._heard + data if self._heard else data
+        frames: list[Frame] = []
+        while len(heard) >= _HEADER.size:
+            transaction, protocol, length, unit = _HEADER.unpack_from(heard)
+            if protocol or length not in _UNIT_AND_PDU:
+                if frames:
+                    break
+                raise Garbled("not a Modbus TCP header", heard, evidence=Evidence.NOISE)
+            end = length + 6
+            if len(heard) < end:
+                break
+            frames.append(Frame(unit, heard[_HEADER.size : end], transaction))
+            heard = heard[end:]
+        self._heard = heard
+        return frames

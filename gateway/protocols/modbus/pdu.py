@@ -1,0 +1,123 @@
+"""Modbus PDUs (application protocol V1.1b3, 6): requests by pymodbus, answers by `struct`."""
+
+from collections.abc import Callable, Sequence
+from itertools import chain
+from struct import Struct
+
+from pymodbus.pdu.bit_message import (
+    ReadCoilsRequest,
+    ReadDiscreteInputsRequest,
+    WriteMultipleCoilsRequest,
+    WriteSingleCoilRequest,
+)
+from pymodbus.pdu.diag_message import ReturnQueryDataRequest
+from pymodbus.pdu.pdu import ModbusPDU
+from pymodbus.pdu.register_message import (
+    ReadHoldingRegistersRequest,
+    ReadInputRegistersRequest,
+    WriteMultipleRegistersRequest,
+    WriteSingleRegisterRequest,
+)
+
+from gateway.errors import NoReply, Refusal, Refused
+from gateway.protocols.modbus.frame import EXCEPTION
+
+_READS: dict[int, type[ModbusPDU]] = {
+    1: ReadCoilsRequest,
+    2: ReadDiscreteInputsRequest,
+    3: ReadHoldingRegistersRequest,
+    4: ReadInputRegistersRequest,
+}
+
+_EXCEPTIONS = {
+    1: ("illegal function", Refusal.OTHER),
+    2: ("illegal data address", Refusal.ADDRESS),
+    3: ("illegal data value", Refusal.OTHER),
+    4: ("device failure", Refusal.OTHER),
+    5: ("acknowledged, but it takes longer", Refusal.BUSY),
+    6: ("device busy", Refusal.BUSY),
+}
+_NO_RESPONSE_BEHIND = 11  # a Modbus TCP gateway got no answer from the device behind it
+
+_BITS = tuple(tuple(byte >> bit & 1 for bit in range(8)) for byte in range(256))
+
+
+def read_request(function: int, wire: int, count: int) -> bytes:
+    return _encode(_READS[function](address=wire, count=count))
+
+
+def write_bits_request(wire: int, bits: Sequence[int], *, single: bool) -> bytes:
+    values = [bool(bit) for bit in bits]
+    if single:
+        return _encode(WriteSingleCoilRequest(address=wire, bits=values))
+    return _encode(WriteMultipleCoilsRequest(address=wire, bits=values))
+
+
+def write_words_request(wire: int, words: Sequence[int], *, single: bool) -> bytes:
+    if single:
+        return _encode(WriteSingleRegisterRequest(address=wire, registers=words))
+    return _encode(WriteMultipleRegistersRequest(address=wire, registers=words))
+
+
+def loopback_request(token: int) -> bytes:
+    return _encode(ReturnQueryDataRequest(message=token.to_bytes(2, "big")))
+
+
+def _encode(pdu: ModbusPDU) -> bytes:
+    return bytes((pdu.function_code,)) + pdu.encode()
+
+
+def bits_in(count: int) -> Callable[[bytes], Sequence[int]]:
+    """What takes `count` bits out of an answer to function 01 or 02: lowest bit first."""
+
+    def unpack(pdu: bytes) -> Sequence[int]:
+        return list(chain.from_iterable(_BITS[byte] for byte in pdu[2:]))[:count]
+
+    return unpack
+
+
+def words_in(count: int) -> Callable[[bytes], Sequence[int]]:
+    """What takes `count` words out of an answer to function 03 or 04: high byte first."""
+    words = Struct(f">{count}H")
+
+    def unpack(pdu: bytes) -> Sequence[int]:
+        return words.unpack_from(pdu, 2)
+
+    return unpack
+
+
+def dwords_in(count: int, *, low_first: bool) -> Callable[[bytes], Sequence[int]]:
+    """What takes `count` pairs of words out of an answer to function 03."""
+    words = Struct(f">{2 * count}H")
+    low, high = (0, 1) if low_first else (1, 0)
+
+    def unpack(pdu: bytes) -> Sequence[int]:
+        heard = words.unpack_from(pdu, 2)
+        return [a | b << 16 for a, b in zip(heard[low::2], heard[high::2], strict=True)]
+
+    return unpack
+
+
+def words_of(dwords: Sequence[int], *, low_first: bool) -> list[int]:
+    """The words that carry these 32-bit units."""
+    pairs = ((dword & 0xFFFF, dword >> 16) for dword in dwords)
+    return [word for low, high in pairs for word in ((low, high) if low_first else (high, low))]
+
+
+def raise_refusal(pdu: bytes, function: int) -> None:
+    """Raise what `pdu` says if it is an exception to a question of that function.
+
+    `Refused` with the exception code in hex; `NoReply` for 0B, by which a gateway tells that
+    the device behind it kept silent: nobody knows then whether a write was done.
+    """
+    if len(pdu) != 2 or pdu[0] != function | EXCEPTION:
+        return
+    code = pdu[1]
+    if code == _NO_RESPONSE_BEHIND:
+        raise NoReply("a gateway on the way got no answer from the device (exception 0B)")
+    words, refusal = _EXCEPTIONS.get(code, ("unknown exception", Refusal.OTHER))
+    raise Refused(
+        f"exception {code:02X} to function {function:02d}: {words}",
+        code=f"{code:02X}",
+        refusal=refusal,
+    )

@@ -1,0 +1,162 @@
+"""Modbus RTU frames (serial line guide V1.02, 2.5.1), found by header, length and CRC.
+
+Not by silence: behind a USB adapter or a device server it cannot be seen, they cut and join the
+stream as they like. The length of a frame follows from its function code and byte count.
+"""
+
+from gateway.errors import Evidence, Garbled
+from gateway.protocols.checksums import crc16
+from gateway.protocols.modbus.frame import (
+    DIAGNOSTICS,
+    EXCEPTION,
+    READ_BITS,
+    READ_WORDS,
+    WRITE_MANY,
+    WRITE_SINGLE,
+    Frame,
+    answer_length,
+)
+
+_WRAPPING = 3  # characters around the PDU: station and CRC
+_SHORTEST = 5  # an exception
+_KEPT = 520  # no frame is longer than 260; what is older than two of them is noise
+_FIXED = (*WRITE_SINGLE, *WRITE_MANY, DIAGNOSTICS)
+_ECHOED = (*WRITE_SINGLE, DIAGNOSTICS)  # the good answer is the question itself
+_KNOWN = (*READ_BITS, *READ_WORDS, *_FIXED)
+
+
+def chars(pdu_length: int) -> int:
+    """The characters of a frame with a PDU of that length."""
+    return pdu_length + _WRAPPING
+
+
+class RtuCodec:
+    """Bytes <-> frames on the master's side.
+
+    It remembers what it sent, because only that tells which bytes are the answer: a frame that
+    can be the answer and is not whole yet is waited for; anything else is noise until its CRC
+    proves otherwise. An echo of the request is noise as well, except of functions 05, 06 and 08,
+    which are answered with the very same bytes: only the line knows whether it echoes.
+    """
+
+    def __init__(self) -> None:
+        self._heard = bytearray()
+        self._sent = b""
+        self._size = 0  # of the whole answer, unless it is an exception
+        self._damage: Garbled | None = None
+
+    def encode(self, frame: Frame) -> bytes:
+        body = bytes((frame.station,)) + frame.pdu
+        self._sent = body + crc16(body)
+        self._size = chars(answer_length(frame.pdu))
+        return self._sent
+
+    def feed(self, data: bytes) -> list[Frame]:
+        """The frames completed by `data`, of any station.
+
+        Raises `Garbled` when what was surely the answer has a wrong CRC. Frames that were whole
+        before it are handed out first.
+        """
+        self._heard += data
+        frames: list[Frame] = []
+        while self._damage is None and (frame := self._take()) is not None:
+            frames.append(frame)
+        if self._damage is not None and not frames:
+            raise self._damage
+        return frames
+
+    def _take(self) -> Frame | None:
+        heard = self._heard
+        del heard[:-_KEPT]
+        for start in range(len(heard) - _SHORTEST + 1):
+            size = _reply_size(heard, start)
+            if size == 0:
+                continue
+            whole = bytes(heard[start : start + size])
+            if len(whole) == size and crc16(whole[:-2]) == whole[-2:]:
+                del heard[: start + size]
+                return Frame(whole[0], whole[1:-2])
+            if whole[:2] != self._sent[:2] or self._is_echo(bytes(heard[start:])):
+                continue
+            if len(whole) < size:
+                return None  # the answer, still on its way
+            if size == self._size:
+                self._damage = Garbled(
+                    "an answer with a wrong CRC", whole, evidence=Evidence.CHECKSUM
+                )
+                return None
+        return None
+
+    def _is_echo(self, heard: bytes) -> bool:
+        return self._sent[1] not in _ECHOED and heard.startswith(self._sent)
+
+
+def _reply_size(heard: bytearray, start: int) -> int:
+    """The length of the answer that begins at `start`; 0 when none can."""
+    function, third = heard[start + 1], heard[start + 2]
+    if function in _FIXED:
+        return 8
+    if function in READ_WORDS:
+        return 5 + third if third and third % 2 == 0 else 0
+    if function in READ_BITS:
+        return 5 + third if third else 0
+    return _SHORTEST if function & EXCEPTION and function - EXCEPTION in _KNOWN else 0
+
+
+class RtuEar:
+    """What a slave hears: the requests on the line.
+
+    A request to this station (or to all) that is not whole yet is waited for; whoever has a
+    clock makes a new ear after a silence. An unknown function has no known length: it is taken
+    for a request when its CRC closes all that has been heard.
+    """
+
+    def __init__(self, station: int) -> None:
+        self._heard = bytearray()
+        self._addressed = (0, station)
+
+    def encode(self, frame: Frame) -> bytes:
+        body = bytes((frame.station,)) + frame.pdu
+        return body + crc16(body)
+
+    def feed(self, data: bytes) -> list[Frame]:
+        self._heard += data
+        frames: list[Frame] = []
+        while (frame := self._take()) is not None:
+            frames.append(frame)
+        return frames
+
+    def _take(self) -> Frame | None:
+        heard = self._heard
+        del heard[:-_KEPT]
+        for start in range(len(heard) - 7):
+            size = _request_size(heard, start)
+            if size == 0:
+                continue
+            whole = bytes(heard[start : start + size])
+            if len(whole) < size and whole[0] in self._addressed:
+                return None
+            if len(whole) == size and crc16(whole[:-2]) == whole[-2:]:
+                del heard[: start + size]
+                return Frame(whole[0], whole[1:-2])
+        return self._unknown()
+
+    def _unknown(self) -> Frame | None:
+        whole = bytes(self._heard)
+        if (
+            len(whole) < 4
+            or whole[0] not in self._addressed
+            or whole[1] in _KNOWN
+            or crc16(whole[:-2]) != whole[-2:]
+        ):
+            return None
+        self._heard.clear()
+        return Frame(whole[0], whole[1:-2])
+
+
+def _request_size(heard: bytearray, start: int) -> int:
+    """The length of the request that begins at `start`; 0 when none can."""
+    function = heard[start + 1]
+    if function in WRITE_MANY:
+        return 9 + heard[start + 6]
+    return 8 if function in _KNOWN else 0

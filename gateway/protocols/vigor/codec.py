@@ -1,0 +1,134 @@
+"""The frames of the Vigor computer link (manual B-5-2): STX asks, ACK answers, good or bad."""
+
+import re
+from binascii import unhexlify
+from dataclasses import dataclass
+
+from gateway.errors import Evidence, Garbled
+from gateway.protocols.checksums import byte_sum
+
+STX, ETX, ACK = b"\x02", b"\x03", b"\x06"
+HEX_DIGITS = b"0123456789ABCDEF"  # lower case is illegal on the wire
+
+READ, WRITE, FORCE_ON, FORCE_OFF = "51", "61", "70", "71"
+GOOD = "00"
+MOST_BYTES = 128  # that one 51 reads or one 61 writes
+
+SHORT_REPLY = 10  # characters of a reply without data
+LONGEST_REPLY = SHORT_REPLY + 2 * MOST_BYTES
+LONGEST_REQUEST = 14 + 2 * MOST_BYTES
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """A frame to the PLC; `body` is what stands between command and ETX, as characters."""
+
+    station: int
+    command: str
+    body: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Reply:
+    """A frame from the PLC; `status` is "00" when it was done, `data` the bytes read."""
+
+    station: int
+    command: str
+    status: str
+    data: bytes = b""
+
+
+Frame = Request | Reply
+
+
+def encode(frame: Frame) -> bytes:
+    """The frame as it goes on the wire. The sum runs from the station to ETX.
+
+    A station echoes a damaged command as it came, hence any character.
+    """
+    match frame:
+        case Request(station, command, body):
+            start, rest = STX, command.encode("latin-1") + body
+        case Reply(station, command, status, data):
+            start, rest = ACK, (command + status + data.hex().upper()).encode("latin-1")
+    summed = b"%02X" % station + rest + ETX
+    return start + summed + byte_sum(summed)
+
+
+# What follows ACK: station, command, status; data; then ETX and the sum, or the character that
+# should not be there. An ACK not followed by six digits was noise, one inside a frame begins anew.
+_REPLY = re.compile(
+    rb"\x06([0-9A-F]{6})([0-9A-F]{0,256}+)(?:\x03([^\x06]{2})|([^\x03\x06]))", re.DOTALL
+)
+_REQUEST = re.compile(rb"\x02[^\x02\x03]{0,266}+\x03[^\x02]{2}", re.DOTALL)
+
+
+class VigorCodec:
+    """Bytes <-> frames on the master's side: hears replies, passes over everything else.
+
+    What it makes of a stream does not depend on how the stream was cut into pieces.
+    """
+
+    def __init__(self) -> None:
+        self._buffer = b""
+        self._damage: Garbled | None = None
+
+    def encode(self, frame: Frame) -> bytes:
+        return encode(frame)
+
+    def feed(self, data: bytes) -> list[Frame]:
+        """The replies completed by `data`.
+
+        Raises `Garbled` for a reply that is damaged after its header. Replies that came
+        whole before the damage are handed out first.
+        """
+        self._buffer += data
+        frames: list[Frame] = []
+        while self._damage is None and (match := _REPLY.search(self._buffer)):
+            self._buffer = self._buffer[match.end() :]
+            try:
+                frames.append(_reply(match))
+            except Garbled as damage:
+                self._damage = damage
+        if self._damage is not None and not frames:
+            raise self._damage
+        self._buffer = _unfinished(self._buffer, ACK, LONGEST_REPLY)
+        return frames
+
+
+def _reply(match: re.Match[bytes]) -> Reply:
+    head, digits, check, stray = match.groups()
+    whole = match[0]
+    if stray is not None and len(digits) == 2 * MOST_BYTES:
+        raise Garbled("a reply without an end", whole, evidence=Evidence.TRUNCATED)
+    if stray is not None:
+        raise Garbled(f"{stray.hex().upper()}h in the data of a reply", whole)
+    if byte_sum(whole[1:-2]) != check:
+        raise Garbled("a reply with a wrong sum", whole, evidence=Evidence.CHECKSUM)
+    if len(digits) % 2:
+        raise Garbled("a reply with half a byte of data", whole, evidence=Evidence.SHAPE)
+    names = head.decode("ascii")
+    return Reply(int(names[:2], 16), names[2:4], names[4:], unhexlify(digits))
+
+
+class RequestReader:
+    """The PLC's ear: cuts requests out of a stream, right or wrong, from STX to the sum."""
+
+    def __init__(self) -> None:
+        self._buffer = b""
+
+    def feed(self, data: bytes) -> list[bytes]:
+        """The requests completed by `data`. A new STX begins anew; endless ones are dropped."""
+        self._buffer += data
+        requests = []
+        while match := _REQUEST.search(self._buffer):
+            requests.append(match[0])
+            self._buffer = self._buffer[match.end() :]
+        self._buffer = _unfinished(self._buffer, STX, LONGEST_REQUEST)
+        return requests
+
+
+def _unfinished(buffer: bytes, start: bytes, longest: int) -> bytes:
+    """The part of the buffer that may still become a frame."""
+    begin = buffer.rfind(start)
+    return buffer[begin:] if 0 <= begin > len(buffer) - longest else b""

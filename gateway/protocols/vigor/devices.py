@@ -1,0 +1,117 @@
+"""The devices of a Vigor PLC and where they lie in its byte addresses (manual B-5-3)."""
+
+import struct
+from collections.abc import Sequence
+from functools import lru_cache
+from itertools import chain
+from typing import NamedTuple
+
+from gateway.protocols.devices import DeviceTable
+from gateway.protocols.driver import Area, Span, Unit
+from gateway.protocols.vigor.codec import MOST_BYTES
+
+# Area, and the byte address of its first device.
+_PLACES = (
+    (Area("X", Unit.BIT, 0, 0o777, octal=True), 0x0000),
+    (Area("Y", Unit.BIT, 0, 0o777, octal=True), 0x0040),
+    (Area("M", Unit.BIT, 0, 5119), 0x0080),
+    (Area("S", Unit.BIT, 0, 999), 0x0300),
+    (Area("TS", Unit.BIT, 0, 255), 0x0380),
+    (Area("CS", Unit.BIT, 0, 255), 0x03A0),
+    (Area("M9", Unit.BIT, 9000, 9255), 0x03E0),
+    (Area("TC", Unit.BIT, 0, 255), 0x0780),
+    (Area("CC", Unit.BIT, 0, 255), 0x07A0),
+    (Area("T", Unit.WORD, 0, 255), 0x1400),
+    (Area("D9", Unit.WORD, 9000, 9255), 0x1600),
+    (Area("C", Unit.WORD, 0, 199), 0x1800),
+    (Area("C32", Unit.DWORD, 200, 255), 0x1A00),
+    (Area("D", Unit.WORD, 0, 8191), 0x1C00),
+)
+AREAS = {area.name: area for area, _ in _PLACES}
+_BASES = {area.name: base for area, base in _PLACES}
+
+# The areas the manual lets 70 and 71 force; bits of T and C are reached by whole bytes alone.
+FORCIBLE = frozenset({"X", "Y", "M", "S", "M9"})
+
+# How the devices are written. The bit devices of M and the words of D go on at 9000, after a gap.
+DEVICES: DeviceTable = {
+    letters: tuple(AREAS[name] for name in names)
+    for letters, names in {
+        "X": ("X",),
+        "Y": ("Y",),
+        "M": ("M", "M9"),
+        "S": ("S",),
+        "T": ("T",),
+        "C": ("C", "C32"),
+        "D": ("D", "D9"),
+        "TN": ("T",),
+        "CN": ("C", "C32"),
+        "TS": ("TS",),
+        "CS": ("CS",),
+        "TC": ("TC",),
+        "CC": ("CC",),
+    }.items()
+}
+
+
+class Cover(NamedTuple):
+    """The bytes one exchange must carry for a span."""
+
+    address: int
+    size: int
+    ahead: int  # bits before the span in its first byte
+    behind: int  # bits after it in its last
+
+
+@lru_cache(maxsize=4096)
+def cover(span: Span) -> Cover | None:
+    """The bytes that hold `span`; None if they are too many, or the span is not in its area."""
+    area = AREAS.get(span.area)
+    if area is None or span.size < 1 or span.start < area.first:
+        return None
+    if span.start + span.size - 1 > area.last:
+        return None
+    offset, base = span.start - area.first, _BASES[area.name]
+    match area.unit:
+        case Unit.BIT:
+            ahead = offset % 8
+            count = (ahead + span.size + 7) // 8
+            found = Cover(base + offset // 8, count, ahead, 8 * count - ahead - span.size)
+        case Unit.WORD:
+            found = Cover(base + 2 * offset, 2 * span.size, 0, 0)
+        case Unit.DWORD:
+            found = Cover(base + 4 * offset, 4 * span.size, 0, 0)
+    return found if found.size <= MOST_BYTES else None
+
+
+def bit_address(area: str, number: int) -> int:
+    """What 70 and 71 call a bit: its byte address times eight, plus its place in the byte."""
+    return 8 * _BASES[area] + number - AREAS[area].first
+
+
+_BITS = tuple(tuple(byte >> place & 1 for place in range(8)) for byte in range(256))
+
+
+def bits_from_bytes(data: bytes) -> list[int]:
+    """Eight bits of each byte, the lowest device first."""
+    return list(chain.from_iterable(map(_BITS.__getitem__, data)))
+
+
+def bytes_from_bits(bits: Sequence[int]) -> bytes:
+    """The inverse, for whole bytes of bits."""
+    return bytes(
+        sum(bit << place for place, bit in enumerate(bits[at : at + 8]))
+        for at in range(0, len(bits), 8)
+    )
+
+
+def words_from_bytes(data: bytes, unit: Unit) -> tuple[int, ...]:
+    """Words or double words, their low byte first."""
+    if unit is Unit.DWORD:
+        return struct.unpack(f"<{len(data) // 4}I", data)
+    return struct.unpack(f"<{len(data) // 2}H", data)
+
+
+def bytes_from_words(words: Sequence[int], unit: Unit) -> bytes:
+    """The inverse; every word must fit."""
+    return struct.pack(f"<{len(words)}{'I' if unit is Unit.DWORD else 'H'}", *words)

@@ -1,0 +1,199 @@
+"""Reads and writes the devices of Vigor M, VB and VH PLCs over the computer link (manual B-5)."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Literal
+
+from gateway.errors import BadValue, ConfigError, Refusal, Refused
+from gateway.protocols.devices import parse_device, spell_device
+from gateway.protocols.driver import Address, Area, Cost, Span, Talk, Timing, Unit
+from gateway.protocols.vigor.codec import (
+    FORCE_OFF,
+    FORCE_ON,
+    GOOD,
+    READ,
+    SHORT_REPLY,
+    WRITE,
+    Frame,
+    Reply,
+    Request,
+    VigorCodec,
+)
+from gateway.protocols.vigor.devices import (
+    AREAS,
+    DEVICES,
+    FORCIBLE,
+    Cover,
+    bit_address,
+    bits_from_bytes,
+    bytes_from_bits,
+    bytes_from_words,
+    cover,
+    words_from_bytes,
+)
+
+# Characters of a 51 request and of a 61 request without data; of a 70 or 71 request.
+_BLOCK_REQUEST, _FORCE_REQUEST = 14, 12
+_LARGEST = {Unit.BIT: 1, Unit.WORD: 0xFFFF, Unit.DWORD: 0xFFFFFFFF}
+_REFUSALS = {
+    "10": (Refusal.DAMAGED, "ASCII conversion error, our request did not arrive whole"),
+    "11": (Refusal.DAMAGED, "sum check error, our request did not arrive whole"),
+    "12": (Refusal.OTHER, "no such command"),
+    "14": (Refusal.DAMAGED, "stop bit, parity, frame or overrun error: line settings or noise"),
+    "28": (Refusal.ADDRESS, "data address out of range"),
+}
+_TIMING = Timing(reply_timeout=0.5, turnaround=0.005, silence=0.005, retries=2)
+_MARKS = (1, 3, 5, 7, 9, 11, 13, 15)  # odd byte counts: words are never read in these
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Vigor:
+    """One Vigor PLC. `station` is 0 on port CP1, 0..255 on CP2, 0..99 on CP3."""
+
+    protocol: Literal["vigor"] = "vigor"
+    station: int = 0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.station <= 255:
+            raise ConfigError(f"station {self.station} is not 0..255")
+
+    @property
+    def areas(self) -> Mapping[str, Area]:
+        return AREAS
+
+    @property
+    def timing(self) -> Timing:
+        return _TIMING
+
+    def address(self, text: str) -> Address:
+        """`X17` and `Y20` (octal), `M12`, `S5`, `D100`, `D7.3`, `M9003`, `D9001`; timers and
+        counters: `T5` the value, `TS5` the contact, `TC5` the coil. Raises `ConfigError`."""
+        return parse_device(text, DEVICES)
+
+    def spell(self, address: Address) -> str:
+        return spell_device(address, DEVICES)
+
+    def cost(self, span: Span) -> Cost | None:
+        """One 51: whole bytes, 128 at most."""
+        covered = cover(span)
+        return None if covered is None else _read_cost(covered)
+
+    def write_cost(self, span: Span) -> Cost | None:
+        """One 70, 71 or 61; a 51 and a 61 for bits that do not fill their bytes."""
+        covered = cover(span)
+        if covered is None:
+            return None
+        if _forced(span):
+            return Cost(_FORCE_REQUEST, SHORT_REPLY)
+        write = Cost(_BLOCK_REQUEST + 2 * covered.size, SHORT_REPLY)
+        if not covered.ahead and not covered.behind:
+            return write
+        read = _read_cost(covered)
+        return Cost(read.request + write.request, read.reply + write.reply)
+
+    def codec(self) -> VigorCodec:
+        return VigorCodec()
+
+    async def read(self, talk: Talk[Frame], span: Span) -> Sequence[int]:
+        """The units of `span`. Raises `ConfigError` for a span that `cost` calls impossible."""
+        covered = cover(span)
+        if covered is None:
+            raise ConfigError(f"{span.size} of {span.area} from {span.start}: not in one exchange")
+        data = await self._read_bytes(talk, covered.address, covered.size)
+        unit = AREAS[span.area].unit
+        if unit is Unit.BIT:
+            return bits_from_bytes(data)[covered.ahead : covered.ahead + span.size]
+        return words_from_bytes(data, unit)
+
+    async def write(self, talk: Talk[Frame], span: Span, units: Sequence[int]) -> bool:
+        """Write and hear that it was done.
+
+        Bits that do not fill their bytes, unless it is a single one that can be forced, take
+        their neighbours along: these are read just before, and written back as they were.
+        """
+        covered = cover(span)
+        if covered is None or len(units) != span.size:
+            raise BadValue(f"{len(units)} values for {span.size} of {span.area} from {span.start}")
+        unit = AREAS[span.area].unit
+        if not all(0 <= value <= _LARGEST[unit] for value in units):
+            raise BadValue(f"a {unit} holds 0..{_LARGEST[unit]}")
+        if _forced(span):
+            command = FORCE_ON if units[0] else FORCE_OFF
+            body = b"%04X" % bit_address(span.area, span.start)
+            await self._write_body(talk, command, body)
+            return True
+        if unit is Unit.BIT:
+            data = bytes_from_bits(await self._with_neighbours(talk, covered, units))
+        else:
+            data = bytes_from_words(units, unit)
+        body = b"%04X%02X" % (covered.address, covered.size) + data.hex().upper().encode("ascii")
+        await self._write_body(talk, WRITE, body)
+        return True
+
+    async def resync(self, talk: Talk[Frame], doubt: Span | None, salt: int) -> None:
+        """Read M0 and up, in a number of bytes that no open question asks for.
+
+        A refusal names no question: the first may be the late answer to `doubt`, so another
+        mark is asked for. A second one is an answer to us, and proves life as well as data.
+        """
+        doubted = cover(doubt) if doubt is not None else None
+        marks = [mark for mark in _MARKS if doubted is None or mark != doubted.size]
+        for attempt in (2 * salt, 2 * salt + 1):
+            try:
+                await self._read_bytes(talk, 0x0080, marks[attempt % len(marks)])
+            except Refused:
+                continue
+            return
+
+    async def _read_bytes(self, talk: Talk[Frame], address: int, count: int) -> bytes:
+        request = _read_request(self.station, address, count)
+        return await talk.ask(request, SHORT_REPLY + 2 * count, _answers(self.station, READ, count))
+
+    async def _write_body(self, talk: Talk[Frame], command: str, body: bytes) -> None:
+        request = Request(self.station, command, body)
+        await talk.ask(request, SHORT_REPLY, _answers(self.station, command, 0))
+
+    async def _with_neighbours(
+        self, talk: Talk[Frame], covered: Cover, units: Sequence[int]
+    ) -> Sequence[int]:
+        """The bits that fill the covered bytes."""
+        if not covered.ahead and not covered.behind:
+            return units
+        bits = bits_from_bytes(await self._read_bytes(talk, covered.address, covered.size))
+        bits[covered.ahead : len(bits) - covered.behind] = units
+        return bits
+
+
+def _forced(span: Span) -> bool:
+    return span.size == 1 and span.area in FORCIBLE
+
+
+def _read_cost(covered: Cover) -> Cost:
+    return Cost(_BLOCK_REQUEST, SHORT_REPLY + 2 * covered.size)
+
+
+@lru_cache(maxsize=4096)
+def _read_request(station: int, address: int, count: int) -> Request:
+    return Request(station, READ, b"%04X%02X" % (address, count))
+
+
+@lru_cache(maxsize=1024)
+def _answers(station: int, command: str, count: int) -> Callable[[Frame], bytes | None]:
+    """What takes the answer to a question: the `count` bytes it carries, or its refusal."""
+
+    def answers(frame: Frame) -> bytes | None:
+        if not isinstance(frame, Reply) or frame.station != station or frame.command != command:
+            return None
+        if frame.status == GOOD:
+            return frame.data if len(frame.data) == count else None
+        if frame.data:
+            return None
+        refusal, meaning = _REFUSALS.get(frame.status, (Refusal.OTHER, "a code unknown to us"))
+        raise Refused(
+            f"station {station} answers {frame.status} to command {command}: {meaning}",
+            code=frame.status,
+            refusal=refusal,
+        )
+
+    return answers

@@ -1,0 +1,123 @@
+"""Finding the address a device refuses by halving its block, and remembering it.
+
+A device answers a request that touches one address it does not have with a refusal of the
+whole. The block is cut in two, and the refused half again, until the culprit stands alone;
+then everything else is planned together again around it.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from gateway.planner import Block, Cuts, items_of
+from gateway.protocols.driver import Cost, Span
+from gateway.tags import Tag
+
+RETRY = 300.0  # seconds between two tries of an address that was refused
+CostOf = Callable[[Span], Cost | None]
+
+
+@dataclass(frozen=True, slots=True)
+class BadRange:
+    """Addresses the device refuses."""
+
+    span: Span
+    since: int  # ns since 1970
+    code: str
+    tags: tuple[Tag, ...]
+
+
+@dataclass(slots=True)
+class _Node:
+    """A block under suspicion, or one half of one."""
+
+    span: Span
+    good: bool | None = None
+    halves: tuple["_Node", ...] = ()
+
+    def settled(self) -> bool:
+        return all(half.settled() for half in self.halves) if self.halves else self.good is not None
+
+    def clean(self) -> bool:
+        return all(half.clean() for half in self.halves) if self.halves else self.good is True
+
+    def cuts(self) -> set[tuple[str, int]]:
+        """The boundaries that the finished search has shown to be needed."""
+        if not self.halves:
+            if self.good:
+                return set()
+            area, start, size = self.span
+            return {(area, start), (area, start + size)}
+        needed = set().union(*(half.cuts() for half in self.halves))
+        if self.clean():  # each half is there, but not both in one request
+            needed.add((self.span.area, self.halves[1].span.start))
+        return needed
+
+
+@dataclass(slots=True)
+class Refusals:
+    """What one device refuses. Feed it each refused and each good block."""
+
+    cost: CostOf
+    bad: dict[Span, BadRange] = field(default_factory=dict)
+    _cuts: set[tuple[str, int]] = field(default_factory=set)
+    _roots: list[_Node] = field(default_factory=list)
+    _leaves: dict[Span, _Node] = field(default_factory=dict)
+
+    @property
+    def cuts(self) -> Cuts:
+        """Boundaries the planner must keep."""
+        return frozenset(self._cuts)
+
+    @property
+    def searching(self) -> bool:
+        return bool(self._roots)
+
+    def refused(self, block: Block, now: int, code: str) -> tuple[Block, ...]:
+        """What to ask instead of `block`: its two halves, or nothing where it is the culprit."""
+        if block.span in self.bad:
+            return ()
+        node = self._leaves.pop(block.span, None)
+        if node is None:
+            node = _Node(block.span)
+            self._roots.append(node)
+        halves = self._halves(block, node)
+        if not halves:
+            node.good = False
+            self.bad[block.span] = BadRange(block.span, now, code, block.tags)
+        return halves
+
+    def read(self, block: Block) -> bool:
+        """The block was read well. True when an address refused before is there now."""
+        node = self._leaves.pop(block.span, None)
+        if node is not None:
+            node.good = True
+        if self.bad.pop(block.span, None) is None:
+            return False
+        self._cuts = {cut for cut in self._cuts if cut[0] != block.span.area}
+        return True
+
+    def settle(self) -> bool:
+        """True when a search has just ended: plan the device anew."""
+        done = [root for root in self._roots if root.settled()]
+        for root in done:
+            self._roots.remove(root)
+            self._cuts |= root.cuts()
+        return bool(done)
+
+    def _halves(self, block: Block, node: _Node) -> tuple[Block, ...]:
+        items = items_of(block.tags)
+        if len(items) < 2:
+            return ()
+        middle = len(items) // 2
+        found = []
+        for part in (items[:middle], items[middle:]):
+            span = Span(block.span.area, part[0].start, part[-1].end - part[0].start)
+            cost = self.cost(span)
+            if cost is None:
+                return ()
+            tags = tuple(tag for item in part for tag in item.tags)
+            found.append((Block(span, block.every, tags, cost), _Node(span)))
+        node.halves = tuple(leaf for _, leaf in found)
+        for half, leaf in found:
+            self._leaves[half.span] = leaf
+        return tuple(half for half, _ in found)

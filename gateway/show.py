@@ -1,0 +1,130 @@
+"""Tables for people: samples, plans, what is typed next."""
+
+from collections.abc import Iterable, Sequence
+
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from gateway.client import Shown
+from gateway.config import Config
+from gateway.forecast import LineForecast
+from gateway.payload import rfc3339
+from gateway.planner import Block
+from gateway.tags import Quality, Sample, Tag
+
+
+def shown(sample: Sample) -> Shown:
+    """A sample of our own as it would have arrived from Zenoh."""
+    document: dict[str, object] = {
+        "value": sample.value,
+        "quality": sample.quality.value,
+        "time": rfc3339(sample.time),
+    }
+    if sample.reason is not None:
+        document["reason"] = sample.reason.value
+    return Shown(sample.tag.key, document)
+
+
+def is_good(sample: Shown) -> bool:
+    return sample.document.get("quality") == Quality.GOOD
+
+
+def samples(rows: Iterable[Shown], tags: dict[str, Tag]) -> Table:
+    """A table of current values, one row a tag."""
+    table = Table(box=None, pad_edge=False)
+    for column in ("tag", "value", "unit", "quality", "time"):
+        table.add_column(column, justify="right" if column == "value" else "left")
+    for row in rows:
+        document = row.document
+        good = is_good(row)
+        quality = "good" if good else f"bad: {document.get('reason')}"
+        tag = tags.get(row.tag)
+        table.add_row(
+            Text(row.tag),
+            Text("-" if document.get("value") is None else _value(document["value"])),
+            Text(tag.unit if tag else ""),
+            Text(quality, style="" if good else "red"),
+            Text(str(document.get("time", ""))),
+        )
+    return table
+
+
+def plan(lines: Sequence[LineForecast], *, every_block: bool) -> RenderableType:
+    """The plan of all lines, as `check` prints it."""
+    parts: list[RenderableType] = []
+    for line in lines:
+        parts.append(_line(line))
+        if every_block:
+            parts.append(_blocks(line))
+        parts.append(Text())
+    return Group(*parts)
+
+
+def _line(line: LineForecast) -> Text:
+    text = (
+        f"line {line.name}: {len(line.blocks)} requests, {line.requests:.2f} a second, "
+        f"{line.characters:.0f} characters a second at {line.wire.baudrate} baud\n"
+        f"  load {line.load:.1%} of the wire; one round of everything takes {seconds(line.cycle)}\n"
+        f"  worst write latency {seconds(line.worst_write)}, "
+        f"{seconds(line.worst_write_silent)} while a station has just gone silent"
+    )
+    return Text(text)
+
+
+def _blocks(line: LineForecast) -> Table:
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    for column in ("  device", "request", "tags", "every", "characters", "takes", "worst age"):
+        table.add_column(column)
+    for row in line.blocks:
+        block = row.block
+        table.add_row(
+            f"  {row.device.name}",
+            _span(block),
+            str(len(block.tags)),
+            seconds(block.every),
+            f"{block.cost.request} + {block.cost.reply}",
+            seconds(row.seconds),
+            seconds(row.worst_age),
+        )
+    return table
+
+
+def _span(block: Block) -> str:
+    first = min(block.tags, key=lambda tag: tag.span.start)
+    last = max(block.tags, key=lambda tag: tag.span.start + tag.span.size)
+    return first.text if first is last else f"{first.text}..{last.text}"
+
+
+def seconds(time: float) -> str:
+    """`12.3 ms`, `1.43 s`."""
+    return f"{time * 1000:.1f} ms" if time < 1 else f"{time:.2f} s"
+
+
+def next_steps(config: Config, path: str) -> str:
+    """What a newcomer types in a second terminal."""
+    tags = [tag for device in config.devices for tag in device.tags]
+    counted = f"{len(tags)} tags on {len(config.lines)} lines"
+    lines = [
+        f"Gateway {config.name}: {counted}. In a second terminal:",
+        f"  plc-gateway watch {path}",
+    ]
+    if tags:
+        lines.append(f"  plc-gateway read {path} {tags[0].key}")
+    for tag in tags:
+        if tag.write is not None:
+            lines.append(f"  plc-gateway write {path} {tag.key} {_example(tag)}")
+            break
+    lines.append("Ctrl-C ends it.")
+    return "\n".join(lines)
+
+
+def _example(tag: Tag) -> str:
+    if not tag.layout.type.is_number:
+        return "true" if tag.layout.type.words == 1 else "TEXT"
+    low = 0.0 if tag.write is None or tag.write.min is None else tag.write.min
+    return f"{low + 1:g}"
+
+
+def _value(value: object) -> str:
+    return {True: "true", False: "false"}[value] if isinstance(value, bool) else str(value)

@@ -1,0 +1,86 @@
+"""The built-in simulated plant: a PLC for every device of a file, with values that move."""
+
+import math
+from collections.abc import Callable, Iterable
+
+from gateway.errors import BadValue, ConfigError
+from gateway.protocols.computer_link import ComputerLink
+from gateway.protocols.driver import AnyDriver
+from gateway.protocols.modbus import ModbusAscii, ModbusRtu, ModbusTcp
+from gateway.protocols.vigor import Vigor
+from gateway.stations.computer_link import ComputerLinkStation
+from gateway.stations.modbus import ModbusStation
+from gateway.stations.station import Memory, Station
+from gateway.stations.vigor import VigorStation
+from gateway.tags import Tag
+from gateway.values import Kind, Value
+
+
+def station_for(driver: AnyDriver, tags: Iterable[Tag]) -> Station:
+    """A simulated PLC that the driver can talk to, whose tags move unless they can be written."""
+    station = _station(driver)
+    for number, tag in enumerate(tags):
+        _animate(station.memory, tag, number)
+    return station
+
+
+def _station(driver: AnyDriver) -> Station:
+    match driver:
+        case Vigor():
+            return VigorStation(driver.station)
+        case ComputerLink():
+            return ComputerLinkStation(
+                driver.station, driver.profile, driver.frame_format, driver.sum_check
+            )
+        case ModbusRtu():
+            return ModbusStation(station=driver.station, framing="rtu", dialect=driver.addressing)
+        case ModbusAscii():
+            return ModbusStation(station=driver.station, framing="ascii", dialect=driver.addressing)
+        case ModbusTcp():
+            return ModbusStation(station=driver.station, framing="tcp", dialect=driver.addressing)
+    raise ConfigError(f"there is no simulated device for protocol {driver.protocol}")
+
+
+def _animate(memory: Memory, tag: Tag, number: int) -> None:
+    area, start, size = tag.span
+    if not memory.holds(area, start, size):
+        return
+    if tag.address.bit is not None:
+        if tag.write is None:
+            memory.animate(area, start, lambda now: int(now) & 0xFFFF)
+        return
+    motion = _motion(tag, number)
+    try:
+        units = tag.encode(motion(0.0))
+    except BadValue:
+        return  # the tag's own limits leave no room to move in
+    if tag.write is not None or tag.layout.type.kind is Kind.STRING:
+        memory.write(area, start, units)
+        return
+    for i in range(size):
+        memory.animate(area, start + i, _unit(tag, motion, i))
+
+
+def _unit(tag: Tag, motion: Callable[[float], Value], i: int) -> Callable[[float], int]:
+    return lambda now: tag.encode(motion(now))[i]
+
+
+def _motion(tag: Tag, number: int) -> Callable[[float], Value]:
+    """What the tag shows at a time, in its own units; no two tags move alike."""
+    period = 20.0 + 7 * (number % 11)
+    kind = tag.layout.type.kind
+    if kind is Kind.STRING:
+        return lambda now: "SIMULATED"[: tag.layout.type.length]
+    if kind is Kind.BOOL:
+        return lambda now: int(now / (period / 8)) % 2 == 1
+    low, high = 10.0, 90.0
+    if tag.write is not None:
+        low = low if tag.write.min is None else tag.write.min
+        high = max(low, high if tag.write.max is None else tag.write.max)
+
+    def wave(now: float) -> Value:
+        value = low + (high - low) * (0.5 + 0.5 * math.sin(2 * math.pi * now / period + number))
+        whole = not kind.value.startswith("float") and tag.scale == 1
+        return round(value) if whole else round(value, 3)
+
+    return wave

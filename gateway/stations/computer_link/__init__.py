@@ -1,0 +1,5 @@
+"""A simulated Liyan EX or Mitsubishi FX PLC on the Computer Link."""
+
+from gateway.stations.computer_link.station import ComputerLinkStation
+
+__all__ = ["ComputerLinkStation"]

@@ -1,0 +1,90 @@
+"""The ear of a simulated Computer Link PLC: where a request begins and where it ends."""
+
+from gateway.protocols.checksums import byte_sum
+from gateway.protocols.computer_link.codec import ACK, CL, ENQ, EOT, NAK, FrameFormat
+
+_HEADER = 7  # station, PC number, command, wait
+_LONGEST = 600
+_NOT_YET, _NEVER = 10_000, 20_000  # longer than any request
+_BARE = ("RR", "RS", "MB", "MN", "MW", "PC")
+_ENTRY = {"BW": 1, "WW": 4, "BT": 6, "WT": 9, "BM": 5, "WM": 5, "TT": 1}
+_HEX = frozenset("0123456789ABCDEF")
+
+
+class RequestReader:
+    """Cuts the requests out of what is on the wire, right or wrong, to whichever station.
+
+    ENQ begins a request; EOT, CL, ACK and NAK end the hearing of it. In format 4 it ends with
+    CR LF. In format 1 command and count tell its length; where they cannot (an unknown
+    command), it ends where the sum is right, or, without sum check, with the piece heard.
+    """
+
+    def __init__(self, frame_format: FrameFormat, sum_check: bool) -> None:
+        self._frame_format = frame_format
+        self._sum = 2 if sum_check else 0
+        self._block: bytearray | None = None
+        self._heard = 0.0
+
+    def feed(self, data: bytes, now: float) -> list[str]:
+        """The requests completed by `data`, from station to sum."""
+        self._heard = now
+        requests: list[str] = []
+        for byte in data:
+            if byte in (ENQ, EOT, CL, ACK, NAK):
+                self._block = bytearray() if byte == ENQ else None
+            elif self._block is not None:
+                self._block.append(byte)
+                requests += self._cut(self._block)
+        if self._block is not None and self._ends_with_the_piece(self._block):
+            requests.append(self._block.decode("latin-1"))
+            self._block = None
+        return requests
+
+    def expire(self, now: float, time_out: float) -> str:
+        """The beginning of a request that was not finished in time, or ""."""
+        block = self._block
+        late = now - self._heard > time_out
+        if block is None or not (late or len(block) > _LONGEST):
+            return ""
+        self._block = None
+        return block.decode("latin-1")
+
+    def _cut(self, block: bytearray) -> list[str]:
+        if self._frame_format == 4:
+            if not block.endswith(b"\r\n"):
+                return []
+            del block[-2:]
+        elif len(block) != _HEADER + _area_length(block.decode("latin-1")) + self._sum:
+            return []
+        self._block = None
+        return [block.decode("latin-1")]
+
+    def _ends_with_the_piece(self, block: bytearray) -> bool:
+        if self._frame_format == 4 or len(block) < _HEADER + self._sum:
+            return False
+        if _area_length(block.decode("latin-1")) != _NEVER:
+            return False
+        return not self._sum or byte_sum(bytes(block[:-2])) == block[-2:]
+
+
+def _area_length(text: str) -> int:
+    """The characters of the area; _NOT_YET while they cannot be told, _NEVER if they never can."""
+    command, area = text[4:6], text[_HEADER:]
+    if len(text) < _HEADER:
+        return _NOT_YET
+    if command in _BARE:
+        return 0
+    if command == "GW":
+        return 1
+    if command in ("BR", "WR"):
+        return 7
+    if command not in _ENTRY:
+        return _NEVER
+    before = 5 if command in ("BW", "WW") else 0
+    count = area[before : before + 2]
+    if len(count) < 2:
+        return _NOT_YET
+    if not _HEX.issuperset(count):
+        return _NEVER
+    entry = 8 if command == "WW" and "CN200" <= area[:5] <= "CN255" else _ENTRY[command]
+    return before + 2 + int(count, 16) * entry

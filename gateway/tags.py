@@ -1,0 +1,197 @@
+"""Tags and their samples: what a device has to say, and how well we know it."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+from functools import lru_cache
+from typing import NamedTuple
+
+from gateway.errors import BadValue
+from gateway.protocols.driver import Address, Span, Unit
+from gateway.values import Layout, Value, from_words, to_words
+
+
+class Quality(StrEnum):
+    GOOD = "good"
+    BAD = "bad"
+
+
+class Reason(StrEnum):
+    """Why a value is not known."""
+
+    STARTING = "starting"  # not read yet
+    NO_REPLY = "no-reply"  # the device is silent
+    GARBLED = "garbled"  # the device answers, but nothing that can be understood
+    REFUSED = "refused"  # the device answers "no": this address does not exist there
+    LINE_DOWN = "line-down"  # the port is gone
+    DISABLED = "disabled"  # switched off in the file
+    NOT_A_NUMBER = "not-a-number"  # read well, but no value of the tag's type (NaN, bad BCD)
+
+
+class Publish(StrEnum):
+    CHANGE = "change"
+    ALWAYS = "always"
+
+
+class Deadband(NamedTuple):
+    """A change smaller than this is not published. `percent`: of the last published value."""
+
+    amount: float
+    percent: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class WriteRule:
+    """What may be written, and how: bounds are in the tag's own units."""
+
+    min: float | None = None
+    max: float | None = None
+    verify: bool = False  # read back after the acknowledgement and compare
+    repeat: bool = False  # may be sent again when nobody knows whether it was done
+    latest: bool = False  # of several waiting writes only the last is sent
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Tag:
+    """One value of one device: where it lives, how to read it, how often, who may write it."""
+
+    device: str
+    name: str
+    text: str  # the address as the file writes it
+    address: Address
+    span: Span
+    unit_kind: Unit
+    layout: Layout
+    every: float = 1.0
+    scale: float = 1.0
+    offset: float = 0.0
+    unit: str = ""
+    description: str = ""
+    deadband: Deadband | None = None
+    publish: Publish = Publish.CHANGE
+    heartbeat: float | None = None
+    history: bool = False
+    write: WriteRule | None = None
+    decode: Callable[[Sequence[int]], Value | None] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        decode = _decoder(
+            self.layout, self.unit_kind, self.address.bit, float(self.scale), float(self.offset)
+        )
+        object.__setattr__(self, "decode", decode)
+
+    @property
+    def key(self) -> str:
+        """Unique in the gateway: `device/name`."""
+        return f"{self.device}/{self.name}"
+
+    def encode(self, value: Value) -> list[int]:
+        """The units to write for `value`. Raises `BadValue` before anything is sent.
+
+        For one bit of a word it is the bit alone: [0] or [1].
+        """
+        rule = self.write or WriteRule()
+        if not isinstance(value, (bool, str)):
+            if rule.min is not None and value < rule.min:
+                raise BadValue(f"{value} is below the least value {_short(rule.min)}")
+            if rule.max is not None and value > rule.max:
+                raise BadValue(f"{value} is above the greatest value {_short(rule.max)}")
+        words = to_words(self.layout)(self._unscaled(value))
+        if self.unit_kind is Unit.DWORD:
+            return [low | high << 16 for low, high in zip(words[::2], words[1::2], strict=True)]
+        return words
+
+    def from_units(self, units: Sequence[int]) -> Value | None:
+        """The value that `encode` made these units from: what really goes to the device."""
+        if self.address.bit is not None:
+            return bool(units[0])
+        return self.decode(units)
+
+    def _unscaled(self, value: Value) -> Value:
+        if not self.layout.type.is_number or isinstance(value, (bool, str)):
+            return value
+        if self.scale == 1 and self.offset == 0:
+            return value
+        try:
+            raw = (value - self.offset) / self.scale
+        except OverflowError:
+            raise BadValue(f"{value} is too large") from None
+        if self.layout.type.kind.value.startswith("float"):
+            return raw
+        if not math.isfinite(raw):
+            raise BadValue(f"{value} is no finite number")
+        return round(raw)
+
+
+def _short(number: float) -> str:
+    return f"{number:g}"
+
+
+def _decimals(number: float) -> int:
+    """The decimals of a number as a person wrote it: 0.1 -> 1, 2 -> 0, 1e-05 -> 5."""
+    mantissa, _, exponent = repr(number).partition("e")
+    fraction = mantissa.partition(".")[2].rstrip("0")
+    return max(0, len(fraction) - int(exponent or 0))
+
+
+@lru_cache(maxsize=4096)
+def _decoder(
+    layout: Layout, unit: Unit, bit: int | None, scale: float, offset: float
+) -> Callable[[Sequence[int]], Value | None]:
+    """One compiled function per kind of tag, shared by all tags of that kind."""
+    if bit is not None:
+        return lambda units: bool(units[0] >> bit & 1)
+    plain = from_words(layout)
+    if unit is Unit.DWORD:
+        narrow = plain
+
+        def plain(units: Sequence[int]) -> Value | None:
+            return narrow([half for word in units for half in (word & 0xFFFF, word >> 16)])
+
+    if (scale == 1 and offset == 0) or not layout.type.is_number:
+        return plain
+    decimals = max(_decimals(scale), _decimals(offset))
+    exact = not layout.type.kind.value.startswith("float")
+
+    def scaled(units: Sequence[int]) -> Value | None:
+        raw = plain(units)
+        if raw is None or isinstance(raw, str):
+            return raw
+        value = raw * scale + offset
+        # 123 x 0.1 is 12.3 to a person; binary fractions would make it 12.3000000000000007.
+        return round(value, decimals) if exact else value
+
+    return scaled
+
+
+class Sample(NamedTuple):
+    """What is known of a tag: a value that was in the device at `time`, or why there is none.
+
+    `time` is nanoseconds since 1970, UTC: when the reply arrived, or when it became bad.
+    """
+
+    tag: Tag
+    value: Value | None
+    quality: Quality
+    time: int
+    reason: Reason | None = None
+    detail: str = ""  # one plain sentence for people, where there is one
+
+
+def good(tag: Tag, value: Value, time: int) -> Sample:
+    return Sample(tag, value, Quality.GOOD, time)
+
+
+def bad(tag: Tag, reason: Reason, time: int, detail: str = "") -> Sample:
+    return Sample(tag, None, Quality.BAD, time, reason, detail)
+
+
+class Written(NamedTuple):
+    """A write that was done: what the device now holds, as far as it told us."""
+
+    value: Value
+    time: int  # ns since 1970: when it was acknowledged
+    took: float  # seconds from submitting to the acknowledgement
+    verified: bool = False  # read back, and so it is
+    acknowledged: bool = True  # False only for a broadcast, which nobody acknowledges

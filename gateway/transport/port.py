@@ -1,0 +1,86 @@
+"""What a port is to the line that owns it, and how a port is written in the file."""
+
+import re
+from dataclasses import dataclass
+from typing import Protocol
+
+from gateway.errors import ConfigError
+
+
+class Ear(Protocol):
+    """Who hears a port. Called from the event loop."""
+
+    def received(self, data: bytes) -> None: ...
+
+    def lost(self, error: Exception) -> None:
+        """The port is gone; called once, never after `close`."""
+
+
+class Port(Protocol):
+    """An open port. Bytes that arrive go to the `Ear` it was opened with."""
+
+    def write(self, data: bytes) -> None:
+        """Hand the bytes to the system; returns at once. Raises `LineDown`."""
+
+    async def close(self) -> None:
+        """Give the port back; never raises."""
+
+
+@dataclass(frozen=True, slots=True)
+class SerialPath:
+    """A local serial port: `/dev/ttyUSB0`, `COM3`."""
+
+    path: str
+
+
+@dataclass(frozen=True, slots=True)
+class TcpAddress:
+    """A device server in raw mode, or a Modbus TCP device: `tcp://host:port`."""
+
+    host: str
+    port: int
+
+
+@dataclass(frozen=True, slots=True)
+class Rfc2217Address:
+    """A device server that takes baud rate and format from us: `rfc2217://host:port`."""
+
+    host: str
+    port: int
+
+
+@dataclass(frozen=True, slots=True)
+class SimulatorAddress:
+    """The built-in simulated PLCs, in memory."""
+
+
+PortAddress = SerialPath | TcpAddress | Rfc2217Address | SimulatorAddress
+
+
+@dataclass(frozen=True, slots=True)
+class SerialSettings:
+    """Baud rate and character format of a wire; `format` as in `7E1`."""
+
+    baudrate: int = 9600
+    format: str = "8N1"
+
+
+_URL = re.compile(r"(tcp|rfc2217)://(\[[0-9A-Fa-f:.%]+\]|[^\[\]/:\s]+):([0-9]{1,5})\Z")
+_SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+://")
+
+
+def parse_port(text: str) -> PortAddress:
+    """The port as the file writes it. Raises `ConfigError`."""
+    if text == "simulator":
+        return SimulatorAddress()
+    if match := _URL.match(text):
+        scheme, host, port = match[1], match[2].strip("[]"), int(match[3])
+        if not 1 <= port <= 65535:
+            raise ConfigError(f"port number {port} is not 1..65535")
+        return TcpAddress(host, port) if scheme == "tcp" else Rfc2217Address(host, port)
+    if _SCHEME.match(text) or not text.strip() or text != text.strip():
+        raise ConfigError(
+            f"{text!r} is no port: write a path such as /dev/ttyUSB0 or COM3, "
+            "tcp://host:port, rfc2217://host:port, or simulator"
+        )
+    return SerialPath(text)

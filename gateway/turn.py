@@ -1,0 +1,219 @@
+"""One conversation on the wire: the `Talk` that drivers are given."""
+
+import asyncio
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
+
+from gateway.errors import DeviceError, Evidence, Garbled, LineDown, NoReply
+from gateway.protocols.driver import Codec
+from gateway.recorder import Recorder
+from gateway.transport import Port
+from gateway.wiretime import Wire
+
+T = TypeVar("T")
+KEPT = 64  # bytes of a failed conversation kept for the log
+
+
+@dataclass(slots=True)
+class Clock:
+    """When the wire was last busy; shared by all turns of a line.
+
+    Event loops round sleeps up by about a millisecond. On a fast line the last `spin` seconds
+    of a silence are therefore waited for by looking at the clock.
+    """
+
+    quiet_since: float = 0.0
+    spin: float = 0.0
+
+
+@dataclass(slots=True, eq=False)
+class _Question:
+    answers: Callable[[Any], Any]
+    future: "asyncio.Future[Any]"
+
+
+@dataclass(slots=True, eq=False)
+class Turn:
+    """What is said and heard between one request and its reply (or a few, one after another).
+
+    Bytes that arrive while the turn is open come in by `received`. After a time-out the turn
+    stays useful: `settle` goes on listening for the late answer.
+    """
+
+    port: Port
+    codec: Codec[Any]
+    wire: Wire
+    silence: float
+    reply_timeout: float
+    clock: Clock
+    recorder: Recorder
+    station: int
+    echo: bool = False
+    sent: int = 0  # characters, for the statistics
+    heard: int = 0
+    exchanges: int = 0  # questions answered
+    turnaround: float = 0.0  # of all of them together, beyond the characters' own time
+    passed: int = 0  # frames that answered nothing
+    _foreign: bool = False
+    _expired: Callable[[Any], Any] | None = None  # what the timed-out question takes for an answer
+    _late: "asyncio.Future[None] | None" = None
+    _rest: bytes = b""  # what was heard since the last question
+    _echo: bytes = b""
+    _open: list[_Question] = field(default_factory=list)
+    _broken: Garbled | None = None
+
+    async def tell(self, frame: Any) -> None:
+        data = self.codec.encode(frame)
+        await self._quiet()
+        self._send(data)
+        # Nobody answers; the line is ours until the last character is out.
+        self.clock.quiet_since += len(data) * self.wire.character
+
+    async def ask(self, frame: Any, reply: int, answers: Callable[[Any], T | None]) -> T:
+        data = self.codec.encode(frame)
+        if not self._open:
+            await self._quiet()
+        loop = asyncio.get_running_loop()
+        question = _Question(answers, loop.create_future())
+        self._open.append(question)
+        self._rest = b""
+        started = loop.time()
+        self._send(data)
+        if self.echo:
+            self._echo += data
+        spoken = (len(data) * (2 if self.echo else 1) + reply) * self.wire.character
+        timer = loop.call_later(spoken + self.reply_timeout, self._expire, question, data)
+        try:
+            answer: T = await question.future
+        finally:
+            timer.cancel()
+            self._open.remove(question)
+        busy = (len(data) + len(self._rest)) * self.wire.character
+        self.exchanges += 1
+        self.turnaround += max(0.0, self.clock.quiet_since - started - busy)
+        return answer
+
+    def received(self, data: bytes) -> None:
+        """Bytes from the wire while this turn is open."""
+        self.clock.quiet_since = asyncio.get_running_loop().time()
+        self.heard += len(data)
+        if self._echo:
+            data = self._strip_echo(data)
+        if len(self._rest) < 4096:
+            self._rest += data
+        if self._broken is not None:
+            return
+        try:
+            for frame in self.codec.feed(data):
+                self._offer(frame)
+        except Garbled as error:
+            self._broken = error
+            for question in self._open:
+                _fail(question, error)
+
+    def lost(self, error: LineDown) -> None:
+        """The port is gone."""
+        for question in self._open:
+            _fail(question, error)
+
+    async def settle(self, guard: float, gap: float) -> float | None:
+        """Keep quiet until nothing of this conversation can disturb the next.
+
+        After a time-out: until the late answer has passed, or for `guard` seconds. After bytes
+        that made no sense: until `gap` seconds have passed without one, at most `guard`.
+        Returns how late the answer was, or None when it did not come.
+        """
+        loop = asyncio.get_running_loop()
+        start = loop.time()
+        if self._expired is None:
+            while (wait := min(self.clock.quiet_since + gap, start + guard) - loop.time()) > 0:
+                await asyncio.sleep(wait)
+            return None
+        self._late = loop.create_future()
+        timer = loop.call_later(guard, self._late.cancel)
+        try:
+            await self._late
+        except asyncio.CancelledError:
+            if not self._late.cancelled() or _being_cancelled():
+                raise
+            return None
+        finally:
+            timer.cancel()
+        return loop.time() - start
+
+    def _offer(self, frame: Any) -> None:
+        for question in self._open:
+            if question.future.done():
+                continue
+            try:
+                answer = question.answers(frame)
+            except DeviceError as error:
+                _fail(question, error)
+                return
+            if answer is not None:
+                question.future.set_result(answer)
+                return
+        if self._expired is not None and _accepts(self._expired, frame):
+            self._expired = None
+            if self._late is not None and not self._late.done():
+                self._late.set_result(None)
+            return
+        self.passed += 1
+        self._foreign = self._foreign or getattr(frame, "station", self.station) != self.station
+
+    def _send(self, data: bytes) -> None:
+        self.recorder.sent(data)
+        self.sent += len(data)
+        self.clock.quiet_since = asyncio.get_running_loop().time()
+        self.port.write(data)
+
+    async def _quiet(self) -> None:
+        """Keep the silence before a request, by the clock: loops may wake early or late."""
+        loop = asyncio.get_running_loop()
+        while (wait := self.clock.quiet_since + self.silence - loop.time()) > 0:
+            await asyncio.sleep(wait - self.clock.spin if wait > self.clock.spin else 0)
+
+    def _strip_echo(self, data: bytes) -> bytes:
+        """Drop our own request, which a two-wire adapter hands back before the reply."""
+        length = min(len(self._echo), len(data))
+        if data[:length] != self._echo[:length]:
+            self._echo = b""  # no echo after all: let the codec look for the reply
+            return data
+        self._echo = self._echo[length:]
+        return data[length:]
+
+    def _expire(self, question: _Question, request: bytes) -> None:
+        if not question.future.done():
+            self._expired = question.answers
+            question.future.set_exception(self._verdict(request))
+
+    def _verdict(self, request: bytes) -> DeviceError:
+        heard = self._rest
+        shown = f"heard {heard[:KEPT].hex(' ')}"
+        if not heard:
+            return NoReply("no reply")
+        if heard == request:
+            return Garbled("heard only our own request", heard, evidence=Evidence.ECHO)
+        if self.passed and self._foreign:
+            return Garbled(f"another station spoke: {shown}", heard, evidence=Evidence.STATION)
+        if self.passed:
+            return Garbled(f"no answer to this: {shown}", heard, evidence=Evidence.SHAPE)
+        return Garbled(f"no whole frame: {shown}", heard, evidence=Evidence.NOISE)
+
+
+def _being_cancelled() -> bool:
+    task = asyncio.current_task()
+    return task is not None and task.cancelling() > 0
+
+
+def _fail(question: _Question, error: Exception) -> None:
+    if not question.future.done():
+        question.future.set_exception(error)
+
+
+def _accepts(answers: Callable[[Any], Any], frame: Any) -> bool:
+    try:
+        return answers(frame) is not None
+    except DeviceError:
+        return True  # a refusal answers the question too

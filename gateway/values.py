@@ -1,0 +1,274 @@
+"""Raw words and bits <-> the values people read: types, word and byte order, BCD, strings.
+
+Words are unsigned 16-bit integers in the order of their addresses. Every conversion is
+compiled once, at configuration time, into a plain function.
+"""
+
+import math
+import re
+import struct
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+from gateway.errors import BadValue, ConfigError
+
+Value = bool | int | float | str
+Words = Sequence[int]
+FromWords = Callable[[Words], Value | None]
+ToWords = Callable[[Value], list[int]]
+
+
+class Kind(StrEnum):
+    BOOL = "bool"
+    INT16 = "int16"
+    UINT16 = "uint16"
+    INT32 = "int32"
+    UINT32 = "uint32"
+    INT64 = "int64"
+    UINT64 = "uint64"
+    FLOAT32 = "float32"
+    FLOAT64 = "float64"
+    BCD16 = "bcd16"
+    BCD32 = "bcd32"
+    STRING = "string"
+
+
+class Order(StrEnum):
+    """Which half comes first: of the words of a number, or of the bytes of a word."""
+
+    LOW_FIRST = "low_first"
+    HIGH_FIRST = "high_first"
+
+
+_WORDS = {
+    Kind.BOOL: 1,
+    Kind.INT16: 1,
+    Kind.UINT16: 1,
+    Kind.BCD16: 1,
+    Kind.INT32: 2,
+    Kind.UINT32: 2,
+    Kind.FLOAT32: 2,
+    Kind.BCD32: 2,
+    Kind.INT64: 4,
+    Kind.UINT64: 4,
+    Kind.FLOAT64: 4,
+}
+_STRUCT = {
+    Kind.INT16: ">h",
+    Kind.UINT16: ">H",
+    Kind.INT32: ">i",
+    Kind.UINT32: ">I",
+    Kind.INT64: ">q",
+    Kind.UINT64: ">Q",
+    Kind.FLOAT32: ">f",
+    Kind.FLOAT64: ">d",
+}
+_FLOATS = (Kind.FLOAT32, Kind.FLOAT64)
+_BCD = (Kind.BCD16, Kind.BCD32)
+_SINGLE = struct.Struct(">f")
+_LARGEST_SINGLE = 3.4028234663852886e38
+LONGEST_STRING = 250
+
+
+@dataclass(frozen=True, slots=True)
+class ValueType:
+    """A tag's type as the file writes it; `length` is the characters of a string."""
+
+    kind: Kind
+    length: int = 0
+
+    @property
+    def words(self) -> int:
+        """The 16-bit words it takes."""
+        return (self.length + 1) // 2 if self.kind is Kind.STRING else _WORDS[self.kind]
+
+    @property
+    def is_number(self) -> bool:
+        return self.kind not in (Kind.BOOL, Kind.STRING)
+
+    def __str__(self) -> str:
+        return f"string[{self.length}]" if self.kind is Kind.STRING else self.kind.value
+
+
+_STRING = re.compile(r"string\[([0-9]{1,4})\]\Z")
+
+
+def parse_type(text: str) -> ValueType:
+    """`int16`, `float32`, `string[16]` ... Raises `ConfigError`."""
+    if match := _STRING.match(text):
+        length = int(match[1])
+        if not 1 <= length <= LONGEST_STRING:
+            raise ConfigError(f"{text}: a string has 1 to {LONGEST_STRING} characters")
+        return ValueType(Kind.STRING, length)
+    known = [kind.value for kind in Kind if kind is not Kind.STRING]
+    if text not in known:
+        raise ConfigError(f"{text!r} is no type: use {', '.join(known)} or string[n]")
+    return ValueType(Kind(text))
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """How a value lies in its words.
+
+    `byte_order` says which byte of each word comes first. For a number it is usually
+    `high_first`; `low_first` swaps the bytes of every word.
+    """
+
+    type: ValueType
+    word_order: Order = Order.LOW_FIRST
+    byte_order: Order = Order.HIGH_FIRST
+
+
+def from_words(layout: Layout) -> FromWords:
+    """The function that turns `layout.type.words` words into the value.
+
+    It returns None for words that are no such value: a float that is NaN or infinite, BCD
+    with a digit above 9.
+    """
+    kind = layout.type.kind
+    if kind is Kind.STRING:
+        return lambda words: _text(_octets(words, layout.byte_order))
+    if kind is Kind.BOOL:
+        return lambda words: bool(words[0])
+    if kind in _BCD:
+        return lambda words: _from_bcd(_ordered(words, layout))
+    unpack = struct.Struct(_STRUCT[kind]).unpack
+    if kind is Kind.FLOAT32:
+        return lambda words: _shortest(unpack(_octets(_ordered(words, layout)))[0])
+    if kind is Kind.FLOAT64:
+        return lambda words: _finite(unpack(_octets(_ordered(words, layout)))[0])
+    plain = layout.byte_order is Order.HIGH_FIRST
+    if plain and kind is Kind.UINT16:
+        return lambda words: words[0]
+    if plain and kind is Kind.INT16:
+        return lambda words: words[0] - 0x10000 if words[0] & 0x8000 else words[0]
+
+    def number(words: Words) -> Value | None:
+        value: int = unpack(_octets(_ordered(words, layout)))[0]
+        return value
+
+    return number
+
+
+def to_words(layout: Layout) -> ToWords:
+    """The inverse of `from_words`; the function raises `BadValue` for what does not fit."""
+    kind = layout.type.kind
+    if kind is Kind.STRING:
+        return lambda value: _string_words(value, layout)
+    if kind is Kind.BOOL:
+        return lambda value: [int(_boolean(value))]
+    if kind in _BCD:
+        digits = 4 * layout.type.words
+        return lambda value: _ordered(_to_bcd(_whole(value), digits), layout)
+    pack = struct.Struct(_STRUCT[kind]).pack
+    convert: Callable[[Value], int | float] = _real if kind in _FLOATS else _whole
+
+    def encode(value: Value) -> list[int]:
+        number = convert(value)
+        try:
+            raw = pack(number)
+        except (struct.error, OverflowError):
+            raise BadValue(f"{value} does not fit {kind.value} ({_bounds(kind)})") from None
+        return _ordered(struct.unpack(f">{len(raw) // 2}H", raw), layout)
+
+    return encode
+
+
+def _ordered(words: Words, layout: Layout) -> list[int]:
+    """Words by address <-> words with the most significant first; its own inverse."""
+    row = [swapped(word) for word in words] if layout.byte_order is Order.LOW_FIRST else list(words)
+    return row[::-1] if layout.word_order is Order.LOW_FIRST else row
+
+
+def swapped(word: int) -> int:
+    """The word with its two bytes exchanged."""
+    return (word >> 8) | (word & 0xFF) << 8
+
+
+def _octets(words: Words, order: Order = Order.HIGH_FIRST) -> bytes:
+    return struct.pack(f"{'>' if order is Order.HIGH_FIRST else '<'}{len(words)}H", *words)
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _shortest(value: float) -> float | None:
+    """The decimal a person would write for a 32-bit float: 0.1, not 0.10000000149011612."""
+    if not math.isfinite(value):
+        return None
+    packed = _SINGLE.pack(value)
+    for digits in (6, 7, 8):
+        short = float(f"{value:.{digits}g}")
+        if abs(short) <= _LARGEST_SINGLE and _SINGLE.pack(short) == packed:
+            return short
+    return float(f"{value:.9g}")
+
+
+def _text(octets: bytes) -> str:
+    return octets.split(b"\0", 1)[0].decode("latin-1")
+
+
+def _string_words(value: Value, layout: Layout) -> list[int]:
+    if not isinstance(value, str):
+        raise BadValue(f"{value!r} is no text")
+    length = layout.type.length
+    try:
+        octets = value.encode("latin-1")
+    except UnicodeEncodeError:
+        raise BadValue(f"{value!r} has characters that are not in Latin-1") from None
+    if len(octets) > length:
+        raise BadValue(f"{value!r} is longer than {length} characters")
+    if b"\0" in octets:
+        raise BadValue("a text cannot contain the character NUL")
+    octets = octets.ljust(2 * layout.type.words, b"\0")
+    prefix = ">" if layout.byte_order is Order.HIGH_FIRST else "<"
+    return list(struct.unpack(f"{prefix}{layout.type.words}H", octets))
+
+
+def _boolean(value: Value) -> bool:
+    if isinstance(value, str) or value not in (0, 1):
+        raise BadValue(f"{value!r} is neither true nor false")
+    return bool(value)
+
+
+def _whole(value: Value) -> int:
+    if isinstance(value, (bool, str)):
+        raise BadValue(f"{value!r} is no number")
+    if isinstance(value, float) and not value.is_integer():
+        raise BadValue(f"{value} is no whole number")
+    return int(value)
+
+
+def _real(value: Value) -> float:
+    if isinstance(value, (bool, str)):
+        raise BadValue(f"{value!r} is no number")
+    try:
+        number = float(value)
+    except OverflowError:
+        number = math.inf
+    if not math.isfinite(number):
+        raise BadValue(f"{value} is no finite number")
+    return number
+
+
+def _bounds(kind: Kind) -> str:
+    if kind in _FLOATS:
+        return "up to 3.4e38 either way" if kind is Kind.FLOAT32 else "up to 1.8e308 either way"
+    bits = 16 * _WORDS[kind]
+    if kind.value.startswith("u"):
+        return f"0 to {2**bits - 1}"
+    return f"{-(2 ** (bits - 1))} to {2 ** (bits - 1) - 1}"
+
+
+def _from_bcd(words: Words) -> int | None:
+    digits = "".join(f"{word:04x}" for word in words)
+    return int(digits) if digits.isdecimal() else None
+
+
+def _to_bcd(value: int, digits: int) -> list[int]:
+    if not 0 <= value < 10**digits:
+        raise BadValue(f"{value} does not fit {digits} BCD digits (0 to {10**digits - 1})")
+    text = f"{value:0{digits}}"
+    return [int(text[i : i + 4], 16) for i in range(0, digits, 4)]

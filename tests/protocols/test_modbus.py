@@ -1,0 +1,498 @@
+"""The Modbus drivers: addresses, limits, what counts as an answer, writes, resynchronising."""
+
+import asyncio
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any, TypeVar
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gateway.errors import BadValue, ConfigError, DeviceError, NoReply, Refusal, Refused
+from gateway.protocols.driver import Address, Cost, Driver, Span
+from gateway.protocols.modbus import Frame, ModbusAscii, ModbusRtu, ModbusTcp
+from gateway.stations.modbus import ModbusStation
+from gateway.wiretime import Wire
+from tests.doubles import Script
+from tests.protocols.modbus_peer import KINDS, Hearing
+from tests.vectors import vectors
+
+T = TypeVar("T")
+MODERATE = settings(max_examples=100, deadline=None)
+DIALECTS = ("plain", "vigor", "k120s", "ex485lnk")
+VECTORS = {v.id: v for v in vectors("modbus-rtu", "modbus-ascii")}
+
+
+def pdu(name: str) -> bytes:
+    return bytes.fromhex(VECTORS[name].fields["pdu"])
+
+
+def framed(kind: type, station: int, body: bytes, number: int = 1) -> bytes:
+    frame = Frame(station, body, number if kind is ModbusTcp else 0)
+    coded: bytes = kind(station=station).codec().encode(frame)
+    return coded
+
+
+# ---- addresses -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("settings_", "text", "address"),
+    [
+        ({}, "holding:100", Address("holding", 100)),
+        ({}, "holding:100.15", Address("holding", 100, 15)),
+        ({}, "coil:5", Address("coil", 5)),
+        ({}, "discrete:65535", Address("discrete", 65535)),
+        ({"numbering": "modicon"}, "40101", Address("holding", 100)),
+        ({"numbering": "modicon"}, "400101", Address("holding", 100)),
+        ({"numbering": "modicon"}, "30001.3", Address("input", 0, 3)),
+        ({"numbering": "modicon"}, "00020", Address("coil", 19)),
+        ({"numbering": "modicon"}, "165536", Address("discrete", 65535)),
+        ({"addressing": "vigor"}, "X17", Address("X", 0o17)),
+        ({"addressing": "vigor"}, "C200", Address("C32", 200)),
+        ({"addressing": "vigor"}, "CN199", Address("C", 199)),
+        ({"addressing": "vigor"}, "M9003", Address("M9", 9003)),
+        ({"addressing": "vigor"}, "D7.3", Address("D", 7, 3)),
+        ({"addressing": "k120s"}, "M0010", Address("M", 16)),
+        ({"addressing": "k120s"}, "M191F", Address("M", 191 * 16 + 15)),
+        ({"addressing": "k120s"}, "M003", Address("MW", 3)),
+        ({"addressing": "k120s"}, "M003.5", Address("MW", 3, 5)),
+        ({"addressing": "k120s"}, "p001f", Address("P", 31)),
+        ({"addressing": "k120s"}, "T5", Address("T", 5)),
+        ({"addressing": "k120s"}, "TS005", Address("TS", 5)),
+        ({"addressing": "k120s"}, "D0100", Address("D", 100)),
+        ({"addressing": "ex485lnk"}, "BFM#4", Address("holding", 4)),
+        ({"addressing": "ex485lnk"}, "holding:4", Address("holding", 4)),
+    ],
+)
+def test_addresses_are_read_as_their_makers_write_them(
+    settings_: dict[str, Any], text: str, address: Address
+) -> None:
+    driver = ModbusRtu(station=1, **settings_)
+    assert driver.address(text) == address
+    assert driver.address(driver.spell(address)) == address
+    assert address.area in driver.areas
+
+
+@pytest.mark.parametrize(
+    ("settings_", "text", "hint"),
+    [
+        ({}, "40101", "numbering: modicon"),
+        ({}, "holding:65536", "0 to 65535"),
+        ({}, "coil:5.1", "a bit already"),
+        ({}, "holding:5.16", r"\.0 to \.15"),
+        ({}, "D100", "holding:100"),
+        ({"numbering": "modicon"}, "holding:100", "40101"),
+        ({"numbering": "modicon"}, "40000", "0001 to 65536"),
+        ({"numbering": "modicon"}, "465537", "0001 to 65536"),
+        ({"addressing": "vigor"}, "X8", "octal"),
+        ({"addressing": "vigor"}, "D8192", "D8191"),
+        ({"addressing": "vigor"}, "TC5", "there is no device TC"),
+        ({"addressing": "vigor"}, "S1000", "S999"),
+        ({"addressing": "vigor"}, "C200.1", "32 bits"),
+        ({"addressing": "k120s"}, "M10", "M0010"),
+        ({"addressing": "k120s"}, "L63F", "L0010"),
+        ({"addressing": "k120s"}, "M0010.1", "hex"),
+        ({"addressing": "k120s"}, "M2560", "000 to 255"),
+        ({"addressing": "k120s"}, "D5000", "D4999"),
+        ({"addressing": "k120s"}, "X1", "P, M, L, K, F"),
+        ({"addressing": "ex485lnk"}, "input:4", "BFM#4"),
+    ],
+)
+def test_an_address_the_device_does_not_have_says_what_would_be_right(
+    settings_: dict[str, Any], text: str, hint: str
+) -> None:
+    with pytest.raises(ConfigError, match=hint):
+        ModbusRtu(station=1, **settings_).address(text)
+
+
+@pytest.mark.parametrize("dialect", DIALECTS)
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_address_survives_being_spelled(kind: type, dialect: Any) -> None:
+    driver: Driver[Frame] = kind(station=1, addressing=dialect)
+    for area in driver.areas.values():
+        numbers = {area.first, area.last, *range(area.first, area.last, 97)}
+        for number in numbers:
+            address = Address(area.name, number)
+            assert driver.address(driver.spell(address)) == address
+
+
+# ---- settings --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("kind", "settings_", "hint"),
+    [
+        (ModbusRtu, {"station": 248}, "0..247"),
+        (ModbusRtu, {"station": 0, "addressing": "k120s"}, r"1\.\.31"),
+        (ModbusTcp, {"station": 32, "addressing": "k120s"}, r"1\.\.31"),
+        (ModbusTcp, {"station": 256}, "0..255"),
+        (ModbusTcp, {"window": 0}, "window"),
+        (ModbusAscii, {"station": 1, "max_read_words": 126}, "max_read_words 126"),
+        (ModbusAscii, {"station": 1, "max_write_bits": 0}, "max_write_bits 0"),
+        (ModbusRtu, {"station": 1, "addressing": "vigor", "numbering": "modicon"}, "plain"),
+    ],
+)
+def test_settings_out_of_range_are_refused(
+    kind: type, settings_: dict[str, Any], hint: str
+) -> None:
+    with pytest.raises(ConfigError, match=hint):
+        kind(**settings_)
+
+
+def test_rtu_keeps_3_5_characters_of_silence_and_1_75_ms_above_19200_baud() -> None:
+    timing = ModbusRtu(station=1).timing
+    assert Wire(9600, 11).silence(timing) == pytest.approx(3.5 * 11 / 9600)
+    assert Wire(19200, 11).silence(timing) == pytest.approx(3.5 * 11 / 19200)
+    assert Wire(38400, 11).silence(timing) == pytest.approx(0.00175)
+
+
+def test_ex485lnk_keeps_10_ms_of_silence_or_3_5_characters() -> None:
+    timing = ModbusRtu(station=1, addressing="ex485lnk").timing
+    assert Wire(9600, 11).silence(timing) == pytest.approx(0.010)
+    assert Wire(1200, 11).silence(timing) == pytest.approx(3.5 * 11 / 1200)
+
+
+# ---- limits and costs ------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("kind", "settings_", "words", "bits", "out_words", "out_bits"),
+    [
+        (ModbusRtu, {}, 125, 2000, 123, 1968),
+        (ModbusTcp, {}, 125, 2000, 123, 1968),
+        (ModbusAscii, {"addressing": "k120s"}, 29, 464, 27, 432),
+        (ModbusRtu, {"addressing": "k120s"}, 125, 2000, 123, 1968),
+        (ModbusRtu, {"max_read_words": 10, "max_write_bits": 5}, 10, 2000, 123, 5),
+    ],
+)
+def test_no_exchange_is_longer_than_the_device_takes(
+    kind: type, settings_: dict[str, Any], words: int, bits: int, out_words: int, out_bits: int
+) -> None:
+    driver: Driver[Frame] = kind(station=1, **settings_)
+    word, bit = ("D", "M") if "addressing" in settings_ else ("holding", "coil")
+    for cost, area, most in (
+        (driver.cost, word, words),
+        (driver.cost, bit, bits),
+        (driver.write_cost, word, out_words),
+        (driver.write_cost, bit, out_bits),
+    ):
+        assert cost(Span(area, 0, most)) is not None
+        assert cost(Span(area, 0, most + 1)) is None
+
+
+def test_k120s_ascii_frames_are_at_most_128_characters() -> None:
+    driver = ModbusAscii(station=1, addressing="k120s")
+    costs = [
+        driver.cost(Span("D", 0, 29)),
+        driver.cost(Span("M", 0, 464)),
+        driver.write_cost(Span("D", 0, 27)),
+        driver.write_cost(Span("M", 0, 432)),
+    ]
+    assert [max(cost) for cost in costs if cost] == [127, 127, 127, 127]
+
+
+def test_ex485lnk_reads_and_writes_32_registers_by_functions_03_and_16() -> None:
+    driver = ModbusRtu(station=32, addressing="ex485lnk")
+    assert set(driver.areas) == {"holding"}
+    assert driver.cost(Span("holding", 0, 32)) == Cost(8, 69)
+    assert driver.cost(Span("holding", 0, 33)) is None
+    assert driver.write_cost(Span("holding", 0, 1)) == Cost(11, 8)  # never function 06
+
+
+@pytest.mark.parametrize(
+    "span",
+    [
+        Span("holding", 65535, 2),
+        Span("holding", -1, 1),
+        Span("holding", 0, 0),
+        Span("nowhere", 0, 1),
+    ],
+)
+async def test_a_span_outside_the_device_is_not_asked(span: Span) -> None:
+    driver = ModbusRtu(station=1)
+    assert driver.cost(span) is None
+    assert driver.write_cost(span) is None
+    with pytest.raises(BadValue):
+        await driver.read(Script(driver), span)
+
+
+def test_vigor_holes_belong_to_no_area() -> None:
+    driver = ModbusRtu(station=1, addressing="vigor")
+    assert driver.cost(Span("S", 999, 1)) is not None
+    assert driver.cost(Span("S", 999, 2)) is None  # coils 6632 to 6655
+    assert driver.cost(Span("CS", 255, 2)) is None  # coils 7168 to 7423
+    assert driver.write_cost(Span("X", 0, 1)) is None
+
+
+# ---- what is an answer -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    ("station", "body"),
+    [
+        (2, pdu("modbus-rtu-002")),  # another station
+        (1, pdu("modbus-rtu-041")),  # function 04
+        (1, bytes((3, 2)) + bytes(2)),  # one register instead of two: a late answer
+        (1, bytes((3, 6)) + bytes(6)),
+        (1, bytes((0x84, 2))),  # an exception to another function
+        (1, pdu("modbus-rtu-001")),  # the question itself
+    ],
+)
+async def test_only_station_function_and_byte_count_asked_for_are_taken(
+    kind: type, station: int, body: bytes
+) -> None:
+    driver = kind(station=1)
+    wrong = framed(kind, station, body)
+    right = framed(kind, 1, pdu("modbus-rtu-002"))
+    with pytest.raises(NoReply):
+        await driver.read(Hearing(driver, [wrong]), Span("holding", 0, 2))
+    talk = Hearing(kind(station=1), [wrong, right])
+    assert list(await kind(station=1).read(talk, Span("holding", 0, 2))) == [0, 0]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+async def test_an_echo_that_looks_like_three_bytes_of_coils_is_no_answer(kind: type) -> None:
+    driver, span = kind(station=1), Span("coil", 0x0300, 24)
+    with pytest.raises(NoReply):
+        await driver.read(Hearing(driver, lambda sent: [sent]), span)
+
+
+async def test_modbus_tcp_takes_the_answer_of_its_own_number_alone() -> None:
+    driver = ModbusTcp()
+    talk = Hearing(
+        driver,
+        [framed(ModbusTcp, 1, bytes((3, 2, 0, 1)), 1)],
+        [framed(ModbusTcp, 1, bytes((3, 2, 0, 9)), number) for number in (1, 3, 0)],
+        [framed(ModbusTcp, 1, bytes((3, 2, 0, number)), number) for number in (1, 2, 3)],
+    )
+    span = Span("holding", 0, 1)
+    assert list(await driver.read(talk, span)) == [1]
+    with pytest.raises(NoReply):
+        await driver.read(talk, span)
+    assert list(await driver.read(talk, span)) == [3]
+
+
+async def test_modbus_tcp_numbers_go_round() -> None:
+    driver = ModbusTcp()
+    numbers = []
+
+    async def number() -> None:
+        talk = Hearing(driver)
+        with pytest.raises(NoReply):
+            await driver.read(talk, Span("holding", 0, 1))
+        numbers.append(int.from_bytes(talk.sent[0][:2], "big"))
+
+    for _ in range(65537):
+        next(driver._dialogue._numbers)
+    await number()
+    await number()
+    assert numbers == [3, 4]
+
+
+class Answering:
+    """A talk on which several questions are open; the answers come in the other order."""
+
+    def __init__(self, driver: ModbusTcp, station: ModbusStation, open_at_once: int) -> None:
+        self._codec, self._station, self._wanted = driver.codec(), station, open_at_once
+        self._asked: list[tuple[bytes, Callable[[Frame], Any], asyncio.Future[Any]]] = []
+
+    async def tell(self, frame: Frame) -> None:
+        raise AssertionError("nothing is broadcast")
+
+    async def ask(self, frame: Frame, reply: int, answers: Callable[[Frame], T | None]) -> T:
+        future: asyncio.Future[T] = asyncio.get_running_loop().create_future()
+        self._asked.append((self._codec.encode(frame), answers, future))
+        if len(self._asked) == self._wanted:
+            for question, _, _ in reversed(self._asked):
+                for answer in self._station.hear(question, 0.0):
+                    for heard in self._codec.feed(answer):
+                        self._deliver(heard)
+        return await future
+
+    def _deliver(self, frame: Frame) -> None:
+        for _, answers, future in self._asked:
+            if not future.done() and (said := answers(frame)) is not None:
+                future.set_result(said)
+                return
+
+
+async def test_modbus_tcp_keeps_several_questions_apart() -> None:
+    driver, station = ModbusTcp(window=8), ModbusStation(framing="tcp")
+    station.memory.write("holding", 0, range(8))
+    talk = Answering(driver, station, 8)
+    reads = (driver.read(talk, Span("holding", i, 1)) for i in range(8))
+    assert [list(units) for units in await asyncio.gather(*reads)] == [[i] for i in range(8)]
+
+
+@pytest.mark.parametrize(
+    ("code", "refusal"),
+    [
+        (1, Refusal.OTHER),
+        (2, Refusal.ADDRESS),
+        (3, Refusal.OTHER),
+        (4, Refusal.OTHER),
+        (5, Refusal.BUSY),
+        (6, Refusal.BUSY),
+        (0x2A, Refusal.OTHER),
+    ],
+)
+async def test_exceptions_say_what_to_do_next(code: int, refusal: Refusal) -> None:
+    driver = ModbusRtu(station=1)
+    talk = Hearing(driver, [framed(ModbusRtu, 1, bytes((0x83, code)))])
+    with pytest.raises(Refused) as refused:
+        await driver.read(talk, Span("holding", 0, 2))
+    assert (refused.value.code, refused.value.refusal) == (f"{code:02X}", refusal)
+
+
+async def test_a_gateways_exception_0b_leaves_a_write_unclear() -> None:
+    driver = ModbusTcp()
+    talk = Hearing(driver, [framed(ModbusTcp, 1, bytes((0x86, 0x0B)))])
+    with pytest.raises(NoReply):
+        await driver.write(talk, Span("holding", 0, 1), [5])
+
+
+@MODERATE
+@given(st.sampled_from(KINDS), st.lists(st.binary(max_size=30), max_size=5), st.booleans())
+async def test_whatever_comes_back_is_units_or_a_device_error(
+    kind: type, heard: list[bytes], writing: bool
+) -> None:
+    driver, span = kind(station=1), Span("holding", 0, 2)
+    bodies = [framed(kind, 1, piece[:20]) for piece in heard if piece]
+    talk = Hearing(driver, [piece for pair in zip(heard, bodies, strict=False) for piece in pair])
+    with suppress(DeviceError):
+        if writing:
+            assert await driver.write(talk, span, [1, 2]) is True
+        else:
+            assert len(await driver.read(talk, span)) == 2
+
+
+# ---- writing ---------------------------------------------------------------------------
+
+
+async def test_a_write_is_acknowledged_by_its_own_address_and_value_only() -> None:
+    driver, span = ModbusRtu(station=10), Span("holding", 0, 1)
+    good = VECTORS["modbus-rtu-010"].frame
+    others = [bytes((6, 0, 1, 0x12, 0x34)), bytes((6, 0, 0, 0x12, 0x35)), bytes((16, 0, 0, 0, 1))]
+    wrong = [framed(ModbusRtu, 10, body) for body in others]
+    assert await driver.write(Hearing(driver, [*wrong, good]), span, [0x1234]) is True
+    with pytest.raises(NoReply):
+        await driver.write(Hearing(driver, wrong), span, [0x1234])
+
+
+async def test_vigor_may_forget_the_address_in_its_answer_to_function_06() -> None:
+    forgetful = framed(ModbusRtu, 1, bytes((6, 0, 0, 0x12, 0x34)))
+    other_value = framed(ModbusRtu, 1, bytes((6, 0, 0, 0x12, 0x35)))
+    vigor, plain = ModbusRtu(station=1, addressing="vigor"), ModbusRtu(station=1)
+    assert await vigor.write(Hearing(vigor, [forgetful]), Span("D", 7, 1), [0x1234]) is True
+    with pytest.raises(NoReply):
+        await vigor.write(Hearing(vigor, [other_value]), Span("D", 7, 1), [0x1234])
+    with pytest.raises(NoReply):
+        await plain.write(Hearing(plain, [forgetful]), Span("holding", 7, 1), [0x1234])
+
+
+@pytest.mark.parametrize("kind", [ModbusRtu, ModbusAscii])
+async def test_a_broadcast_is_told_and_nobody_is_waited_for(kind: type) -> None:
+    driver = kind(station=0, addressing="ex485lnk")
+    name = "modbus-rtu-005" if kind is ModbusRtu else "modbus-ascii-005"
+    script, span = Script(driver, f"> {VECTORS[name].frame.hex()}"), Span("holding", 4, 2)
+    assert await driver.write(script, span, [0x4321, 0x8765]) is False
+    script.done()
+    assert script.replies == []
+    assert driver.write_cost(span) == Cost(len(VECTORS[name].frame), 0)
+
+
+def test_a_broadcast_device_is_written_to_only() -> None:
+    driver = ModbusRtu(station=0)
+    assert driver.cost(Span("holding", 0, 1)) is None
+    assert set(driver.areas) == {"holding", "coil"}
+    assert not any(area.readable for area in driver.areas.values())
+
+
+async def test_modbus_tcp_unit_0_answers() -> None:
+    driver = ModbusTcp(station=0)
+    talk = Hearing(driver, [framed(ModbusTcp, 0, bytes((3, 2, 0, 7)))])
+    assert list(await driver.read(talk, Span("holding", 0, 1))) == [7]
+
+
+@pytest.mark.parametrize("order", ["low_first", "high_first"])
+async def test_vigor_counters_from_c200_are_two_registers(order: Any) -> None:
+    driver = ModbusRtu(station=1, addressing="vigor", counter_word_order=order)
+    first, second = (0x5678, 0x1234) if order == "low_first" else (0x1234, 0x5678)
+    answer = bytes((3, 4)) + first.to_bytes(2, "big") + second.to_bytes(2, "big")
+    span = Span("C32", 200, 1)
+    talk = Hearing(driver, [framed(ModbusRtu, 1, answer)])
+    assert list(await driver.read(talk, span)) == [0x12345678]
+    assert talk.sent == [VECTORS["modbus-rtu-035"].frame]
+    writing = Hearing(driver, [framed(ModbusRtu, 1, bytes((16, 0x21, 0xC8, 0, 2)))])
+    assert await driver.write(writing, span, [0x12345678]) is True
+    assert writing.sent[0][7:11] == answer[2:]
+
+
+@pytest.mark.parametrize("units", [[65536, 0], [-1, 0], [1], [1, 2, 3]])
+async def test_units_that_do_not_fit_are_not_sent(units: list[int]) -> None:
+    driver = ModbusRtu(station=1)
+    with pytest.raises(BadValue):
+        await driver.write(Script(driver), Span("holding", 0, 2), units)
+
+
+# ---- resynchronising -------------------------------------------------------------------
+
+
+@MODERATE
+@given(
+    st.sampled_from(KINDS),
+    st.sampled_from(DIALECTS),
+    st.integers(0, 10**6),
+    st.data(),
+)
+async def test_a_resync_differs_from_the_doubt_and_from_the_last_resync(
+    kind: type, dialect: Any, salt: int, data: st.DataObject
+) -> None:
+    driver = kind(station=1, addressing=dialect)
+    area = data.draw(st.sampled_from(sorted(driver.areas.values(), key=lambda a: a.name)))
+    start = data.draw(st.integers(area.first, area.last))
+    size = data.draw(st.integers(1, min(29, area.last - start + 1)))
+    span = Span(area.name, start, size)
+    cost = driver.cost(span)
+    lengths = []
+    for turn in (salt, salt + 1):
+        talk = Hearing(driver)
+        with pytest.raises(NoReply):
+            await driver.resync(talk, span, turn)
+        lengths += talk.replies
+    assert cost is not None
+    assert len({cost.reply, *lengths}) == 3
+
+
+async def test_an_exception_to_a_resync_is_asked_again_and_is_a_sign_of_life() -> None:
+    driver, no = ModbusRtu(station=1), framed(ModbusRtu, 1, bytes((0x83, 2)))
+    talk = Hearing(driver, [no], [no])
+    await driver.resync(talk, Span("holding", 65535, 1), 0)
+    assert len(talk.replies) == len(set(talk.replies)) == 2
+
+
+async def test_a_numbered_exception_is_believed() -> None:
+    driver = ModbusTcp()
+    talk = Hearing(driver, [framed(ModbusTcp, 1, bytes((0x83, 2)))])
+    await driver.resync(talk, None, 0)
+    assert len(talk.sent) == 1
+
+
+async def test_a_resync_by_diagnostics_takes_its_own_token_alone() -> None:
+    driver = ModbusRtu(station=1, diagnostics=True)
+    station = ModbusStation()
+    await driver.resync(Hearing(driver, lambda sent: station.hear(sent, 0.0)), None, 70000)
+    earlier = framed(ModbusRtu, 1, bytes((8, 0, 0, 0, 41)))
+    with pytest.raises(NoReply):
+        await driver.resync(Hearing(driver, [earlier]), None, 42)
+
+
+async def test_a_resync_where_one_word_is_the_limit_asks_another_function() -> None:
+    driver = ModbusRtu(station=1, max_read_words=1)
+    talk = Hearing(driver)
+    with pytest.raises(NoReply):
+        await driver.resync(talk, Span("holding", 5, 1), 0)
+    assert talk.sent[0][1] != 3

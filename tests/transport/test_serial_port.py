@@ -1,0 +1,256 @@
+"""A local serial port: opened exclusively, and its end told once."""
+
+import asyncio
+import os
+import shutil
+import termios
+import threading
+from collections.abc import AsyncIterator, Iterator
+from pathlib import Path
+
+import pytest
+
+from gateway.errors import LineDown
+from gateway.transport import SerialPath, SerialSettings, open_port
+from tests.transport.ends import PATIENCE, Heard, Master
+from tests.vectors import vectors
+
+REQUEST, REPLY = (vector.frame for vector in vectors("vigor")[:2])
+SEVEN_EVEN = SerialSettings(19200, "7E1")
+
+
+@pytest.fixture
+def plug() -> Iterator[Master]:
+    master = Master()
+    yield master
+    master.unplug()
+
+
+def open_files() -> set[str]:
+    """What this process has open, by number and name."""
+    found = set()
+    for entry in Path("/proc/self/fd").iterdir():
+        try:
+            found.add(f"{entry.name} {entry.readlink()}")
+        except FileNotFoundError:
+            continue  # the listing's own
+    return found
+
+
+async def test_bytes_pass_both_ways_at_7e1(plug: Master) -> None:
+    ear = Heard()
+    port = await open_port(SerialPath(plug.path), SEVEN_EVEN, ear)
+    port.write(REQUEST)
+    assert await plug.read(len(REQUEST)) == REQUEST
+    plug.write(REPLY)
+    await ear.until(lambda e: len(e.data) >= len(REPLY))
+    assert ear.data == REPLY
+    await port.close()
+    assert ear.losses == []
+
+
+async def test_every_byte_value_passes_at_8n1(plug: Master) -> None:
+    ear = Heard()
+    port = await open_port(SerialPath(plug.path), SerialSettings(9600, "8N1"), ear)
+    everything = bytes(range(256))
+    port.write(everything)
+    assert await plug.read(256) == everything
+    plug.write(everything)
+    await ear.until(lambda e: len(e.data) >= 256)
+    assert ear.data == everything
+    await port.close()
+
+
+@pytest.mark.parametrize(
+    ("settings", "speed", "stop_bits"),
+    [
+        (SerialSettings(9600, "8N1"), termios.B9600, 0),
+        (SerialSettings(19200, "8N2"), termios.B19200, termios.CSTOPB),
+        (SerialSettings(115200, "7E2"), termios.B115200, termios.CSTOPB),
+    ],
+)
+async def test_speed_and_stop_bits_are_set(
+    plug: Master, settings: SerialSettings, speed: int, stop_bits: int
+) -> None:
+    # Data bits and parity cannot be seen on a pty: it has always 8 and none.
+    port = await open_port(SerialPath(plug.path), settings, Heard())
+    flags, set_speed = plug.format()
+    assert set_speed == speed
+    assert flags & termios.CSTOPB == stop_bits
+    await port.close()
+
+
+async def test_a_port_in_use_is_refused_until_it_is_given_back(plug: Master) -> None:
+    first = await open_port(SerialPath(plug.path), SEVEN_EVEN, Heard())
+    with pytest.raises(LineDown, match=f"^{plug.path}: in use by another program$"):
+        await open_port(SerialPath(plug.path), SEVEN_EVEN, Heard())
+    await first.close()
+    second = await open_port(SerialPath(plug.path), SEVEN_EVEN, Heard())
+    await second.close()
+
+
+@pytest.mark.parametrize(
+    ("path", "sentence"),
+    [
+        ("/dev/ttyNOTHERE", "no such port"),
+        ("/dev/null/tty", "no such port"),
+        ("/dev/null", "not a serial port"),
+        ("/tmp", "not a serial port"),
+    ],
+)
+async def test_what_is_no_port_is_said_plainly(path: str, sentence: str) -> None:
+    with pytest.raises(LineDown) as caught:
+        await open_port(SerialPath(path), SEVEN_EVEN, Heard())
+    assert str(caught.value) == f"{path}: {sentence}"
+
+
+async def test_permission_denied_names_the_group(tmp_path: Path) -> None:
+    if os.geteuid() == 0:
+        pytest.skip("root may open everything")
+    closed = tmp_path / "tty"
+    closed.touch(mode=0)
+    with pytest.raises(LineDown, match="permission denied: is the user in group dialout"):
+        await open_port(SerialPath(str(closed)), SEVEN_EVEN, Heard())
+
+
+@pytest.mark.parametrize("path", ["a\0b", "x" * 5000])
+async def test_a_path_no_system_takes_is_line_down(path: str) -> None:
+    with pytest.raises(LineDown):
+        await open_port(SerialPath(path), SEVEN_EVEN, Heard())
+
+
+async def test_a_pty_can_be_opened_as_7e1_again_and_again(plug: Master) -> None:
+    # Linux refuses 7 bits and parity on a pty from the second time on.
+    for _ in range(3):
+        port = await open_port(SerialPath(plug.path), SEVEN_EVEN, Heard())
+        await port.close()
+
+
+async def test_unplugging_is_told_once_and_writing_fails_after_it(plug: Master) -> None:
+    ear = Heard()
+    port = await open_port(SerialPath(plug.path), SEVEN_EVEN, ear)
+    plug.unplug()
+    await ear.until(lambda e: bool(e.losses))
+    with pytest.raises(LineDown, match="unplugged"):
+        port.write(REQUEST)
+    await port.close()
+    await port.close()
+    assert [type(error) for error in ear.losses] == [LineDown]
+
+
+async def test_a_write_that_meets_the_unplugging_fails(plug: Master) -> None:
+    ear = Heard()
+    port = await open_port(SerialPath(plug.path), SEVEN_EVEN, ear)
+    plug.unplug()
+    with pytest.raises(LineDown):  # before the loop could hear of it
+        port.write(REQUEST)
+    await ear.until(lambda e: bool(e.losses))
+    await port.close()
+    assert len(ear.losses) == 1
+
+
+async def test_nothing_is_told_after_close(plug: Master) -> None:
+    ear = Heard()
+    port = await open_port(SerialPath(plug.path), SEVEN_EVEN, ear)
+    await asyncio.gather(port.close(), port.close())
+    plug.unplug()
+    with pytest.raises(LineDown):
+        port.write(REQUEST)
+    await asyncio.sleep(0)
+    assert (ear.data, ear.losses) == (b"", [])
+
+
+async def test_a_port_that_takes_nothing_is_down_and_keeps_no_old_requests(plug: Master) -> None:
+    ear = Heard()
+    port = await open_port(SerialPath(plug.path), SEVEN_EVEN, ear)
+
+    def keep_writing() -> None:
+        for _ in range(1000):  # nobody reads the pty
+            port.write(REQUEST * 10)
+
+    with pytest.raises(LineDown, match="does not take what is sent"):
+        keep_writing()
+    await ear.until(lambda e: bool(e.losses))
+    await port.close()
+    assert len(ear.losses) == 1
+
+
+async def test_what_was_received_before_opening_is_not_heard(plug: Master) -> None:
+    plug.write(REPLY)
+    ear = Heard()
+    port = await open_port(SerialPath(plug.path), SEVEN_EVEN, ear)
+    plug.write(REQUEST)
+    await ear.until(lambda e: len(e.data) >= len(REQUEST))
+    assert ear.data == REQUEST
+    await port.close()
+
+
+async def test_opening_and_closing_leaves_nothing_behind(plug: Master) -> None:
+    await (await open_port(SerialPath(plug.path), SEVEN_EVEN, Heard())).close()
+    files, tasks = open_files(), asyncio.all_tasks()
+    for _ in range(5):
+        port = await open_port(SerialPath(plug.path), SEVEN_EVEN, Heard())
+        with pytest.raises(LineDown):
+            await open_port(SerialPath(plug.path), SEVEN_EVEN, Heard())
+        await port.close()
+    assert open_files() == files
+    await asyncio.sleep(0)
+    assert asyncio.all_tasks() == tasks
+    # Only the loop's own executor, whose threads end with the loop.
+    assert all(
+        thread is threading.main_thread() or thread.name.startswith("asyncio_")
+        for thread in threading.enumerate()
+    )
+
+
+async def test_opening_that_is_cancelled_gives_the_port_back(plug: Master) -> None:
+    files = open_files()
+    opening = asyncio.create_task(open_port(SerialPath(plug.path), SEVEN_EVEN, Heard()))
+    await asyncio.sleep(0)
+    opening.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await opening
+    assert open_files() == files
+
+
+@pytest.fixture
+async def cable(tmp_path: Path) -> AsyncIterator[tuple[str, str, asyncio.subprocess.Process]]:
+    """Two ports with a cable between them."""
+    if shutil.which("socat") is None:
+        pytest.skip("socat is not installed")
+    ends = str(tmp_path / "a"), str(tmp_path / "b")
+    socat = await asyncio.create_subprocess_exec(
+        "socat", "-d", "-d", *(f"pty,raw,echo=0,link={end}" for end in ends),
+        stderr=asyncio.subprocess.PIPE,
+    )  # fmt: skip
+    assert socat.stderr is not None
+    async with asyncio.timeout(PATIENCE):
+        while b"starting data transfer" not in await socat.stderr.readline():
+            pass
+    yield *ends, socat
+    if socat.returncode is None:
+        socat.terminate()
+    await socat.communicate()
+
+
+async def test_two_ports_on_a_cable_and_the_cable_pulled(
+    cable: tuple[str, str, asyncio.subprocess.Process],
+) -> None:
+    left, right, socat = cable
+    ears = Heard(), Heard()
+    ports = [
+        await open_port(SerialPath(path), SEVEN_EVEN, ear)
+        for path, ear in zip((left, right), ears, strict=True)
+    ]
+    ports[0].write(REQUEST)
+    await ears[1].until(lambda e: len(e.data) >= len(REQUEST))
+    ports[1].write(REPLY)
+    await ears[0].until(lambda e: len(e.data) >= len(REPLY))
+    assert (ears[1].data, ears[0].data) == (REQUEST, REPLY)
+    socat.terminate()
+    for ear, port in zip(ears, ports, strict=True):
+        await ear.until(lambda e: bool(e.losses))
+        with pytest.raises(LineDown):
+            port.write(REQUEST)
+        await port.close()
+        assert len(ear.losses) == 1

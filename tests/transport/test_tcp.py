@@ -1,0 +1,217 @@
+"""A raw TCP port: refused, silent, reset, half-closed, and noticed when the other side is gone."""
+
+import asyncio
+import socket
+import struct
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+import pytest
+
+from gateway.errors import LineDown
+from gateway.transport import Port, SerialSettings, TcpAddress, open_port
+from gateway.transport.stream import LONGEST_CLOSE, StreamPort
+from gateway.transport.trouble import line_down
+from tests.transport.ends import PATIENCE, Heard, free_port, listening
+from tests.vectors import vectors
+
+REQUEST, REPLY = (vector.frame for vector in vectors("vigor")[:2])
+ANY = SerialSettings()
+
+
+@asynccontextmanager
+async def connected(ear: Heard) -> AsyncIterator[tuple[Port, socket.socket]]:
+    """Our port and the other side's socket."""
+    loop = asyncio.get_running_loop()
+    with listening() as server:
+        accepting = asyncio.create_task(loop.sock_accept(server))
+        port = await open_port(TcpAddress(*server.getsockname()), ANY, ear)
+        peer, _ = await accepting
+        peer.setblocking(False)
+        with peer:
+            yield port, peer
+        await port.close()
+
+
+def reset(peer: socket.socket) -> None:
+    """What a device server that has restarted answers with."""
+    peer.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+    peer.close()
+
+
+async def test_every_byte_value_passes_both_ways() -> None:
+    ear, loop = Heard(), asyncio.get_running_loop()
+    everything = bytes(range(256))
+    async with connected(ear) as (port, peer):
+        port.write(everything)
+        assert await loop.sock_recv(peer, 1000) == everything
+        await loop.sock_sendall(peer, everything)
+        await ear.until(lambda e: len(e.data) >= 256)
+    assert ear.data == everything
+    assert ear.losses == []
+
+
+async def test_nobody_there_is_connection_refused() -> None:
+    where = TcpAddress("127.0.0.1", free_port())
+    with pytest.raises(LineDown, match=rf"^127.0.0.1:{where.port}: connection refused$"):
+        await open_port(where, ANY, Heard())
+
+
+async def test_a_host_with_two_addresses_that_both_refuse() -> None:
+    # asyncio puts both into one text and leaves the number out.
+    both = OSError(
+        "Multiple exceptions: [Errno 111] Connect call failed ('::1', 1, 0, 0), "
+        "[Errno 111] Connect call failed ('127.0.0.1', 1)"
+    )
+    assert str(line_down("localhost:1", both)) == "localhost:1: connection refused"
+
+
+async def test_a_name_nobody_knows_is_said_plainly() -> None:
+    unknown = socket.gaierror(socket.EAI_NONAME, "Name or service not known")
+    assert str(line_down("moxa:4001", unknown)) == "moxa:4001: unknown host"
+
+
+@pytest.mark.parametrize("host", ["a..b", "x" * 300])
+async def test_a_name_that_cannot_be_looked_up_is_line_down(host: str) -> None:
+    with pytest.raises(LineDown):
+        await open_port(TcpAddress(host, 4001), ANY, Heard())
+
+
+async def test_a_silent_host_times_out_and_the_loop_goes_on() -> None:
+    loop = asyncio.get_running_loop()
+    with listening(backlog=0) as server:
+        # A full backlog drops what comes, as a host does that is switched off.
+        first = [socket.socket() for _ in range(2)]
+        for one in first:
+            one.setblocking(False)
+            one.connect_ex(server.getsockname())
+        ticks = 0
+
+        def tick() -> None:
+            nonlocal ticks, timer
+            ticks += 1
+            timer = loop.call_later(0.01, tick)
+
+        timer = loop.call_soon(tick)
+        begin = loop.time()
+        async with asyncio.timeout(PATIENCE):
+            with pytest.raises(LineDown, match="no answer"):
+                await open_port(TcpAddress(*server.getsockname()), ANY, Heard(), timeout=0.3)
+        took = loop.time() - begin
+        timer.cancel()
+        for one in first:
+            one.close()
+    assert 0.25 < took < 2
+    assert ticks > 10
+
+
+async def test_a_reset_is_told_once_and_writing_fails_after_it() -> None:
+    ear = Heard()
+    async with connected(ear) as (port, peer):
+        reset(peer)
+        await ear.until(lambda e: bool(e.losses))
+        with pytest.raises(LineDown, match="connection reset"):
+            port.write(REQUEST)
+        await port.close()
+        await port.close()
+    assert [type(error) for error in ear.losses] == [LineDown]
+    assert "connection reset by the other side" in str(ear.losses[0])
+
+
+async def test_a_half_close_ends_the_port() -> None:
+    # A device server that stops talking will not answer, even if it would still listen.
+    ear, loop = Heard(), asyncio.get_running_loop()
+    async with connected(ear) as (port, peer):
+        await loop.sock_sendall(peer, REPLY)
+        peer.shutdown(socket.SHUT_WR)
+        await ear.until(lambda e: bool(e.losses))
+        with pytest.raises(LineDown, match="closed by the other side"):
+            port.write(REQUEST)
+    assert ear.data == REPLY  # what came before it counts
+    assert len(ear.losses) == 1
+
+
+async def test_closing_sends_what_was_written_and_is_not_told() -> None:
+    ear, loop = Heard(), asyncio.get_running_loop()
+    async with connected(ear) as (port, peer):
+        port.write(REQUEST)
+        await port.close()
+        assert await loop.sock_recv(peer, 1000) == REQUEST
+        assert await loop.sock_recv(peer, 1000) == b""
+        with pytest.raises(LineDown):
+            port.write(REQUEST)
+    assert ear.losses == []
+
+
+async def test_a_peer_that_takes_nothing_is_down_and_keeps_no_old_requests() -> None:
+    ear = Heard()
+    async with connected(ear) as (port, _):
+
+        def keep_writing() -> None:
+            for _ in range(10_000):  # nobody reads the other end
+                port.write(REQUEST * 100)
+
+        with pytest.raises(LineDown, match="does not take what is sent"):
+            keep_writing()
+        await ear.until(lambda e: bool(e.losses))
+    assert len(ear.losses) == 1
+
+
+async def test_a_connection_reset_at_once_is_told_by_open_or_by_the_ear_but_once() -> None:
+    ear, loop = Heard(), asyncio.get_running_loop()
+    with listening() as server:
+
+        async def refuse() -> None:
+            peer, _ = await loop.sock_accept(server)
+            reset(peer)
+
+        refusing = asyncio.create_task(refuse())
+        try:
+            port = await open_port(TcpAddress(*server.getsockname()), ANY, ear)
+        except LineDown:
+            assert ear.losses == []
+        else:
+            await ear.until(lambda e: bool(e.losses))
+            await port.close()
+            assert len(ear.losses) == 1
+        await refusing
+
+
+async def test_opening_that_is_cancelled_leaves_no_connection() -> None:
+    with listening() as server:
+        where = TcpAddress(*server.getsockname())
+        opening = asyncio.create_task(open_port(where, ANY, Heard()))
+        await asyncio.sleep(0)
+        opening.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await opening
+
+
+async def test_closing_does_not_wait_for_a_peer_that_takes_nothing() -> None:
+    loop = asyncio.get_running_loop()
+    async with connected(Heard()) as (port, peer):
+        assert isinstance(port, StreamPort)
+        assert port._transport is not None
+        while port._transport.get_write_buffer_size() == 0:
+            port.write(bytes(1000))
+        begin = loop.time()
+        await port.close()
+        assert loop.time() - begin < LONGEST_CLOSE / 2
+        arrived = 1
+        while arrived:  # what waited in the port was not sent after it was given back
+            arrived = len(await loop.sock_recv(peer, 1_000_000))
+
+
+async def test_a_dead_peer_is_noticed_within_a_minute_and_nothing_waits_to_be_sent() -> None:
+    async with connected(Heard()) as (port, _):
+        assert isinstance(port, StreamPort)
+        assert port._transport is not None
+        ours = port._transport.get_extra_info("socket")
+        asked = [
+            ours.getsockopt(socket.IPPROTO_TCP, option)
+            for option in (socket.TCP_KEEPIDLE, socket.TCP_KEEPINTVL, socket.TCP_KEEPCNT)
+        ]
+        assert ours.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE)
+        assert ours.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
+        assert 10 <= asked[0] + asked[1] * asked[2] <= 60
+        assert 10_000 <= ours.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT) <= 60_000

@@ -1,0 +1,388 @@
+"""A Zenoh router, peer or client in another process, driven from a test.
+
+In a test:
+
+    async with ZenohPeer(Mode.ROUTER, listen=[endpoint]) as router: ...
+    async with ZenohPeer("client", connect=[endpoint]) as client:
+        heard = await client.subscribe("plant/**")             # a Subscription: its samples
+        await heard.next(lambda s: s.key == "plant/mixer/speed" and s.json["value"] == 12)
+        replies = await client.get("plant/mixer/*")            # list of Reply
+        [reply] = await client.get("plant/mixer/recipe/@set", b"7")
+        replies = await client.many([("plant/mixer/recipe/@set", b"7")] * 1000)   # all at once
+        await client.put("plant/mixer/recipe/@set", b"7")
+        await client.delete("plant/mixer/recipe/@set")
+        alive = await client.liveliness("plant/**")            # a Subscription: PUT and DELETE
+        await client.tokens("plant/**")                        # who is alive now: list of keys
+        await client.kill()                                    # SIGKILL; .pid is there for the rest
+
+`subscribe(key, advanced=True)` is Zenoh's AdvancedSubscriber with history.
+
+The script speaks JSON lines: `{"n": 1, "do": "get", …}` in, `{"n": 1, "result": …}` or
+`{"n": 1, "error": "…"}` out, and `{"heard": <subscription>, …}` for every sample. Payloads travel
+as base64. It ends when its standard input does.
+"""
+
+import asyncio
+import base64
+import json
+import socket
+import sys
+import threading
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple, Self
+
+import zenoh
+from zenoh import ext
+
+TIMEOUT = 10.0  # seconds a test waits for anything
+# A question that every gateway answers. Zenoh declares without waiting, but what was declared
+# before goes the same way first.
+BARRIER = "*/@gateway/*/status"
+
+
+def free_endpoint() -> str:
+    """A loopback endpoint nobody listens on now."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+# -- the test's side ---------------------------------------------------------------------------
+
+
+class Heard(NamedTuple):
+    """One sample; `time` is Zenoh's time stamp in ns, `kind` is PUT or DELETE."""
+
+    key: str
+    kind: str
+    payload: bytes
+    encoding: str
+    time: int | None
+
+    @property
+    def json(self) -> Any:
+        return json.loads(self.payload)
+
+
+class Reply(NamedTuple):
+    """One reply; an error has no key."""
+
+    ok: bool
+    key: str | None
+    payload: bytes
+    encoding: str
+    time: int | None
+
+    @property
+    def json(self) -> Any:
+        return json.loads(self.payload)
+
+
+class Subscription:
+    """The samples of one subscription in the order of arrival; `samples` holds all of them."""
+
+    def __init__(self) -> None:
+        self.samples: list[Heard] = []
+        self._arrived = asyncio.Event()
+
+    def feed(self, sample: Heard) -> None:
+        self.samples.append(sample)
+        self._arrived.set()
+
+    def latest(self) -> dict[str, Heard]:
+        """By key."""
+        return {sample.key: sample for sample in self.samples}
+
+    async def next(self, wanted: Callable[[Heard], bool], timeout: float = TIMEOUT) -> Heard:
+        """The first sample that fits among those not yet passed over by `forget`."""
+        seen = 0
+        async with asyncio.timeout(timeout):
+            while True:
+                for sample in self.samples[seen:]:
+                    if wanted(sample):
+                        return sample
+                seen = len(self.samples)
+                self._arrived.clear()
+                await self._arrived.wait()
+
+    async def until(self, done: Callable[["Subscription"], bool], timeout: float = TIMEOUT) -> None:
+        """Waits until `done(self)`, looked at after every arrival."""
+        async with asyncio.timeout(timeout):
+            while not done(self):
+                self._arrived.clear()
+                await self._arrived.wait()
+
+    def forget(self) -> None:
+        self.samples.clear()
+
+
+class ZenohPeer:
+    """The other process. An async context manager; `config` is Zenoh's own, {path: value}."""
+
+    def __init__(
+        self,
+        mode: str,
+        listen: Sequence[str] = (),
+        connect: Sequence[str] = (),
+        config: dict[str, Any] | None = None,
+    ) -> None:
+        self._setup = {
+            "mode": str(mode),
+            "listen": list(listen),
+            "connect": list(connect),
+            "config": config or {},
+        }
+        self.connect = list(connect)
+        self._process: asyncio.subprocess.Process | None = None
+        self._reader: asyncio.Task[None] | None = None
+        self._asked: dict[int, asyncio.Future[Any]] = {}
+        self._subscriptions: dict[int, Subscription] = {}
+        self._count = 0
+
+    async def __aenter__(self) -> Self:
+        self._process = await asyncio.create_subprocess_exec(
+            sys.executable,
+            str(Path(__file__)),
+            json.dumps(self._setup),
+            stdin=asyncio.subprocess.PIPE,
+            stdout=asyncio.subprocess.PIPE,
+            limit=64 * 1024 * 1024,
+        )
+        self._reader = asyncio.create_task(self._read())
+        try:
+            await self._ask("hello")
+        except BaseException:
+            await self.kill()  # nobody would: there is no `__aexit__` after this
+            raise
+        return self
+
+    async def __aexit__(self, *_error: object) -> None:
+        assert self._process is not None
+        assert self._process.stdin is not None
+        assert self._reader is not None
+        self._process.stdin.close()
+        try:
+            async with asyncio.timeout(5):
+                await self._process.wait()
+        except TimeoutError:
+            self._process.kill()
+            await self._process.wait()
+        await self._reader
+
+    @property
+    def pid(self) -> int:
+        assert self._process is not None
+        return self._process.pid
+
+    async def kill(self) -> None:
+        assert self._process is not None
+        self._process.kill()
+        await self._process.wait()
+
+    async def subscribe(self, key: str, *, advanced: bool = False) -> Subscription:
+        """Returns when every gateway that can be reached knows of it."""
+        subscription = await self._subscribe("subscribe", key=key, advanced=advanced)
+        await self.get(BARRIER)
+        return subscription
+
+    async def liveliness(self, key: str) -> Subscription:
+        """Tokens that come (PUT) and go (DELETE), those already there included."""
+        return await self._subscribe("liveliness", key=key)
+
+    async def tokens(self, key: str) -> list[str]:
+        result: list[str] = await self._ask("tokens", key=key)
+        return result
+
+    async def get(
+        self, selector: str, payload: bytes | None = None, timeout: float = TIMEOUT, **how: str
+    ) -> list[Reply]:
+        """`how`: `target="ALL"`, `consolidation="NONE"`."""
+        [replies] = await self.many([(selector, payload)], timeout, **how)
+        return replies
+
+    async def many(
+        self,
+        queries: Sequence[tuple[str, bytes | None]],
+        timeout: float = TIMEOUT,
+        **how: str,
+    ) -> list[list[Reply]]:
+        """All at once; the replies of each in the order of the queries."""
+        asked = [(selector, _text(payload)) for selector, payload in queries]
+        result = await self._ask("get", queries=asked, timeout=timeout, how=how)
+        return [
+            [Reply(ok, key, base64.b64decode(data), *rest) for ok, key, data, *rest in replies]
+            for replies in result
+        ]
+
+    async def put(self, key: str, payload: bytes) -> None:
+        await self._ask("put", key=key, payload=_text(payload))
+
+    async def delete(self, key: str) -> None:
+        await self._ask("delete", key=key)
+
+    async def _subscribe(self, do: str, **arguments: Any) -> Subscription:
+        subscription = Subscription()
+        self._subscriptions[self._count + 1] = subscription
+        await self._ask(do, **arguments)
+        return subscription
+
+    async def _ask(self, do: str, **arguments: Any) -> Any:
+        assert self._process is not None
+        assert self._process.stdin is not None
+        self._count += 1
+        n = self._count
+        self._asked[n] = answer = asyncio.get_running_loop().create_future()
+        line = json.dumps({"n": n, "do": do, **arguments})
+        self._process.stdin.write(line.encode() + b"\n")
+        await self._process.stdin.drain()
+        async with asyncio.timeout(3 * TIMEOUT):
+            return await answer
+
+    async def _read(self) -> None:
+        assert self._process is not None
+        assert self._process.stdout is not None
+        async for line in self._process.stdout:
+            message = json.loads(line)
+            if "heard" in message:
+                key, kind, data, encoding, time = message["sample"]
+                self._subscriptions[message["heard"]].feed(
+                    Heard(key, kind, base64.b64decode(data), encoding, time)
+                )
+            elif "error" in message:
+                self._asked.pop(message["n"]).set_exception(RuntimeError(message["error"]))
+            else:
+                self._asked.pop(message["n"]).set_result(message["result"])
+        for answer in self._asked.values():
+            if not answer.done():
+                answer.set_exception(ConnectionError("the Zenoh peer has ended"))
+
+
+def _text(payload: bytes | None) -> str | None:
+    return None if payload is None else base64.b64encode(payload).decode()
+
+
+# -- the other process -------------------------------------------------------------------------
+
+_stdout = threading.Lock()
+
+
+def _say(message: dict[str, Any]) -> None:
+    line = json.dumps(message) + "\n"
+    with _stdout:
+        sys.stdout.write(line)
+        sys.stdout.flush()
+
+
+def _hear(n: int) -> Callable[[zenoh.Sample], None]:
+    return lambda sample: _say({"heard": n, "sample": _flat(sample)})
+
+
+def _flat(sample: zenoh.Sample) -> list[Any]:
+    stamp = sample.timestamp
+    return [
+        str(sample.key_expr),
+        str(sample.kind).rpartition(".")[2],
+        _text(bytes(sample.payload)),
+        str(sample.encoding),
+        None if stamp is None else stamp.get_time_as_ntp64().as_nanos(),
+    ]
+
+
+def _reply(answer: zenoh.Reply) -> list[Any]:
+    if answer.ok is not None:
+        key, _, data, encoding, time = _flat(answer.ok)
+        return [True, key, data, encoding, time]
+    assert answer.err is not None
+    return [False, None, _text(bytes(answer.err.payload)), str(answer.err.encoding), None]
+
+
+def _octets(text: str | None) -> bytes | None:
+    return None if text is None else base64.b64decode(text)
+
+
+def _get(
+    session: zenoh.Session,
+    queries: list[tuple[str, str | None]],
+    timeout: float,
+    how: dict[str, str],
+) -> list[list[Any]]:
+    options: dict[str, Any] = {"timeout": timeout}
+    if "target" in how:
+        options["target"] = getattr(zenoh.QueryTarget, how["target"])
+    if "consolidation" in how:
+        options["consolidation"] = getattr(zenoh.ConsolidationMode, how["consolidation"])
+    found: list[list[zenoh.Reply]] = [[] for _ in queries]
+    ends = [threading.Event() for _ in queries]
+    for (selector, payload), replies, end in zip(queries, found, ends, strict=True):
+        handler = zenoh.handlers.Callback(replies.append, end.set, indirect=False)
+        session.get(selector, handler, payload=_octets(payload), **options)
+    for end in ends:
+        end.wait()
+    return [[_reply(answer) for answer in replies] for replies in found]
+
+
+def _obey(session: zenoh.Session, kept: list[object], ask: dict[str, Any]) -> Any:
+    match ask:
+        case {"do": "hello"}:
+            return str(session.zid())
+        case {"do": "subscribe", "n": n, "key": key, "advanced": False}:
+            kept.append(session.declare_subscriber(key, _hear(n)))
+        case {"do": "subscribe", "n": n, "key": key}:
+            history = ext.HistoryConfig(max_samples=1)
+            kept.append(ext.declare_advanced_subscriber(session, key, _hear(n), history=history))
+        case {"do": "liveliness", "n": n, "key": key}:
+            live = session.liveliness()
+            kept.append(live.declare_subscriber(key, _hear(n), history=True))
+        case {"do": "tokens", "key": key}:
+            found = session.liveliness().get(key, timeout=2)
+            return sorted(str(answer.ok.key_expr) for answer in found if answer.ok)
+        case {"do": "get", "queries": queries, "timeout": timeout, "how": how}:
+            return _get(session, queries, timeout, how)
+        case {"do": "put", "key": key, "payload": payload}:
+            block = zenoh.CongestionControl.BLOCK
+            session.put(key, _octets(payload) or b"", congestion_control=block)
+        case {"do": "delete", "key": key}:
+            session.delete(key)
+        case _:
+            raise ValueError(f"no such command: {ask}")
+    return None
+
+
+def _configured(setup: dict[str, Any]) -> zenoh.Config:
+    config = zenoh.Config()
+    settings = {
+        "mode": setup["mode"],
+        "listen/endpoints": setup["listen"],
+        "connect/endpoints": setup["connect"],
+        "connect/timeout_ms": 5000,
+        "connect/retry": {
+            "period_init_ms": 100,
+            "period_max_ms": 400,
+            "period_increase_factor": 2,
+        },
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/autoconnect": [],
+        "timestamping/enabled": True,
+        "transport/shared_memory/enabled": False,
+        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 50_000,
+        **setup["config"],
+    }
+    for path, value in settings.items():
+        config.insert_json5(path, json.dumps(value))
+    return config
+
+
+def main() -> None:
+    kept: list[object] = []
+    with zenoh.open(_configured(json.loads(sys.argv[1]))) as session:
+        for line in sys.stdin:
+            ask = json.loads(line)
+            try:
+                _say({"n": ask["n"], "result": _obey(session, kept, ask)})
+            except (zenoh.ZError, ValueError) as error:
+                _say({"n": ask["n"], "error": str(error)})
+
+
+if __name__ == "__main__":
+    main()
