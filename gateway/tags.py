@@ -9,7 +9,10 @@ from typing import NamedTuple
 
 from gateway.errors import BadValue
 from gateway.protocols.driver import Address, Span, Unit
-from gateway.values import Layout, Value, from_words, to_words
+from gateway.values import Kind, Layout, Value, from_words, to_words
+
+# Of a whole number that is worth looking at: as many as the largest float has.
+_MOST_BITS = 1024
 
 
 class Quality(StrEnum):
@@ -91,16 +94,31 @@ class Tag:
 
         For one bit of a word it is the bit alone: [0] or [1].
         """
-        rule = self.write or WriteRule()
-        if not isinstance(value, (bool, str)):
-            if rule.min is not None and value < rule.min:
-                raise BadValue(f"{value} is below the least value {_short(rule.min)}")
-            if rule.max is not None and value > rule.max:
-                raise BadValue(f"{value} is above the greatest value {_short(rule.max)}")
+        if isinstance(value, int) and value.bit_length() > _MOST_BITS:
+            raise BadValue("the number is too large")
+        self._keep_limits(value, str(value))
         words = to_words(self.layout)(self._unscaled(value))
         if self.unit_kind is Unit.DWORD:
-            return [low | high << 16 for low, high in zip(words[::2], words[1::2], strict=True)]
-        return words
+            units = [low | high << 16 for low, high in zip(words[::2], words[1::2], strict=True)]
+        else:
+            units = words
+        if self._rounds and (real := self.from_units(units)) is not None:
+            self._keep_limits(real, f"{value} (the device holds {real})")
+        return units
+
+    @property
+    def _rounds(self) -> bool:
+        """Whether a value moves to the device's next step when it is written."""
+        scaled = self.scale != 1 or self.offset != 0
+        return scaled and self.layout.type.is_number and not _is_float(self.layout)
+
+    def _keep_limits(self, value: Value, told: str) -> None:
+        if self.write is None or isinstance(value, (bool, str)):
+            return
+        if self.write.min is not None and value < self.write.min:
+            raise BadValue(f"{told} is below the least value {_short(self.write.min)}")
+        if self.write.max is not None and value > self.write.max:
+            raise BadValue(f"{told} is above the greatest value {_short(self.write.max)}")
 
     def from_units(self, units: Sequence[int]) -> Value | None:
         """The value that `encode` made these units from: what really goes to the device."""
@@ -117,7 +135,7 @@ class Tag:
             raw = (value - self.offset) / self.scale
         except OverflowError:
             raise BadValue(f"{value} is too large") from None
-        if self.layout.type.kind.value.startswith("float"):
+        if _is_float(self.layout):
             return raw
         if not math.isfinite(raw):
             raise BadValue(f"{value} is no finite number")
@@ -125,7 +143,11 @@ class Tag:
 
 
 def _short(number: float) -> str:
-    return f"{number:g}"
+    return f"{number:.15g}"
+
+
+def _is_float(layout: Layout) -> bool:
+    return layout.type.kind in (Kind.FLOAT32, Kind.FLOAT64)
 
 
 def _decimals(number: float) -> int:
@@ -152,13 +174,15 @@ def _decoder(
     if (scale == 1 and offset == 0) or not layout.type.is_number:
         return plain
     decimals = max(_decimals(scale), _decimals(offset))
-    exact = not layout.type.kind.value.startswith("float")
+    exact = not _is_float(layout)
 
     def scaled(units: Sequence[int]) -> Value | None:
         raw = plain(units)
         if raw is None or isinstance(raw, str):
             return raw
         value = raw * scale + offset
+        if not math.isfinite(value):
+            return None
         # 123 x 0.1 is 12.3 to a person; binary fractions would make it 12.3000000000000007.
         return round(value, decimals) if exact else value
 

@@ -128,7 +128,8 @@ def from_words(layout: Layout) -> FromWords:
     """
     kind = layout.type.kind
     if kind is Kind.STRING:
-        return lambda words: _text(_octets(words, layout.byte_order))
+        length = layout.type.length
+        return lambda words: _text(_octets(words, layout.byte_order)[:length])
     if kind is Kind.BOOL:
         return lambda words: bool(words[0])
     if kind in _BCD:

@@ -453,6 +453,22 @@ TAGS = [
         "use one of int32, uint32, float32, bcd32",
     ),
     bad(
+        "order of a 32-bit counter",
+        tags("a: {address: C200, word_order: high_first}"),
+        f"8: {M}.tags.a.word_order: C200 has 32 bits by nature: it needs no word_order",
+    ),
+    bad(
+        "numbers beyond all measure",
+        tags(f"a: {{address: D1, every: {10**400}}}", f"b: {{address: D1, scale: {10**400}}}"),
+        f"8: {M}.tags.a.every: such a large number has no unit: write it as 500ms or 2s",
+        f"9: {M}.tags.b.scale: such a large number is no number",
+    ),
+    bad(
+        "a limit between the device's steps",
+        tags("a: {address: D1, scale: 0.1, write: {max: 1.35}}"),
+        f"8: {M}.tags.a.write.max: 1.35 (the device holds 1.4) is above the greatest value 1.35",
+    ),
+    bad(
         "unknown type",
         tags("a: {address: D1, type: int, write: {max: 70000}}"),
         f"8: {M}.tags.a.type: 'int' is no type: use {TYPES} or string[n]",
@@ -755,6 +771,13 @@ def test_a_default_that_does_not_suit_a_tag_is_passed_over(file: Callable[[str],
     assert input_.layout.type == ValueType(Kind.FLOAT32)
     assert holding.write == WriteRule(min=0, max=9)
     assert holding.deadband == Deadband(1.0, percent=True)
+
+
+def test_the_order_of_words_is_none_of_a_32_bit_counters(file: Callable[[str], Config]) -> None:
+    rows = tags("a: {address: C200}", "b: {address: D1, type: int32}")
+    counter, pair = file("defaults: {word_order: high_first}\n" + rows).devices[0].tags
+    assert counter.decode([0x00012345]) == 0x00012345
+    assert pair.decode([0x0001, 0x2345]) == 0x00012345
 
 
 def test_a_default_can_be_taken_back(file: Callable[[str], Config]) -> None:

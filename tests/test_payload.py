@@ -192,6 +192,7 @@ def test_the_answer_to_a_write() -> None:
         "value": 12.5,
         "time": "2026-11-20T12:00:00.123456Z",
         "verified": True,
+        "acknowledged": True,
         "took": 0.031,
     }
 

@@ -90,6 +90,10 @@ def shown(value: object) -> str:
         case list():
             return "a list"
         case int() | float():
-            return f"{value:g}" if isinstance(value, float) else str(value)
+            return f"{value:.15g}" if isinstance(value, float) else _digits(value)
         case _:
             return repr(value)
+
+
+def _digits(value: int) -> str:
+    return str(value) if value.bit_length() < 128 else "such a large number"

@@ -142,7 +142,7 @@ class WriteSection(Section):
     @model_validator(mode="after")
     def _order(self) -> Self:
         if self.min is not None and self.max is not None and self.min > self.max:
-            raise ValueError(f"min {self.min:g} is above max {self.max:g}")
+            raise ValueError(f"min {self.min:.15g} is above max {self.max:.15g}")
         return self
 
 

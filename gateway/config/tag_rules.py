@@ -64,7 +64,6 @@ def build_tag(source: TagSource, driver: AnyDriver, mistakes: Mistakes) -> Tag |
         mistakes.add((*source.path, place), problem)
     if len(mistakes) > before:
         return None
-    order = settings.byte_order or byte_order(driver, kind.kind)
     number = kind.is_number
     tag = Tag(
         device=source.device,
@@ -73,7 +72,7 @@ def build_tag(source: TagSource, driver: AnyDriver, mistakes: Mistakes) -> Tag |
         address=address,
         span=span,
         unit_kind=area.unit,
-        layout=Layout(kind, settings.word_order, order),
+        layout=_layout(settings, driver, area, kind),
         every=settings.every,
         scale=settings.scale if number else 1.0,
         offset=settings.offset if number else 0.0,
@@ -108,6 +107,12 @@ def _type(
     return custom
 
 
+def _layout(settings: TagDefaults, driver: AnyDriver, area: Area, kind: ValueType) -> Layout:
+    if area.unit is Unit.DWORD:  # the driver puts it together, whatever its order on the wire
+        return Layout(kind)
+    return Layout(kind, settings.word_order, settings.byte_order or byte_order(driver, kind.kind))
+
+
 def _type_misfit(kind: ValueType, area: Area, address: Address, driver: AnyDriver) -> str | None:
     spelt = driver.spell(address)
     if area.unit is Unit.BIT or address.bit is not None:
@@ -138,6 +143,10 @@ def _misfits(
         yield "write", f"{first} is never read at station {driver.station}: it needs write: true"
     if not area.readable and write is not None and write.verify:
         yield "write", f"{first} is never read at station {driver.station}: verify cannot work"
+    if area.unit is Unit.DWORD:
+        for setting in ("word_order", "byte_order"):
+            if source.says(setting):
+                yield setting, f"{first} has 32 bits by nature: it needs no {setting}"
     if not kind.is_number:
         for setting in ("scale", "offset", "deadband"):
             if source.says(setting):

@@ -75,7 +75,7 @@ def deadband(text: object) -> Deadband:
     """`0.5` in the tag's unit, `2%` of the last published value."""
     if isinstance(text, (int, float)) and not isinstance(text, bool):
         if not 0 <= text < math.inf:
-            raise ConfigError(f"{text:g}: a deadband is 0 or more")
+            raise ConfigError(f"{shown(text)}: a deadband is 0 or more")
         return Deadband(float(text))
     match = _PERCENT.match(text) if isinstance(text, str) else None
     if match is None:
@@ -154,7 +154,7 @@ def baudrate(value: object) -> int:
         raise ConfigError(f"{shown(value)} is no baud rate: write a number such as 9600")
     if value not in BAUDRATES:
         near = min(BAUDRATES, key=lambda rate: abs(rate - value))
-        raise ConfigError(f"{value} is no baud rate of serial ports; the nearest is {near}")
+        raise ConfigError(f"{shown(value)} is no baud rate of serial ports; the nearest is {near}")
     return value
 
 

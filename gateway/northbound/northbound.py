@@ -49,7 +49,13 @@ class Northbound:
     """
 
     def __init__(
-        self, settings: ZenohSettings, name: str, plant: Plant, history: History | None = None
+        self,
+        settings: ZenohSettings,
+        name: str,
+        plant: Plant,
+        *,
+        history: History | None = None,
+        status_every: float = STATUS_EVERY,
     ) -> None:
         self.keys = Keys(settings.prefix, name)
         self.opened = asyncio.Event()  # everything is declared, all current values are queued
@@ -57,6 +63,7 @@ class Northbound:
         self._retry = settings.mode is Mode.CLIENT
         self._plant = plant
         self._history = history
+        self._status_every = status_every
         self._publisher = Publisher(self.keys)
         self._directory = Directory(self.keys, ())
         self._queries: Queries | None = None
@@ -250,7 +257,7 @@ class Northbound:
 
     async def _tell_status(self) -> None:
         while True:
-            await asyncio.sleep(STATUS_EVERY)
+            await asyncio.sleep(self._status_every)
             self._publish_status()
 
     def _publish_status(self) -> None:

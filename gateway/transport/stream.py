@@ -48,7 +48,8 @@ class StreamPort(asyncio.Protocol):
             raise self._ending()
 
     def _ending(self) -> LineDown:
-        return self._loss or line_down(self.name, None)
+        # A new one each time: one that is raised again and again drags all its tracebacks along.
+        return LineDown(str(self._loss)) if self._loss else line_down(self.name, None)
 
     async def close(self) -> None:
         self._live = False

@@ -8,7 +8,7 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
-from gateway.errors import NoReply
+from gateway.errors import DeviceError, NoReply
 from gateway.protocols.driver import AnyDriver
 from gateway.stations.station import Station
 
@@ -110,7 +110,7 @@ class Turn:
                     continue
                 try:
                     said = answers(frame)
-                except Exception as refusal:  # noqa: BLE001 - it belongs to whoever asked
+                except DeviceError as refusal:
                     future.set_exception(refusal)
                     break
                 if said is not None:

@@ -1,6 +1,7 @@
 """Fields: what is taken out of a frame, what is put into one, and what neither can be."""
 
 import struct
+from contextlib import suppress
 
 import pytest
 from hypothesis import given
@@ -140,8 +141,10 @@ def test_decimals_as_devices_write_them(raw: bytes, value: float) -> None:
 
 @pytest.mark.parametrize(
     "raw",
-    [b"", b"   ", b"+", b".", b"1_0", b"1e5", b"nan", b"inf", b"1 2", b"12,5", b"0x1F", b"--1"]
-    + [b"1.2.3", b"12kg", b"9" * 19, b"\xb2", b"+9999.9\x00", b"1\n"],
+    [
+        *(b"", b"   ", b"+", b".", b"1_0", b"1e5", b"nan", b"inf", b"1 2", b"12,5", b"0x1F"),
+        *(b"--1", b"1.2.3", b"12kg", b"9" * 19, b"\xb2", b"+9999.9\x00", b"1\n"),
+    ],
 )
 def test_what_is_no_number_is_never_read_as_one(raw: bytes) -> None:
     for field in (Field(type="decimal"), Field(type="integer")):
@@ -201,10 +204,9 @@ def test_a_text_by_columns_loses_its_padding_and_a_group_keeps_its_spaces() -> N
 @given(st.sampled_from(["decimal", "integer", "text", "uint16", "bcd16", "float32"]), st.binary())
 def test_any_bytes_give_a_value_or_garbled(kind: str, raw: bytes) -> None:
     order = None if kind in ("decimal", "integer", "text") else "low_first"
-    try:
-        Field(type=kind, byte_order=order).take(raw)  # type: ignore[arg-type]
-    except Garbled as error:
-        assert str(error)
+    with suppress(Garbled):
+        value = Field(type=kind, byte_order=order).take(raw)  # type: ignore[arg-type]
+        assert isinstance(value, str if kind == "text" else (int, float))
 
 
 @pytest.mark.parametrize(

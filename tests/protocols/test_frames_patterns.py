@@ -1,6 +1,7 @@
 """Patterns that some frame could keep the gateway busy with are refused when the file is read."""
 
 import re
+from contextlib import suppress
 
 import pytest
 from hypothesis import given
@@ -76,10 +77,9 @@ def test_what_cannot_be_checked_is_refused(text: str, message: str) -> None:
 
 @given(st.text(alphabet="ab.|()[]{}*+?^$\\,-:P<>123x0", max_size=14))
 def test_any_text_is_taken_or_refused(text: str) -> None:
-    try:
+    with suppress(ConfigError):
         check_pattern(text, 64)
-    except ConfigError as error:
-        assert repr(text) in str(error)
+        assert pattern(text).pattern == text.encode()
 
 
 parts = st.recursive(

@@ -249,6 +249,23 @@ def test_an_incomplete_message_is_dropped_after_d8129_and_not_answered() -> None
     assert len(station.hear(block[-1:], 20.2)) == 1
 
 
+def test_an_endless_message_is_dropped() -> None:
+    station = ComputerLinkStation(5, frame_format=4)
+    station.hear(b"\x0505FF" + b"0" * 700, 0.0)
+    assert station.hear(b"\r\n", 0.0) == []
+    assert station.memory.read("D8", 8063) == [6306]
+
+
+@pytest.mark.parametrize("procedure", PROCEDURES)
+def test_2_13_a_loopback_of_unprintable_characters_is_refused(procedure: tuple[int, bool]) -> None:
+    station = ComputerLinkStation(5, "liyan", *procedure)
+    for byte in (0x00, 0x7F, 0x80, 0xFF):
+        body = b"05FFTT001" + bytes([byte])
+        check = b"%02X" % (sum(body) % 256) if procedure[1] else b""
+        block = b"\x05" + body + check + (b"\r\n" if procedure[0] == 4 else b"")
+        assert station.hear(block, 0.0) == [Peer(5, *procedure).nak("07")]
+
+
 @pytest.mark.parametrize("number", ["091", "064", "066"])
 def test_eot_ack_and_nak_of_the_computer_begin_the_sequence_anew(number: str) -> None:
     station, block = ComputerLinkStation(5), Peer(5, 1, True).enq("05FFPC0")
@@ -386,6 +403,8 @@ pieces_of_line = st.lists(
                 b"BW0",
                 b"WT0",
                 b"TT0",
+                b"\x0505FFTT001",
+                b"\x0505FFBW0M000001",
                 b"FF",
                 b"\x05FFFFGW01",
             ]

@@ -155,8 +155,6 @@ class LinkCodec:
                 )
         else:
             return 0
-        if etx <= _ROUTE:
-            return 1
         size = etx + 1 + (2 if self._sum_check else 0) + len(self._end)
         if self._sum_check and not self._sum_is_right(etx):
             return 0

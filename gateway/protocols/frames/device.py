@@ -48,6 +48,7 @@ class Frames:
     write: Mapping[str, Write] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        self._check_framings()
         longest = written_out(self.framing).longest
         if not (self.listen or self.ask or self.write):
             raise ConfigError("say what it sends (listen), is asked (ask) or takes (write)")
@@ -137,6 +138,13 @@ class Frames:
     @property
     def _longest_reply(self) -> int:
         return written_out(self.framing).longest_on_line
+
+    def _check_framings(self) -> None:
+        for name, framing in (("framing", self.framing), ("send_framing", self.send_framing)):
+            try:
+                written_out(framing or self.framing)
+            except ConfigError as error:
+                raise ConfigError(f"{name}: {error}") from None
 
     def _patterns(self) -> Iterator[str]:
         yield from (one.match for one in self.listen.values())

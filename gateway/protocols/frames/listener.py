@@ -83,9 +83,13 @@ class Listener:
         return []
 
     def _said(self, frames: list[bytes | Garbled], now: float) -> list[Said]:
-        return [
-            item if isinstance(item, Garbled) else self._understood(item, now) for item in frames
-        ]
+        """Damage upon damage is told once: noise must not fill lists."""
+        said: list[Said] = []
+        for item in frames:
+            news = item if isinstance(item, Garbled) else self._understood(item, now)
+            if not (isinstance(news, Garbled) and said and isinstance(said[-1], Garbled)):
+                said.append(news)
+        return said
 
     def _understood(self, frame: bytes, now: float) -> Said:
         heard = self._device.hear(frame)

@@ -241,6 +241,8 @@ class ComputerLinkStation:
         count = _hex(area[:2])
         if not 1 <= count <= self._limits.loopback or len(area) != 2 + count:
             raise No("06")
+        if not (area.isascii() and area.isprintable()):
+            raise No("07")
         return lambda now: Text(self.station, area)
 
     def _locate(self, device: str, words: bool, count: int) -> Cells:

@@ -1,0 +1,166 @@
+"""How busy a line is when it is asked for more than it carries: `python -m benchmarks.bus_use`.
+
+The gateway's own line talks to a wire paced in another process, over a pty. `busy` is the time
+characters were on the wire, as a share of the time that the station's turnaround and the
+protocol's silences leave. `cycle` compares one round of all blocks with what `check` predicts.
+"""
+
+import argparse
+import asyncio
+import json
+import logging
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import structlog
+
+from gateway.device import Device
+from gateway.forecast import forecast
+from gateway.line import Line
+from gateway.protocols.computer_link import ComputerLink
+from gateway.protocols.driver import Address, AnyDriver, Span, Unit
+from gateway.protocols.modbus import ModbusRtu
+from gateway.protocols.vigor import Vigor
+from gateway.stations.computer_link import ComputerLinkStation
+from gateway.stations.modbus import ModbusStation
+from gateway.stations.station import Station
+from gateway.stations.vigor import VigorStation
+from gateway.tags import Sample, Tag
+from gateway.transport import SerialPath, SerialSettings, open_port
+from gateway.values import Layout, parse_type
+from gateway.wiretime import Wire, character_bits
+
+TURNAROUND = 0.005
+BLOCKS, WORDS = 4, 64
+
+
+class Setting(NamedTuple):
+    driver: Callable[[], AnyDriver]
+    station: Callable[[], Station]
+    format: str
+    area: str
+
+    @property
+    def bits(self) -> int:
+        return character_bits(self.format)
+
+
+SETTINGS = {
+    "vigor": Setting(lambda: Vigor(station=1), lambda: VigorStation(1), "7E1", "D"),
+    "computer-link": Setting(
+        lambda: ComputerLink(station=1), lambda: ComputerLinkStation(1), "7E1", "D"
+    ),
+    "modbus-rtu": Setting(
+        lambda: ModbusRtu(station=1), lambda: ModbusStation(station=1), "8E1", "holding"
+    ),
+}
+
+
+class Counting:
+    """Upstairs that only counts."""
+
+    def __init__(self) -> None:
+        self.count = 0
+
+    def samples(self, samples: Sequence[Sample]) -> None:
+        self.count += len(samples)
+
+    def alive(self, device: Device, alive: bool) -> None:
+        pass
+
+
+@dataclass(frozen=True)
+class Result:
+    busy: float
+    cycle: float
+    predicted: float
+    exchanges: int
+
+
+def tags(area: str) -> tuple[Tag, ...]:
+    """Four full blocks of 64 words, asked for ten times faster than any line carries them."""
+    found = []
+    for number in range(BLOCKS * WORDS):
+        address = number + (number // WORDS) * 200  # too far apart to share a request
+        found.append(
+            Tag(
+                device="plc",
+                name=f"t{number}",
+                text=f"{area}{address}",
+                address=Address(area, address),
+                span=Span(area, address, 1),
+                unit_kind=Unit.WORD,
+                layout=Layout(parse_type("int16")),
+                every=0.01,
+            )
+        )
+    return tuple(found)
+
+
+async def measure(name: str, baud: int, seconds: float) -> Result:
+    setting = SETTINGS[name]
+    child = subprocess.Popen(
+        [sys.executable, "-m", "benchmarks.paced_wire", name, str(baud), str(TURNAROUND)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert child.stdin is not None
+    assert child.stdout is not None
+    path = child.stdout.readline().strip()
+    driver, wire = setting.driver(), Wire(baud, setting.bits)
+    device = Device(
+        "plc", driver, wire, driver.timing, tags(setting.area), 0.5, turnaround=TURNAROUND
+    )
+    # 8N1 on the pty whatever the format: a pty cannot do parity.
+    serial = SerialSettings(baud, "8N1")
+    line = Line(
+        "bench",
+        [device],
+        wire,
+        lambda ear: open_port(SerialPath(path), serial, ear),
+        Counting(),
+        time.time_ns,
+    )
+    task = asyncio.create_task(line.run())
+    await asyncio.sleep(seconds)
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)
+    child.stdin.close()
+    passed = json.loads(child.stdout.readline())
+    child.wait()
+    exchanges = passed["exchanges"]
+    silences = (exchanges - 1) * wire.silence(driver.timing)
+    free = passed["elapsed"] - passed["turnarounds"] - silences
+    return Result(
+        busy=passed["characters"] * wire.character / free,
+        cycle=passed["elapsed"] / exchanges * len(device.blocks),
+        predicted=forecast("bench", [device], wire).cycle,
+        exchanges=exchanges,
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seconds", type=float, default=6.0)
+    parser.add_argument("--protocols", nargs="*", default=list(SETTINGS))
+    parser.add_argument("--bauds", nargs="*", type=int, default=[9600, 19200, 38400, 115200])
+    arguments = parser.parse_args()
+    structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.WARNING))
+    print(f"{'protocol':14} {'baud':>7} {'exchanges':>9} {'busy':>7} {'cycle':>9} {'predicted':>9}")
+    for name in arguments.protocols:
+        for baud in arguments.bauds:
+            result = asyncio.run(measure(name, baud, arguments.seconds))
+            print(
+                f"{name:14} {baud:7} {result.exchanges:9} {result.busy:7.1%} "
+                f"{result.cycle * 1000:6.1f} ms {result.predicted * 1000:6.1f} ms "
+                f"({result.cycle / result.predicted - 1:+.1%})"
+            )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,82 @@
+"""A wire on a pty at a real baud rate, in a process of its own: `python -m benchmarks.paced_wire`.
+
+Stations answer after their turnaround, each character of the reply arrives when it would have.
+The process prints the pty's path, serves until its standard input closes, and prints as JSON
+what passed: characters, turnarounds and elapsed time, as the wire saw them.
+"""
+
+import ctypes
+import json
+import os
+import select
+import sys
+import time
+import tty
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+
+from gateway.stations.station import Station
+
+PR_SET_TIMERSLACK = 29
+FIFO = 16  # characters a UART hands over at once
+
+
+@dataclass(slots=True)
+class Passed:
+    """Seconds and characters, from the first request to the end of the last reply."""
+
+    exchanges: int = 0
+    characters: int = 0
+    turnarounds: float = 0.0
+    elapsed: float = 0.0
+
+
+def serve(stations: Sequence[Station], character: float, turnaround: float) -> None:
+    ctypes.CDLL(None).prctl(PR_SET_TIMERSLACK, 1, 0, 0, 0)  # wake up to the microsecond
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    print(os.ttyname(slave), flush=True)
+    passed = Passed()
+    started = 0.0
+    while True:
+        ready = select.select([master, sys.stdin], [], [])[0]
+        if sys.stdin in ready:
+            break
+        arrived = time.monotonic()
+        request = os.read(master, 4096)
+        started = started or arrived
+        spoken = arrived + len(request) * character
+        replies = [reply for s in stations for reply in s.hear(request, time.monotonic())]
+        if not replies:
+            continue
+        begin = spoken + turnaround
+        ended = _send(master, b"".join(replies), begin, character)
+        passed.exchanges += 1
+        passed.characters += len(request) + sum(map(len, replies))
+        passed.turnarounds += turnaround
+        passed.elapsed = ended - started
+    print(json.dumps(asdict(passed)), flush=True)
+
+
+def _send(master: int, data: bytes, begin: float, character: float) -> float:
+    """Pieces of a FIFO's size, each when its last character is through; when the last one was."""
+    due = begin
+    for start in range(0, len(data), FIFO):
+        piece = data[start : start + FIFO]
+        due = begin + (start + len(piece)) * character
+        while (wait := due - time.monotonic()) > 0:
+            time.sleep(wait)
+        os.write(master, piece)
+    return due
+
+
+def main() -> None:
+    from benchmarks.bus_use import SETTINGS
+
+    name, baud, turnaround = sys.argv[1], int(sys.argv[2]), float(sys.argv[3])
+    setting = SETTINGS[name]
+    serve([setting.station()], setting.bits / baud, turnaround)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,162 @@
+"""Listening: unasked frames in order, silence that ends frames and values, nothing that grows."""
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gateway.errors import Garbled
+from gateway.protocols.frames import Field, Frames, Framing, Heard, Listen, Listener, Said, Stale
+from tests.protocols.frames_examples import device
+from tests.protocols.test_frames_device import OVERLOAD, STABLE
+from tests.vectors import vectors
+
+K120S = {v.id: v.frame for v in vectors("noproto-k120s")}
+
+
+def weights(said: list[Said]) -> list[object]:
+    return [item.values["weight"] for item in said if isinstance(item, Heard)]
+
+
+def test_frames_are_heard_in_order_however_they_are_cut() -> None:
+    listener = Listener(device("reader"), now=0.0)
+    stream = b"".join(b"\x02CODE-%d\x03" % number for number in (1, 1, 2))
+    said = [item for octet in stream for item in listener.received(bytes([octet]), now=5.0)]
+    assert [item.values for item in said if isinstance(item, Heard)] == [
+        {"barcode": "CODE-1"},
+        {"barcode": "CODE-1"},
+        {"barcode": "CODE-2"},
+    ]
+
+
+def test_a_silent_device_costs_nothing() -> None:
+    listener = Listener(device("reader"), now=0.0)
+    assert listener.due is None
+    listener.received(b"\x02CODE-1\x03", now=1.0)
+    assert listener.due is None
+
+
+def test_a_frame_under_way_when_the_port_opened_is_not_taken_for_a_whole_one() -> None:
+    listener = Listener(device("scale"), now=0.0)
+    said = listener.received(b"5.5  g\r\n" + STABLE, now=0.01)
+    assert weights(said) == [1234.5]
+    assert len(said) == 1
+
+
+def test_the_first_frame_after_a_silence_is_taken() -> None:
+    listener = Listener(device("scale"), now=0.0)
+    assert weights(listener.received(STABLE, now=0.3)) == [1234.5]
+
+
+def test_what_is_not_understood_is_told_and_never_passed_over() -> None:
+    listener = Listener(device("scale"), now=0.0)
+    said = listener.received(STABLE + OVERLOAD + STABLE, now=1.0)
+    assert weights(said) == [1234.5, 1234.5]
+    assert isinstance(said[1], Garbled)
+    assert said[1].data == OVERLOAD.rstrip()
+
+
+def test_a_frame_that_is_known_and_means_nothing_is_no_damage() -> None:
+    one = Frames(
+        framing=Framing(ending="CR LF"),
+        listen={
+            "weight": Listen(
+                match="ST,(?P<weight>.{9}).*", fields={"weight": Field(type="decimal")}
+            ),
+            "overload": Listen(match="OL.*"),
+        },
+    )
+    said = Listener(one, now=0.0).received(STABLE + OVERLOAD, now=1.0)
+    assert said == [Heard("weight", {"weight": 1234.5}), Heard("overload", {})]
+
+
+def test_a_streaming_scale_that_falls_silent_is_stale_once() -> None:
+    listener = Listener(device("scale"), now=0.0)
+    listener.received(STABLE, now=1.0)
+    assert listener.due == 3.0
+    assert listener.tick(now=2.9) == []
+    assert listener.tick(now=3.0) == [Stale(frozenset({"weight", "state", "unit"}))]
+    assert listener.due is None
+    assert listener.tick(now=9.0) == []
+    listener.received(STABLE, now=10.0)
+    assert listener.due == 12.0
+
+
+def test_a_scale_that_was_never_heard_is_stale_too() -> None:
+    listener = Listener(device("scale"), now=100.0)
+    assert listener.due == 102.0
+    assert listener.tick(now=102.0) == [Stale(frozenset({"weight", "state", "unit"}))]
+
+
+def test_damage_does_not_keep_a_value_alive() -> None:
+    listener = Listener(device("scale"), now=0.0)
+    listener.received(STABLE, now=1.0)
+    listener.received(OVERLOAD, now=2.5)
+    assert listener.due == 3.0
+
+
+def test_a_gap_ends_a_frame_that_nothing_else_ends() -> None:
+    one = Frames(
+        framing=Framing(gap=0.05),
+        listen={"any": Listen(match="(?P<text>.*)", fields={"text": Field(type="text")})},
+    )
+    listener = Listener(one, now=0.0)
+    assert listener.received(b"AB", now=1.0) == []
+    assert listener.received(b"C", now=1.03) == []
+    assert listener.due == 1.03 + 0.05
+    assert listener.tick(now=1.07) == []
+    assert listener.tick(now=1.08) == [Heard("any", {"text": "ABC"})]
+    assert listener.due is None
+
+
+def test_a_gap_counts_by_the_bytes_when_the_line_was_late() -> None:
+    one = Frames(
+        framing=Framing(gap=0.05),
+        listen={"any": Listen(match="(?P<text>.*)", fields={"text": Field(type="text")})},
+    )
+    listener = Listener(one, now=0.0)
+    listener.received(b"AB", now=1.0)
+    assert listener.received(b"CD", now=1.2) == [Heard("any", {"text": "AB"})]
+
+
+def test_half_a_frame_is_void_after_a_long_pause_even_without_a_gap() -> None:
+    listener = Listener(device("scale"), now=0.0)
+    assert listener.received(STABLE[:5], now=1.0) == []
+    said = listener.received(STABLE, now=60.0)
+    assert isinstance(said[0], Garbled)
+    assert weights(said) == [1234.5]
+
+
+def test_after_others_spoke_only_a_frame_that_began_afterwards_is_taken() -> None:
+    listener = Listener(device("scale"), now=0.0)
+    listener.received(STABLE[:5], now=1.0)
+    listener.disturbed(now=1.1)
+    assert weights(listener.received(STABLE[5:] + STABLE, now=1.11)) == [1234.5]
+
+
+def test_the_k120s_weighing_machine_gets_its_answer() -> None:
+    one = device("weighing")
+    (heard,) = Listener(one, now=0.0).received(K120S["noproto-k120s-001"], now=1.0)
+    assert isinstance(heard, Heard)
+    assert heard.answer is not None
+    assert one.codec().encode(heard.answer) == K120S["noproto-k120s-002"]
+
+
+steps = st.lists(
+    st.tuples(
+        st.sampled_from([b"", STABLE, OVERLOAD, STABLE[:7], b"\r\n"]) | st.binary(max_size=40),
+        st.floats(0, 3),
+    ),
+    max_size=12,
+)
+
+
+@settings(max_examples=150)
+@given(steps, st.sampled_from(["scale", "scale-by-columns", "reader", "weighing"]))
+def test_whatever_comes_and_whenever_a_listener_tells_and_never_fails(
+    steps: list[tuple[bytes, float]], name: str
+) -> None:
+    listener, now = Listener(device(name), now=0.0), 0.0
+    for data, pause in steps:
+        now += pause
+        said = listener.received(data, now) + listener.tick(now)
+        assert all(isinstance(item, Heard | Garbled | Stale) for item in said)
+        assert listener.due is None or listener.due > now
