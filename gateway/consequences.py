@@ -9,6 +9,7 @@ import structlog
 
 from gateway.device import Device, Standing
 from gateway.errors import Evidence, Garbled, Refusal, Refused, Unclear
+from gateway.protocols.driver import Span
 from gateway.schedule import Poll, Schedule
 from gateway.tags import Reason, Sample, Tag, bad
 
@@ -56,13 +57,13 @@ class Consequences:
         if before in (Standing.STARTING, Standing.SILENT):
             self.upstairs.alive(device, True)
             log.info("device answers", line=self.line, device=device.name)
-        if before is Standing.SILENT:
+            device.refusals.abandon()
             self.schedule.woke(device, _now())
 
-    def doubt(self, device: Device, error: Unclear, poll: Poll | None) -> Standing:
+    def doubt(self, device: Device, error: Unclear, asked: Span | None) -> Standing:
         """A conversation ended unclear. Returns the device's standing before."""
         before = device.standing
-        device.failed(error, None if poll is None else poll.block.span)
+        device.failed(error, asked)
         log.info("no good reply", line=self.line, device=device.name, why=str(error))
         self._watch_stale(device)
         return before
@@ -94,11 +95,12 @@ class Consequences:
         device = poll.device
         if device.standing is Standing.SILENT:
             return
-        if poll.tries < device.timing.retries:
+        if poll.tries < device.timing.retries and not poll.setbacks:
             self.schedule.again(poll)
             return
+        poll.last_good = None
         self.bad(poll.block.tags, device.reason, str(error))
-        self.schedule.polled(poll, _now())
+        self.schedule.polled(poll, _now(), answered=False)
 
     def refused(self, poll: Poll, error: Refused) -> None:
         """A poll was refused: asked again, halved to find the culprit, or its tags are bad."""
@@ -134,16 +136,17 @@ class Consequences:
             self.bad(device.tags, Reason.LINE_DOWN, why)
 
     def line_up(self) -> None:
-        """Everything is asked at once; a doubt from before the loss stays."""
+        """Every device is to be heard anew; a doubt from before the loss stays."""
         for device in self.schedule.devices:
-            device.standing = Standing.STARTING
-            self.schedule.woke(device, _now())
+            device.start()
+        self.schedule.opened(_now())
 
     def _settle(self, device: Device) -> None:
         if device.refusals.settle():
             self._replan(device)
 
     def _replan(self, device: Device) -> None:
+        device.refusals.abandon()
         device.plan()
         self.schedule.plan(device, _now())
 

@@ -53,24 +53,25 @@ class Device:
     standing: Standing = Standing.STARTING
     failures: int = 0  # conversations in a row that ended unclear
     doubt: Span | None = None  # the question whose answer may still come
-    doubtful: bool = False
+    doubtful: bool = True  # what is heard next may answer an older question
     salt: int = 0
     pause: float = 0.0
     next_probe: float = 0.0
     trouble: DeviceError | None = None
     record: Record = field(default_factory=Record)
     refusals: Refusals = field(init=False)
+    broadcast: bool = field(init=False)  # nobody answers: it is written to, never asked
 
     def __post_init__(self) -> None:
         self.refusals = Refusals(self.driver.cost)
+        self.broadcast = not any(self.driver.areas[tag.span.area].readable for tag in self.tags)
+        self.doubtful = not self.broadcast
         self.plan()
 
     @property
-    def broadcast(self) -> bool:
-        """Nobody answers at this station number: it is written to, never asked."""
-        return not self.tags or all(
-            not self.driver.areas[tag.span.area].readable for tag in self.tags
-        )
+    def served(self) -> bool:
+        """It answers, as far as we know: its blocks are asked for."""
+        return self.standing is Standing.UP or self.standing is Standing.FAILING
 
     def seconds(self, cost: Cost) -> float:
         """One exchange on this line with this station."""
@@ -86,6 +87,12 @@ class Device:
             return max(RETRY, block.every)
         return block.every
 
+    def start(self) -> None:
+        """The line was opened: who knows what is still on its way from before."""
+        self.standing = Standing.STARTING
+        self.failures = 0
+        self.doubtful = not self.broadcast
+
     def answered(self) -> None:
         """A conversation ended well."""
         self.standing = Standing.UP
@@ -95,11 +102,16 @@ class Device:
         self.trouble = None
 
     def failed(self, error: DeviceError, doubt: Span | None) -> None:
-        """A conversation ended unclear; its answer may still be on the way."""
+        """A conversation ended unclear; its answer may still be on the way.
+
+        `doubt`: what was asked; None for a probe, which leaves an older doubt as it was.
+        """
         self.failures += 1
-        self.trouble = error
-        self.doubtful = True
-        self.doubt = doubt
+        if not (self._slow and isinstance(error, NoReply)):
+            self.trouble = error  # who is known to be slow is not called dead: nobody waits for it
+        self.doubtful = not self.broadcast
+        if doubt is not None:
+            self.doubt = doubt
         if self.standing is not Standing.SILENT:
             self.standing = Standing.FAILING
         match error:
@@ -107,6 +119,11 @@ class Device:
                 self.record.failures[error.evidence] += 1
             case _:
                 self.record.failures["other"] += 1
+
+    @property
+    def _slow(self) -> bool:
+        trouble = self.trouble
+        return isinstance(trouble, Garbled) and trouble.evidence is Evidence.SLOW
 
     def measured(self, turnaround: float) -> None:
         """A station's own time in one exchange, smoothed over about ten."""

@@ -6,6 +6,7 @@ before a request and the station's turnaround; no fixed gap is right at every ba
 slower tag that lies inside a faster block rides along for nothing.
 """
 
+from bisect import bisect_left
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
@@ -119,6 +120,8 @@ def _cover(
     a span grows, so the search for i ends where the span has become too long for one request.
     """
     items = items_of(tags)
+    fences = sorted(n for name, n in cuts if name == area)
+    fenced = [i == 0 or _between(items[i - 1].end, items[i].start, fences) for i in range(len(items))]
     best = [0.0]
     last: list[tuple[int, Cost]] = []  # of the cover of the first j items: its last block
     for j in range(1, len(items) + 1):
@@ -132,13 +135,19 @@ def _cover(
             time = best[i] + seconds(cost)
             if time < least - 1e-12:
                 least, choice = time, (i, cost)
-            if (area, start) in cuts or (i and (area, items[i - 1].end) in cuts):
+            if fenced[i]:
                 break
         if choice is None:
             raise ConfigError(f"{items[j - 1].tags[0].text} cannot be read in one request")
         best.append(least)
         last.append(choice)
     return _walk_back(area, items, last)
+
+
+def _between(end: int, start: int, fences: Sequence[int]) -> bool:
+    """Whether a cut lies between an item that ends at `end` and the next one at `start`."""
+    place = bisect_left(fences, end)
+    return place < len(fences) and fences[place] <= start
 
 
 def _walk_back(

@@ -37,20 +37,19 @@ class _Node:
     def settled(self) -> bool:
         return all(half.settled() for half in self.halves) if self.halves else self.good is not None
 
-    def clean(self) -> bool:
-        return all(half.clean() for half in self.halves) if self.halves else self.good is True
-
     def cuts(self) -> set[tuple[str, int]]:
         """The boundaries that the finished search has shown to be needed."""
         if not self.halves:
             if self.good:
                 return set()
-            area, start, size = self.span
-            return {(area, start), (area, start + size)}
-        needed = set().union(*(half.cuts() for half in self.halves))
-        if self.clean():  # each half is there, but not both in one request
-            needed.add((self.span.area, self.halves[1].span.start))
-        return needed
+            return _bounds(self.span)
+        if all(half.good for half in self.halves):  # each is there, but not both in one request
+            return {(self.span.area, self.halves[1].span.start)}
+        return set().union(*(half.cuts() for half in self.halves))
+
+
+def _bounds(span: Span) -> set[tuple[str, int]]:
+    return {(span.area, span.start), (span.area, span.start + span.size)}
 
 
 @dataclass(slots=True)
@@ -74,9 +73,11 @@ class Refusals:
 
     def refused(self, block: Block, now: int, code: str) -> tuple[Block, ...]:
         """What to ask instead of `block`: its two halves, or nothing where it is the culprit."""
-        if block.span in self.bad:
-            return ()
         node = self._leaves.pop(block.span, None)
+        if block.span in self.bad:
+            if node is not None:
+                node.good = False
+            return ()
         if node is None:
             node = _Node(block.span)
             self._roots.append(node)
@@ -93,16 +94,24 @@ class Refusals:
             node.good = True
         if self.bad.pop(block.span, None) is None:
             return False
-        self._cuts = {cut for cut in self._cuts if cut[0] != block.span.area}
+        self._cuts -= _bounds(block.span)
+        for span in self.bad:  # a neighbour may share a boundary
+            self._cuts |= _bounds(span)
         return True
 
     def settle(self) -> bool:
-        """True when a search has just ended: plan the device anew."""
-        done = [root for root in self._roots if root.settled()]
-        for root in done:
-            self._roots.remove(root)
+        """True when all searches have just ended: plan the device anew."""
+        if not self._roots or not all(root.settled() for root in self._roots):
+            return False
+        for root in self._roots:
             self._cuts |= root.cuts()
-        return bool(done)
+        self.abandon()
+        return True
+
+    def abandon(self) -> None:
+        """The blocks are about to be other ones: what is still searched for will be again."""
+        self._roots.clear()
+        self._leaves.clear()
 
     def _halves(self, block: Block, node: _Node) -> tuple[Block, ...]:
         items = items_of(block.tags)

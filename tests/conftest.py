@@ -1,1 +1,29 @@
 """Fixtures shared by all tests."""
+
+import os
+import shutil
+from collections.abc import Callable, Coroutine
+from typing import Any, NoReturn
+
+import pytest
+
+from tests.sim.virtual import run_virtual as run_virtual_coroutine
+
+
+@pytest.fixture
+def run_virtual() -> Callable[[Coroutine[Any, Any, Any]], Any]:
+    """Runs a coroutine to its end on a virtual clock: hours in seconds, the same every time."""
+    return run_virtual_coroutine
+
+
+def needs(program: str) -> str:
+    """Where a program is that a test cannot do without (see `lacking`)."""
+    places = f"{os.environ.get('PATH', '')}:/usr/sbin:/usr/local/sbin"
+    return shutil.which(program, path=places) or lacking(f"{program} is not installed")
+
+
+def lacking(what: str) -> NoReturn:
+    """Skips the test and says why; where PLC_GATEWAY_NO_SKIPS=1 is set, the test fails instead."""
+    if os.environ.get("PLC_GATEWAY_NO_SKIPS") == "1":
+        pytest.fail(f"{what}, and PLC_GATEWAY_NO_SKIPS=1 lets nothing be skipped")
+    pytest.skip(what)

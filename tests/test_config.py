@@ -459,9 +459,12 @@ TAGS = [
     ),
     bad(
         "numbers beyond all measure",
-        tags(f"a: {{address: D1, every: {10**400}}}", f"b: {{address: D1, scale: {10**400}}}"),
-        f"8: {M}.tags.a.every: such a large number has no unit: write it as 500ms or 2s",
+        tags(f"a: {{address: D1, every: {10**299}}}", f"b: {{address: D1, scale: 0x{'f' * 300}}}",
+             f"c: {{address: D1, scale: {'9' * 5000}}}"),
+        f"8: {M}.tags.a.every: such a large number is no duration: "
+        "write it as 500ms, 2s, 15min, 1h or 7d",
         f"9: {M}.tags.b.scale: such a large number is no number",
+        f"10: {M}.tags.c.scale: inf is no number that can be used",
     ),
     bad(
         "a limit between the device's steps",

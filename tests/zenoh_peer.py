@@ -12,7 +12,7 @@ In a test:
         await client.put("plant/mixer/recipe/@set", b"7")
         await client.delete("plant/mixer/recipe/@set")
         alive = await client.liveliness("plant/**")            # a Subscription: PUT and DELETE
-        await client.tokens("plant/**")                        # who is alive now: list of keys
+        await client.until_alive("plant/*", ["plant/mixer"])   # these and no others
         await client.kill()                                    # SIGKILL; .pid is there for the rest
 
 `subscribe(key, advanced=True)` is Zenoh's AdvancedSubscriber with history.
@@ -191,8 +191,15 @@ class ZenohPeer:
         return await self._subscribe("liveliness", key=key)
 
     async def tokens(self, key: str) -> list[str]:
+        """Zenoh 1.10.2 answers nothing now and then just after a token came: see `until_alive`."""
         result: list[str] = await self._ask("tokens", key=key)
         return result
+
+    async def until_alive(self, key: str, tokens: list[str], timeout: float = TIMEOUT) -> None:
+        """Waits until these tokens, and no others, are alive under `key`."""
+        async with asyncio.timeout(timeout):
+            while await self.tokens(key) != tokens:
+                pass
 
     async def get(
         self, selector: str, payload: bytes | None = None, timeout: float = TIMEOUT, **how: str

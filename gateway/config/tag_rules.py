@@ -143,14 +143,19 @@ def _misfits(
         yield "write", f"{first} is never read at station {driver.station}: it needs write: true"
     if not area.readable and write is not None and write.verify:
         yield "write", f"{first} is never read at station {driver.station}: verify cannot work"
+    yield from _unsuited(source, area, first, kind)
+
+
+def _unsuited(
+    source: TagSource, area: Area, first: str, kind: ValueType
+) -> Iterator[tuple[str, str]]:
+    """Settings that such a tag cannot have."""
     if area.unit is Unit.DWORD:
-        for setting in ("word_order", "byte_order"):
-            if source.says(setting):
-                yield setting, f"{first} has 32 bits by nature: it needs no {setting}"
+        for setting in filter(source.says, ("word_order", "byte_order")):
+            yield setting, f"{first} has 32 bits by nature: it needs no {setting}"
     if not kind.is_number:
-        for setting in ("scale", "offset", "deadband"):
-            if source.says(setting):
-                yield setting, f"a {kind} has no {setting}: only numbers have"
+        for setting in filter(source.says, ("scale", "offset", "deadband")):
+            yield setting, f"a {kind} has no {setting}: only numbers have"
 
 
 def _write(

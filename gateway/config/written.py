@@ -36,7 +36,7 @@ DURATIONS = "500ms, 2s, 15min, 1h or 7d"
 
 def duration(text: object) -> float:
     """`500ms` -> 0.5 seconds. A number without its unit is refused."""
-    if isinstance(text, (int, float)) and not isinstance(text, bool):
+    if isinstance(text, (int, float)) and not isinstance(text, bool) and 0 < text < _LONGEST_TIME:
         number = shown(text)
         raise ConfigError(f"{number} has no unit: write {number}s or {number}ms")
     match = _DURATION.match(text) if isinstance(text, str) else None

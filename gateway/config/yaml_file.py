@@ -31,7 +31,7 @@ _LOADER: Any = type(
     },
 )
 
-_INT = re.compile(r"[-+]?[0-9]+\Z")
+_INT = re.compile(r"[-+]?[0-9]{1,300}\Z")  # a longer one is a float, and infinite
 _BASED = re.compile(r"0o[0-7]+\Z|0x[0-9A-Fa-f]+\Z")
 _FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?\Z")
 _WORDS: dict[str, object] = {
@@ -196,7 +196,7 @@ def _syntax(name: str, text: str, error: yaml.MarkedYAMLError) -> str:
         return f"{name}:{line}: a tab: YAML is indented with spaces"
     if problem == "but found another document":
         return f"{name}:{line}: a second document (`---`): a configuration is one document"
-    if problem == "found undefined alias":
+    if problem.startswith("found undefined alias"):
         return f"{name}:{line}: an alias (*) without its anchor (&) before it"
     context = f" {error.context}" if error.context else ""
     begun = ""

@@ -3,7 +3,7 @@
 from contextlib import suppress
 
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
 from gateway.errors import Evidence, Garbled
@@ -117,6 +117,7 @@ def test_rtu_noise_seen_on_real_lines_does_not_hide_the_answer(noise: str) -> No
 
 @MODERATE
 @given(stations, words, st.integers(0, 65535), cuts)
+@example(1, [0], 0x0200, [7])  # all but one of the echo's characters: as long as the answer
 def test_rtu_an_echo_does_not_hide_the_answer(
     station: int, values: list[int], wire: int, sizes: list[int]
 ) -> None:

@@ -19,7 +19,7 @@ from gateway.stations.station import Memory
 from gateway.stations.vigor import VigorStation
 from gateway.tags import Quality, Reason, Sample, Tag, WriteRule, Written
 from gateway.transport import Ear, Port, open_simulator
-from gateway.values import Kind, Layout, ValueType, Value, parse_type
+from gateway.values import Layout, Value, parse_type
 from gateway.wiretime import Wire
 
 WIRE = Wire(19200, 10)
@@ -94,7 +94,7 @@ class Unruly:
         self.inner.mute = mute
 
     def hear(self, data: bytes, now: float) -> list[bytes]:
-        if int(data[1:3] or b"0", 16) == self.inner.station:
+        if data[1:3] == b"%02X" % self.inner.station:
             self.heard.append((now, data))
         replies = self.inner.hear(data, now)
         if not replies:

@@ -1,10 +1,14 @@
 """An event loop whose clock jumps: nothing waits, everything happens in its order."""
 
 import asyncio
+import functools
 import selectors
-from collections.abc import Coroutine
-from typing import Any, NoReturn, TypeVar
+from collections.abc import Awaitable, Callable, Coroutine
+from typing import Any, NoReturn, ParamSpec, TypeVar
 
+from structlog.testing import capture_logs
+
+P = ParamSpec("P")
 T = TypeVar("T")
 BUSY_PASSES = 50  # passes of the loop in one moment before somebody must be watching the clock
 TICK = 1e-5
@@ -64,3 +68,17 @@ def run_virtual(coroutine: Coroutine[Any, Any, T]) -> T:
     """Run to the end on a virtual clock of its own. Raises `Deadlock`."""
     with asyncio.Runner(loop_factory=VirtualLoop) as runner:
         return runner.run(coroutine)
+
+
+def on_virtual_time(test: Callable[P, Awaitable[None]]) -> Callable[P, None]:
+    """A test that is a coroutine, run on a virtual clock. What is logged is kept off the screen."""
+
+    @functools.wraps(test)
+    def run(*args: P.args, **kwargs: P.kwargs) -> None:
+        async def whole() -> None:
+            await test(*args, **kwargs)
+
+        with capture_logs():
+            run_virtual(whole())
+
+    return run

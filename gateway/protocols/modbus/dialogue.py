@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from itertools import cycle, repeat
+from itertools import count, repeat
 from typing import NamedTuple
 
 from gateway.errors import BadValue, Refused
@@ -44,7 +44,7 @@ class Dialogue:
     _questions: dict[Span, Question] = field(init=False, default_factory=dict)
 
     def __post_init__(self) -> None:
-        numbers = cycle(range(1, 65536)) if self.numbered else repeat(0)
+        numbers = count(1) if self.numbered else repeat(0)
         object.__setattr__(self, "_numbers", numbers)
         areas = [place.area for place in self.dialect.places.values()]
         if self.broadcast:
@@ -90,20 +90,26 @@ class Dialogue:
     async def read(self, talk: Talk[Frame], span: Span) -> Sequence[int]:
         question = self._questions.get(span) or self._prepare(span)
         request, head, length, chars, units = question
-        station, number = self.station, next(self._numbers)
+        station, number = self.station, next(self._numbers) & 0xFFFF
         function = head[0]
 
         def answers(frame: Frame) -> Sequence[int] | None:
             heard = frame.pdu
             if frame.station != station or frame.transaction != number:
                 return None
-            # An echoed question can look like an answer: 24 coils from wire address 0300h.
-            if len(heard) == length and heard[:2] == head and heard != request:
-                return units(heard)
+            if len(heard) == length and heard[:2] == head:
+                return () if heard == request and not self.numbered else units(heard)
             pdu.raise_refusal(heard, function)
             return None
 
-        return await talk.ask(Frame(station, request, number), chars, answers)
+        said = await talk.ask(Frame(station, request, number), chars, answers)
+        if said:
+            return said
+        # 17 to 24 coils from wire address 03xxh: the answer may be the question letter for letter,
+        # and what was heard may be its echo. Two shorter answers cannot.
+        area, start, size = span
+        first = await self.read(talk, Span(area, start, 16))
+        return [*first, *await self.read(talk, Span(area, start + 16, size - 16))]
 
     def _prepare(self, span: Span) -> Question:
         place = self._place(span)
@@ -127,7 +133,7 @@ class Dialogue:
 
     async def write(self, talk: Talk[Frame], span: Span, units: Sequence[int]) -> bool:
         request = self._write_request(span, units)
-        number = next(self._numbers)
+        number = next(self._numbers) & 0xFFFF
         frame = Frame(self.station, request, number)
         if self.broadcast:
             await talk.tell(frame)
@@ -198,7 +204,7 @@ class Dialogue:
 
     async def _loopback(self, talk: Talk[Frame], token: int) -> None:
         request = pdu.loopback_request(token)
-        number = next(self._numbers)
+        number = next(self._numbers) & 0xFFFF
 
         def answers(heard: Frame) -> bool | None:
             if heard.station != self.station or heard.transaction != number:

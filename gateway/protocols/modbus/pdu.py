@@ -36,6 +36,7 @@ _EXCEPTIONS = {
     4: ("device failure", Refusal.OTHER),
     5: ("acknowledged, but it takes longer", Refusal.BUSY),
     6: ("device busy", Refusal.BUSY),
+    10: ("a gateway on the way has no path to the device", Refusal.BUSY),
 }
 _NO_RESPONSE_BEHIND = 11  # a Modbus TCP gateway got no answer from the device behind it
 

@@ -76,7 +76,7 @@ class RtuCodec:
             if len(whole) == size and crc16(whole[:-2]) == whole[-2:]:
                 del heard[: start + size]
                 return Frame(whole[0], whole[1:-2])
-            if whole[:2] != self._sent[:2] or self._is_echo(bytes(heard[start:])):
+            if whole[:2] != self._sent[:2] or self._may_be_echo(heard[start:]):
                 continue
             if len(whole) < size:
                 return None  # the answer, still on its way
@@ -87,8 +87,10 @@ class RtuCodec:
                 return None
         return None
 
-    def _is_echo(self, heard: bytes) -> bool:
-        return self._sent[1] not in _ECHOED and heard.startswith(self._sent)
+    def _may_be_echo(self, heard: bytearray) -> bool:
+        """Whether what was heard is the request, as far as it goes."""
+        sent = self._sent
+        return sent[1] not in _ECHOED and sent.startswith(heard[: len(sent)])
 
 
 def _reply_size(heard: bytearray, start: int) -> int:

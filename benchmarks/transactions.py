@@ -1,0 +1,295 @@
+"""CPU per read of 64 words: `python -m benchmarks.transactions`.
+
+Our whole line (schedule, turn, driver, decoding, mirror) beside pymodbus's asyncio client and a
+libmodbus loop in C, against the same slave (libmodbus, in another process) in one run. Vigor has
+no foreign slave, so a simulated station in another process answers. Figures are processor
+time of this process, or of the C loop, per exchange; ratios within the run are what counts.
+"""
+
+import argparse
+import asyncio
+import contextlib
+import logging
+import os
+import shutil
+import socket
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Awaitable, Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import structlog
+from pymodbus.client import AsyncModbusSerialClient, AsyncModbusTcpClient
+
+from gateway.device import Device
+from gateway.line import Line
+from gateway.mirror import Mirror
+from gateway.protocols.driver import Address, AnyDriver, Span, Unit
+from gateway.protocols.modbus import ModbusRtu, ModbusTcp
+from gateway.protocols.vigor import Vigor
+from gateway.tags import Sample, Tag
+from gateway.transport import Ear, Port, SerialPath, SerialSettings, TcpAddress, open_port
+from gateway.values import Layout, parse_type
+from gateway.wiretime import NETWORK_BAUD, Wire
+
+INTEROP = Path(__file__).parent.parent / "tests" / "interop"
+WORDS, FIRST = 64, 100
+VIGOR_STATION = """
+import asyncio, sys
+from gateway.stations.vigor import VigorStation
+from gateway.transport.serve import serve_on_pty, serve_on_tcp
+from gateway.wiretime import Wire
+
+async def main():
+    wire = Wire(115200, 10)
+    stations = [VigorStation(1)]
+    if sys.argv[1] == "pty":
+        served = await serve_on_pty(stations, wire, turnaround=0, paced=False)
+    else:
+        served = await serve_on_tcp(stations, wire, "127.0.0.1", 0, turnaround=0, paced=False)
+    print(served.address, flush=True)
+    await asyncio.Event().wait()
+
+asyncio.run(main())
+"""
+
+
+class Counting:
+    """Upstairs with a mirror, as the gateway has one; stops the run after so many exchanges."""
+
+    def __init__(self, tags: Sequence[Tag], exchanges: int) -> None:
+        self._mirror = Mirror(tags, 0)
+        self._left = exchanges
+        self.done = asyncio.Event()
+        self.cpu = 0.0
+
+    def samples(self, samples: Sequence[Sample]) -> None:
+        self._mirror.update(samples)
+        self._left -= 1
+        if self._left == 0:
+            self.cpu = time.process_time()
+            self.done.set()
+
+    def alive(self, device: Device, alive: bool) -> None:
+        pass
+
+
+def tags(area: str, each: int) -> tuple[Tag, ...]:
+    """64 words as 64 tags, or as 2 tags at both ends (`each` = 1 or 63)."""
+    return tuple(
+        Tag(
+            device="plc",
+            name=f"t{n}",
+            text=f"{area}{n}",
+            address=Address(area, n),
+            span=Span(area, n, 1),
+            unit_kind=Unit.WORD,
+            layout=Layout(parse_type("uint16")),
+            every=1e-6,
+        )
+        for n in range(FIRST, FIRST + WORDS, each)
+    )
+
+
+async def ours(
+    driver: AnyDriver, area: str, each: int, where: Callable[[Ear], Awaitable[Port]], count: int
+) -> float:
+    """Seconds of processor time per exchange. No silence is kept: it would only add sleep."""
+    timing = replace(driver.timing, silence=0.0, silence_chars=0.0)
+    wire = Wire(NETWORK_BAUD, 10)
+    chosen = tags(area, each)
+    device = Device("plc", driver, wire, timing, chosen, 0.5, turnaround=1.0)
+    assert len(device.blocks) == 1, device.blocks
+    upstairs = Counting(chosen, count)
+    line = Line("bench", [device], wire, where, upstairs, time.time_ns)
+    begun = time.process_time()
+    task = asyncio.create_task(line.run())
+    await upstairs.done.wait()
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)
+    return (upstairs.cpu - begun) / count
+
+
+async def pymodbus(
+    make: Callable[[], AsyncModbusTcpClient | AsyncModbusSerialClient], count: int
+) -> float:
+    client = make()
+    await client.connect()
+    begun = time.process_time()
+    for _ in range(count):
+        reply = await client.read_holding_registers(FIRST, count=WORDS, device_id=1)
+        assert reply.registers[0] == FIRST
+    spent = time.process_time() - begun
+    client.close()
+    return spent / count
+
+
+def libmodbus(master: Path, mode: str, where: str, count: int) -> float:
+    """The C loop tells wall and CPU microseconds per read; children's time is what we take."""
+    before = os.times().children_user + os.times().children_system
+    subprocess.run([master, mode, where, "1", str(count)], check=True, stdout=subprocess.DEVNULL)
+    return (os.times().children_user + os.times().children_system - before) / count
+
+
+@contextlib.contextmanager
+def process(*command: str | Path) -> Iterator[str]:
+    """A peer in another process; what it printed first."""
+    child = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    try:
+        assert child.stdout is not None
+        yield child.stdout.readline().strip()
+    finally:
+        child.terminate()
+        child.wait()
+        child.stdout.close()
+
+
+def compiled(folder: Path, name: str) -> Path | None:
+    flags = ["-I/usr/include/modbus", "-lmodbus"]
+    if not Path("/usr/include/modbus/modbus.h").exists() or shutil.which("cc") is None:
+        return None
+    program = folder / name
+    subprocess.run(["cc", "-O2", INTEROP / f"{name}.c", "-o", program, *flags], check=True)
+    return program
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+@contextlib.contextmanager
+def pty_pair(folder: Path) -> Iterator[tuple[str, str]]:
+    ends = [str(folder / "a"), str(folder / "b")]
+    child = subprocess.Popen(["socat", *(f"pty,raw,echo=0,link={end}" for end in ends)])
+    try:
+        while not all(Path(end).exists() for end in ends):
+            time.sleep(0.01)
+        yield ends[0], ends[1]
+    finally:
+        child.terminate()
+        child.wait()
+
+
+def tcp_opener(port: int) -> Callable[[Ear], Awaitable[Port]]:
+    return lambda ear: open_port(TcpAddress("127.0.0.1", port), SerialSettings(), ear)
+
+
+def serial_opener(path: str) -> Callable[[Ear], Awaitable[Port]]:
+    return lambda ear: open_port(SerialPath(path), SerialSettings(115200, "8N1"), ear)
+
+
+Runs = dict[str, Callable[[int], float]]
+
+
+def repeated(runs: Runs, count: int, rounds: int) -> dict[str, float]:
+    """The median of a few rounds, each of all contestants in turn."""
+    found: dict[str, list[float]] = {name: [] for name in runs}
+    for _ in range(rounds):
+        for name, run in runs.items():
+            found[name].append(run(count) * 1e6)
+    return {name: statistics.median(values) for name, values in found.items()}
+
+
+def modbus_tcp(folder: Path, count: int, rounds: int) -> dict[str, float] | None:
+    slave, master = compiled(folder, "modbus_slave"), compiled(folder, "modbus_master")
+    if slave is None or master is None:
+        return None
+    port = free_port()
+    driver = ModbusTcp(station=1)
+    with process(slave, "tcp", str(port)):
+        return repeated(
+            {
+                "ours, 2 tags": lambda n: asyncio.run(
+                    ours(driver, "holding", 63, tcp_opener(port), n)
+                ),
+                "ours, 64 tags": lambda n: asyncio.run(
+                    ours(driver, "holding", 1, tcp_opener(port), n)
+                ),
+                "pymodbus client": lambda n: asyncio.run(
+                    pymodbus(lambda: AsyncModbusTcpClient("127.0.0.1", port=port), n)
+                ),
+                "libmodbus in C": lambda n: libmodbus(master, "tcp", str(port), n),
+            },
+            count,
+            rounds,
+        )
+
+
+def modbus_rtu(folder: Path, count: int, rounds: int) -> dict[str, float] | None:
+    slave, master = compiled(folder, "modbus_slave"), compiled(folder, "modbus_master")
+    if slave is None or master is None or shutil.which("socat") is None:
+        return None
+    driver = ModbusRtu(station=1)
+    with pty_pair(folder) as (near, far), process(slave, "rtu", far, "1"):
+        return repeated(
+            {
+                "ours, 2 tags": lambda n: asyncio.run(
+                    ours(driver, "holding", 63, serial_opener(near), n)
+                ),
+                "ours, 64 tags": lambda n: asyncio.run(
+                    ours(driver, "holding", 1, serial_opener(near), n)
+                ),
+                "pymodbus client": lambda n: asyncio.run(
+                    pymodbus(lambda: AsyncModbusSerialClient(near, baudrate=115200), n)
+                ),
+                "libmodbus in C": lambda n: libmodbus(master, "rtu", near, n),
+            },
+            count,
+            rounds,
+        )
+
+
+def vigor(count: int, rounds: int, way: str) -> dict[str, float]:
+    driver = Vigor(station=1)
+    with process(sys.executable, "-c", VIGOR_STATION, way) as where:
+        opener = serial_opener(where)
+        if way == "tcp":
+            opener = tcp_opener(int(where.rpartition(":")[2]))
+        return repeated(
+            {
+                "ours, 2 tags": lambda n: asyncio.run(ours(driver, "D", 63, opener, n)),
+                "ours, 64 tags": lambda n: asyncio.run(ours(driver, "D", 1, opener, n)),
+            },
+            count,
+            rounds,
+        )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--count", type=int, default=3000)
+    parser.add_argument("--rounds", type=int, default=5)
+    arguments = parser.parse_args()
+    structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.WARNING))
+    count, rounds = arguments.count, arguments.rounds
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        tables = {
+            "Modbus TCP": modbus_tcp(folder, count, rounds),
+            "Modbus RTU on a pty": modbus_rtu(folder, count, rounds),
+            "Vigor over TCP": vigor(count, rounds, "tcp"),
+            "Vigor on a pty": vigor(count, rounds, "pty"),
+        }
+    for title, figures in tables.items():
+        print(f"\n{title}: microseconds of CPU per read of {WORDS} words")
+        if figures is None:
+            print("  not run: needs libmodbus, a C compiler and socat")
+            continue
+        for contestant, spent in figures.items():
+            ratios = "".join(
+                f"  {spent / figures[other]:5.2f} x {other}"
+                for other in ("pymodbus client", "libmodbus in C")
+                if other in figures and other != contestant
+            )
+            print(f"  {contestant:16} {spent:7.1f}{ratios}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,232 @@
+"""Programs as processes of their own: started, listened to, ended by their ids."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple, Self
+
+PATIENCE = 20.0  # seconds; never waited for when all is well
+ROOT = Path(__file__).parents[2]
+_ENVIRONMENT = {**os.environ, "PYTHONUNBUFFERED": "1", "NO_COLOR": "1", "COLUMNS": "120"}
+
+
+class Done(NamedTuple):
+    """A program that came to its end by itself."""
+
+    code: int
+    out: str
+    err: str
+
+
+def plc_gateway(*arguments: object, **how: Any) -> Done:
+    """Run the command to its end."""
+    done = subprocess.run(
+        [sys.executable, "-m", "gateway", *map(str, arguments)],
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+        cwd=how.pop("cwd", ROOT),
+        env=_ENVIRONMENT,
+        check=False,
+    )
+    assert "Traceback" not in done.stderr, done.stderr
+    return Done(done.returncode, done.stdout, done.stderr)
+
+
+class Program:
+    """A running program. What it says is kept, and shown by pytest when the test fails."""
+
+    def __init__(self, *command: object, merged: bool = True) -> None:
+        """`merged`: its errors are among its lines; otherwise they are in `errors`."""
+        self.lines: list[str] = []
+        self.errors: list[str] = []
+        self._name = " ".join(map(str, command))[-100:]
+        self._passed = 0  # lines that `says` has gone past
+        self._news = threading.Condition()
+        self._process = subprocess.Popen(
+            [str(part) for part in command],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT if merged else subprocess.PIPE,
+            text=True,
+            bufsize=1,
+            cwd=ROOT,
+            env=_ENVIRONMENT,
+        )
+        self._readers = [threading.Thread(target=self._read, args=("stdout", self.lines))]
+        if not merged:
+            self._readers.append(threading.Thread(target=self._read, args=("stderr", self.errors)))
+        for reader in self._readers:
+            reader.start()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        if self._process.poll() is None:
+            self._process.kill()
+        self._finish()
+        print(f"--- {self._name} ended with {self._process.returncode}, having said:")
+        print("\n".join([*self.lines, *self.errors]))
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid
+
+    @property
+    def running(self) -> bool:
+        return self._process.poll() is None
+
+    def says(self, *words: str, timeout: float = PATIENCE) -> str:
+        """Waits for the next line that holds all the words; lines before it are passed over."""
+        until = time.monotonic() + timeout
+        with self._news:
+            while True:
+                for number in range(self._passed, len(self.lines)):
+                    if all(word in self.lines[number] for word in words):
+                        self._passed = number + 1
+                        return self.lines[number]
+                left = until - time.monotonic()
+                ended = not any(reader.is_alive() for reader in self._readers)
+                if left <= 0 or ended or not self._news.wait(left):
+                    said = "\n".join(self.lines)
+                    raise AssertionError(f"{self._name} did not say {words}, but:\n{said}")
+
+    def has_said(self, *words: str) -> bool:
+        return any(all(word in line for word in words) for line in self.lines)
+
+    def tell(self, command: str) -> str:
+        """One line to its standard input; returns the line `ok …` it answers with."""
+        assert self._process.stdin is not None
+        self._process.stdin.write(command + "\n")
+        self._process.stdin.flush()
+        return self.says("ok").removeprefix("ok").strip()
+
+    def end(self, by: signal.Signals = signal.SIGTERM, within: float = PATIENCE) -> int:
+        """Send a signal and wait; the exit code, negative where the signal itself ended it."""
+        self._process.send_signal(by)
+        return self.ended(within)
+
+    def ended(self, within: float = PATIENCE) -> int:
+        """Wait for its end."""
+        code = self._process.wait(within)
+        self._finish()
+        return code
+
+    def _finish(self) -> None:
+        self._process.wait(PATIENCE)
+        for reader in self._readers:
+            reader.join(PATIENCE)
+        for stream in (self._process.stdin, self._process.stdout, self._process.stderr):
+            if stream is not None and not stream.closed:
+                stream.close()
+
+    def _read(self, name: str, lines: list[str]) -> None:
+        stream = getattr(self._process, name)
+        for line in stream:
+            with self._news:
+                lines.append(line.rstrip("\n"))
+                self._news.notify_all()
+        with self._news:
+            self._news.notify_all()
+
+
+def gateway(*arguments: object, merged: bool = True) -> Program:
+    """`plc-gateway …` as a process; for `run` wait with `.says("on Zenoh")`."""
+    return Program(sys.executable, "-m", "gateway", *arguments, merged=merged)
+
+
+def started(config: Path) -> Program:
+    """A gateway that is on Zenoh."""
+    program = gateway("run", config)
+    try:
+        program.says("on Zenoh")
+    except BaseException:
+        program.__exit__()
+        raise
+    return program
+
+
+def station(*where: str, stations: tuple[int, ...] = (1,)) -> Program:
+    """Simulated Vigor PLCs that obey commands (tests/e2e/station.py), ready to be spoken to."""
+    numbers = ",".join(map(str, stations))
+    program = Program(sys.executable, "-m", "tests.e2e.station", numbers, *where)
+    try:
+        program.says("ready")
+    except BaseException:
+        program.__exit__()
+        raise
+    return program
+
+
+def cable(socat: str, link: Path, far_end: str) -> Program:
+    """A pty at `link` with a cable to `far_end`, as socat writes it. Killed, it is pulled out."""
+    program = Program(socat, "-d", "-d", f"pty,raw,echo=0,link={link}", far_end)
+    program.says("starting data transfer loop")
+    return program
+
+
+def device_server(ser2net: str, folder: Path, tty: Path) -> tuple[Program, int]:
+    """ser2net, telnet with RFC 2217, in front of a serial port."""
+    number = free_port()
+    config = folder / "ser2net.yaml"
+    config.write_text(
+        "connection: &a\n"
+        f"  accepter: telnet(rfc2217),tcp,127.0.0.1,{number}\n"
+        f"  connector: serialdev,{tty},9600n81,local\n"
+    )
+    program = Program(ser2net, "-n", "-u", "-c", config, "-P", folder / "ser2net.pid")
+    until(lambda: listens(number), "ser2net listens")  # it does not say so itself
+    return program, number
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        number: int = probe.getsockname()[1]
+    return number
+
+
+def listens(number: int) -> bool:
+    """Whether anybody listens there: without connecting, as a port may serve one at a time."""
+    return f"0100007F:{number:04X} 00000000:0000 0A" in Path("/proc/net/tcp").read_text()
+
+
+def until(happened: Callable[[], bool], what: str) -> None:
+    """For what only the system can be asked about, and which tells nobody."""
+    end = time.monotonic() + PATIENCE
+    while not happened():
+        assert time.monotonic() < end, f"it did not happen that {what}"
+        time.sleep(0.01)
+
+
+def write_config(path: Path, endpoint: str, lines: dict[str, Any], **sections: Any) -> Path:
+    """A configuration file (JSON is YAML)."""
+    document = {
+        "gateway": {"name": "demo"},
+        "zenoh": {"prefix": "plant", "listen": [endpoint]},
+        "defaults": {"every": "200ms"},
+        **sections,
+        "lines": lines,
+    }
+    path.write_text(json.dumps(document))
+    return path
+
+
+def vigor_line(port: str, tags: dict[str, Any], **device: Any) -> dict[str, Any]:
+    """One line at 19200 7E1 with the PLC `mixer`, station 1, that answers within 200 ms."""
+    settings = {"protocol": "vigor", "station": 1, "reply_timeout": "200ms", **device}
+    return {
+        "port": port,
+        "baudrate": 19200,
+        "format": "7E1",
+        "devices": {"mixer": {**settings, "tags": tags}},
+    }

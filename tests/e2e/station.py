@@ -1,0 +1,92 @@
+"""Simulated Vigor PLCs in a process of their own that do what they are told.
+
+`python -m tests.e2e.station 1,2 pty LINK` or `… tcp PORT`. It says `ready`, then obeys lines on
+its standard input and answers each with `ok …`:
+
+    mute 1            obeys, but its answers are lost          speak 1     answers again
+    hole 1 D 700      this model lacks the device              fill 1 D 700
+    set 1 D 100 5     what its program would do                get 1 D 500
+    count 1 D 10      a register that counts ten a second      delay 1 0.3 slow to answer
+    deaf / hear       the port is closed, and opened again
+"""
+
+import asyncio
+import sys
+
+from gateway.stations.vigor import VigorStation
+from gateway.transport.serve import Served, serve_on_pty, serve_on_tcp
+from gateway.wiretime import Wire, character_bits
+
+WIRE = Wire(19200, character_bits("7E1"))
+
+
+class Plant:
+    """The stations, and the port they are behind."""
+
+    def __init__(self, numbers: list[int], kind: str, where: str) -> None:
+        self.stations = {number: VigorStation(number) for number in numbers}
+        self._kind = kind
+        self._where = where
+        self._served: Served | None = None
+
+    async def open(self) -> None:
+        stations = list(self.stations.values())
+        if self._kind == "pty":
+            self._served = await serve_on_pty(stations, WIRE, self._where)
+        else:
+            self._served = await serve_on_tcp(stations, WIRE, "127.0.0.1", int(self._where))
+
+    async def close(self) -> None:
+        if self._served is not None:
+            await self._served.close()
+
+    async def obey(self, words: list[str]) -> object:
+        match words:
+            case ["deaf"]:
+                return await self.close()
+            case ["hear"]:
+                return await self.open()
+            case [verb, number, *rest]:
+                return _obey(self.stations[int(number)], verb, rest)
+        raise ValueError(words)
+
+
+def _obey(station: VigorStation, verb: str, rest: list[str]) -> object:
+    match verb, *rest:
+        case ["mute"]:
+            station.mute = True
+        case ["speak"]:
+            station.mute = False
+        case ["hole", area, number]:
+            station.holes.add((area, int(number)))
+        case ["fill", area, number]:
+            station.holes.discard((area, int(number)))
+        case ["set", area, number, value]:
+            station.memory.write(area, int(number), [int(value)])
+        case ["get", area, number]:
+            return station.memory.read(area, int(number))[0]
+        case ["count", area, number]:
+            station.memory.animate(area, int(number), lambda now: int(now * 10) & 0x7FFF)
+        case ["delay", seconds]:
+            station.delay = float(seconds)  # type: ignore[attr-defined]  # the wire looks for it
+        case _:
+            raise ValueError((verb, rest))
+    return ""
+
+
+async def main(numbers: str, kind: str, where: str) -> None:
+    plant = Plant([int(number) for number in numbers.split(",")], kind, where)
+    await plant.open()
+    print("ready", flush=True)
+    orders = asyncio.StreamReader()
+    await asyncio.get_running_loop().connect_read_pipe(
+        lambda: asyncio.StreamReaderProtocol(orders), sys.stdin
+    )
+    async for line in orders:
+        answer = await plant.obey(line.decode().split())
+        print("ok", "" if answer is None else answer, flush=True)
+    await plant.close()
+
+
+if __name__ == "__main__":
+    asyncio.run(main(*sys.argv[1:]))

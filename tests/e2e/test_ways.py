@@ -1,0 +1,112 @@
+"""Every way to a PLC: a pty, a cable of two ptys, TCP, RFC 2217; PLC, gateway and Zenoh client
+are processes of their own."""
+
+import json
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import needs
+from tests.e2e.processes import (
+    cable,
+    device_server,
+    free_port,
+    gateway,
+    started,
+    vigor_line,
+    write_config,
+)
+from tests.zenoh_peer import ZenohPeer, free_endpoint
+
+TAGS = {
+    "speed": {"address": "D10", "scale": 0.1},
+    "level": {"address": "D20", "type": "float32", "every": "500ms"},
+    "door": {"address": "M12"},
+    "button": {"address": "X17"},
+    "batches": {"address": "C200"},
+    "name": {"address": "D600", "type": "string[16]", "write": True},
+    "recipe": {"address": "D500", "write": {"min": 1, "max": 40, "verify": True}},
+    "run": {"address": "Y20", "write": True},
+    "valve": {"address": "D7.3", "write": True},
+}
+Way = Callable[[ExitStack, Path], str]
+
+
+def _simulated_on_pty(stack: ExitStack, folder: Path) -> Path:
+    """`plc-gateway simulate` of the same devices; the link to its pty."""
+    plan = write_config(folder / "plc.yaml", free_endpoint(), {"hall": vigor_line("COM1", TAGS)})
+    simulated = stack.enter_context(gateway("simulate", plan, "--links", folder))
+    assert str(folder / "hall") in simulated.says("line hall: stations 1 at")
+    simulated.says("Ctrl-C")
+    return folder / "hall"
+
+
+def _pty(stack: ExitStack, folder: Path) -> str:
+    return str(_simulated_on_pty(stack, folder))
+
+
+def _cable(stack: ExitStack, folder: Path) -> str:
+    socat = needs("socat")
+    far_end = f"file:{_simulated_on_pty(stack, folder)},raw,echo=0"
+    stack.enter_context(cable(socat, folder / "near", far_end))
+    return str(folder / "near")
+
+
+def _tcp(stack: ExitStack, folder: Path) -> str:
+    plan = write_config(folder / "plc.yaml", free_endpoint(), {"hall": vigor_line("COM1", TAGS)})
+    number = free_port()
+    simulated = stack.enter_context(gateway("simulate", plan, "--tcp", f"127.0.0.1:{number}"))
+    assert f"tcp://127.0.0.1:{number}" in simulated.says("line hall: stations 1 at")
+    return f"tcp://127.0.0.1:{number}"
+
+
+def _rfc2217(stack: ExitStack, folder: Path) -> str:
+    program = needs("ser2net")
+    server, number = device_server(program, folder, _simulated_on_pty(stack, folder))
+    stack.enter_context(server)
+    return f"rfc2217://127.0.0.1:{number}"
+
+
+@pytest.fixture
+def stack() -> Iterator[ExitStack]:
+    with ExitStack() as stack:
+        yield stack
+
+
+@pytest.mark.parametrize("way", [_pty, _cable, _tcp, _rfc2217], ids=lambda way: way.__name__[1:])
+async def test_values_come_and_writes_go(way: Way, stack: ExitStack, tmp_path: Path) -> None:
+    endpoint = free_endpoint()
+    port = way(stack, tmp_path)
+    config = write_config(tmp_path / "config.yaml", endpoint, {"hall": vigor_line(port, TAGS)})
+    stack.enter_context(started(config))
+    async with ZenohPeer("client", connect=[endpoint]) as client:
+        heard = await client.subscribe("plant/**")
+        for name in ("speed", "level", "batches"):  # each is seen to move
+            key = f"plant/mixer/{name}"
+            first = await heard.next(lambda s, k=key: s.key == k and s.json["quality"] == "good")
+            await heard.next(lambda s, f=first: s.key == f.key and s.json["value"] != f.json["value"])
+
+        replies = await client.get("plant/mixer/**", consolidation="NONE")
+        values = {reply.key: reply.json for reply in replies}
+        assert set(values) == {f"plant/mixer/{name}" for name in TAGS}
+        assert {value["quality"] for value in values.values()} == {"good"}
+        assert isinstance(values["plant/mixer/level"]["value"], float)
+        assert isinstance(values["plant/mixer/door"]["value"], bool)
+        assert values["plant/mixer/name"]["value"] == "SIMULATED"
+
+        asked = {"recipe": 7, "run": True, "valve": True, "name": "ÜBER-B7"[1:]}
+        for name, value in asked.items():
+            [reply] = await client.get(f"plant/mixer/{name}/@set", json.dumps(value).encode())
+            assert reply.ok, reply
+            assert reply.json["value"] == value
+            assert reply.json["verified"] is (name == "recipe")
+            await heard.next(lambda s, n=name, v=value: _shows(s.key, s.json, n, v))
+        [run] = await client.get("plant/mixer/run")
+        assert run.json["value"] is True
+        assert all(sample.encoding == "application/json" for sample in heard.samples)
+
+
+def _shows(key: str, document: dict[str, object], name: str, value: object) -> bool:
+    return key == f"plant/mixer/{name}" and document["value"] == value
