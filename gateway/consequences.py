@@ -2,7 +2,7 @@
 
 import asyncio
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Protocol
 
 import structlog
@@ -32,7 +32,7 @@ class Consequences:
     schedule: Schedule
     upstairs: Upstairs
     wall: Callable[[], int]  # ns since 1970
-    _stale_timers: dict[Device, asyncio.TimerHandle] = field(default_factory=dict)
+    _stale_timer: asyncio.TimerHandle | None = None
 
     def read(self, poll: Poll, units: Sequence[int]) -> None:
         """A block was read well."""
@@ -65,7 +65,7 @@ class Consequences:
         before = device.standing
         device.failed(error, asked)
         log.info("no good reply", line=self.line, device=device.name, why=str(error))
-        self._watch_stale(device)
+        self._watch_stale()
         return before
 
     def unclear(self, device: Device, before: Standing, took: float, late: float | None) -> None:
@@ -130,8 +130,8 @@ class Consequences:
         self.upstairs.samples([bad(tag, reason, now, detail) for tag in tags])
 
     def line_down(self, why: str) -> None:
+        self._forget_stale_timer()
         for device in self.schedule.devices:
-            self._forget_stale_timer(device)
             self.upstairs.alive(device, False)
             self.bad(device.tags, Reason.LINE_DOWN, why)
 
@@ -150,29 +150,41 @@ class Consequences:
         device.plan()
         self.schedule.plan(device, _now())
 
-    def _watch_stale(self, device: Device) -> None:
-        """While a device fails, each value turns bad once it is two intervals old."""
-        self._forget_stale_timer(device)
-        if device.standing not in (Standing.FAILING, Standing.SILENT):
-            return
-        now, later = _now(), []
-        for poll in self.schedule.polls(device):
-            if poll.last_good is None:
-                continue
-            ends = poll.last_good + 2 * poll.block.every
-            if ends > now:
-                later.append(ends)
-            else:
-                poll.last_good = None
-                self.bad(poll.block.tags, device.reason, device.diagnosis())
-        if later:
-            loop = asyncio.get_running_loop()
-            self._stale_timers[device] = loop.call_at(min(later), self._watch_stale, device)
+    def _watch_stale(self) -> None:
+        """While a device fails, each of its values turns bad once it is two intervals old.
 
-    def _forget_stale_timer(self, device: Device) -> None:
-        timer = self._stale_timers.pop(device, None)
-        if timer is not None:
-            timer.cancel()
+        So do those of devices that it holds up, after the longest that one failure takes: where
+        all are dead, their turn to be found out may be long in coming.
+        """
+        self._forget_stale_timer()
+        devices = self.schedule.devices
+        if not any(device.standing is Standing.FAILING for device in devices):
+            return
+        now, later = _now(), float("inf")
+        load = max(1.0, sum(device.load for device in devices if device.served))
+        held_up = max(device.timing.reply_timeout + device.late_guard for device in devices)
+        for device in devices:
+            if not device.served:
+                continue  # its values are bad already
+            failing = device.standing is Standing.FAILING
+            stretch, grace = (2.0, 0.0) if failing else (2.0 * load, held_up)
+            why = device.diagnosis() if failing else "not asked: another device holds up the line"
+            for poll in self.schedule.polls(device):
+                if poll.last_good is None:
+                    continue
+                ends = poll.last_good + stretch * poll.block.every + grace
+                if ends > now:
+                    later = min(later, ends)
+                else:
+                    poll.last_good = None
+                    self.bad(poll.block.tags, device.reason, why)
+        if later < float("inf"):
+            self._stale_timer = asyncio.get_running_loop().call_at(later, self._watch_stale)
+
+    def _forget_stale_timer(self) -> None:
+        if self._stale_timer is not None:
+            self._stale_timer.cancel()
+            self._stale_timer = None
 
 
 def _now() -> float:

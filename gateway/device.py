@@ -38,6 +38,18 @@ class Record:
     slowest_write: float = 0.0
 
 
+@dataclass(slots=True)
+class LineRecord:
+    """What has been counted on a line since the start. Times in seconds."""
+
+    opened: int = 0
+    since: float = 0.0  # when it was opened last, by the loop's clock
+    busy: float = 0.0  # characters on the wire, both ways
+    turnarounds: float = 0.0  # waiting for stations that answered
+    unasked: int = 0  # bytes that nobody had asked for
+    trouble: str = ""  # why the port is not open
+
+
 @dataclass(slots=True, eq=False)
 class Device:
     """Settings, plan and state of one device; belongs to one line and to nobody else."""
@@ -77,6 +89,11 @@ class Device:
         """One exchange on this line with this station."""
         return self.wire.exchange(cost, self.timing, self.turnaround)
 
+    @property
+    def load(self) -> float:
+        """The share of the line's time that its polls take."""
+        return sum(self.seconds(block.cost) / block.every for block in self.blocks)
+
     def plan(self) -> None:
         """Decide anew what to ask, around what the device has refused."""
         self.blocks = plan(self.tags, self.driver, self.seconds, self.refusals.cuts)
@@ -112,7 +129,7 @@ class Device:
         self.doubtful = not self.broadcast
         if doubt is not None:
             self.doubt = doubt
-        if self.standing is not Standing.SILENT:
+        if self.standing is Standing.UP:
             self.standing = Standing.FAILING
         match error:
             case NoReply() | Garbled():

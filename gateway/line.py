@@ -4,13 +4,13 @@ import asyncio
 import random
 from collections.abc import Awaitable, Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 
 import structlog
 
 from gateway.consequences import Consequences, Upstairs
-from gateway.device import Device, Standing, Write
+from gateway.device import Device, LineRecord, Standing, Write
 from gateway.errors import Busy, GatewayError, LineDown, Offline, Refused, Unclear
+from gateway.protocols.driver import Span
 from gateway.recorder import Recorder
 from gateway.schedule import Idle, Poll, Probe, Schedule
 from gateway.tags import Tag, Written
@@ -27,18 +27,6 @@ GAP = 0.02  # quiet that ends a run of bytes nobody understood
 BROADCAST_PAUSE = 0.1
 
 Done = Callable[[Written | GatewayError], None]
-
-
-@dataclass(slots=True)
-class LineRecord:
-    """What has been counted on a line since the start. Times in seconds."""
-
-    opened: int = 0
-    since: float = 0.0  # when it was opened last, by the loop's clock
-    busy: float = 0.0  # characters on the wire, both ways
-    turnarounds: float = 0.0  # waiting for stations that answered
-    unasked: int = 0  # bytes that nobody had asked for
-    trouble: str = ""  # why the port is not open
 
 
 class Line:
@@ -83,6 +71,8 @@ class Line:
         write = Write(device, tag, units, now, now + PATIENCE, done)
         if not self.is_open:
             done(LineDown(self.record.trouble or f"line {self.name} is not open"))
+        elif not self._schedule.reachable(device, now):
+            done(_offline(device))
         elif not self._schedule.submit(write):
             done(Busy(f"line {self.name}: too many writes are waiting; not sent"))
         else:
@@ -116,24 +106,21 @@ class Line:
         pause = REOPEN_FIRST
         while True:
             try:
-                await self._open_and_serve()
-            except LineDown as error:
-                trouble = str(error)
-                log.warning("line down", line=self.name, why=trouble)
-            except Exception as error:  # the bulkhead: lines must not sink together
-                trouble = f"internal error: {error!r}"
-                log.exception("line failed", line=self.name)
-            if self.record.opened and _now() - self.record.since > REOPEN_LONGEST:
+                trouble = await self._open_and_serve()
+                served = _now() - self.record.since if self.is_open else 0.0
+                self._fall(trouble)  # told before closing, which may take a while
+            finally:
+                await self._close()
+            if served > REOPEN_LONGEST:
                 pause = REOPEN_FIRST
-            self.record.trouble = trouble
-            self._then.line_down(trouble)
             await asyncio.sleep(pause * self._random.uniform(0.8, 1.2))
             pause = min(2 * pause, REOPEN_LONGEST)
 
-    async def _open_and_serve(self) -> None:
+    async def _open_and_serve(self) -> str:
+        """Why it ended."""
         self._down = None
-        self._port = await self._open_port(self)
         try:
+            self._port = await self._open_port(self)
             self.is_open = True
             self.record.opened += 1
             self.record.since = _now()
@@ -141,12 +128,29 @@ class Line:
             log.info("line open", line=self.name)
             self._then.line_up()
             await self._serve()
-        finally:
-            self.is_open = False
-            for write in self._schedule.withdraw():
-                write.done(LineDown(f"line {self.name} went down; not sent"))
-            await self._port.close()
-            self._port = None
+        except LineDown as error:
+            log.warning("line down", line=self.name, why=str(error))
+            return str(error)
+        except Exception as error:  # the bulkhead: lines must not sink together
+            log.exception("line failed", line=self.name)
+            return f"internal error: {error!r}"
+        return "closed"
+
+    def _fall(self, why: str) -> None:
+        self.record.trouble = why
+        self._stop_writes()
+        self._then.line_down(why)
+
+    def _stop_writes(self) -> None:
+        self.is_open = False
+        for write in self._schedule.withdraw():
+            write.done(LineDown(f"line {self.name} went down; not sent"))
+
+    async def _close(self) -> None:
+        self._stop_writes()
+        port, self._port = self._port, None
+        if port is not None:
+            await port.close()
 
     async def _serve(self) -> None:
         while self._down is None:
@@ -183,7 +187,7 @@ class Line:
             raise self._down or LineDown(f"line {self.name} is not open")
         turn = self._turn = Turn(
             self._port,
-            device.driver.codec(),
+            device.driver.codec,
             self.wire,
             self.wire.silence(device.timing),
             device.timing.reply_timeout,
@@ -206,18 +210,18 @@ class Line:
                 device.measured(turn.turnaround / turn.exchanges)
 
     async def _poll(self, poll: Poll) -> None:
-        device = poll.device
+        device, span = poll.device, poll.block.span
         with self._turn_with(device) as turn:
             try:
-                units = await device.driver.read(turn, poll.block.span)
+                units = await device.driver.read(turn, span)
             except Refused as error:
                 self._then.answered(device)
                 self._then.refused(poll, error)
             except Unclear as error:
-                await self._unclear(device, turn, error, poll)
+                await self._unclear(device, turn, error, span)
                 self._then.unread(poll, error)
             except LineDown:
-                device.doubtful = True
+                device.doubt = span
                 raise
             else:
                 self._then.answered(device)
@@ -228,10 +232,10 @@ class Line:
             device.salt += 1
             try:
                 await device.driver.resync(turn, device.doubt, device.salt)
+            except Refused:  # that is an answer too
+                self._then.answered(device)
             except Unclear as error:
                 await self._unclear(device, turn, error, None)
-                for write in self._schedule.withdraw(device):
-                    write.done(Offline(f"{device.name} does not answer; nothing was sent"))
             else:
                 self._then.answered(device)
 
@@ -244,7 +248,7 @@ class Line:
             outcome = await self._try_to_write(write)
         except LineDown as error:
             outcome = Unclear(f"{error}; nobody knows whether the write was done")
-            device.doubtful = True
+            device.doubt = write.tag.span
             raise
         finally:
             device.record.writes += 1
@@ -254,28 +258,35 @@ class Line:
 
     async def _try_to_write(self, write: Write) -> Written | GatewayError:
         """Never simply sent again: what may follow an unclear end is the tag's own rule."""
-        device = write.device
-        try:
-            with self._turn_with(device) as turn:
-                try:
-                    return self._noted(device, await carry_out(turn, write, self._wall))
-                except Differs as error:
-                    self._then.answered(device)
-                    return error
-                except Unclear as error:
-                    unclear = error
-                    await self._unclear(device, turn, error, None)
-            with self._turn_with(device) as turn:
-                try:
-                    settled = await look_again(turn, write, self._wall)
-                    return unclear if settled is None else self._noted(device, settled)
-                except Unclear as error:
-                    await self._unclear(device, turn, error, None)
-                    return error if isinstance(error, Differs) else unclear
-        except Refused as error:
-            self._then.answered(device)
-            device.record.refusals[error.code] += 1
-            return error
+        device, span = write.device, write.tag.span
+        with self._turn_with(device) as turn:
+            try:
+                return self._noted(device, await carry_out(turn, write, self._wall))
+            except Refused as error:
+                return self._denied(device, error)
+            except Differs as error:
+                self._then.answered(device)
+                return error
+            except Unclear as error:
+                unclear = error
+                await self._unclear(device, turn, error, span)
+        with self._turn_with(device) as turn:
+            try:
+                settled = await look_again(turn, write, self._wall)
+                return unclear if settled is None else self._noted(device, settled)
+            except Refused as error:  # not what became of the first try
+                self._denied(device, error)
+            except Differs as error:
+                self._then.answered(device)
+                return error
+            except Unclear as error:
+                await self._unclear(device, turn, error, span)
+        return unclear
+
+    def _denied(self, device: Device, error: Refused) -> Refused:
+        self._then.answered(device)
+        device.record.refusals[error.code] += 1
+        return error
 
     def _noted(self, device: Device, done: Written) -> Written:
         if done.acknowledged:
@@ -284,14 +295,21 @@ class Line:
             self._clock.quiet_since += device.turnaround or BROADCAST_PAUSE
         return done
 
-    async def _unclear(self, device: Device, turn: Turn, error: Unclear, poll: Poll | None) -> None:
+    async def _unclear(
+        self, device: Device, turn: Turn, error: Unclear, asked: Span | None
+    ) -> None:
         """Note what was heard and keep quiet until nothing of it can disturb what comes next."""
-        started = _now()
-        before = self._then.doubt(device, error, poll)
+        before = self._then.doubt(device, error, asked)
         guard = 0.0 if before is Standing.SILENT else device.late_guard
         late = await turn.settle(guard, max(GAP, 4 * self.wire.character))
-        took = device.timing.reply_timeout + _now() - started
-        self._then.unclear(device, before, took, late)
+        self._then.unclear(device, before, _now() - turn.started, late)
+        if device.standing is Standing.SILENT:
+            for write in self._schedule.withdraw(device):
+                write.done(_offline(device))
+
+
+def _offline(device: Device) -> Offline:
+    return Offline(f"{device.name} does not answer; nothing was sent")
 
 
 def _now() -> float:

@@ -10,6 +10,7 @@ from bisect import bisect_left
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 from gateway.errors import ConfigError
 from gateway.protocols.driver import AnyDriver, Cost, Span
@@ -121,7 +122,7 @@ def _cover(
     """
     items = items_of(tags)
     fences = sorted(n for name, n in cuts if name == area)
-    fenced = [i == 0 or _between(items[i - 1].end, items[i].start, fences) for i in range(len(items))]
+    fenced = [True] + [_between(a.end, b.start, fences) for a, b in pairwise(items)]
     best = [0.0]
     last: list[tuple[int, Cost]] = []  # of the cover of the first j items: its last block
     for j in range(1, len(items) + 1):

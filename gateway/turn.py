@@ -42,7 +42,7 @@ class Turn:
     """
 
     port: Port
-    codec: Codec[Any]
+    new_codec: Callable[[], Codec[Any]]
     wire: Wire
     silence: float
     reply_timeout: float
@@ -50,6 +50,7 @@ class Turn:
     recorder: Recorder
     station: int
     echo: bool = False
+    started: float = 0.0  # when the first question was sent
     sent: int = 0  # characters, for the statistics
     heard: int = 0
     exchanges: int = 0  # questions answered
@@ -57,31 +58,39 @@ class Turn:
     passed: int = 0  # frames that answered nothing
     _foreign: bool = False
     _expired: Callable[[Any], Any] | None = None  # what the timed-out question takes for an answer
-    _late: "asyncio.Future[None] | None" = None
+    _late: "asyncio.Future[bool] | None" = None  # whether it came
+    _came_late: bool = False
     _rest: bytes = b""  # what was heard since the last question
-    _echo: bytes = b""
+    _echo: bytes = b""  # what must still come back
+    _unechoed: bytes = b""  # what came instead, so far
     _open: list[_Question] = field(default_factory=list)
     _broken: Garbled | None = None
+    _lost: LineDown | None = None
+    _codec: Codec[Any] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._codec = self.new_codec()
 
     async def tell(self, frame: Any) -> None:
-        data = self.codec.encode(frame)
+        data = self._codec.encode(frame)
         await self._quiet()
         self._send(data)
         # Nobody answers; the line is ours until the last character is out.
         self.clock.quiet_since += len(data) * self.wire.character
 
     async def ask(self, frame: Any, reply: int, answers: Callable[[Any], T | None]) -> T:
-        data = self.codec.encode(frame)
         if not self._open:
             await self._quiet()
+            # What was heard until now answers nothing: not a byte of it may be read as an answer.
+            self._codec = self.new_codec()
+            self._broken = None
+        data = self._codec.encode(frame)
         loop = asyncio.get_running_loop()
-        question = _Question(answers, loop.create_future())
-        self._open.append(question)
         self._rest = b""
         started = loop.time()
         self._send(data)
-        if self.echo:
-            self._echo += data
+        question = _Question(answers, loop.create_future())
+        self._open.append(question)
         spoken = (len(data) * (2 if self.echo else 1) + reply) * self.wire.character
         timer = loop.call_later(spoken + self.reply_timeout, self._expire, question, data)
         try:
@@ -98,14 +107,14 @@ class Turn:
         """Bytes from the wire while this turn is open."""
         self.clock.quiet_since = asyncio.get_running_loop().time()
         self.heard += len(data)
-        if self._echo:
-            data = self._strip_echo(data)
+        if self._echo and not (data := self._strip_echo(data)):
+            return
         if len(self._rest) < 4096:
             self._rest += data
         if self._broken is not None:
             return
         try:
-            for frame in self.codec.feed(data):
+            for frame in self._codec.feed(data):
                 self._offer(frame)
         except Garbled as error:
             self._broken = error
@@ -114,6 +123,9 @@ class Turn:
 
     def lost(self, error: LineDown) -> None:
         """The port is gone."""
+        self._lost = error
+        if self._late is not None and not self._late.done():
+            self._late.set_result(False)
         for question in self._open:
             _fail(question, error)
 
@@ -126,21 +138,23 @@ class Turn:
         """
         loop = asyncio.get_running_loop()
         start = loop.time()
+        if self._came_late:
+            return 0.0
+        until = start + guard
         if self._expired is None:
-            while (wait := min(self.clock.quiet_since + gap, start + guard) - loop.time()) > 0:
+            while (wait := min(self.clock.quiet_since + gap, until) - loop.time()) > 0:
+                if self._lost is not None:
+                    break
                 await asyncio.sleep(wait)
             return None
-        self._late = loop.create_future()
-        timer = loop.call_later(guard, self._late.cancel)
-        try:
-            await self._late
-        except asyncio.CancelledError:
-            if not self._late.cancelled() or _being_cancelled():
-                raise
+        if self._lost is not None:
             return None
+        self._late = loop.create_future()
+        timer = loop.call_at(until, _give_up, self._late)
+        try:
+            return loop.time() - start if await self._late else None
         finally:
             timer.cancel()
-        return loop.time() - start
 
     def _offer(self, frame: Any) -> None:
         for question in self._open:
@@ -156,16 +170,22 @@ class Turn:
                 return
         if self._expired is not None and _accepts(self._expired, frame):
             self._expired = None
+            self._came_late = True
             if self._late is not None and not self._late.done():
-                self._late.set_result(None)
+                self._late.set_result(True)
             return
         self.passed += 1
         self._foreign = self._foreign or getattr(frame, "station", self.station) != self.station
 
     def _send(self, data: bytes) -> None:
+        if self._lost is not None:
+            raise self._lost
+        if self.echo:
+            self._echo, self._unechoed = data, b""
         self.recorder.sent(data)
-        self.sent += len(data)
         self.clock.quiet_since = asyncio.get_running_loop().time()
+        self.started = self.started or self.clock.quiet_since
+        self.sent += len(data)
         self.port.write(data)
 
     async def _quiet(self) -> None:
@@ -175,13 +195,18 @@ class Turn:
             await asyncio.sleep(wait - self.clock.spin if wait > self.clock.spin else 0)
 
     def _strip_echo(self, data: bytes) -> bytes:
-        """Drop our own request, which a two-wire adapter hands back before the reply."""
-        length = min(len(self._echo), len(data))
-        if data[:length] != self._echo[:length]:
-            self._echo = b""  # no echo after all: let the codec look for the reply
-            return data
-        self._echo = self._echo[length:]
-        return data[length:]
+        """Drop our own request, which a two-wire adapter hands back, and all that came before it.
+
+        Until it has come back whole nothing is believed: some acknowledgements look like it.
+        """
+        self._unechoed += data
+        place = self._unechoed.find(self._echo)
+        if place < 0:
+            self._unechoed = self._unechoed[-KEPT - len(self._echo) :]
+            return b""
+        rest = self._unechoed[place + len(self._echo) :]
+        self._echo = self._unechoed = b""
+        return rest
 
     def _expire(self, question: _Question, request: bytes) -> None:
         if not question.future.done():
@@ -189,10 +214,12 @@ class Turn:
             question.future.set_exception(self._verdict(request))
 
     def _verdict(self, request: bytes) -> DeviceError:
-        heard = self._rest
+        heard = self._rest or self._unechoed
         shown = f"heard {heard[:KEPT].hex(' ')}"
         if not heard:
             return NoReply("no reply")
+        if self._unechoed:
+            return Garbled(f"our own request did not come back: {shown}", heard)
         if heard == request:
             return Garbled("heard only our own request", heard, evidence=Evidence.ECHO)
         if self.passed and self._foreign:
@@ -202,9 +229,9 @@ class Turn:
         return Garbled(f"no whole frame: {shown}", heard, evidence=Evidence.NOISE)
 
 
-def _being_cancelled() -> bool:
-    task = asyncio.current_task()
-    return task is not None and task.cancelling() > 0
+def _give_up(waiting: "asyncio.Future[bool]") -> None:
+    if not waiting.done():
+        waiting.set_result(False)
 
 
 def _fail(question: _Question, error: Exception) -> None:

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from gateway.device import Write
-from gateway.errors import Unclear
+from gateway.errors import Refused, Unclear
 from gateway.protocols.driver import Talk
 from gateway.tags import Written
 from gateway.values import Value
@@ -14,7 +14,7 @@ Wall = Callable[[], int]
 
 
 class Differs(Unclear):
-    """The write was acknowledged, but reading back shows something else."""
+    """The write was acknowledged, but reading back does not show it."""
 
 
 async def carry_out(talk: Talk[Any], write: Write, wall: Wall) -> Written:
@@ -32,7 +32,10 @@ async def carry_out(talk: Talk[Any], write: Write, wall: Wall) -> Written:
     done = written(write, wall, acknowledged=acknowledged)
     if not acknowledged or tag.write is None or not tag.write.verify:
         return done
-    held = await driver.read(talk, tag.span)
+    try:
+        held = await driver.read(talk, tag.span)
+    except Refused as error:
+        raise Differs(f"acknowledged, but reading back was refused: {error}") from error
     if not holds(write, held):
         raise Differs(f"acknowledged, but the device now holds {tag.decode(held)!r}")
     return written(write, wall, verified=True)
@@ -51,7 +54,8 @@ async def look_again(talk: Talk[Any], write: Write, wall: Wall) -> Written | Non
     await device.driver.resync(talk, device.doubt, device.salt)
     if rule.verify and holds(write, await device.driver.read(talk, write.tag.span)):
         return written(write, wall, verified=True)
-    return await carry_out(talk, write, wall) if rule.repeat else None
+    in_time = asyncio.get_running_loop().time() < write.expires
+    return await carry_out(talk, write, wall) if rule.repeat and in_time else None
 
 
 def holds(write: Write, units: Sequence[int]) -> bool:

@@ -659,6 +659,7 @@ def test_nothing_listens_unless_it_is_said_where() -> None:
         ({"connect": ("tcp/router",)}, "write it as tcp/host:port"),
         ({"connect": ("tcp/router:99999",)}, "write it as tcp/host:port"),
         ({"connect": ("serial/x:1",)}, "serial is none of tcp"),
+        ({"mode": Mode.CLIENT}, "which router"),
         ({"prefix": "plant/**"}, "the prefix 'plant/\\*\\*'"),
         ({"config_file": Path("/nowhere/zenoh.json5")}, "No such file"),
     ],

@@ -139,7 +139,9 @@ class Northbound:
     async def run(self) -> None:
         """Serves until cancelled; the session is closed whatever happens, within 2 s.
 
-        Raises `GatewayError` when the session cannot be opened. A client waits for its router.
+        Once only: for another session make another `Northbound`. Raises `GatewayError` when the
+        session cannot be opened (a client waits for its router), and an `ExceptionGroup` with
+        whatever ended it later.
         """
         session = await opened(self._config, retry=self._retry)
         try:

@@ -89,7 +89,7 @@ class Publisher:
 
         Before the session is open nothing is kept: opening publishes all current values.
         """
-        if self._session is None:
+        if self._session is None or self._closing:
             return
         stamp = self._session.new_timestamp
         with self._filled:
@@ -103,7 +103,7 @@ class Publisher:
 
     def block(self, device: str, samples: Sequence[Sample]) -> None:
         """All that changed in one scan of a device; merged with a block that still waits."""
-        if self._session is None:
+        if self._session is None or self._closing:
             return
         key = self._keys.block(device)
         with self._filled:
@@ -134,7 +134,7 @@ class Publisher:
 
     def _event(self, key: str, what: Sample | bytes) -> None:
         with self._filled:
-            if self._session is None or self._events >= EVENTS_LIMIT:
+            if self._session is None or self._closing or self._events >= EVENTS_LIMIT:
                 self.counters.dropped += 1
                 return
             self._events += 1

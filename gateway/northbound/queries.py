@@ -85,7 +85,7 @@ class Queries:
             case Family.SET:
                 self._task(self._set(query))
             case Family.STATUS:
-                self._soon(query, partial(self._replies.status, self._documents()))
+                self._task(self._status(query))
             case Family.VALUE if query.parameters.get("_time") is not None:
                 self._widely(query, partial(self._replies.history, wanted))
             case Family.VALUE if query.parameters.get("max_age") is not None:
@@ -124,13 +124,20 @@ class Queries:
         finally:
             self._soon(query, partial(self._replies.outcome, result))
 
+    async def _status(self, query: zenoh.Query) -> None:
+        documents: dict[str, bytes] = {}
+        try:
+            documents = self._documents()
+        finally:
+            self._soon(query, partial(self._replies.status, documents))
+
     async def _fresh(self, query: zenoh.Query, wanted: Asked) -> None:
         answer: Answer = partial(
             self._replies.outcome, Failure(Problem.UNCLEAR, "no answer in time")
         )
         try:
             samples = await self._read(wanted, query.parameters.get("max_age") or "")
-            answer = partial(self._replies.samples, samples)
+            answer = partial(self._replies.fresh, samples)
         except TimeoutError:
             pass
         except BadValue as error:

@@ -62,10 +62,12 @@ class Replies:
         sample = self._plant.sample(tag)
         self._reply(query, self._keys.value(tag.key), payload.value(sample), stamp)
 
-    def samples(self, samples: Iterable[Sample], query: zenoh.Query) -> None:
+    def fresh(self, samples: Iterable[Sample], query: zenoh.Query) -> None:
+        """What was just read, or what has been read since."""
         for sample in samples:
-            key = self._keys.value(sample.tag.key)
-            self._reply(query, key, payload.value(sample), self._stamp())
+            stamp = self._stamp()
+            newest = max(sample, self._plant.sample(sample.tag), key=lambda of: of.time)
+            self._reply(query, self._keys.value(sample.tag.key), payload.value(newest), stamp)
 
     def history(self, wanted: Asked, query: zenoh.Query) -> None:
         tags = self._directory.find(wanted.of)
@@ -79,7 +81,9 @@ class Replies:
                 for sample in self._history.samples(
                     tag, query.parameters.get("_time") or "", None if limit is None else int(limit)
                 ):
-                    self.samples((sample,), query)
+                    self._reply(
+                        query, self._keys.value(tag.key), payload.value(sample), self._stamp()
+                    )
         except ValueError as error:
             self.outcome(Failure(Problem.BAD_QUERY, str(error)), query)
 

@@ -19,7 +19,7 @@ log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 
 T = TypeVar("T")
 CLOSE_WITHIN = 2.0  # seconds
-_LONGEST_RETRY = 5.0  # seconds between two attempts of a client
+_SHORTEST_RETRY, _LONGEST_RETRY = 0.5, 5.0  # seconds between two attempts of a client
 
 
 class Mode(StrEnum):
@@ -79,6 +79,8 @@ def configure(settings: ZenohSettings) -> zenoh.Config:
             _check(side, endpoint)
         if endpoints:
             config.insert_json5(f"{side}/endpoints", json.dumps(endpoints))
+    if settings.mode is Mode.CLIENT and json.loads(config.get_json("connect/endpoints")) == []:
+        raise ConfigError("zenoh mode client: say in `connect` which router it is a client of")
     return config
 
 
@@ -116,7 +118,7 @@ async def opened(config: zenoh.Config, *, retry: bool) -> zenoh.Session:
 
     Raises `GatewayError` when it cannot be opened, a port in use for instance.
     """
-    pause = 0.5
+    pause = _SHORTEST_RETRY
     while True:
         opening = asyncio.ensure_future(off_loop(zenoh.open, config))
         try:
@@ -128,7 +130,8 @@ async def opened(config: zenoh.Config, *, retry: bool) -> zenoh.Session:
         except zenoh.ZError as error:
             if not retry:
                 raise GatewayError(f"Zenoh cannot be opened: {_plain(error)}") from None
-            log.warning("no Zenoh router yet", error=_plain(error), again_in=pause)
+            tell = log.warning if pause == _SHORTEST_RETRY else log.debug  # once is enough
+            tell("no Zenoh router yet: it is tried again", error=_plain(error))
         await asyncio.sleep(pause)
         pause = min(pause * 2, _LONGEST_RETRY)
 

@@ -174,9 +174,8 @@ def cable(socat: str, link: Path, far_end: str) -> Program:
     return program
 
 
-def device_server(ser2net: str, folder: Path, tty: Path) -> tuple[Program, int]:
-    """ser2net, telnet with RFC 2217, in front of a serial port."""
-    number = free_port()
+def device_server(ser2net: str, folder: Path, tty: Path, number: int) -> Program:
+    """ser2net, telnet with RFC 2217, on this TCP port in front of a serial port."""
     config = folder / "ser2net.yaml"
     config.write_text(
         "connection: &a\n"
@@ -185,7 +184,7 @@ def device_server(ser2net: str, folder: Path, tty: Path) -> tuple[Program, int]:
     )
     program = Program(ser2net, "-n", "-u", "-c", config, "-P", folder / "ser2net.pid")
     until(lambda: listens(number), "ser2net listens")  # it does not say so itself
-    return program, number
+    return program
 
 
 def free_port() -> int:

@@ -7,35 +7,40 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gateway.errors import BadValue, ConfigError, Evidence, Garbled
+from gateway.errors import BadValue, Evidence, Garbled
 from gateway.protocols.frames import FrameCodec, FrameReader, Framing
 from gateway.protocols.frames.presets import written_out
 
 SMALL = 8  # a short maximum, so that few bytes reach every branch
 CHARACTERS = b"\x02\x03\r\nA0F*"  # marks are as likely as data
 
-marks = st.sampled_from(["", "<02>", "<03>", "<02><03>", "**", "<10><02>"])
+marks = st.sampled_from(["<02>", "<03>", "<02><03>", "**", "<10><02>", "A"])
+nothing = st.just("")
 
 
 @st.composite
 def framings(draw: st.DrawFn) -> Framing:
     exact = draw(st.booleans())
-    try:
-        return Framing(
-            header=draw(marks),
-            terminator=draw(marks),
-            ending=draw(st.sampled_from(["", "CR", "CR LF"])),
-            sum_check=draw(st.booleans()),
-            conversion=draw(st.booleans()),
-            keep_terminator=draw(st.booleans()),
-            length=draw(st.integers(1, SMALL)) if exact else None,
-            max_length=None if exact else SMALL,
-        )
-    except ConfigError:
-        return Framing(header="<02>", terminator="<03>", max_length=SMALL)
+    terminator = draw(marks | nothing)
+    keep = bool(terminator) and draw(st.integers(0, 4)) == 0
+    return Framing(
+        header=draw(marks | nothing),
+        terminator=terminator,
+        ending="" if keep else draw(st.sampled_from(["", "CR", "CR LF"])),
+        sum_check=bool(terminator) and not keep and draw(st.booleans()),
+        conversion=draw(st.booleans()),
+        keep_terminator=keep,
+        length=draw(st.integers(1, SMALL)) if exact else None,
+        max_length=None if exact else SMALL,
+    )
 
 
-noise = st.lists(st.sampled_from(list(CHARACTERS)), max_size=60).map(bytes) | st.binary(max_size=60)
+noise = st.one_of(
+    st.binary(max_size=60),
+    # Even for hypothesis, which likes short lists: enough marks in a row to make frames of.
+    st.integers(0, 2**32).map(lambda seed: bytes(random.Random(seed).choices(CHARACTERS, k=60))),
+    st.lists(st.sampled_from(list(CHARACTERS)), max_size=60).map(bytes),
+)
 sizes = st.lists(st.integers(1, 9), min_size=1, max_size=8)
 
 
@@ -243,3 +248,45 @@ def test_endless_noise_leaves_memory_flat(name: str) -> None:
     assert reader.pending <= written_out(framing).longest_on_line
     assert after - before < 8_000
     assert peak - before < 2_000_000
+
+
+def test_damage_without_a_header_voids_everything_up_to_the_next_end_of_a_frame() -> None:
+    reader = FrameReader(Framing(ending="CR LF", max_length=4))
+    found = reader.feed(b"ABCDEFG\r\nHI\r\n")
+    assert frames(found) == [b"HI"]
+    assert isinstance(found[0], Garbled)
+
+
+def test_a_wrong_sum_takes_only_its_own_frame() -> None:
+    for header in ("", "<02>"):
+        framing = Framing(header=header, terminator="<03>", sum_check=True)
+        good = FrameCodec(framing).encode(b"AB")
+        damaged = good[:-1] + bytes([good[-1] ^ 1])
+        found = FrameReader(framing).feed(damaged + good)
+        assert [type(item) for item in found] == [Garbled, bytes]
+        assert found[1] == b"AB"
+
+
+def test_a_false_frame_whose_sum_would_be_the_next_header_does_not_take_it() -> None:
+    framing = Framing(header="<02>", terminator="<03>", sum_check=True)
+    good = FrameCodec(framing).encode(b"AB")
+    assert frames(FrameReader(framing).feed(b"\x02\x03" + good)) == [b"AB"]
+
+
+def test_hex_digits_may_be_small_letters_for_they_mean_nothing_else() -> None:
+    framing = Framing(header="<02>", terminator="<03>", sum_check=True, conversion=True)
+    sent = FrameCodec(framing).encode(b"\xab\xcd\xef")
+    assert sent[1:-3] == b"ABCDEF"
+    line = sent[1:-2].lower()
+    assert FrameCodec(framing).feed(b"\x02" + line + b"%02x" % (sum(line) % 256)) == [
+        b"\xab\xcd\xef"
+    ]
+    other = Framing(header="<02>", terminator="<03>", sum_check=True)
+    sum_of_letters = FrameCodec(other).encode(b"xyz")
+    assert sum_of_letters != sum_of_letters.lower()
+    assert FrameCodec(other).feed(sum_of_letters.lower()) == [b"xyz"]
+
+
+def test_half_a_converted_byte_is_error_3() -> None:
+    with pytest.raises(Garbled, match="error 3"):
+        FrameCodec(Framing(terminator="<03>", conversion=True)).feed(b"ABC\x03")

@@ -99,6 +99,31 @@ async def test_a_value_that_does_not_fit_is_refused_before_anything_is_sent(name
     talk.done()
 
 
+async def test_a_text_that_its_framing_cannot_carry_is_refused_before_anything_is_sent() -> None:
+    one = Frames(
+        framing=Framing(terminator="**"),
+        write={"text": Write(send="PRINT {value}", value=Field(type="text"))},
+    )
+    told: list[bytes] = []
+
+    class Telling:
+        async def tell(self, frame: bytes) -> None:
+            told.append(frame)
+
+    with pytest.raises(BadValue):
+        await one.tell(Telling(), "text", "A**RESET")  # type: ignore[arg-type]  # it tells only
+    assert told == []
+
+
+def test_only_the_whole_reply_is_an_acknowledgement() -> None:
+    write = Write(send="S{value}", value=Field(type="integer"), match="OK")
+    assert write.answers(b"OK") is True
+    assert write.answers(b"OKAY?") is None
+    assert write.answers(b"NOT OK") is None
+    weight = {"weight": Field(type="decimal")}
+    assert Ask(send="W", match="(?P<weight>[0-9.]{4})", fields=weight).answers(b"12.50") is None
+
+
 def test_the_k120s_weighing_machine_is_answered_ack_station_ok_eot() -> None:
     one = device("weighing")
     (frame,) = one.codec().feed(BY_ID["noproto-k120s-001"].frame)

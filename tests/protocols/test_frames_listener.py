@@ -86,6 +86,26 @@ def test_a_scale_that_was_never_heard_is_stale_too() -> None:
     assert listener.tick(now=102.0) == [Stale(frozenset({"weight", "state", "unit"}))]
 
 
+def test_a_value_heard_by_a_frame_that_is_never_stale_stays_known() -> None:
+    weight = {"weight": Field(type="decimal")}
+    one = Frames(
+        framing=Framing(ending="CR LF"),
+        listen={
+            "streamed": Listen(match="ST,(?P<weight>.{9}).*", fields=weight, stale_after=2.0),
+            "printed": Listen(match="P(?P<weight>.*)", fields=weight),
+        },
+    )
+    listener = Listener(one, now=0.0)
+    listener.received(STABLE, now=1.0)
+    listener.received(b"P12.5\r\n", now=2.0)
+    assert listener.due is None
+
+
+def test_damage_upon_damage_is_told_once() -> None:
+    said = Listener(device("scale"), now=0.0).received(OVERLOAD * 1000, now=1.0)
+    assert [type(item) for item in said] == [Garbled]
+
+
 def test_damage_does_not_keep_a_value_alive() -> None:
     listener = Listener(device("scale"), now=0.0)
     listener.received(STABLE, now=1.0)

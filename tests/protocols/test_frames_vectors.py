@@ -219,6 +219,13 @@ def test_k120s_saves_the_whole_frame_its_end_byte_included(vector: Vector) -> No
             assert from_words(words, len(vector.frame), high_first=high_first) == vector.frame
 
 
+def test_k120s_counts_the_end_byte_into_its_255() -> None:
+    codec = FrameCodec(Framing(preset="k120s-drcv", terminator="<03>"))
+    assert codec.feed(b"A" * 254 + b"\x03") == [b"A" * 254 + b"\x03"]
+    with pytest.raises(Garbled, match="error 10"):
+        codec.feed(b"A" * 255 + b"\x03")
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [

@@ -252,3 +252,12 @@ def test_any_request_is_answered_or_refused(pdu: bytes, dialect: Any) -> None:
         frame = codec.feed(answer)[0]
         assert frame.transaction == 77
         assert frame.pdu[0] & 0x7F == pdu[0]
+
+
+@pytest.mark.parametrize("kind", [ModbusAscii, ModbusTcp])
+def test_where_frames_have_a_beginning_a_pause_inside_one_does_no_harm(kind: type) -> None:
+    framing: Any = FRAMINGS[kind]
+    station = ModbusStation(framing=framing)
+    request = kind(station=1).codec().encode(Frame(1, bytes.fromhex("0300000001")))
+    assert station.hear(request[:5], 0.0) == []
+    assert len(station.hear(request[5:], 0.9)) == 1

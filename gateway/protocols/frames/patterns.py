@@ -127,8 +127,6 @@ def _ways(node: _Node, follow: frozenset[int], longest: int) -> int:
 def _repeat_ways(node: _Repeat, follow: frozenset[int], longest: int) -> int:
     again = _first(node.part)
     inner = _ways(node.part, follow | again if node.most > 1 else follow, longest)
-    if _empty(node.part) and node.most > 1:
-        inner += 1
     total = 1
     for _ in range(node.most if inner > 1 else 0):
         total = _capped(total * inner)

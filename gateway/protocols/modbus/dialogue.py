@@ -115,15 +115,15 @@ class Dialogue:
         place = self._place(span)
         if place is None or self.cost(span) is None:
             raise BadValue(f"{span} cannot be read in one exchange")
-        count = span.size * place.registers
-        request = pdu.read_request(place.function, place.at(span.start), count)
+        registers = span.size * place.registers
+        request = pdu.read_request(place.function, place.at(span.start), registers)
         length = answer_length(request)
         if _is_bits(place):
-            units = pdu.bits_in(count)
+            units = pdu.bits_in(registers)
         elif place.area.unit is Unit.DWORD:
             units = pdu.dwords_in(span.size, low_first=self.low_first)
         else:
-            units = pdu.words_in(count)
+            units = pdu.words_in(registers)
         head = bytes((place.function, length - 2))
         question = Question(request, head, length, self.chars(length), units)
         if len(self._questions) >= _REMEMBERED:

@@ -1,0 +1,177 @@
+"""How a gateway ends, and how the next one begins: signals, kill -9, ports that are taken."""
+
+import asyncio
+import signal
+import time
+from collections.abc import Iterator
+from datetime import datetime
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+
+from tests.e2e.processes import (
+    Program,
+    gateway,
+    plc_gateway,
+    started,
+    station,
+    until,
+    vigor_line,
+    write_config,
+)
+from tests.zenoh_peer import ZenohPeer, free_endpoint
+
+WITHIN = 2.0  # s: the contract's promise for SIGTERM and Ctrl-C
+
+
+class Plant(NamedTuple):
+    config: Path
+    endpoint: str
+    plc: Program
+
+
+def _plant(folder: Path, tags: dict[str, Any], **device: Any) -> Iterator[Plant]:
+    endpoint, tty = free_endpoint(), str(folder / "tty")
+    config = write_config(
+        folder / "config.yaml", endpoint, {"hall": vigor_line(tty, tags, **device)}
+    )
+    with station("pty", tty) as plc:
+        plc.tell("count 1 D 10")
+        yield Plant(config, endpoint, plc)
+
+
+@pytest.fixture
+def plant(tmp_path: Path) -> Iterator[Plant]:
+    tags = {
+        "speed": {"address": "D10", "publish": "always"},
+        "recipe": {"address": "D500", "write": True},
+    }
+    yield from _plant(tmp_path, tags)
+
+
+@pytest.fixture
+def busy_plant(tmp_path: Path) -> Iterator[Plant]:
+    """Asked for far more than 19200 baud carry: the wire is never quiet."""
+    tags = {f"d{i}": {"address": f"D{100 * i}", "every": "50ms"} for i in range(20)}
+    tags["speed"] = {"address": "D10", "every": "50ms", "publish": "always"}
+    tags |= {f"w{i}": {"address": f"D{3000 + i}", "write": True} for i in range(20)}
+    yield from _plant(tmp_path, tags)
+
+
+@pytest.mark.parametrize("by", [signal.SIGTERM, signal.SIGINT])
+async def test_it_ends_in_time_under_load(busy_plant: Plant, by: signal.Signals) -> None:
+    with started(busy_plant.config) as gateway:
+        async with ZenohPeer("client", connect=[busy_plant.endpoint]) as client:
+            alive = await client.liveliness("plant/**")
+            heard = await client.subscribe("plant/**")
+            await heard.next(lambda s: s.key == "plant/mixer/speed" and s.json["value"] is not None)
+            writing = asyncio.create_task(
+                client.many([(f"plant/mixer/w{i}/@set", b"%d" % (i + 1)) for i in range(20)])
+            )
+            await heard.next(lambda s: s.key == "plant/mixer/w0" and s.json["value"] == 1)
+            seen = len(heard.samples)
+
+            told, wall = time.monotonic(), time.time()
+            code = await asyncio.to_thread(gateway.end, by)
+            took = time.monotonic() - told
+            assert code == 0
+            assert took < WITHIN
+            assert not gateway.has_said("Traceback")
+
+            # Every write was answered, and nobody was told anything untrue.
+            for i, replies in enumerate(await writing):
+                [reply] = replies
+                held = int(busy_plant.plc.tell(f"get 1 D {3000 + i}"))
+                if reply.ok:
+                    assert held == i + 1
+                elif reply.json["error"] != "unclear":
+                    assert held == 0
+            # What the last exchanges said went out; the tokens went with the gateway.
+            await alive.until(lambda a: all(t.kind == "DELETE" for t in a.latest().values()))
+            last = [s for s in heard.samples if s.key == "plant/mixer/speed"][-1]
+            assert len(heard.samples) >= seen
+            assert wall - _time(last.json) < 1.0
+
+
+async def test_a_write_in_flight_gets_an_answer(tmp_path: Path) -> None:
+    tags = {"recipe": {"address": "D500", "write": True, "every": "1h"}}
+    for plant in _plant(tmp_path, tags, reply_timeout="5s"):
+        with started(plant.config) as gateway:
+            gateway.says("device answers")
+            plant.plc.tell("delay 1 4")
+            async with ZenohPeer("client", connect=[plant.endpoint]) as client:
+                writing = asyncio.create_task(client.get("plant/mixer/recipe/@set", b"7"))
+                behind = asyncio.create_task(client.get("plant/mixer/recipe/@set", b"8"))
+                await asyncio.to_thread(
+                    until, lambda: plant.plc.tell("get 1 D 500") != "0", "the PLC obeys"
+                )
+                told = time.monotonic()
+                assert await asyncio.to_thread(gateway.end) == 0
+                assert time.monotonic() - told < WITHIN
+                answers = [reply.json for replies in (await writing, await behind) for reply in replies]
+                assert len(answers) == 2
+                held = plant.plc.tell("get 1 D 500")
+                mine, other = answers if held == "7" else answers[::-1]
+                assert mine["error"] == "unclear"
+                assert other["error"] in ("line-down", "unclear")
+
+
+async def test_after_kill_9_the_next_one_starts_at_once(plant: Plant) -> None:
+    with started(plant.config) as first:
+        first.says("device answers")
+        assert first.end(signal.SIGKILL) == -signal.SIGKILL
+    with started(plant.config) as second:
+        second.says("device answers")
+        async with ZenohPeer("client", connect=[plant.endpoint]) as client:
+            [reply] = await client.get("plant/mixer/recipe/@set", b"7")
+            assert reply.ok
+        assert not second.has_said("line down")
+        second.end()
+    with started(plant.config) as third:
+        third.says("device answers")
+        assert not third.has_said("line down")
+
+
+async def test_a_second_gateway_at_the_same_port_says_so_and_waits(
+    plant: Plant, tmp_path: Path
+) -> None:
+    endpoint = free_endpoint()
+    tty = str(tmp_path / "tty")
+    tags = {"speed": {"address": "D10"}}
+    other = write_config(tmp_path / "other.yaml", endpoint, {"hall": vigor_line(tty, tags)})
+    with started(plant.config) as first:
+        first.says("device answers")
+        with gateway("run", other) as second:
+            why = second.says("line down")
+            assert f"{tty}: in use by another program" in why
+            second.says("on Zenoh")
+            async with ZenohPeer("client", connect=[endpoint]) as client:
+                heard = await client.subscribe("plant/**")
+                [value] = await client.get("plant/mixer/speed")
+                assert (value.json["value"], value.json["reason"]) == (None, "line-down")
+                [line] = await client.get("plant/@gateway/demo/lines/hall")
+                assert "in use by another program" in line.json["trouble"]
+                assert not first.has_said("line down")
+
+                direct = plc_gateway("read", plant.config, "mixer/speed", "--direct")
+                assert direct.code == 1
+                assert "in use by another program" in direct.err + direct.out
+
+                first.end()
+                await heard.next(lambda s: s.json["quality"] == "good")
+
+
+def test_a_zenoh_port_in_use_is_said_in_one_line(plant: Plant, tmp_path: Path) -> None:
+    lines = {"hall": vigor_line("simulator", {"speed": {"address": "D10"}})}
+    other = write_config(tmp_path / "other.yaml", plant.endpoint, lines)
+    with started(plant.config):
+        done = plc_gateway("run", other)
+    assert done.code == 1
+    said = [line for line in done.err.splitlines() if "Zenoh" in line]
+    assert len(said) == 1
+    assert plant.endpoint.removeprefix("tcp/") in said[0]
+
+
+def _time(document: Any) -> float:
+    return datetime.fromisoformat(document["time"]).timestamp()

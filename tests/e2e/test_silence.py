@@ -1,0 +1,123 @@
+"""A station that falls silent and comes back, as Zenoh clients in another process see it.
+
+The configuration says `every: 1s` and `reply_timeout: 200ms`, and leaves `retries` (2) and
+`late_guard` (as long as the reply time-out) as they are.
+"""
+
+from collections.abc import Iterator
+from datetime import datetime
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+
+from tests.e2e.processes import Program, started, station, write_config
+from tests.zenoh_peer import Heard, ZenohPeer, free_endpoint
+
+EVERY = 1.0
+SLACK = 0.15  # s: two processes share a machine with everything else
+
+
+class Plant(NamedTuple):
+    endpoint: str
+    plc: Program
+    gateway: Program
+
+
+@pytest.fixture
+def plant(tmp_path: Path) -> Iterator[Plant]:
+    """Two PLCs on one line."""
+    tags = {"speed": {"address": "D10"}, "fault": {"address": "M5"}}
+    devices: dict[str, Any] = {
+        name: {"protocol": "vigor", "station": number, "reply_timeout": "200ms", "tags": tags}
+        for name, number in (("mixer", 1), ("oven", 2))
+    }
+    devices["mixer"]["tags"] = {**tags, "recipe": {"address": "D500", "write": True}}
+    tty = tmp_path / "tty"
+    line = {"port": str(tty), "baudrate": 19200, "format": "7E1", "devices": devices}
+    endpoint = free_endpoint()
+    config = write_config(
+        tmp_path / "config.yaml",
+        endpoint,
+        {"hall": line},
+        defaults={"every": "1s", "publish": "always"},
+    )
+    with station("pty", str(tty), stations=(1, 2)) as plc:
+        plc.tell("count 1 D 10")
+        plc.tell("count 2 D 10")
+        with started(config) as gateway:
+            yield Plant(endpoint, plc, gateway)
+
+
+async def test_quality_goes_bad_within_two_intervals_and_good_again(plant: Plant) -> None:
+    async with ZenohPeer("client", connect=[plant.endpoint]) as client:
+        alive = await client.liveliness("plant/*")
+        heard = await client.subscribe("plant/**")
+        await alive.until(lambda a: {"plant/mixer", "plant/oven"} <= a.latest().keys())
+        await heard.next(lambda s: s.key == "plant/mixer/speed" and _good(s))
+
+        plant.plc.tell("mute 1")
+        bad = await heard.next(lambda s: s.key == "plant/mixer/speed" and not _good(s))
+        assert bad.json["value"] is None
+        assert bad.json["reason"] == "no-reply"
+        last_good = [s for s in heard.samples if s.key == bad.key and _good(s)][-1]
+        assert _time(bad) - _time(last_good) <= 2 * EVERY + SLACK
+        await heard.next(lambda s: s.key == "plant/mixer/fault" and not _good(s))
+        gone = await alive.next(lambda t: t.kind == "DELETE")
+        assert gone.key == "plant/mixer"
+
+        # Its neighbour goes on, in time: at most one poll of it was held up by the silence.
+        oven = [_time(s) for s in heard.samples if s.key == "plant/oven/speed"]
+        assert all(_good(s) for s in heard.samples if s.key.startswith("plant/oven/"))
+        assert max(b - a for a, b in zip(oven, oven[1:], strict=False)) < 2 * EVERY
+
+        [state] = await client.get("plant/mixer/speed")
+        assert state.json["quality"] == "bad"
+        [refused] = await client.get("plant/mixer/recipe/@set", b"7")
+        assert not refused.ok
+        assert refused.json["error"] == "no-reply"
+        assert plant.plc.tell("get 1 D 500") == "0"
+
+        heard.forget()
+        alive.forget()
+        plant.plc.tell("speak 1")
+        back = await heard.next(lambda s: s.key == "plant/mixer/speed" and _good(s))
+        assert back.json["value"] > last_good.json["value"]
+        await heard.next(lambda s: s.key == "plant/mixer/fault" and _good(s))
+        came = await alive.next(lambda t: t.kind == "PUT")
+        assert came.key == "plant/mixer"
+        assert await client.tokens("plant/*") == ["plant/mixer", "plant/oven"]
+        [device] = await client.get("plant/@gateway/demo/devices/mixer")
+        assert device.json["failures"]["silence"] >= 3
+
+
+async def test_a_write_whose_answer_is_lost_is_unclear(plant: Plant) -> None:
+    """A mute station obeys: whoever says it was not done, or that it was, is guessing."""
+    async with ZenohPeer("client", connect=[plant.endpoint]) as client:
+        [good] = await client.get("plant/mixer/recipe/@set", b"3")
+        assert good.ok
+        plant.plc.tell("mute 1")
+        [reply] = await client.get("plant/mixer/recipe/@set", b"7")
+        assert not reply.ok
+        assert reply.json["error"] in ("unclear", "no-reply")
+        done = plant.plc.tell("get 1 D 500") == "7"
+        assert reply.json["error"] == "unclear" or not done
+
+
+async def test_the_gateways_own_token_goes_with_it(plant: Plant) -> None:
+    async with ZenohPeer("router", listen=[endpoint := free_endpoint()], connect=[plant.endpoint]):
+        async with ZenohPeer("client", connect=[endpoint]) as client:
+            alive = await client.liveliness("plant/@gateway/*")
+            came = await alive.next(lambda t: t.kind == "PUT")
+            assert came.key == "plant/@gateway/demo"
+            plant.gateway.end()
+            gone = await alive.next(lambda t: t.kind == "DELETE")
+            assert gone.key == "plant/@gateway/demo"
+
+
+def _good(sample: Heard) -> bool:
+    return bool(sample.json["quality"] == "good")
+
+
+def _time(sample: Heard) -> float:
+    return datetime.fromisoformat(sample.json["time"]).timestamp()
