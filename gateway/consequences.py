@@ -81,6 +81,8 @@ class Consequences:
                 f"it took {total:.2f} s, reply_timeout is {device.timing.reply_timeout:g} s",
                 evidence=Evidence.SLOW,
             )
+        if before is not Standing.SILENT:
+            self.schedule.failed(_now(), took)
         unknown = before in (Standing.STARTING, Standing.SILENT)
         if not unknown and device.failures <= device.timing.retries:
             return

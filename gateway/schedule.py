@@ -68,8 +68,8 @@ class Schedule:
     over all devices. What somebody wants to see now goes before other polls, but not twice in
     a row while one is due. A late poll is done once, not once per missed period. A device in
     doubt is probed before anything else is asked of it or written to it. A device that was not
-    heard yet is probed at once; while polls of others are due, such probes get half of the
-    wire's time. A silent device is left alone but for probes at growing pauses, and all silent
+    heard yet is probed at once. While polls of others are due, such probes and those of devices
+    that have just failed get half of the wire's time. A silent device is left alone but for probes at growing pauses, and all silent
     devices together get at most a twentieth of the wire's time while others are there to be
     served.
     """
@@ -85,7 +85,7 @@ class Schedule:
         self._writes: deque[Write] = deque()
         self._wrote = False
         self._hurried = False
-        self._starting_lane = now  # when the next device not heard yet may be probed
+        self._failed_lane = now  # when, with polls of others due, the next may fail
         self._silent_lane = now  # when the next silent one may
         for device in devices:
             self.plan(device, now)
@@ -168,8 +168,11 @@ class Schedule:
         hurry = bool(self._urgent) and not (self._hurried and self._ready)
         poll = self._urgent[0] if hurry else self._ready[0][2]
         if poll.device.doubtful:
-            return Probe(poll.device)
-        if hurry:
+            other = self._undoubted() if now < self._failed_lane else None
+            if other is None:
+                return Probe(poll.device)
+            poll = other  # its place in the heap is void with its ticket
+        elif hurry:
             self._urgent.popleft()
         else:
             heapq.heappop(self._ready)
@@ -179,12 +182,24 @@ class Schedule:
         poll.asked = now
         return poll
 
+    def _undoubted(self) -> Poll | None:
+        """Of the polls that are due and of no device in doubt the one with the earliest deadline."""
+        return min(
+            (
+                poll
+                for _, ticket, poll in self._ready
+                if poll.ticket == ticket and poll.live and not poll.device.doubtful
+            ),
+            key=lambda poll: poll.deadline,
+            default=None,
+        )
+
     def _strangers(self, now: float) -> Iterator[tuple[Device, float]]:
         """The next device to be probed of those not heard yet and of the silent: from when on."""
         silent: Device | None = None
         for device in self.devices:
             if device.standing is Standing.STARTING and not device.broadcast:
-                yield device, self._starting_lane
+                yield device, self._failed_lane
                 break
         for device in self.devices:
             if device.standing is Standing.SILENT and (
@@ -220,10 +235,12 @@ class Schedule:
         """The waiting writes nobody waits for any longer; they are forgotten here."""
         return self._take_writes(lambda write: write.expires <= now) if self._writes else []
 
+    def failed(self, now: float, took: float) -> None:
+        """A conversation with a device not silent yet ended unclear after `took` seconds."""
+        self._failed_lane = now + took
+
     def silent(self, device: Device, now: float, took: float) -> None:
         """A probe or the last retry failed after `took` seconds on the wire."""
-        if device.standing is Standing.STARTING:
-            self._starting_lane = now + took
         device.pause = min(max(2 * device.pause, PAUSE_FIRST), PAUSE_LONGEST)
         device.standing = Standing.SILENT
         device.next_probe = now + device.pause * self._random.uniform(0.9, 1.1)
@@ -240,7 +257,7 @@ class Schedule:
 
     def opened(self, now: float) -> None:
         """The line has been opened: every device is to be heard anew."""
-        self._starting_lane = self._silent_lane = now
+        self._failed_lane = self._silent_lane = now
         self._wrote = self._hurried = False
 
     def _take_writes(self, which: Callable[[Write], bool]) -> list[Write]:

@@ -1,10 +1,12 @@
 """The gateway on Zenoh, seen by other processes: values, questions, writes, signs of life."""
 
 import asyncio
+import itertools
 import json
 import os
 import signal
 import sys
+import threading
 import time
 from collections.abc import AsyncIterator, Iterable, Mapping, Sequence
 from contextlib import asynccontextmanager
@@ -23,8 +25,10 @@ from gateway.errors import (
     NoReply,
     Refused,
 )
+from gateway.keys import Keys
 from gateway.northbound import Mode, Northbound, ZenohSettings
 from gateway.northbound.inbox import LIMIT, Inbox
+from gateway.northbound.publisher import EVENTS_LIMIT, Publisher
 from gateway.northbound.session import configure
 from gateway.northbound.writes import AT_ONCE
 from gateway.protocols.driver import Address, Span, Unit
@@ -186,19 +190,63 @@ async def test_values_leave_in_the_order_of_their_stamps() -> None:
         assert counters["superseded"] + len(heard.samples) in range(600, 605)
 
 
-async def test_a_slow_network_costs_old_values_and_never_the_newest() -> None:
+class StuckSession:
+    """As much of a session as the publisher uses; its first put hangs until `go` is set."""
+
+    def __init__(self) -> None:
+        self.go = threading.Event()
+        self.hangs = threading.Event()
+        self.puts: list[tuple[int, str, Any]] = []
+        self._clock = itertools.count()
+
+    def new_timestamp(self) -> int:
+        return next(self._clock)
+
+    def put(self, key: str, data: bytes, *, timestamp: int, **_how: object) -> None:
+        self.hangs.set()
+        assert self.go.wait(5)
+        self.puts.append((timestamp, key, json.loads(data)["value"]))
+
+
+async def test_a_stuck_network_costs_old_values_never_the_newest_nor_the_order() -> None:
     plant = mixer()
-    northbound = Northbound(ZenohSettings(), "demo", plant)
-    serves = asyncio.create_task(northbound.run())
-    await northbound.opened.wait()
-    # No turn of the loop in between and hardly one of the thread: the map holds one per tag.
-    for value in range(20_000):
-        northbound.publish([plant.now("mixer/speed", value)])
-    counters = northbound.counters()
-    assert counters["superseded"] > 0
-    assert counters["superseded"] + counters["published"] <= 20_010
-    serves.cancel()
-    await asyncio.wait([serves])
+    session: Any = StuckSession()
+    publisher = Publisher(Keys("plant", "demo"))
+    publisher.start(session)
+    publisher.values([plant.now("mixer/speed", 0)])
+    await asyncio.to_thread(session.hangs.wait, 5)
+    publisher.values([plant.now("mixer/speed", 1), plant.now("mixer/recipe", 10)])
+    publisher.events([plant.now("oven/temperature", value) for value in (100, 101)])
+    for value in range(2, 20_000):
+        publisher.values([plant.now("mixer/speed", value)])
+    session.go.set()
+    await asyncio.to_thread(publisher.stop, 5)
+    speed, recipe, oven = "plant/mixer/speed", "plant/mixer/recipe", "plant/oven/temperature"
+    assert [(key, value) for _, key, value in session.puts] == [
+        (speed, 0),
+        (recipe, 10),
+        (oven, 100),
+        (oven, 101),
+        (speed, 19_999),
+    ]
+    assert session.puts == sorted(session.puts)  # by their stamps
+    assert publisher.counters.superseded == 19_998
+    assert publisher.counters.published == 5
+
+
+async def test_events_beyond_the_limit_are_dropped_and_counted() -> None:
+    plant = mixer()
+    session: Any = StuckSession()
+    publisher = Publisher(Keys("plant", "demo"))
+    publisher.events([plant.now("mixer/speed", 0)])  # no session yet
+    publisher.start(session)
+    publisher.values([plant.now("mixer/recipe", 0)])
+    await asyncio.to_thread(session.hangs.wait, 5)
+    publisher.events(plant.now("mixer/speed", value) for value in range(EVENTS_LIMIT + 5))
+    session.go.set()
+    await asyncio.to_thread(publisher.stop, 5)
+    assert publisher.counters.dropped == 6
+    assert [value for *_, value in session.puts] == [0, *range(EVENTS_LIMIT)]
 
 
 async def test_events_all_arrive_in_order() -> None:
@@ -467,9 +515,10 @@ async def test_a_put_writes_too_and_its_outcome_is_told() -> None:
 
 async def test_a_message_of_many_megabytes_ends_unheard_and_the_link_lives() -> None:
     plant = mixer()
-    async with together(plant) as (_, client):
+    async with together(plant) as (northbound, client):
         [reply] = await client.get("plant/mixer/recipe/@set", b"7" * 20_000_000, timeout=1)
         assert not reply.ok
+        assert northbound.counters()["queries"] == 0  # it was never put together here
         [reply] = await client.get("plant/mixer/recipe/@set", b"7")
         assert reply.ok
         assert plant.written == [("mixer/recipe", 7)]

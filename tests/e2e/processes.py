@@ -49,7 +49,6 @@ class Program:
         self.lines: list[str] = []
         self.errors: list[str] = []
         self._name = " ".join(map(str, command))[-100:]
-        self._passed = 0  # lines that `says` has gone past
         self._news = threading.Condition()
         self._process = subprocess.Popen(
             [str(part) for part in command],
@@ -75,7 +74,7 @@ class Program:
             self._process.kill()
         self._finish()
         print(f"--- {self._name} ended with {self._process.returncode}, having said:")
-        print("\n".join([*self.lines, *self.errors]))
+        print("\n".join(line for line in [*self.lines, *self.errors] if line[:3] != "ok "))
 
     @property
     def pid(self) -> int:
@@ -86,14 +85,16 @@ class Program:
         return self._process.poll() is None
 
     def says(self, *words: str, timeout: float = PATIENCE) -> str:
-        """Waits for the next line that holds all the words; lines before it are passed over."""
+        """Waits for a line that holds all the words, and returns the first."""
+        return self._wait(words, 0, timeout)
+
+    def _wait(self, words: tuple[str, ...], first: int, timeout: float = PATIENCE) -> str:
         until = time.monotonic() + timeout
         with self._news:
             while True:
-                for number in range(self._passed, len(self.lines)):
-                    if all(word in self.lines[number] for word in words):
-                        self._passed = number + 1
-                        return self.lines[number]
+                for line in self.lines[first:]:
+                    if all(word in line for word in words):
+                        return line
                 left = until - time.monotonic()
                 ended = not any(reader.is_alive() for reader in self._readers)
                 if left <= 0 or ended or not self._news.wait(left):
@@ -104,11 +105,12 @@ class Program:
         return any(all(word in line for word in words) for line in self.lines)
 
     def tell(self, command: str) -> str:
-        """One line to its standard input; returns the line `ok …` it answers with."""
+        """One line to its standard input; returns what it answers after `ok`."""
+        first = len(self.lines)
         assert self._process.stdin is not None
         self._process.stdin.write(command + "\n")
         self._process.stdin.flush()
-        return self.says("ok").removeprefix("ok").strip()
+        return self._wait(("ok",), first).removeprefix("ok").strip()
 
     def end(self, by: signal.Signals = signal.SIGTERM, within: float = PATIENCE) -> int:
         """Send a signal and wait; the exit code, negative where the signal itself ended it."""

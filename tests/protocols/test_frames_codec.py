@@ -213,9 +213,11 @@ def test_a_gap_inside_a_frame_says_what_is_missing(heard: bytes, message: str) -
 
 def test_a_good_frame_is_handed_out_before_the_damage_behind_it() -> None:
     codec = FrameCodec(Framing(header="<02>", terminator="<03>", max_length=4))
-    assert codec.feed(b"\x02AB\x03\x02ABCDE\x02AB\x03") == [b"AB"]
-    with pytest.raises(Garbled, match="error 10"):
-        codec.feed(b"")
+    assert codec.feed(b"\x02AB\x03\x02ABCDE\x02AB\x03\x02CDEFGH") == [b"AB"]
+    for heard in (b"", b"\x02CDEFGH"):
+        with pytest.raises(Garbled, match="error 10") as caught:
+            codec.feed(heard)
+        assert caught.value.data.startswith(b"\x02ABCDE")  # the first damage is told, and kept
 
 
 NOISY = {

@@ -74,6 +74,7 @@ class Unruly:
     delay: float = 0.0  # what the simulated wire adds to the turnaround
     lose: float = 0.0  # share of replies that are lost
     cut: float = 0.0  # share of replies that break off
+    wire: Wire = WIRE
     heard: list[tuple[float, bytes]] = field(default_factory=list)  # its requests
     lost: int = 0
 
@@ -105,7 +106,7 @@ class Unruly:
         if self._random.random() < self.cut:
             replies = [reply[: self._random.randrange(1, len(reply))] for reply in replies]
         self.delay = max(self.late(self._random), self._until - now)
-        length = sum(map(len, replies)) * WIRE.character
+        length = sum(map(len, replies)) * self.wire.character
         self._until = now + self.delay + length + TURNAROUND
         return replies
 
@@ -279,7 +280,10 @@ def device(
 
 def plant(devices: Sequence[Device], *, wire: Wire = WIRE, seed: int = 0, **bench: Any) -> Plant:
     """A station for every device; its knobs and the bench's can be turned at any time."""
-    stations = [Unruly(VigorStation(d.driver.station), seed * 1000 + i) for i, d in enumerate(devices)]
+    stations = [
+        Unruly(VigorStation(d.driver.station), seed * 1000 + i, wire=wire)
+        for i, d in enumerate(devices)
+    ]
     return Plant(list(devices), stations, Bench(seed=seed, **bench), wire)
 
 
