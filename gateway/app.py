@@ -46,6 +46,18 @@ def opener(line: LineConfig) -> Callable[[Ear], Awaitable[Port]]:
     return lambda ear: open_port(line.port, line.serial, ear)
 
 
+def forecasts(config: Config) -> list[LineForecast]:
+    """What the file will do to each line."""
+    return [
+        forecast(
+            line.name,
+            [device_of(device, line) for device in line.devices if device.enabled],
+            line.wire,
+        )
+        for line in config.lines
+    ]
+
+
 class Gateway:
     """Everything below Zenoh: the lines, and what is known of every tag."""
 

@@ -4,31 +4,33 @@ import asyncio
 import json
 import logging
 import sys
-import threading
-import time
-from collections.abc import Callable
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from typing import Annotated, NoReturn
 
 import structlog
 import typer
-import zenoh
 from rich.console import Console
-from rich.live import Live
 
 from gateway import __version__, app, direct, show, simulate
-from gateway.client import Client, Shown, connected, parse_value
+from gateway.client import NOTHING, Shown, connected, matches, parse_value, wanted_keys
 from gateway.config import Config, load
 from gateway.config import schema as config_schema
 from gateway.errors import BadValue, ConfigError, GatewayError
-from gateway.forecast import LineForecast, forecast
+from gateway.keys import max_age as age_of
+from gateway.payload import Problem
 from gateway.tags import Tag
+from gateway.values import Kind
 
 USER_MISTAKE, FAILED = 2, 1
-out = Console(highlight=False, width=None if sys.stdout.isatty() else 200)
-err = Console(stderr=True, highlight=False, soft_wrap=True)
+_MISTAKES = {Problem.BAD_VALUE, Problem.NOT_WRITABLE, Problem.UNKNOWN_TAG}
+# What is printed is text, whatever brackets and colons a tag has in its value.
+out = Console(
+    highlight=False, markup=False, emoji=False, width=None if sys.stdout.isatty() else 200
+)
+err = Console(stderr=True, highlight=False, markup=False, emoji=False, soft_wrap=True)
 cli = typer.Typer(
     name="plc-gateway",
     help="PLCs on serial lines <-> Eclipse Zenoh: polls, mirrors, writes back.",
@@ -65,9 +67,7 @@ def main() -> None:
     """The console command. Exit codes: 0 good, 1 it failed, 2 the user's mistake."""
     try:
         cli()
-    except ConfigError as error:
-        _end(str(error), USER_MISTAKE)
-    except BadValue as error:
+    except (ConfigError, BadValue) as error:
         _end(str(error), USER_MISTAKE)
     except GatewayError as error:
         _end(str(error), FAILED)
@@ -87,7 +87,7 @@ def run(
     """The service: poll, mirror onto Zenoh, take writes. SIGTERM or Ctrl-C ends it."""
     loaded = load(config)
     _log(log_format, log_level)
-    asyncio.run(app.run(loaded, lambda: err.print(show.next_steps(loaded, str(config)))))
+    asyncio.run(app.run(loaded, lambda: err.print(show.next_steps(loaded, config, show.typed()))))
 
 
 @cli.command()
@@ -100,7 +100,7 @@ def check(
 ) -> None:
     """Validate the file and print what it will do to each line. Sends nothing."""
     loaded = load(config)
-    lines = _forecasts(loaded)
+    lines = app.forecasts(loaded)
     few = sum(len(line.blocks) for line in lines) <= 100
     out.print(show.plan(lines, every_block=few if blocks is None else blocks))
     for tag in _tags(loaded).values():
@@ -112,7 +112,7 @@ def check(
     for line in lines:
         if line.overloaded:
             err.print(f"warning: {line.advice()}")
-    out.print(f"{config}: good, {len(_tags(loaded))} tags on {len(lines)} lines")
+    print(f"{config}: good, {len(_tags(loaded))} tags on {len(lines)} lines")
 
 
 @cli.command()
@@ -127,16 +127,21 @@ def read(
 ) -> None:
     """The current values, through the running gateway or --direct from the PLC."""
     loaded = load(config)
-    wanted = _wanted(loaded, tags)
+    wanted = wanted_keys(loaded, tags)
+    if max_age is not None:
+        age_of(max_age)  # wrong: said at once, without a gateway
     if without_gateway:
         _log(LogFormat.TEXT, LogLevel.ERROR)
-        chosen = [tag for tag in _tags(loaded).values() if _matches(tag.key, wanted)]
-        found = [show.shown(s) for s in asyncio.run(direct.read(loaded, chosen))]
+        chosen = [tag for tag in _tags(loaded).values() if matches(tag.key, wanted)]
+        samples = asyncio.run(direct.read(loaded, chosen))
+        found = [show.shown(sample) for sample in samples]
+        for trouble in dict.fromkeys(f"{s.tag.device}: {s.detail}" for s in samples if s.detail):
+            err.print(trouble)
     else:
         with connected(loaded) as client:
             found = [row for want in wanted for row in client.values(want, max_age)]
             if not found:
-                raise GatewayError("nothing was answered: is the gateway of this file running?")
+                raise GatewayError(NOTHING)
     _print(found, _tags(loaded), as_json=as_json)
     if not all(show.is_good(row) for row in found):
         sys.exit(FAILED)
@@ -157,36 +162,40 @@ def write(
         raise ConfigError(f"there is no tag {tag} in {config}")
     if known.write is None:
         raise ConfigError(f"{tag} cannot be written: it has no `write: true` in {config}")
-    text = parse_value(value)
-    if known.layout.type.kind == "string":
-        text = value
+    wanted = parse_value(value)
+    if known.layout.type.kind is Kind.STRING and not isinstance(wanted, str):
+        wanted = value  # 12 is a text here
+    try:
+        known.encode(wanted)
+    except BadValue as error:
+        raise BadValue(f"{tag}: {error}") from None
     if without_gateway:
         _log(LogFormat.TEXT, LogLevel.ERROR)
-        answer: dict[str, object] = asyncio.run(direct.write(loaded, known, text))._asdict()
+        answer = direct.told(loaded, known, wanted)
     else:
-        known.encode(text)
         with connected(loaded) as client:
-            answer = client.write(tag, text)
+            answer = client.write(tag, wanted)
     if as_json:
-        out.print(json.dumps(answer))
+        print(json.dumps(answer))
     elif "error" in answer:
-        err.print(f"{tag}: {answer['error']}: {answer.get('reason')}", style="red")
+        err.print(show.outcome(tag, answer), style="red")
     else:
-        out.print(f"{tag} = {answer['value']}: {_how(answer)}")
+        print(show.outcome(tag, answer))
     if "error" in answer:
-        sys.exit(USER_MISTAKE if answer["error"] == "bad-value" else FAILED)
+        sys.exit(USER_MISTAKE if answer["error"] in _MISTAKES else FAILED)
 
 
 @cli.command()
 def watch(config: ConfigPath, tags: TagNames = None, as_json: AsJson = False) -> None:
     """A live table of values; Ctrl-C ends it."""
     loaded = load(config)
-    wanted, known = _wanted(loaded, tags), _tags(loaded)
+    wanted, known = wanted_keys(loaded, tags), _tags(loaded)
     with connected(loaded) as client, suppress(KeyboardInterrupt):
-        if as_json or not out.is_terminal:
-            _follow(client, wanted, lambda row: _print([row], known, as_json=as_json))
+        if out.is_terminal and not as_json:
+            show.live(out, client.follow(wanted), known)
         else:
-            _live_table(client, wanted, known)
+            for row in client.follow(wanted):
+                _print([row], known, as_json=as_json)
 
 
 @cli.command(name="simulate")
@@ -203,14 +212,14 @@ def simulate_command(
     """Serve the configured devices as simulated PLCs on ptys or TCP ports."""
     loaded = load(config)
     _log(LogFormat.TEXT, LogLevel.INFO)
-    asyncio.run(simulate.serve(loaded, tcp, links, out.print))
+    asyncio.run(simulate.serve(loaded, tcp, links, partial(print, flush=True)))
 
 
 @cli.command()
 def health(config: ConfigPath) -> None:
     """Ask the running gateway how it is: exit code 0 when it answers (for containers)."""
     with connected(load(config)) as client:
-        out.print(json.dumps(client.status()))
+        print(json.dumps(client.status()))
 
 
 @cli.command()
@@ -222,11 +231,11 @@ def schema() -> None:
 @cli.command()
 def version() -> None:
     """Print the version."""
-    out.print(__version__)
+    print(__version__)
 
 
 def _end(message: str, code: int) -> NoReturn:
-    err.print(message, markup=False)
+    err.print(message)
     sys.exit(code)
 
 
@@ -257,70 +266,9 @@ def _tags(config: Config) -> dict[str, Tag]:
     return {tag.key: tag for device in config.devices for tag in device.tags}
 
 
-def _wanted(config: Config, names: list[str] | None) -> list[str]:
-    """The key expressions to ask for; a name without wildcard must be a tag or a device."""
-    if not names:
-        return ["**"]
-    known, devices = _tags(config), {device.name for device in config.devices}
-    wanted = []
-    for name in names:
-        if name in devices:
-            name = f"{name}/**"
-        elif "*" not in name and name not in known:
-            raise ConfigError(f"there is no tag or device {name}")
-        wanted.append(name)
-    return wanted
-
-
-def _matches(key: str, wanted: list[str]) -> bool:
-    return any(zenoh.KeyExpr(want).intersects(zenoh.KeyExpr(key)) for want in wanted)
-
-
 def _print(rows: list[Shown], tags: dict[str, Tag], *, as_json: bool) -> None:
     if as_json:
         for row in rows:
-            out.print(json.dumps({"tag": row.tag, **row.document}), markup=False)
+            print(json.dumps({"tag": row.tag, **row.document}), flush=True)
     else:
         out.print(show.samples(rows, tags))
-
-
-def _how(answer: dict[str, object]) -> str:
-    took = f"{float(str(answer['took'])) * 1000:.0f} ms"
-    if answer.get("verified"):
-        return f"acknowledged and read back, {took}"
-    if answer.get("acknowledged") is False:
-        return f"broadcast, nobody acknowledges it, {took}"
-    return f"acknowledged by the PLC, {took}"
-
-
-def _forecasts(config: Config) -> list[LineForecast]:
-    return [
-        forecast(
-            line.name,
-            [app.device_of(device, line) for device in line.devices if device.enabled],
-            line.wire,
-        )
-        for line in config.lines
-    ]
-
-
-def _follow(client: Client, wanted: list[str], told: Callable[[Shown], None]) -> None:
-    with ExitStack() as stack:
-        for want in wanted:
-            stack.enter_context(client.watching(want, told))
-            for row in client.values(want):
-                told(row)
-        threading.Event().wait()
-
-
-def _live_table(client: Client, wanted: list[str], tags: dict[str, Tag]) -> None:
-    rows: dict[str, Shown] = {}
-    with Live(console=out, refresh_per_second=5, screen=False) as live:
-
-        def told(row: Shown) -> None:
-            rows[row.tag] = row
-
-        threading.Thread(target=_follow, args=(client, wanted, told), daemon=True).start()
-        while True:
-            live.update(show.samples(sorted(dict(rows).values()), tags))
-            time.sleep(0.2)

@@ -1,21 +1,25 @@
 """The command line as a Zenoh client of a running gateway."""
 
 import json
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
+from queue import SimpleQueue
 from typing import NamedTuple
 
 import orjson
 import zenoh
 
 from gateway.config import Config
-from gateway.errors import GatewayError
+from gateway.errors import ConfigError, GatewayError
 from gateway.keys import Keys
 from gateway.northbound import Mode, ZenohSettings
 from gateway.northbound.session import configure
+from gateway.payload import rfc3339
 from gateway.values import Value
 
 PATIENCE = 10.0  # seconds a question may take
+NOTHING = "nothing was answered: is the gateway of this file running?"
 
 
 class Shown(NamedTuple):
@@ -62,17 +66,55 @@ class Client:
                 return _document(answer.payload.to_bytes())
         raise GatewayError(f"no gateway answered for {tag}: is it running?")
 
-    @contextmanager
-    def watching(self, wanted: str, shown: Callable[[Shown], None]) -> Iterator[None]:
-        """While inside, every sample that arrives is handed to `shown`, on another thread."""
+    def follow(self, wanted: Sequence[str]) -> Iterator[Shown]:
+        """The current values, then every change as it comes, without end.
 
+        When the gateway goes, what was good is bad: `no-gateway`; when it returns, its values
+        are asked for again. Raises `GatewayError` when there is none to begin with.
+        """
+        news: SimpleQueue[Shown | bool] = SimpleQueue()
+        seen: set[str] = set()
+        with ExitStack() as stack:
+            for want in wanted:
+                stack.enter_context(self._subscribed(want, news.put))
+            for watcher in self._gateway_seen(news.put):
+                stack.enter_context(watcher)
+            # What arrived meanwhile is handed on after this, however old this is.
+            event: Shown | bool = True
+            while True:
+                match event:
+                    case True:
+                        rows = [row for want in wanted for row in self.values(want)]
+                        if not rows and not seen:
+                            raise GatewayError(NOTHING)
+                    case False:
+                        rows = [_lost(tag) for tag in sorted(seen)]
+                    case row:
+                        rows = [row]
+                seen.update(row.tag for row in rows)
+                yield from rows
+                event = news.get()
+
+    def _subscribed(self, wanted: str, told: Callable[[Shown], None]) -> zenoh.Subscriber[None]:
         def arrived(sample: zenoh.Sample) -> None:
             got = self._shown(sample)
             if got is not None:
-                shown(got)
+                told(got)
 
-        with self._session.declare_subscriber(self._keys.value(wanted), arrived):
-            yield
+        return self._session.declare_subscriber(self._keys.value(wanted), arrived)
+
+    def _gateway_seen(
+        self, told: Callable[[bool], None]
+    ) -> tuple[AbstractContextManager[object], ...]:
+        """True when the gateway comes, False when it goes, or the only link to it."""
+
+        def event(what: zenoh.Sample | zenoh.TransportEvent) -> None:
+            told(what.kind == zenoh.SampleKind.PUT)
+
+        return (
+            self._session.liveliness().declare_subscriber(self._keys.own, event),
+            self._session.info.declare_transport_events_listener(event),
+        )
 
     def _ask(self, selector: str, payload: bytes | None) -> list[zenoh.Reply]:
         try:
@@ -123,6 +165,31 @@ def connected(config: Config) -> Iterator[Client]:
         session.close()  # type: ignore[no-untyped-call]  # Zenoh's stub lacks it
 
 
+def wanted_keys(config: Config, names: list[str] | None) -> list[str]:
+    """The key expressions of what was named: tags, devices, wildcards. Raises `ConfigError`."""
+    if not names:
+        return ["**"]
+    known = [tag.key for device in config.devices for tag in device.tags]
+    devices = {device.name for device in config.devices}
+    wanted = []
+    for name in names:
+        if name in devices:
+            name = f"{name}/**"
+        try:
+            found = any(matches(key, [name]) for key in known)
+        except zenoh.ZError:
+            raise ConfigError(f"{name} is no tag, and no wildcard such as 'mixer/**'") from None
+        if not found:
+            raise ConfigError(f"there is no tag or device {name}")
+        wanted.append(name)
+    return wanted
+
+
+def matches(key: str, wanted: list[str]) -> bool:
+    """Raises `ZError` for what is no key expression."""
+    return any(zenoh.KeyExpr(want).intersects(zenoh.KeyExpr(key)) for want in wanted)
+
+
 def parse_value(text: str) -> Value:
     """A value as typed in a shell: a JSON scalar (`true`, `12.5`, `"AB"`), or else text."""
     try:
@@ -130,6 +197,12 @@ def parse_value(text: str) -> Value:
     except ValueError:
         return text
     return value if isinstance(value, (bool, int, float, str)) else text
+
+
+def _lost(tag: str) -> Shown:
+    """Nobody knows the value any more."""
+    now = rfc3339(time.time_ns())
+    return Shown(tag, {"value": None, "quality": "bad", "reason": "no-gateway", "time": now})
 
 
 def _reachable(endpoint: str) -> str:

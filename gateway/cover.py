@@ -8,7 +8,8 @@ the least wire time per second.
 The row is walked from left to right. A state says, for each interval, where its request that
 reaches over the current item began, if there is one. Of all states only those are kept that
 could still win: whoever is dearer than the cheapest by as much as it costs to begin its
-open requests afresh will never be cheaper.
+open requests afresh will never be cheaper; nor will one that is no cheaper and has less room
+left in its open requests.
 """
 
 from collections.abc import Callable, Sequence
@@ -46,12 +47,18 @@ class _Closed:
 
 
 def cover(
-    intervals: Sequence[float], seconds: SecondsOf, splits: frozenset[int] = frozenset()
+    intervals: Sequence[float],
+    seconds: SecondsOf,
+    splits: frozenset[int] = frozenset(),
+    *,
+    even: bool = False,
 ) -> list[Request]:
     """The requests of least wire time for items with these intervals (seconds), by address.
 
     No request reaches over the border before an item in `splits`. Raises `ValueError` when a
-    single item fits no request. `seconds` must not fall when a request grows.
+    single item fits no request. `seconds` must not fall when a request grows. `even` promises
+    that one more item costs a request the same wherever it began (registers do, bits that are
+    packed from their first one do not); it makes long rows much faster.
     """
     rates = sorted(set(intervals))
     states = [_State((CLOSED,) * len(rates), 0.0, 0.0, None)]
@@ -67,6 +74,8 @@ def cover(
                 if known is None or after.total < known.total - _TINY:
                     found[after.starts] = after
         states = _contenders(list(found.values()), rates, alone)
+        if even and len(states) > 1:
+            states = _undominated(states, [alone / every for every in rates])
     best = min(states, key=lambda state: state.total)
     return _requests(best, len(intervals) - 1, rates)
 
@@ -84,34 +93,40 @@ class _Step:
     def after(self, state: _State) -> list[_State]:
         """Every state that `state` can become: each open request goes on or ends, others begin."""
         ways = [_State((), state.paid, state.paid, state.done)]
+        # Of the open requests only the fastest served the item before, so it alone may end there:
+        # the others would have ended sooner. In the same way a request begins where it serves.
+        fastest = next((r for r, start in enumerate(state.starts) if start != CLOSED), None)
         for rate, start in enumerate(state.starts):
-            ways = [more for way in ways for more in self._choices(way, rate, start)]
+            ends = rate == fastest
+            ways = [more for way in ways for more in self._choices(way, rate, start, ends=ends)]
         return [way for way in ways if self._served(way)]
 
-    def _choices(self, way: _State, rate: int, start: int) -> list[_State]:
+    def _choices(self, way: _State, rate: int, start: int, *, ends: bool) -> list[_State]:
         every = self.rates[rate]
         found = []
         closed = way
         if start != CLOSED:
             longer = None if self.split else self.seconds(start, self.item)
             if longer is not None:
-                found.append(_extended(way, start, longer / every, way.paid))
+                found.append(_extended(way, start, longer / every))
+                if not ends:
+                    return found
             spent = (self.seconds(start, self.item - 1) or 0.0) / every
             done = _Closed(Request(start, self.item - 1, every), way.done)
             closed = _State(way.starts, way.paid + spent, way.total + spent, done)
-        found.append(_State((*closed.starts, CLOSED), closed.paid, closed.total, closed.done))
         if rate <= self.rate and not self._served(way):
             alone = self.seconds(self.item, self.item)
             if alone is not None:
-                found.append(_extended(closed, self.item, alone / every, closed.paid))
+                found.append(_extended(closed, self.item, alone / every))
+        found.append(_State((*closed.starts, CLOSED), closed.paid, closed.total, closed.done))
         return found
 
     def _served(self, way: _State) -> bool:
         return any(start != CLOSED for start in way.starts[: self.rate + 1])
 
 
-def _extended(way: _State, start: int, spent: float, paid: float) -> _State:
-    return _State((*way.starts, start), paid, way.total + spent, way.done)
+def _extended(way: _State, start: int, spent: float) -> _State:
+    return _State((*way.starts, start), way.paid, way.total + spent, way.done)
 
 
 def _contenders(states: list[_State], rates: Sequence[float], alone: float) -> list[_State]:
@@ -128,6 +143,25 @@ def _contenders(states: list[_State], rates: Sequence[float], alone: float) -> l
         return state.total < best + fresh - _TINY or state.total <= best + _TINY
 
     return [state for state in states if could_win(state)]
+
+
+def _undominated(states: list[_State], fresh: Sequence[float]) -> list[_State]:
+    """Without those that another can match by beginning afresh only where it has less room."""
+    kept: list[_State] = []
+    for state in sorted(states, key=lambda state: (state.total, [-s for s in state.starts])):
+        limit = state.total + _TINY
+        if not any(other.total + _to_match(other, state, fresh) <= limit for other in kept):
+            kept.append(state)
+    return kept
+
+
+def _to_match(state: _State, other: _State, fresh: Sequence[float]) -> float:
+    """What it costs at most to have as much room as `other` in all its open requests."""
+    spent = 0.0
+    for start, wanted, price in zip(state.starts, other.starts, fresh, strict=True):
+        if wanted > start:  # CLOSED is below every start
+            spent += price
+    return spent
 
 
 def _requests(state: _State, last: int, rates: Sequence[float]) -> list[Request]:

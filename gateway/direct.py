@@ -3,29 +3,33 @@
 import asyncio
 import time
 from collections.abc import Sequence
+from collections.abc import Set as AbstractSet
 
+import orjson
+
+from gateway import payload
 from gateway.app import device_of, opener
 from gateway.config import Config, DeviceConfig, LineConfig
 from gateway.device import Device
-from gateway.errors import GatewayError, LineDown
+from gateway.errors import BadValue, GatewayError, LineDown
 from gateway.line import Line
-from gateway.tags import Reason, Sample, Tag, Written
+from gateway.tags import Reason, Sample, Tag, Written, bad
 from gateway.values import Value
 
 
 class _Once:
     """Upstairs for a line that lives until every wanted tag has been heard of."""
 
-    def __init__(self, wanted: Sequence[Tag]) -> None:
+    def __init__(self, wanted: AbstractSet[Tag] = frozenset()) -> None:
         self.heard: dict[Tag, Sample] = {}
         self.all_heard = asyncio.Event()
-        self._wanted = set(wanted)
+        self.wanted = wanted
 
     def samples(self, samples: Sequence[Sample]) -> None:
         for sample in samples:
-            if sample.tag in self._wanted and sample.reason is not Reason.STARTING:
+            if sample.tag in self.wanted and sample.reason is not Reason.STARTING:
                 self.heard[sample.tag] = sample
-        if len(self.heard) == len(self._wanted):
+        if len(self.heard) == len(self.wanted):
             self.all_heard.set()
 
     def alive(self, device: Device, alive: bool) -> None:
@@ -36,21 +40,34 @@ async def read(config: Config, tags: Sequence[Tag]) -> list[Sample]:
     """One sample of each tag, good or bad, in the order asked."""
     found: dict[Tag, Sample] = {}
     for line_config in config.lines:
-        wanted = [tag for tag in tags if tag in line_config.tags]
-        if wanted:
-            once = _Once(wanted)
-            task = asyncio.create_task(_line(line_config, wanted, once).run())
-            await once.all_heard.wait()
-            await _end(task)
-            found |= once.heard
+        enabled = {device.name for device in line_config.devices if device.enabled}
+        mine = [tag for tag in tags if tag in line_config.tags]
+        wanted = [tag for tag in mine if tag.device in enabled]
+        found |= {tag: bad(tag, Reason.DISABLED, time.time_ns()) for tag in mine}
+        found |= {tag: bad(tag, Reason.STARTING, time.time_ns()) for tag in wanted}
+        found |= await _read(line_config, wanted)
     return [found[tag] for tag in tags]
 
 
+async def _read(config: LineConfig, tags: Sequence[Tag]) -> dict[Tag, Sample]:
+    """What is not in any block (nobody can read it) is not in the answer either."""
+    line = _line(config, tags, once := _Once())
+    asked = {tag for device in line.devices for block in device.blocks for tag in block.tags}
+    if asked:
+        once.wanted = asked
+        task = asyncio.create_task(line.run())
+        await once.all_heard.wait()
+        await _end(task)
+    return once.heard
+
+
 async def write(config: Config, tag: Tag, value: Value) -> Written:
-    """Raises `GatewayError` when it was not done, or nobody knows."""
+    """Raises `GatewayError` when it was not done, or nobody knows; `BadValue` before anything."""
     units = tag.encode(value)
     (line_config,) = (line for line in config.lines if tag in line.tags)
-    once = _Once([tag])
+    if not any(device.enabled for device in line_config.devices if device.name == tag.device):
+        raise BadValue(f"device {tag.device} is disabled")
+    once = _Once({tag})
     line = _line(line_config, [tag], once)
     (device,) = line.devices
     device.blocks = ()  # nothing is to be read
@@ -64,6 +81,16 @@ async def write(config: Config, tag: Tag, value: Value) -> Written:
     if isinstance(result, GatewayError):
         raise result
     return result
+
+
+def told(config: Config, tag: Tag, value: Value) -> dict[str, object]:
+    """`write`, and the outcome as a gateway would have told it. Not to be awaited."""
+    try:
+        result = payload.outcome(asyncio.run(write(config, tag, value)))
+    except GatewayError as error:
+        result = payload.outcome(payload.failure(error))
+    answer: dict[str, object] = orjson.loads(result)
+    return answer
 
 
 def _line(config: LineConfig, tags: Sequence[Tag], once: _Once) -> Line:

@@ -26,14 +26,23 @@ class Mirror:
 
     def update(self, samples: Iterable[Sample]) -> list[Sample]:
         """Take the samples in; those worth publishing come back, in their order."""
-        current, published = self._current, self._published
+        current, published, good = self._current, self._published, Quality.GOOD
         news = []
         for sample in samples:
-            tag = sample.tag
-            if sample.quality is Quality.BAD and _same_trouble(current[tag], sample):
+            tag, value, quality, _, _, _ = sample
+            if quality is not good and _same_trouble(current[tag], sample):
                 continue  # it became bad then, not now
             current[tag] = sample
-            if _worth_telling(published.get(tag), sample):
+            told = published.get(tag)
+            if (
+                told is not None
+                and told.value == value
+                and quality is told.quality is good
+                and tag.heartbeat is None
+                and tag.publish is not Publish.ALWAYS
+            ):
+                continue  # as the last one: most samples end here
+            if _worth_telling(told, sample):
                 published[tag] = sample
                 news.append(sample)
         return news

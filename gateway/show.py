@@ -1,8 +1,13 @@
 """Tables for people: samples, plans, what is typed next."""
 
+import shlex
+import shutil
+import sys
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 
-from rich.console import Group, RenderableType
+from rich.console import Console, Group, RenderableType
+from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
@@ -11,7 +16,8 @@ from gateway.config import Config
 from gateway.forecast import LineForecast
 from gateway.payload import rfc3339
 from gateway.planner import Block
-from gateway.tags import Quality, Sample, Tag
+from gateway.tags import Quality, Sample, Tag, WriteRule
+from gateway.values import Kind
 
 
 def shown(sample: Sample) -> Shown:
@@ -48,6 +54,40 @@ def samples(rows: Iterable[Shown], tags: dict[str, Tag]) -> Table:
             Text(str(document.get("time", ""))),
         )
     return table
+
+
+def outcome(tag: str, answer: dict[str, object]) -> str:
+    """How a write ended, in one line."""
+    if "error" in answer:
+        code = f" {answer['code']}" if answer.get("code") else ""
+        return f"{tag}: {answer['error']}{code}: {answer.get('reason')}"
+    took = f"{float(str(answer['took'])) * 1000:.0f} ms"
+    how = "acknowledged by the PLC"
+    if answer.get("verified"):
+        how = "acknowledged and read back"
+    elif answer.get("acknowledged") is False:
+        how = "broadcast, nobody acknowledges it"
+    return f"{tag} = {_value(answer['value'])}: {how}, {took}"
+
+
+def live(screen: Console, news: Iterable[Shown], tags: dict[str, Tag]) -> None:
+    """A table of the newest, until the news end."""
+    rows: dict[str, Shown] = {}
+
+    def table() -> Table:
+        return samples([rows[tag] for tag in sorted(rows)], tags)
+
+    with Live(console=screen, refresh_per_second=5, get_renderable=table):
+        for row in news:
+            rows[row.tag] = row
+
+
+def typed() -> str:
+    """How this program was started, so that what it prints can be typed again."""
+    program = Path(sys.argv[0])
+    if program.name == "__main__.py":
+        return f"{sys.executable} -m {program.parent.name}"
+    return program.name if shutil.which(program.name) else str(program)
 
 
 def plan(lines: Sequence[LineForecast], *, every_block: bool) -> RenderableType:
@@ -101,29 +141,34 @@ def seconds(time: float) -> str:
     return f"{time * 1000:.1f} ms" if time < 1 else f"{time:.2f} s"
 
 
-def next_steps(config: Config, path: str) -> str:
-    """What a newcomer types in a second terminal."""
+def next_steps(config: Config, path: Path, command: str) -> str:
+    """What a newcomer types in a second terminal; `command` is how this one was started."""
+    file = shlex.quote(str(path))
     tags = [tag for device in config.devices for tag in device.tags]
     counted = f"{len(tags)} tags on {len(config.lines)} lines"
     lines = [
         f"Gateway {config.name}: {counted}. In a second terminal:",
-        f"  plc-gateway watch {path}",
+        f"  {command} watch {file}",
     ]
     if tags:
-        lines.append(f"  plc-gateway read {path} {tags[0].key}")
+        lines.append(f"  {command} read {file} {tags[0].key}")
     for tag in tags:
         if tag.write is not None:
-            lines.append(f"  plc-gateway write {path} {tag.key} {_example(tag)}")
+            lines.append(f"  {command} write {file} {tag.key} {_example(tag)}")
             break
     lines.append("Ctrl-C ends it.")
     return "\n".join(lines)
 
 
 def _example(tag: Tag) -> str:
-    if not tag.layout.type.is_number:
-        return "true" if tag.layout.type.words == 1 else "TEXT"
-    low = 0.0 if tag.write is None or tag.write.min is None else tag.write.min
-    return f"{low + 1:g}"
+    """A value that the tag takes."""
+    kind, rule = tag.layout.type, tag.write or WriteRule()
+    if kind.kind is Kind.STRING:
+        return "AB"[: kind.length]
+    if not kind.is_number:
+        return "true"
+    value = 1 if rule.min is None else rule.min + 1
+    return f"{value if rule.max is None else min(value, rule.max):g}"
 
 
 def _value(value: object) -> str:

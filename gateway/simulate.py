@@ -11,6 +11,7 @@ from gateway.errors import ConfigError
 from gateway.simulation import station_for
 from gateway.transport import TcpAddress
 from gateway.transport.serve import Served, serve_on_pty, serve_on_tcp
+from gateway.wiretime import NETWORK_BAUD
 
 
 async def serve(
@@ -42,7 +43,8 @@ async def _serve(line: LineConfig, place: tuple[str, int] | None, links: Path | 
     if place is None and isinstance(line.port, TcpAddress):
         place = ("127.0.0.1", line.port.port)
     if place is not None:
-        return await serve_on_tcp(stations, line.wire, *place)
+        wired = line.wire.baudrate != NETWORK_BAUD
+        return await serve_on_tcp(stations, line.wire, *place, paced=wired)
     link = None if links is None else str(links / line.name)
     return await serve_on_pty(stations, line.wire, link)
 

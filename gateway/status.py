@@ -6,7 +6,6 @@ from gateway.device import Device
 from gateway.forecast import LineForecast
 from gateway.line import Line
 from gateway.refusals import BadRange
-from gateway.wiretime import Wire
 
 Document = Mapping[str, object]
 
@@ -52,7 +51,7 @@ def line_document(line: Line, expected: LineForecast, now: float) -> Document:
         "trouble": record.trouble,
         "opened": record.opened,
         "open_for": round(open_for, 1),
-        "baudrate": wire_rate(line.wire),
+        "baudrate": line.wire.baudrate,
         "devices": {device.name: device.standing.value for device in line.devices},
         "busy_time": round(busy, 3),
         "unasked_bytes": record.unasked,
@@ -63,7 +62,3 @@ def line_document(line: Line, expected: LineForecast, now: float) -> Document:
             "worst_write": round(expected.worst_write, 4),
         },
     }
-
-
-def wire_rate(wire: Wire) -> int:
-    return wire.baudrate

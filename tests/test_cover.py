@@ -94,9 +94,22 @@ def test_no_cover_is_cheaper(
     pick = st.sampled_from([1.0, 2.0, 10.0]) if len(row) < 5 else st.sampled_from([1.0, 3.0])
     intervals = [data.draw(pick) for _ in row]
     seconds = wire(row, overhead, 1.0, limit, grain)
-    found = cover(intervals, seconds)
+    found = cover(intervals, seconds, even=grain == 1)
     check_served(found, intervals)
     assert spent(found, seconds) == pytest.approx(brute_force(intervals, seconds), rel=1e-9)
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.lists(st.tuples(st.integers(0, 4), st.sampled_from([0.5, 1.0, 5.0])), max_size=40))
+def test_the_short_cut_for_even_costs_loses_nothing(steps: list[tuple[int, float]]) -> None:
+    row, at = [], 0
+    for gap, _ in steps:
+        row.append((at + gap, 1))
+        at += gap + 1
+    intervals = [every for _, every in steps]
+    seconds = wire(row, 3, 1, 7)
+    quick, slow = cover(intervals, seconds, even=True), cover(intervals, seconds)
+    assert spent(quick, seconds) == pytest.approx(spent(slow, seconds))
 
 
 def test_a_slower_item_rides_in_a_faster_request() -> None:
@@ -132,7 +145,7 @@ def test_the_work_grows_with_the_number_of_items_not_with_its_square() -> None:
             at += row[-1][1]
         intervals = [rng.choice([0.5, 1.0, 5.0]) for _ in range(n)]
         begun = time.process_time()
-        cover(intervals, wire(row, 12, 1, 64))
+        cover(intervals, wire(row, 12, 1, 64), even=True)
         return time.process_time() - begun
 
     work(200)  # warm

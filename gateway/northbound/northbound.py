@@ -66,6 +66,7 @@ class Northbound:
         self._status_every = status_every
         self._publisher = Publisher(self.keys)
         self._directory = Directory(self.keys, ())
+        self._declared: list[object] = []
         self._queries: Queries | None = None
         self._with_blocks: frozenset[str] = frozenset()
         self._links: dict[str, str] = {}  # what is at the other end, by its id
@@ -167,12 +168,13 @@ class Northbound:
         self._puts = PutWrites(writes, self._directory)
         puts = Inbox(self._puts.take, self._puts.refuse)
         links = Inbox(self._link, lambda _: None)
-        declared = await off_loop(self._declare, session, queries, puts, links)
+        # Kept, for what is forgotten is undeclared.
+        self._declared = await off_loop(self._declare, session, queries, puts, links)
         self._publisher.start(session)
         await self._publish_all()
         self._publish_status()
         self.opened.set()
-        log.info("on Zenoh", prefix=self.keys.prefix, declared=len(declared), id=str(session.zid()))
+        log.info("on Zenoh", prefix=self.keys.prefix, id=str(session.zid()))
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(self._tell_status())
             tasks.create_task(self._republish())

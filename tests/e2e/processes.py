@@ -84,9 +84,9 @@ class Program:
     def running(self) -> bool:
         return self._process.poll() is None
 
-    def says(self, *words: str, timeout: float = PATIENCE) -> str:
-        """Waits for a line that holds all the words, and returns the first."""
-        return self._wait(words, 0, timeout)
+    def says(self, *words: str, after: int = 0) -> str:
+        """Waits for a line that holds all the words, and returns the first after so many."""
+        return self._wait(words, after)
 
     def _wait(self, words: tuple[str, ...], first: int, timeout: float = PATIENCE) -> str:
         until = time.monotonic() + timeout

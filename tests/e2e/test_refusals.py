@@ -1,7 +1,6 @@
 """What a Zenoh client in another process is told when it asks for what cannot be done."""
 
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest

@@ -86,7 +86,9 @@ async def test_values_come_and_writes_go(way: Way, stack: ExitStack, tmp_path: P
         for name in ("speed", "level", "batches"):  # each is seen to move
             key = f"plant/mixer/{name}"
             first = await heard.next(lambda s, k=key: s.key == k and s.json["quality"] == "good")
-            await heard.next(lambda s, f=first: s.key == f.key and s.json["value"] != f.json["value"])
+            await heard.next(
+                lambda s, f=first: s.key == f.key and s.json["value"] != f.json["value"]
+            )
 
         replies = await client.get("plant/mixer/**", consolidation="NONE")
         values = {reply.key: reply.json for reply in replies}

@@ -1,0 +1,156 @@
+"""What the history file takes and gives: `python -m benchmarks.history`.
+
+Samples are recorded from an event loop, as the gateway does, at a fixed rate or as fast as it
+goes; beside it the loop's stalls are measured. Then questions are asked of the same file.
+"""
+
+import argparse
+import asyncio
+import random
+import resource
+import tempfile
+import time
+from pathlib import Path
+
+from gateway.history import Historian
+from gateway.history.recent import MOST_RUNS
+from gateway.protocols.driver import Address, Span, Unit
+from gateway.tags import Sample, Tag, good
+from gateway.values import Layout, parse_type
+
+GIGABYTE = 10**9
+
+
+def tags(count: int) -> list[Tag]:
+    return [
+        Tag(
+            device=f"plc{n // 1000}",
+            name=f"t{n % 1000}",
+            text="D100",
+            address=Address("D", 100),
+            span=Span("D", 100, 1),
+            unit_kind=Unit.WORD,
+            layout=Layout(parse_type("float32")),
+            history=True,
+        )
+        for n in range(count)
+    ]
+
+
+async def stalls(late: list[float]) -> None:
+    while True:
+        due = time.perf_counter() + 0.002
+        await asyncio.sleep(0.002)
+        late.append(time.perf_counter() - due)
+
+
+async def record(historian: Historian, some: list[Tag], rate: float, seconds: float) -> list[float]:
+    """Scans of 100 tags; as many as there is room for when `rate` is 0. Returns the stalls."""
+    late: list[float] = []
+    watch = asyncio.create_task(stalls(late))
+    until = time.perf_counter() + seconds
+    begun, done, at = time.perf_counter(), 0, 0
+    while time.perf_counter() < until:
+        scan: list[Sample] = []
+        now = time.time_ns()
+        for _ in range(100):
+            scan.append(good(some[at], random.random() * 100, now))
+            at = (at + 1) % len(some)
+        historian.record(scan)
+        done += len(scan)
+        waiting = historian.document()["waiting"]
+        assert isinstance(waiting, int)
+        if rate:
+            ahead = begun + done / rate - time.perf_counter()
+            await asyncio.sleep(max(0.0, ahead))
+        else:
+            await asyncio.sleep(0.01 if waiting > 30_000 else 0)
+    watch.cancel()
+    return late
+
+
+def cpu() -> float:
+    usage = resource.getrusage(resource.RUSAGE_SELF)
+    return usage.ru_utime + usage.ru_stime
+
+
+def insert(folder: Path, count: int, rate: float, seconds: float) -> None:
+    path = folder / f"{count}-{rate:.0f}.db"
+    historian = Historian(path, 7 * 86400.0, GIGABYTE)
+    historian.start()
+    some = tags(count)
+    begun, used = time.perf_counter(), cpu()
+    late = sorted(asyncio.run(record(historian, some, rate, seconds)))
+    assert historian.close(60)
+    took, used = time.perf_counter() - begun, cpu() - used
+    told = historian.document()
+    stored = told["stored"]
+    assert isinstance(stored, int)
+    print(
+        f"{count:7} {rate or 'all':>8} {stored / took:11,.0f} {told['lost']:6} "
+        f"{used / took:6.0%} {path.stat().st_size / stored:7.1f} "
+        f"{late[len(late) // 2] * 1e3:6.2f} {late[len(late) * 99 // 100] * 1e3:6.2f} "
+        f"{late[-1] * 1e3:6.1f}"
+    )
+    path.unlink()
+
+
+def query(folder: Path, count: int, samples: int) -> None:
+    path = folder / f"query-{count}.db"
+    historian = Historian(path, 7 * 86400.0, GIGABYTE)
+    historian.start()
+    some = tags(count)
+    start = time.time_ns() - 86400 * 10**9
+    step = 80_000 * 10**9 // samples
+    for at in range(0, samples, 1000):
+        historian.record(
+            good(some[n % count], random.random() * 100, start + n * step)
+            for n in range(at, at + 1000)
+        )
+        while int(str(historian.document()["waiting"])) > 30_000 * (MOST_RUNS - 2):
+            time.sleep(0.01)
+    assert historian.close(60)
+    historian = Historian(path, 7 * 86400.0, GIGABYTE)
+    historian.start()
+    while historian.document()["state"] != "ok":
+        time.sleep(0.01)
+    asks = {"all": "[..]", "10 min": "[now(-12h)..now(-710m)]", "first": "[..]"}
+    for what, text in asks.items():
+        limit = 1 if what == "first" else None
+        tried = 1 if what == "all" and count < 10 else 50
+        begun, found = time.perf_counter(), 0
+        for n in range(tried):
+            found += sum(1 for _ in historian.samples(some[n % count], text, limit))
+        took = time.perf_counter() - begun
+        print(
+            f"{count:7} {samples:9,} {what:>7} {found // tried:9,} "
+            f"{took / tried * 1e3:9.2f} {found / took:12,.0f}"
+        )
+    historian.close()
+    path.unlink()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seconds", type=float, default=5.0)
+    parser.add_argument("--samples", type=int, default=1_000_000)
+    parser.add_argument("--tags", nargs="*", type=int, default=[100, 5_000, 50_000])
+    parser.add_argument("--folder", type=Path, help="a folder on the disk to be measured")
+    given = parser.parse_args()
+    with tempfile.TemporaryDirectory(dir=given.folder) as folder:
+        print("recording; stalls of the event loop in ms")
+        print(
+            f"{'tags':>7} {'offered':>8} {'stored/s':>11} {'lost':>6} {'CPU':>6} {'bytes':>7} "
+            f"{'p50':>6} {'p99':>6} {'max':>6}"
+        )
+        for count in given.tags:
+            for rate in (10_000.0, 50_000.0, 0.0):
+                insert(Path(folder), count, rate, given.seconds)
+        print("asking one tag; ms for each question")
+        print(f"{'tags':>7} {'in file':>9} {'range':>7} {'found':>9} {'ms':>9} {'samples/s':>12}")
+        for count in (1, 100, 5_000):
+            query(Path(folder), count, given.samples)
+
+
+if __name__ == "__main__":
+    main()

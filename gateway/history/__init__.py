@@ -1,0 +1,6 @@
+"""Samples of the past: kept on disk for as long as the file says, found by tag and time."""
+
+from gateway.history.historian import Historian
+from gateway.history.timerange import TimeRange, time_range
+
+__all__ = ["Historian", "TimeRange", "time_range"]

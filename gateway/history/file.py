@@ -1,0 +1,260 @@
+"""The history file: an SQLite database that is written in order and sorted run by run.
+
+Samples arrive in table `recent`, in the order of arrival. When a run is closed it moves to
+`sample` in one transaction, sorted by tag and time, at the end of that table: nothing is ever
+inserted in the middle, so a commit writes few pages however many tags there are, and dropping the
+oldest run frees whole pages at the beginning. Every method is one transaction.
+"""
+
+import sqlite3
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from itertools import chain
+from pathlib import Path
+
+import structlog
+
+from gateway.history.recent import Shelved
+from gateway.history.rows import to_row
+from gateway.tags import Sample
+
+log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
+
+APPLICATION = 0x706C6368  # "plch", in the file's header
+SCHEMA_VERSION = 1
+BUSY_WITHIN = 1.0  # seconds another program may hold the file
+
+_SCHEMA = """
+CREATE TABLE tag (id INTEGER PRIMARY KEY, key TEXT NOT NULL UNIQUE);
+CREATE TABLE recent (
+    run INTEGER, n INTEGER, tag INTEGER, time INTEGER, value, kind INTEGER, bad TEXT,
+    PRIMARY KEY (run, n)
+) WITHOUT ROWID;
+CREATE TABLE sample (
+    run INTEGER, tag INTEGER, time INTEGER, n INTEGER, value, kind INTEGER, bad TEXT,
+    PRIMARY KEY (run, tag, time, n)
+) WITHOUT ROWID;
+CREATE TABLE run (
+    run INTEGER PRIMARY KEY, first INTEGER, last INTEGER, samples INTEGER, closed INTEGER
+);
+CREATE TABLE written (id INTEGER PRIMARY KEY, time INTEGER, outcome TEXT);
+CREATE INDEX written_time ON written (time);
+CREATE VIEW history AS
+    SELECT key, datetime(time / 1000000000, 'unixepoch') AS utc, time, value, bad
+    FROM sample JOIN tag ON tag.id = sample.tag
+    UNION ALL
+    SELECT key, datetime(time / 1000000000, 'unixepoch'), time, value, bad
+    FROM recent JOIN tag ON tag.id = recent.tag;
+"""
+
+# Many rows in one statement: for each statement the interpreter lock is given away and must be
+# had again, which takes long when the event loop is busy.
+_INSERTS = [
+    (size, f"INSERT INTO recent VALUES {', '.join(['(?, ?, ?, ?, ?, ?, ?)'] * size)}")
+    for size in (128, 16, 1)
+]
+
+
+class HistoryFile:
+    """The one connection that writes. Raises `sqlite3.Error` and `OSError` as they come."""
+
+    def __init__(self, path: Path, max_size: int) -> None:
+        self.path = path
+        # What is in the log and not yet in the file proper counts as well.
+        self.log_limit = max(256 * 1024, min(4 * 1024 * 1024, max_size // 16))
+        self._database = _opened(path)
+        try:
+            pages = max(16, self.log_limit // (2 * 4096))
+            self._database.execute(f"PRAGMA wal_autocheckpoint = {pages}")
+            self._database.execute(f"PRAGMA journal_size_limit = {self.log_limit}")
+            self.inode = path.stat().st_ino
+            self._tags = dict(self._database.execute("SELECT key, id FROM tag"))
+        except BaseException:
+            self._database.close()
+            raise
+
+    def close(self) -> None:
+        self._database.close()
+
+    # -- writing --
+
+    def new_run(self) -> int:
+        """A number that is higher than any in use."""
+        [(number,)] = self._database.execute(
+            "SELECT 1 + max(ifnull((SELECT max(run) FROM run), 0),"
+            " ifnull((SELECT max(run) FROM recent), 0))"
+        )
+        return int(number)
+
+    def store(self, run: int, start: int, samples: Sequence[Sample]) -> None:
+        """Samples `start` and following of a run, in the order of arrival."""
+        with self._transaction():
+            rows = [
+                (run, n, self._tag(sample.tag.key), *to_row(sample))
+                for n, sample in enumerate(samples, start)
+            ]
+            for size, insert in _INSERTS:
+                while len(rows) >= size:
+                    chunk, rows = rows[:size], rows[size:]
+                    self._database.execute(insert, list(chain.from_iterable(chunk)))
+
+    def _tag(self, key: str) -> int:
+        number = self._tags.get(key)
+        if number is None:
+            number = self._tags[key] = len(self._tags) + 1
+            self._database.execute("INSERT INTO tag VALUES (?, ?)", (number, key))
+        return number
+
+    def store_writes(self, outcomes: Sequence[tuple[int, str]], most: int) -> None:
+        """Outcomes with their time, as on the `writes` key; the newest `most` are kept."""
+        with self._transaction():
+            self._database.executemany(
+                "INSERT INTO written (time, outcome) VALUES (?, ?)", outcomes
+            )
+            self._database.execute(
+                "DELETE FROM written WHERE id <= (SELECT max(id) FROM written) - ?", (most,)
+            )
+
+    def sort(self, run: int, now: int) -> Shelved | None:
+        """Moves a run from `recent` to `sample`; None if there is nothing of it."""
+        with self._transaction():
+            [(first, last, count)] = self._database.execute(
+                "SELECT min(time), max(time), count(*) FROM recent WHERE run = ?", (run,)
+            )
+            if not count:
+                return None
+            shelved = Shelved(run, first, last, count, now)
+            self._database.execute(
+                "INSERT INTO sample SELECT run, tag, time, n, value, kind, bad FROM recent"
+                " WHERE run = ? ORDER BY tag, time, n",
+                (run,),
+            )
+            self._database.execute("INSERT INTO run VALUES (?, ?, ?, ?, ?)", shelved)
+            self._database.execute("DELETE FROM recent WHERE run = ?", (run,))
+        return shelved
+
+    def drop(self, run: int) -> None:
+        with self._transaction():
+            self._database.execute("DELETE FROM sample WHERE run = ?", (run,))
+            self._database.execute("DELETE FROM run WHERE run = ?", (run,))
+
+    def drop_writes(self, before: int) -> None:
+        """Some of those that ended before this time, if there are any."""
+        with self._transaction():
+            self._database.execute(
+                "DELETE FROM written WHERE id IN"
+                " (SELECT id FROM written WHERE time < ? ORDER BY time LIMIT 256)",
+                (before,),
+            )
+
+    def sync(self, full: bool) -> None:
+        """Whether the next transactions wait until they outlast a power cut."""
+        self._database.execute(f"PRAGMA synchronous = {'FULL' if full else 'NORMAL'}")
+
+    def shrink(self) -> None:
+        """Gives some unused pages back to the disk, if an eighth of the file is unused."""
+        if self._pragma("freelist_count") * 8 > self._pragma("page_count"):
+            self._database.execute("PRAGMA incremental_vacuum(256)").fetchall()
+
+    def empty_log(self) -> None:
+        """Moves the log into the file proper, as far as nobody reads an old state."""
+        self._database.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
+
+    # -- what is there --
+
+    def shelved(self) -> list[Shelved]:
+        return [Shelved(*row) for row in self._database.execute("SELECT * FROM run ORDER BY run")]
+
+    def unsorted(self) -> dict[int, int]:
+        """Runs in `recent`, with how many samples each has there."""
+        return dict(self._database.execute("SELECT run, max(n) + 1 FROM recent GROUP BY run"))
+
+    def size(self) -> int:
+        """Bytes on disk, the log included."""
+        return self.path.stat().st_size + self.log_size()
+
+    def log_size(self) -> int:
+        try:
+            return Path(f"{self.path}-wal").stat().st_size
+        except FileNotFoundError:
+            return 0
+
+    def used(self) -> int:
+        """Bytes of the file proper that hold something."""
+        return (self._pragma("page_count") - self._pragma("freelist_count")) * 4096
+
+    def is_there(self) -> bool:
+        """Whether the path still names the file that is open."""
+        try:
+            return self.path.stat().st_ino == self.inode
+        except FileNotFoundError:
+            return False
+
+    def _pragma(self, name: str) -> int:
+        [(number,)] = self._database.execute(f"PRAGMA {name}")
+        return int(number)
+
+    @contextmanager
+    def _transaction(self) -> Iterator[None]:
+        self._database.execute("BEGIN IMMEDIATE")
+        try:
+            yield
+            self._database.execute("COMMIT")
+        except BaseException:
+            if self._database.in_transaction:
+                self._database.execute("ROLLBACK")
+            raise
+
+
+def is_damage(error: sqlite3.Error) -> bool:
+    """The file itself is broken, or none of SQLite's."""
+    name = getattr(error, "sqlite_errorname", "")
+    return name.startswith(("SQLITE_CORRUPT", "SQLITE_NOTADB"))
+
+
+def _opened(path: Path) -> sqlite3.Connection:
+    database = sqlite3.connect(
+        path, timeout=BUSY_WITHIN, isolation_level=None, check_same_thread=False
+    )
+    try:
+        _prepare(database, path)
+    except BaseException:
+        database.close()
+        raise
+    return database
+
+
+class Foreign(Exception):
+    """A database, but not a history this version can use."""
+
+
+def _prepare(database: sqlite3.Connection, path: Path) -> None:
+    [(application,)] = database.execute("PRAGMA application_id")
+    [(version,)] = database.execute("PRAGMA user_version")
+    [(tables,)] = database.execute("SELECT count(*) FROM sqlite_schema")
+    if tables and application != APPLICATION:
+        raise Foreign(f"{path} is a database of another program")
+    if tables and version != SCHEMA_VERSION:
+        raise Foreign(f"{path} has format {version}, and this gateway writes {SCHEMA_VERSION}")
+    database.execute("PRAGMA page_size = 4096")
+    database.execute("PRAGMA auto_vacuum = INCREMENTAL")
+    database.execute("PRAGMA journal_mode = WAL")
+    database.execute("PRAGMA cache_size = -4000")
+    if not tables:
+        database.executescript(
+            f"BEGIN IMMEDIATE; PRAGMA application_id = {APPLICATION};"
+            f" PRAGMA user_version = {SCHEMA_VERSION}; {_SCHEMA} COMMIT;"
+        )
+
+
+def move_aside(path: Path, why: str) -> None:
+    """Renames a file that is of no use, with what SQLite keeps beside it."""
+    stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%S.%fZ")
+    aside = path.with_name(f"{path.name}.aside-{stamp}")
+    path.rename(aside)
+    for tail in ("-wal", "-shm", "-journal"):
+        beside = Path(f"{path}{tail}")
+        if beside.exists():
+            beside.rename(f"{aside}{tail}")
+    log.error("the history file is of no use and was moved aside", why=why, aside=str(aside))

@@ -1,0 +1,123 @@
+"""What the gateway hands its samples to, and what answers questions of the past."""
+
+import sqlite3
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from itertools import islice
+from pathlib import Path
+
+from gateway import payload
+from gateway.errors import BadValue, Busy
+from gateway.history.reader import Part, Reader, in_order
+from gateway.history.recent import Recent, Shelved
+from gateway.history.timerange import TimeRange, time_range
+from gateway.history.writer import Writer
+from gateway.payload import WriteOutcome
+from gateway.tags import Sample, Tag
+
+LONGEST_RUN = 32_768  # samples
+OLDEST_RUN = 600.0  # seconds
+
+
+class Historian:
+    """One history file and the thread that writes it.
+
+    `record` and `record_write` belong to the event loop and never wait. Questions may come from
+    any thread and see everything that was recorded before they were asked.
+    """
+
+    def __init__(
+        self, path: Path, keep: float, max_size: int, wall: Callable[[], int] = time.time_ns
+    ) -> None:
+        """`keep`: seconds; `max_size`: bytes, the database's log included."""
+        longest = max(256, min(LONGEST_RUN, max_size // 1024))
+        self._wall = wall
+        self._recent = Recent(longest, min(OLDEST_RUN, keep / 20))
+        self._reader = Reader(path)
+        self._writer = Writer(path, keep, max_size, self._recent, self._reader, wall)
+
+    def start(self) -> None:
+        """Begins to write. A file that cannot be opened is tried again: see `document`."""
+        self._writer.start()
+
+    def close(self, within: float = 2.0) -> bool:
+        """Stores what waits. Blocks: not on the event loop. Whether all was done in time."""
+        return self._writer.close(within)
+
+    # -- event loop --
+
+    def record(self, samples: Iterable[Sample]) -> None:
+        """Keeps those of tags with `history: true`."""
+        self._recent.add(samples)
+
+    def record_write(self, outcome: WriteOutcome) -> None:
+        """Keeps the line that also goes to the `writes` key."""
+        self._writer.add_write(outcome.time, payload.write_outcome(outcome).decode())
+
+    def document(self) -> Mapping[str, object]:
+        """For the status: `state` is `ok` or one sentence; counts since the start."""
+        writer, recent = self._writer, self._recent
+        oldest = min((run.first for run in recent.shelf), default=None)
+        return {
+            "state": writer.trouble or "ok",
+            "recorded": recent.recorded,
+            "stored": writer.stored,
+            "waiting": recent.waiting,
+            "lost": recent.lost,
+            "writes_stored": writer.writes_stored,
+            "writes_lost": writer.writes_lost,
+            "bytes": writer.size,
+            "oldest": None if oldest is None else payload.rfc3339(oldest),
+        }
+
+    # -- any thread --
+
+    def samples(self, tag: Tag, time_range: str, limit: int | None) -> Iterator[Sample]:
+        """The samples of a tag in a range of Zenoh's form, in the order of time.
+
+        With a limit the first so many: the rest follows by asking again from the last one's time.
+        Raises `BadValue` for a range or limit that cannot be understood, and `Busy`, also in the
+        middle, when the file cannot be read now: what came until then is not all there is.
+        """
+        wanted = self._range(time_range, limit)
+        return islice(self._samples(tag, wanted), limit)
+
+    def writes(self, time_range: str, limit: int | None = None) -> Iterator[str]:
+        """Outcomes of writes as on the `writes` key (JSON), by the time they ended. Raises as
+        `samples` does."""
+        wanted = self._range(time_range, limit)
+        return islice(self._writes(wanted), limit)
+
+    def _range(self, text: str, limit: int | None) -> TimeRange:
+        if limit is not None and limit < 1:
+            raise BadValue(f"limit={limit} is not 1 or more")
+        wanted = time_range(text, self._wall())
+        if not self._writer.readable:
+            raise Busy(f"history cannot be read: {self._writer.trouble}")
+        return wanted
+
+    def _writes(self, wanted: TimeRange) -> Iterator[str]:
+        try:
+            yield from self._reader.writes(wanted)
+        except sqlite3.Error as error:
+            raise Busy(f"history cannot be read: {error}") from error
+
+    def _samples(self, tag: Tag, wanted: TimeRange) -> Iterator[Sample]:
+        shelf, newest = self._recent.of(tag.key)
+        runs = [run for run in shelf if run.first <= wanted.last and run.last >= wanted.first]
+        try:
+            number = self._reader.tag(tag.key) if runs else None
+            parts = [] if number is None else [self._part(tag, number, run, wanted) for run in runs]
+            parts += [_part_of(run, wanted) for run in newest]
+            yield from in_order(parts)
+        except sqlite3.Error as error:
+            raise Busy(f"history cannot be read: {error}") from error
+
+    def _part(self, tag: Tag, number: int, run: Shelved, wanted: TimeRange) -> Part:
+        return Part(run.first, lambda: self._reader.samples(tag, number, run.number, wanted))
+
+
+def _part_of(run: list[Sample], wanted: TimeRange) -> Part:
+    found = [sample for sample in run if wanted.first <= sample.time <= wanted.last]
+    found.sort(key=lambda sample: sample.time)
+    return Part(found[0].time if found else wanted.first, lambda: found)

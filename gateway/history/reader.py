@@ -1,0 +1,116 @@
+"""Reading the history file from any thread, run by run, in the order of time."""
+
+import sqlite3
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from heapq import heappop, heappush
+from pathlib import Path
+from typing import NamedTuple
+
+from gateway.history.rows import from_row
+from gateway.history.timerange import TimeRange
+from gateway.tags import Sample, Tag
+
+
+class Part(NamedTuple):
+    """Samples of one tag and one run; none is earlier than `first`."""
+
+    first: int
+    samples: Callable[[], Iterable[Sample]]  # in the order of time
+
+
+def in_order(parts: Iterable[Part]) -> Iterator[Sample]:
+    """Merges parts by time; samples of equal time in the order of the parts.
+
+    A part is begun when its time has come, so that only those are open at once which overlap
+    (after the clock was set back).
+    """
+    coming = deque(sorted(enumerate(parts), key=lambda numbered: numbered[1].first))
+    heap: list[tuple[int, int, Sample, Iterator[Sample]]] = []
+    while coming or heap:
+        while coming and (not heap or coming[0][1].first <= heap[0][0]):
+            number, part = coming.popleft()
+            _push(heap, number, iter(part.samples()))
+        if heap:
+            _, number, sample, rest = heappop(heap)
+            yield sample
+            _push(heap, number, rest)
+
+
+def _push(
+    heap: list[tuple[int, int, Sample, Iterator[Sample]]], number: int, rest: Iterator[Sample]
+) -> None:
+    for sample in rest:
+        heappush(heap, (sample.time, number, sample, rest))
+        return
+
+
+class Reader:
+    """Connections that only read. No question holds one for longer than one run takes: a long
+    read would keep SQLite from emptying its log."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._lock = threading.Lock()
+        self._idle: list[sqlite3.Connection] = []
+        self._age = 0  # of the file: connections to an older one are not used again
+
+    def tag(self, key: str) -> int | None:
+        """The tag's number in the file. Raises `sqlite3.Error`, as all that follows."""
+        with self._connection() as database:
+            row = database.execute("SELECT id FROM tag WHERE key = ?", (key,)).fetchone()
+        return None if row is None else int(row[0])
+
+    def samples(self, tag: Tag, number: int, run: int, wanted: TimeRange) -> list[Sample]:
+        with self._connection() as database:
+            rows = database.execute(
+                "SELECT time, value, kind, bad FROM sample"
+                " WHERE run = ? AND tag = ? AND time BETWEEN ? AND ? ORDER BY time, n",
+                (run, number, *wanted),
+            ).fetchall()
+        return [from_row(tag, row) for row in rows]
+
+    def writes(self, wanted: TimeRange) -> Iterator[str]:
+        """The outcomes of writes in the order of time."""
+        after = (wanted.first, -1)
+        while True:
+            with self._connection() as database:
+                rows = database.execute(
+                    "SELECT time, id, outcome FROM written"
+                    " WHERE (time, id) > (?, ?) AND time <= ? ORDER BY time, id LIMIT 1000",
+                    (*after, wanted.last),
+                ).fetchall()
+            if not rows:
+                return
+            yield from (outcome for _, _, outcome in rows)
+            after = rows[-1][:2]
+
+    def renew(self) -> None:
+        """The path names another file now, or none."""
+        with self._lock:
+            self._age += 1
+            idle, self._idle = self._idle, []
+        for database in idle:
+            database.close()
+
+    @contextmanager
+    def _connection(self) -> Iterator[sqlite3.Connection]:
+        with self._lock:
+            age = self._age
+            database = self._idle.pop() if self._idle else None
+        if database is None:
+            database = sqlite3.connect(
+                f"{self._path.absolute().as_uri()}?mode=ro", uri=True, check_same_thread=False
+            )
+        try:
+            yield database
+        except BaseException:
+            database.close()
+            raise
+        with self._lock:
+            if age == self._age:
+                self._idle.append(database)
+                return
+        database.close()

@@ -1,0 +1,83 @@
+"""Samples <-> rows of the file, so that every value comes back as exactly what it was.
+
+The columns are meant to be read with any SQLite tool: `value` is the number or text itself, `kind`
+says what SQLite cannot (see `Kind`), `bad` is empty for a good sample and holds the reason else.
+"""
+
+import math
+from enum import IntEnum
+from typing import NamedTuple
+
+from gateway.tags import Quality, Reason, Sample, Tag
+from gateway.values import Value
+
+Stored = int | float | str | bytes | None
+
+
+class Kind(IntEnum):
+    """What a value is, where the column `kind` is not empty."""
+
+    BOOL = 0  # written as 0 or 1
+    LONG = 1  # a whole number beyond 64 bits with sign, written in decimal
+    NOT_A_NUMBER = 2  # which SQLite would make NULL
+    ODD_TEXT = 3  # text that is no UTF-8, as bytes
+
+
+class Row(NamedTuple):
+    """The columns `time, value, kind, bad`."""
+
+    time: int
+    value: Stored
+    kind: int | None
+    bad: str | None
+
+
+def to_row(sample: Sample) -> Row:
+    value, kind = _stored(sample.value)
+    bad = None if sample.quality is Quality.GOOD else sample.reason or ""
+    return Row(sample.time, value, kind, None if bad is None else str(bad))
+
+
+def from_row(tag: Tag, row: tuple[int, Stored, int | None, str | None]) -> Sample:
+    time, stored, kind, bad = row
+    value = _value(stored, kind)
+    if bad is None:
+        return Sample(tag, value, Quality.GOOD, time)
+    return Sample(tag, value, Quality.BAD, time, _REASONS.get(bad))
+
+
+_REASONS = {reason.value: reason for reason in Reason}
+
+
+def _stored(value: Value | None) -> tuple[Stored, int | None]:
+    match value:
+        case bool():
+            return int(value), Kind.BOOL
+        case int():
+            return (value, None) if -(2**63) <= value < 2**63 else (str(value), Kind.LONG)
+        case float():
+            return (None, Kind.NOT_A_NUMBER) if math.isnan(value) else (value, None)
+        case str():
+            try:
+                value.encode()
+            except UnicodeEncodeError:
+                return value.encode("utf-8", "surrogatepass"), Kind.ODD_TEXT
+            return value, None
+        case None:
+            return None, None
+
+
+def _value(stored: Stored, kind: int | None) -> Value | None:
+    match kind, stored:
+        case None, int() | float() | str():
+            return stored
+        case Kind.BOOL, _:
+            return bool(stored)
+        case Kind.LONG, str():
+            return int(stored)
+        case Kind.NOT_A_NUMBER, _:
+            return math.nan
+        case Kind.ODD_TEXT, bytes():
+            return stored.decode("utf-8", "surrogatepass")
+        case _:
+            return None

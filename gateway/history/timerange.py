@@ -1,0 +1,88 @@
+"""Zenoh's `_time` ranges: `[now(-1h)..]`, `[2026-11-20T12:00:00Z..now()]`, `]a..b[`, `[..]`.
+
+A bracket that opens inwards includes its bound, one that opens outwards does not; a bound left out
+is open. A bound is RFC 3339 (UTC unless it says otherwise), `now()` or `now(-1h)`, with durations
+in u, ms, s, m, h, d, w; seconds when there is no unit.
+"""
+
+import re
+from datetime import UTC, datetime
+from typing import NamedTuple
+
+from gateway.errors import BadValue
+
+EARLIEST, LATEST = -(2**63), 2**63 - 1  # what the disk holds: the years 1677 to 2262
+
+_UNITS = {
+    "u": 10**3,
+    "ms": 10**6,
+    "": 10**9,
+    "s": 10**9,
+    "m": 60 * 10**9,
+    "h": 3600 * 10**9,
+    "d": 86400 * 10**9,
+    "w": 7 * 86400 * 10**9,
+}
+_NOW = re.compile(r"now\(([+-]?)(.*)\)\Z")
+_DURATION = re.compile(r"([0-9]{1,18})?(?:\.([0-9]{0,18}))?(u|ms|s|m|h|d|w|)\Z")
+_RFC3339 = re.compile(
+    r"([0-9]{4}-[0-9]{2}-[0-9]{2})[T ]([0-9]{2}:[0-9]{2}:[0-9]{2})"
+    r"(?:\.([0-9]{1,9}))?(Z|[+-][0-9]{2}:[0-9]{2})?\Z"
+)
+
+
+class TimeRange(NamedTuple):
+    """From `first` to `last`, both included: ns since 1970."""
+
+    first: int
+    last: int
+
+
+def time_range(text: str, now: int) -> TimeRange:
+    """What `_time=text` asks for; `now`: ns since 1970. Raises `BadValue`."""
+    if len(text) < 4 or text[0] not in "[]" or text[-1] not in "[]" or ".." not in text:
+        raise BadValue(f"_time={_short(text)} is no range such as [now(-1h)..] or [start..end]")
+    start, _, end = text[1:-1].partition("..")
+    first = _bound(start, now) if start else EARLIEST
+    last = _bound(end, now) if end else LATEST
+    if start and text[0] == "]":
+        first += 1
+    if end and text[-1] == "[":
+        last -= 1
+    return TimeRange(_clamped(first), _clamped(last))
+
+
+def _bound(text: str, now: int) -> int:
+    if match := _NOW.match(text):
+        sign, duration = match[1], match[2]
+        if not sign and not duration:
+            return now
+        return now - _duration(duration) if sign == "-" else now + _duration(duration)
+    if match := _RFC3339.match(text):
+        date, clock, fraction, zone = match.groups()
+        try:
+            moment = datetime.fromisoformat(
+                f"{date}T{clock}{'+00:00' if zone == 'Z' else zone or ''}"
+            )
+        except ValueError:
+            raise BadValue(f"{_short(text)} is no time of the calendar") from None
+        since = moment - datetime(1970, 1, 1, tzinfo=UTC)
+        seconds = since.days * 86400 + since.seconds
+        return seconds * 10**9 + int((fraction or "").ljust(9, "0"))
+    raise BadValue(f"{_short(text)} is no time such as 2026-11-20T12:00:00Z or now(-1h)")
+
+
+def _duration(text: str) -> int:
+    match = _DURATION.match(text)
+    if match is None or not (match[1] or match[2]):
+        raise BadValue(f"{_short(text)} is no duration such as 500ms, 30m or 1.5h")
+    unit, fraction = _UNITS[match[3]], match[2] or ""
+    return int(match[1] or 0) * unit + int(fraction or 0) * unit // int(f"1{'0' * len(fraction)}")
+
+
+def _clamped(time: int) -> int:
+    return max(EARLIEST, min(LATEST, time))
+
+
+def _short(text: str) -> str:
+    return repr(text[:60])

@@ -1,0 +1,105 @@
+"""A device's standing, its doubts, its record and what it says is the matter."""
+
+import pytest
+
+from gateway.device import Device, Standing
+from gateway.errors import Evidence, Garbled, NoReply, Unclear
+from gateway.protocols.driver import Span
+from gateway.tags import Reason
+from tests.sim.plant import device, make_tag, words
+
+
+@pytest.fixture
+def dev() -> Device:
+    return device(words(0, 10))
+
+
+def test_a_device_starts_in_doubt_for_answers_to_an_earlier_gateway_may_still_come(
+    dev: Device,
+) -> None:
+    assert dev.standing is Standing.STARTING
+    assert dev.doubtful
+    assert not dev.served
+
+
+def test_an_answer_ends_all_doubt(dev: Device) -> None:
+    dev.failed(NoReply("silence"), Span("D", 0, 10))
+    dev.answered()
+    assert (dev.standing, dev.failures, dev.doubtful, dev.doubt) == (Standing.UP, 0, False, None)
+    assert dev.diagnosis() == ""
+
+
+def test_a_failure_of_a_device_that_answered_makes_it_failing(dev: Device) -> None:
+    dev.answered()
+    dev.failed(NoReply("silence"), Span("D", 0, 10))
+    assert dev.standing is Standing.FAILING
+    assert dev.served
+    assert dev.doubtful
+
+
+@pytest.mark.parametrize("standing", [Standing.STARTING, Standing.SILENT])
+def test_a_failure_of_one_that_did_not_leaves_it_so(dev: Device, standing: Standing) -> None:
+    dev.standing = standing
+    dev.failed(NoReply("silence"), None)
+    assert dev.standing is standing
+
+
+def test_a_probe_that_fails_does_not_forget_what_may_still_be_answered(dev: Device) -> None:
+    dev.failed(NoReply("silence"), Span("D", 0, 10))
+    dev.failed(NoReply("silence"), None)
+    assert dev.doubt == Span("D", 0, 10)
+
+
+def test_a_reopened_line_leaves_the_doubt(dev: Device) -> None:
+    dev.answered()
+    dev.doubt = Span("D", 0, 10)
+    dev.start()
+    assert dev.standing is Standing.STARTING
+    assert dev.doubtful
+    assert dev.doubt == Span("D", 0, 10)
+
+
+def test_who_is_slow_is_not_called_dead_when_nobody_waits_for_it(dev: Device) -> None:
+    dev.trouble = Garbled("it took 0.7 s", evidence=Evidence.SLOW)
+    dev.failed(NoReply("silence"), None)
+    assert "raise reply_timeout" in dev.diagnosis()
+    dev.failed(Garbled("noise"), None)
+    assert "baud rate" in dev.diagnosis()
+
+
+@pytest.mark.parametrize("evidence", [e for e in Evidence if e is not Evidence.SILENCE])
+def test_every_evidence_has_its_sentence(dev: Device, evidence: Evidence) -> None:
+    dev.failed(Garbled("what was heard", evidence=evidence), None)
+    assert "what was heard" in dev.diagnosis()
+    assert "not understood" not in dev.diagnosis()
+    assert dev.reason is Reason.GARBLED
+    assert dev.record.failures[evidence] == 1
+
+
+def test_silence_has_its_sentence(dev: Device) -> None:
+    dev.failed(NoReply("no reply"), None)
+    assert dev.diagnosis().startswith("No byte came back")
+    assert dev.reason is Reason.NO_REPLY
+    dev.failed(Unclear("something else"), None)
+    assert dev.diagnosis() == "something else"
+    assert dev.record.failures["other"] == 1
+
+
+def test_the_turnaround_is_smoothed_over_about_ten(dev: Device) -> None:
+    dev.measured(0.010)
+    assert dev.record.turnaround == 0.010
+    for _ in range(10):
+        dev.measured(0.020)
+    assert dev.record.turnaround is not None
+    assert 0.0155 < dev.record.turnaround < 0.0175
+
+
+def test_the_load_is_the_share_of_the_lines_time(dev: Device) -> None:
+    (block,) = dev.blocks
+    assert dev.load == pytest.approx(dev.seconds(block.cost) / block.every)
+    assert device([]).load == 0
+
+
+def test_a_device_without_a_readable_tag_is_a_broadcast() -> None:
+    assert device([]).broadcast
+    assert not device([make_tag("D0")]).broadcast
