@@ -1,6 +1,7 @@
 """The command line as a Zenoh client of a running gateway."""
 
 import json
+import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
@@ -108,12 +109,16 @@ class Client:
     ) -> tuple[AbstractContextManager[object], ...]:
         """True when the gateway comes, False when it goes, or the only link to it."""
 
-        def event(what: zenoh.Sample | zenoh.TransportEvent) -> None:
-            told(what.kind == zenoh.SampleKind.PUT)
+        def token(sample: zenoh.Sample) -> None:
+            told(sample.kind == zenoh.SampleKind.PUT)
+
+        def link(event: zenoh.TransportEvent) -> None:
+            if event.kind == zenoh.SampleKind.DELETE:  # when it is back, the token says so
+                told(False)
 
         return (
-            self._session.liveliness().declare_subscriber(self._keys.own, event),
-            self._session.info.declare_transport_events_listener(event),
+            self._session.liveliness().declare_subscriber(self._keys.own, token),
+            self._session.info.declare_transport_events_listener(link),
         )
 
     def _ask(self, selector: str, payload: bytes | None) -> list[zenoh.Reply]:
@@ -196,6 +201,8 @@ def parse_value(text: str) -> Value:
         value = json.loads(text)
     except ValueError:
         return text
+    if isinstance(value, float) and not math.isfinite(value):
+        return text  # NaN and 1e999 are no JSON
     return value if isinstance(value, (bool, int, float, str)) else text
 
 

@@ -66,7 +66,7 @@ def cover(
         alone = seconds(item, item)
         if alone is None:
             raise ValueError(item)
-        step = _Step(item, rates.index(interval), rates, seconds, item in splits)
+        step = _Step(item, rates.index(interval), rates, _Known(seconds), item in splits)
         found: dict[tuple[int, ...], _State] = {}
         for state in states:
             for after in step.after(state):
@@ -80,6 +80,18 @@ def cover(
     return _requests(best, len(intervals) - 1, rates)
 
 
+class _Known(dict[tuple[int, int], float | None]):
+    """What an exchange costs, asked for once in each step."""
+
+    def __init__(self, seconds: SecondsOf) -> None:
+        super().__init__()
+        self._seconds = seconds
+
+    def __missing__(self, run: tuple[int, int]) -> float | None:
+        found = self[run] = self._seconds(*run)
+        return found
+
+
 @dataclass(frozen=True, slots=True)
 class _Step:
     """What may be done at one item."""
@@ -87,7 +99,7 @@ class _Step:
     item: int
     rate: int  # which of the intervals the item wants
     rates: Sequence[float]
-    seconds: SecondsOf
+    seconds: _Known
     split: bool
 
     def after(self, state: _State) -> list[_State]:
@@ -106,16 +118,16 @@ class _Step:
         found = []
         closed = way
         if start != CLOSED:
-            longer = None if self.split else self.seconds(start, self.item)
+            longer = None if self.split else self.seconds[start, self.item]
             if longer is not None:
                 found.append(_extended(way, start, longer / every))
                 if not ends:
                     return found
-            spent = (self.seconds(start, self.item - 1) or 0.0) / every
+            spent = (self.seconds[start, self.item - 1] or 0.0) / every
             done = _Closed(Request(start, self.item - 1, every), way.done)
             closed = _State(way.starts, way.paid + spent, way.total + spent, done)
         if rate <= self.rate and not self._served(way):
-            alone = self.seconds(self.item, self.item)
+            alone = self.seconds[self.item, self.item]
             if alone is not None:
                 found.append(_extended(closed, self.item, alone / every))
         found.append(_State((*closed.starts, CLOSED), closed.paid, closed.total, closed.done))

@@ -12,6 +12,8 @@ from gateway.refusals import RETRY, Refusals
 from gateway.tags import Reason, Tag, Written
 from gateway.wiretime import Wire
 
+Done = Callable[[Written | GatewayError], None]
+
 
 class Standing(StrEnum):
     """How far a device can be trusted to answer."""
@@ -190,4 +192,4 @@ class Write:
     units: Sequence[int]
     submitted: float
     expires: float  # not sent any more after this: whoever asked has given up
-    done: Callable[[Written | GatewayError], None]
+    done: Done

@@ -8,6 +8,7 @@ by name:
     <prefix>/<device>/<tag>/@meta       what it is
     <prefix>/<device>/@block            all tags of the device that changed in one scan
     <prefix>/@gateway/<name>/…          state and statistics, the outcome of every write
+    <prefix>/@standby/<group>/…         tokens of the gateways that stand in for one another
     …/@adv/**                           what a Zenoh AdvancedSubscriber asks late
 """
 
@@ -105,6 +106,14 @@ class Keys:
     def writes(self) -> str:
         """Where the outcome of every write is published."""
         return f"{self.own}/writes"
+
+    def group(self, group: str) -> str:
+        """What gateways of one standby group show lies below."""
+        return f"{self.prefix}/@standby/{group}"
+
+    def sign(self, group: str, role: str, gateway: str, session: str) -> str:
+        """The liveliness token of a role in a standby group."""
+        return f"{self.group(group)}/{role}/{gateway}/{session}"
 
     def status(self, path: str) -> str:
         """`status`, `lines/<line>` or `devices/<device>` of this gateway."""

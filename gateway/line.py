@@ -3,12 +3,12 @@
 import asyncio
 import random
 from collections.abc import Awaitable, Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 import structlog
 
 from gateway.consequences import Consequences, Upstairs
-from gateway.device import Device, LineRecord, Standing, Write
+from gateway.device import Device, Done, LineRecord, Standing, Write
 from gateway.errors import Busy, GatewayError, LineDown, Offline, Refused, Unclear
 from gateway.protocols.driver import Span
 from gateway.recorder import Recorder
@@ -25,8 +25,6 @@ PATIENCE = 5.0  # a write that waited so long is not sent any more
 FAST = 19200  # above this baud rate the millisecond of an event loop counts
 GAP = 0.02  # quiet that ends a run of bytes nobody understood
 BROADCAST_PAUSE = 0.1
-
-Done = Callable[[Written | GatewayError], None]
 
 
 class Line:
@@ -108,7 +106,8 @@ class Line:
             try:
                 trouble = await self._open_and_serve()
                 served = _now() - self.record.since if self.is_open else 0.0
-                self._fall(trouble)  # told before closing, which may take a while
+                self.record.trouble = trouble
+                self._then.line_down(trouble)  # told before closing, which may take a while
             finally:
                 await self._close()
             if served > REOPEN_LONGEST:
@@ -136,18 +135,10 @@ class Line:
             return f"internal error: {error!r}"
         return "closed"
 
-    def _fall(self, why: str) -> None:
-        self.record.trouble = why
-        self._stop_writes()
-        self._then.line_down(why)
-
-    def _stop_writes(self) -> None:
+    async def _close(self) -> None:
         self.is_open = False
         for write in self._schedule.withdraw():
             write.done(LineDown(f"line {self.name} went down; not sent"))
-
-    async def _close(self) -> None:
-        self._stop_writes()
         port, self._port = self._port, None
         if port is not None:
             await port.close()
@@ -170,14 +161,9 @@ class Line:
 
     async def _idle(self, until: float) -> None:
         self._wake.clear()
-        timer = None
-        if until != float("inf"):
-            timer = asyncio.get_running_loop().call_at(until, self._wake.set)
-        try:
-            await self._wake.wait()
-        finally:
-            if timer is not None:
-                timer.cancel()
+        with suppress(TimeoutError):
+            async with asyncio.timeout_at(None if until == float("inf") else until):
+                await self._wake.wait()
 
     # Conversations
 
@@ -231,9 +217,8 @@ class Line:
         with self._turn_with(device) as turn:
             device.salt += 1
             try:
-                await device.driver.resync(turn, device.doubt, device.salt)
-            except Refused:  # that is an answer too
-                self._then.answered(device)
+                with suppress(Refused):  # that is an answer too
+                    await device.driver.resync(turn, device.doubt, device.salt)
             except Unclear as error:
                 await self._unclear(device, turn, error, None)
             else:
@@ -241,9 +226,7 @@ class Line:
 
     async def _write(self, write: Write) -> None:
         device = write.device
-        outcome: Written | GatewayError = Unclear(
-            "the gateway stopped before the acknowledgement came; it may have been done"
-        )
+        outcome: Written | GatewayError = Unclear("the gateway stopped; it may have been done")
         try:
             outcome = await self._try_to_write(write)
         except LineDown as error:

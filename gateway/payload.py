@@ -35,6 +35,7 @@ class Problem(StrEnum):
     NO_REPLY = "no-reply"  # the device is silent; nothing was sent
     BUSY = "busy"  # too much is waiting; nothing was done
     UNKNOWN_TAG = "unknown-tag"
+    NOT_ALLOWED = "not-allowed"  # not to this asker: the token is missing or nobody's
     BAD_QUERY = "bad-query"  # a read that cannot be understood
     NO_HISTORY = "no-history"  # a read of the past, where none is kept
 
@@ -89,6 +90,23 @@ def value(sample: Sample) -> bytes:
     return orjson.dumps(_sample(sample))
 
 
+def bare(sample: Sample) -> bytes | None:
+    """The value alone, as text; None when it is not known. `about` is the rest."""
+    known = _sample(sample)["value"]
+    match known:
+        case None:
+            return None
+        case str():
+            return known.encode()
+        case _:
+            return orjson.dumps(known)
+
+
+def about(sample: Sample) -> bytes:
+    """`{"quality": "good", "time": …}`, and a `reason` when bad."""
+    return orjson.dumps({name: what for name, what in _sample(sample).items() if name != "value"})
+
+
 def block(samples: Iterable[Sample]) -> bytes:
     """`{tag: {value, quality, time}}` of one device."""
     return orjson.dumps({sample.tag.name: _sample(sample) for sample in samples})
@@ -111,6 +129,7 @@ def meta(tag: Tag) -> bytes:
         else {"amount": deadband.amount, "percent": deadband.percent},
         "heartbeat": tag.heartbeat,
         "history": tag.history,
+        "payload": tag.payload.value,
         "write": None
         if rule is None
         else {"min": rule.min, "max": rule.max, "verify": rule.verify},
@@ -126,8 +145,8 @@ def outcome(result: Written | Failure) -> bytes:
 def write_outcome(done: WriteOutcome) -> bytes:
     """The line of the audit trail; `outcome` is `written` or the word for what went wrong."""
     line: dict[str, object] = {
-        "key": done.key[:_LONGEST_REASON],
-        "value": _shown(done.value),
+        "key": short(done.key),
+        "value": shown(done.value),
         "time": rfc3339(done.time),
         "took": round(done.took, 6),
         "by": done.by,
@@ -136,7 +155,7 @@ def write_outcome(done: WriteOutcome) -> bytes:
         case Written(verified=verified):
             line |= {"outcome": "written", "verified": verified}
         case Failure(problem, reason, code):
-            line |= {"outcome": problem.value, "code": code, "reason": _short(reason)}
+            line |= {"outcome": problem.value, "code": code, "reason": short(reason)}
     return orjson.dumps(line)
 
 
@@ -178,21 +197,21 @@ def _result(result: Written | Failure) -> dict[str, Value | None]:
                 "took": round(took, 6),
             }
         case Failure(problem, reason, code):
-            return {"error": problem.value, "code": code, "reason": _short(reason)}
+            return {"error": problem.value, "code": code, "reason": short(reason)}
 
 
-def _shown(asked: Value | None) -> Value | None:
+def shown(asked: Value | None) -> Value | None:
     """What was asked for, if it is of a size to be shown; 64 bits are all that orjson writes."""
     match asked:
         case str():
-            return _short(asked)
+            return short(asked)
         case int() if not -(2**63) <= asked < 2**64:
-            return _short(str(asked))
+            return short(str(asked))
         case _:
             return asked
 
 
-def _short(text: str) -> str:
+def short(text: str) -> str:
     """Never an endless answer, and nothing that is no UTF-8, whatever the asker sent."""
     text = text if len(text) <= _LONGEST_REASON else f"{text[:_LONGEST_REASON]}…"
     return text.encode("utf-8", "replace").decode()

@@ -1,24 +1,26 @@
 """Tags -> blocks: what to ask a device so that the wire is busy the shortest time.
 
-Tags of one area that are polled equally often share blocks. Where to cut is found exactly, by
-dynamic programming over the driver's own character costs, the line's speed, the silence
-before a request and the station's turnaround; no fixed gap is right at every baud rate. A
-slower tag that lies inside a faster block rides along for nothing.
+Tags of one area share blocks. Which, and how often each block is asked, is found exactly
+(`cover`) from the driver's own character costs, the line's speed, the silence before a request
+and the station's turnaround; no fixed gap is right at every baud rate. A slower tag rides in a
+faster block where that costs less than asking for it apart.
 """
 
 from bisect import bisect_left
-from collections import defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections import defaultdict, deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 
+from gateway.cover import Request, cover
 from gateway.errors import ConfigError
-from gateway.protocols.driver import AnyDriver, Cost, Span
+from gateway.protocols.driver import AnyDriver, Cost, Span, Unit
 from gateway.tags import Quality, Reason, Sample, Tag, bad
 from gateway.values import Value
 
 Seconds = Callable[[Cost], float]
 Decode = Callable[[Sequence[int]], Value | None]
+LONG_ROW = 300  # items of one area
 Cuts = frozenset[tuple[str, int]]  # (area, n): no block may hold both n - 1 and n
 
 
@@ -58,6 +60,7 @@ class Item:
 
     start: int
     end: int  # exclusive
+    every: float  # as often as the most impatient of them wants it
     tags: list[Tag]
 
 
@@ -82,90 +85,51 @@ def plan(
 def _plan_area(
     area: str, tags: list[Tag], driver: AnyDriver, seconds: Seconds, cuts: Cuts
 ) -> list[Block]:
-    """Fastest interval first, so that slower tags find the blocks they can ride in."""
-    rates: dict[float, list[Tag]] = defaultdict(list)
-    for tag in tags:
-        rates[tag.every].append(tag)
-    spans: list[tuple[Span, float, Cost]] = []
-    riders: list[list[Tag]] = []
-    for every in sorted(rates):
-        left = []
-        for tag in rates[every]:
-            host = _host(tag, spans)
-            if host is None:
-                left.append(tag)
-            else:
-                riders[host].append(tag)
-        for span, cost, members in _cover(area, left, driver, seconds, cuts):
-            spans.append((span, every, cost))
-            riders.append(members)
-    found = [
-        Block(span, every, tuple(members), cost)
-        for (span, every, cost), members in zip(spans, riders, strict=True)
-    ]
-    return sorted(found, key=lambda block: (block.span.start, block.every))
-
-
-def _host(tag: Tag, spans: Sequence[tuple[Span, float, Cost]]) -> int | None:
-    end = tag.span.start + tag.span.size
-    for number, (span, _, _) in enumerate(spans):
-        if span.start <= tag.span.start and end <= span.start + span.size:
-            return number
-    return None
-
-
-def _cover(
-    area: str, tags: list[Tag], driver: AnyDriver, seconds: Seconds, cuts: Cuts
-) -> list[tuple[Span, Cost, list[Tag]]]:
-    """The cheapest set of spans that holds all tags of one interval.
-
-    best[j] is the least time for the first j items; the last block of such a cover begins at
-    some item i, so best[j] = min over i of best[i] + time(i..j). Driver costs never fall when
-    a span grows, so the search for i ends where the span has become too long for one request.
-    """
     items = items_of(tags)
     fences = sorted(n for name, n in cuts if name == area)
-    fenced = [True] + [_between(a.end, b.start, fences) for a, b in pairwise(items)]
-    best = [0.0]
-    last: list[tuple[int, Cost]] = []  # of the cover of the first j items: its last block
-    for j in range(1, len(items) + 1):
-        end = items[j - 1].end
-        least, choice = float("inf"), None
-        for i in range(j - 1, -1, -1):
-            start = items[i].start
-            cost = driver.cost(Span(area, start, end - start))
-            if cost is None:
-                break
-            time = best[i] + seconds(cost)
-            if time < least - 1e-12:
-                least, choice = time, (i, cost)
-            if fenced[i]:
-                break
-        if choice is None:
-            raise ConfigError(f"{items[j - 1].tags[0].text} cannot be read in one request")
-        best.append(least)
-        last.append(choice)
-    return _walk_back(area, items, last)
+    splits = frozenset(
+        i + 1 for i, (a, b) in enumerate(pairwise(items)) if _between(a.end, b.start, fences)
+    )
+
+    def exchange(first: int, last: int) -> float | None:
+        start = items[first].start
+        cost = driver.cost(Span(area, start, items[last].end - start))
+        return None if cost is None else seconds(cost)
+
+    # In very long rows of packed bits a request may cost a character more than the least.
+    even = driver.areas[area].unit is not Unit.BIT or len(items) > LONG_ROW
+    try:
+        requests = cover([item.every for item in items], exchange, splits, even=even)
+    except ValueError as error:
+        culprit = items[error.args[0]].tags[0].text
+        raise ConfigError(f"{culprit} cannot be read in one request") from None
+    return list(_blocks(area, items, requests, driver))
+
+
+def _blocks(
+    area: str, items: Sequence[Item], requests: Sequence[Request], driver: AnyDriver
+) -> Iterator[Block]:
+    """A tag goes with the fastest request that reaches over it: that one is fresher."""
+    members: dict[Request, list[Tag]] = {request: [] for request in requests}
+    waiting = deque(requests)
+    over: list[Request] = []  # those that reach over the item
+    for number, item in enumerate(items):
+        over = [request for request in over if request.last >= number]
+        while waiting and waiting[0].first == number:
+            over.append(waiting.popleft())
+        members[min(over, key=lambda request: request.every)] += item.tags
+    for request, tags in members.items():
+        start = items[request.first].start
+        span = Span(area, start, items[request.last].end - start)
+        cost = driver.cost(span)
+        if cost is not None and tags:
+            yield Block(span, request.every, tuple(tags), cost)
 
 
 def _between(end: int, start: int, fences: Sequence[int]) -> bool:
     """Whether a cut lies between an item that ends at `end` and the next one at `start`."""
     place = bisect_left(fences, end)
     return place < len(fences) and fences[place] <= start
-
-
-def _walk_back(
-    area: str, items: Sequence[Item], last: Sequence[tuple[int, Cost]]
-) -> list[tuple[Span, Cost, list[Tag]]]:
-    found = []
-    j = len(items)
-    while j:
-        i, cost = last[j - 1]
-        start, end = items[i].start, items[j - 1].end
-        members = [tag for item in items[i:j] for tag in item.tags]
-        found.append((Span(area, start, end - start), cost, members))
-        j = i
-    return found[::-1]
 
 
 def items_of(tags: Iterable[Tag]) -> list[Item]:
@@ -176,6 +140,7 @@ def items_of(tags: Iterable[Tag]) -> list[Item]:
         if items and tag.span.start < items[-1].end:
             items[-1].tags.append(tag)
             items[-1].end = max(items[-1].end, end)
+            items[-1].every = min(items[-1].every, tag.every)
         else:
-            items.append(Item(tag.span.start, end, [tag]))
+            items.append(Item(tag.span.start, end, tag.every, [tag]))
     return items

@@ -69,9 +69,9 @@ class Schedule:
     a row while one is due. A late poll is done once, not once per missed period. A device in
     doubt is probed before anything else is asked of it or written to it. A device that was not
     heard yet is probed at once. While polls of others are due, such probes and those of devices
-    that have just failed get half of the wire's time. A silent device is left alone but for probes at growing pauses, and all silent
-    devices together get at most a twentieth of the wire's time while others are there to be
-    served.
+    that have just failed get half of the wire's time. A silent device is left alone but for
+    probes at growing pauses, and all silent devices together get at most a twentieth of the
+    wire's time while others are there to be served.
     """
 
     def __init__(self, devices: Sequence[Device], now: float, seed: int = 0) -> None:
@@ -183,7 +183,7 @@ class Schedule:
         return poll
 
     def _undoubted(self) -> Poll | None:
-        """Of the polls that are due and of no device in doubt the one with the earliest deadline."""
+        """Of the polls that are due the earliest of a device not in doubt."""
         return min(
             (
                 poll

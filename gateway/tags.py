@@ -37,6 +37,13 @@ class Publish(StrEnum):
     ALWAYS = "always"
 
 
+class Form(StrEnum):
+    """How a value travels."""
+
+    JSON = "json"  # with quality and time
+    RAW = "raw"  # the bare value
+
+
 class Deadband(NamedTuple):
     """A change smaller than this is not published. `percent`: of the last published value."""
 
@@ -75,6 +82,7 @@ class Tag:
     publish: Publish = Publish.CHANGE
     heartbeat: float | None = None
     history: bool = False
+    payload: Form = Form.JSON
     write: WriteRule | None = None
     decode: Callable[[Sequence[int]], Value | None] = field(init=False, repr=False)
 

@@ -1,10 +1,14 @@
 """The command line: what is printed where, and with which exit code. People see no traceback."""
 
 import json
+import os
+import re
 import signal
 import subprocess
 import sys
+import termios
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -329,6 +333,32 @@ def test_watch_goes_on_and_ctrl_c_ends_it(running: Path) -> None:
         _says_another(watch, first)
         assert watch.end(signal.SIGINT) == 0
         assert not watch.has_said("Traceback")
+
+
+def test_watch_on_a_terminal_is_a_table_that_changes(running: Path) -> None:
+    master, slave = os.openpty()
+    termios.tcsetwinsize(slave, (40, 120))
+    watch = subprocess.Popen(
+        [sys.executable, "-m", "gateway", "watch", running, "mixer/speed", "mixer/run"],
+        stdin=slave,
+        stdout=slave,
+        env={**os.environ, "TERM": "xterm"},
+    )
+    os.close(slave)
+    try:
+        text = ""
+        while len(set(re.findall(r"mixer/speed +(\d+) +rpm +good", text))) < 3:
+            text += os.read(master, 4096).decode()  # ends when the program does
+        watch.send_signal(signal.SIGINT)
+        with suppress(OSError):  # EIO: the other side is closed
+            while os.read(master, 4096):
+                pass
+        assert watch.wait(PATIENCE) == 0
+        assert re.search(r"mixer/run +(true|false) +good", text)
+    finally:
+        watch.kill()
+        watch.wait()
+        os.close(master)
 
 
 def test_watch_ends_with_its_reader(running: Path) -> None:

@@ -33,6 +33,7 @@ def config(tmp_path: Path) -> Config:
         ('{"value": 1}', '{"value": 1}'),
         ("NaN", "NaN"),
         ("-Infinity", "-Infinity"),
+        ("1e999", "1e999"),
         ("9" * 5000, "9" * 5000),
     ],
 )

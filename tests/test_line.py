@@ -1,6 +1,7 @@
 """A whole line on virtual time: late, mute, noisy and refusing stations, and ports that vanish."""
 
 import asyncio
+import itertools
 import random
 from typing import Any
 
@@ -223,7 +224,9 @@ async def test_a_hiccup_of_one_station_does_not_spoil_the_others() -> None:
         since = now()
         await asyncio.sleep(120)
     for dev in devices[1:]:
-        assert all(s.quality is Quality.GOOD for at, s in line.told if at > since and s.tag is dev.tags[0])
+        assert all(
+            s.quality is Quality.GOOD for at, s in line.told if at > since and s.tag is dev.tags[0]
+        )
 
 
 @pytest.mark.parametrize(("healthy", "mute"), [(4, 1), (1, 31)])
@@ -332,7 +335,11 @@ async def test_a_block_that_is_never_answered_does_not_take_the_line() -> None:
 @on_virtual_time
 async def test_under_full_load_a_write_waits_for_one_exchange_or_two() -> None:
     dev = device(
-        [*words(0, 50, every=0.02), *words(500, 50, every=0.02), make_tag("D100", write=WriteRule())]
+        [
+            *words(0, 50, every=0.02),
+            *words(500, 50, every=0.02),
+            make_tag("D100", write=WriteRule()),
+        ]
     )
     line = plant([dev])
     longest = max(dev.seconds(block.cost) for block in dev.blocks)
@@ -355,7 +362,9 @@ async def test_under_full_load_a_write_waits_for_one_exchange_or_two() -> None:
 
 @on_virtual_time
 async def test_a_stream_of_writes_starves_no_block() -> None:
-    dev = device([*words(0, 10, every=0.5), *words(500, 10, every=0.5), make_tag("D100", write=WriteRule())])
+    dev = device(
+        [*words(0, 10, every=0.5), *words(500, 10, every=0.5), make_tag("D100", write=WriteRule())]
+    )
     line = plant([dev])
     wind_up(line)
     async with running(line):
@@ -366,7 +375,7 @@ async def test_a_stream_of_writes_starves_no_block() -> None:
             await asyncio.sleep(0.03)
         for tag in (dev.tags[0], dev.tags[10]):
             times = [at for at, s in line.told if s.tag is tag and start <= at]
-            assert max(b - a for a, b in zip(times, times[1:], strict=False)) < 1.5
+            assert max(b - a for a, b in itertools.pairwise(times)) < 1.5
 
 
 @on_virtual_time
@@ -394,7 +403,9 @@ async def test_an_expired_write_is_never_sent() -> None:
 
 
 @on_virtual_time
-async def test_when_the_port_goes_a_write_in_flight_is_unclear_and_those_waiting_fail_at_once() -> None:
+async def test_when_the_port_goes_a_write_in_flight_is_unclear_and_those_waiting_fail_at_once() -> (
+    None
+):
     dev = device([make_tag("D0", write=WriteRule()), *words(10, 20)])
     line = plant([dev])
     async with running(line):
@@ -511,7 +522,7 @@ async def test_an_overloaded_line_is_busy_all_the_time_and_starves_nobody() -> N
             tag = block.tags[0]
             times = [at for at, s in line.told if s.tag is tag and at >= start]
             cycle = sum(d.seconds(b.cost) for d in devices for b in d.blocks)
-            ages = [b - a for a, b in zip(times, times[1:], strict=False)]
+            ages = [b - a for a, b in itertools.pairwise(times)]
             assert max(ages) <= 2 * block.every + cycle
 
 
@@ -528,7 +539,7 @@ async def test_a_late_poll_is_done_once() -> None:
         start = now()
         await asyncio.sleep(4.4)
         gaps = line.reads(slow, start)
-        assert all(b - a > 0.3 for a, b in zip(gaps, gaps[1:], strict=False))
+        assert all(b - a > 0.3 for a, b in itertools.pairwise(gaps))
         assert slow.record.overruns >= 1
 
 
@@ -579,7 +590,7 @@ async def test_the_pause_between_tries_grows_to_ten_seconds_and_starts_anew() ->
             line.bench.vanish()
             await asyncio.sleep(300)
             tries = line.bench.opened
-            pauses = [b - a for a, b in zip(tries, tries[1:], strict=False)]
+            pauses = [b - a for a, b in itertools.pairwise(tries)]
             assert 0.15 < pauses[0] < 0.5
             assert all(0.8 * 10 <= pause <= 1.2 * 10 + 0.01 for pause in pauses[8:])
             assert len({round(pause, 6) for pause in pauses[8:]}) > 5  # jitter

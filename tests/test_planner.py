@@ -1,5 +1,6 @@
 """The planner asks for every tag once, keeps its cuts, and no cover of one interval is cheaper."""
 
+import itertools
 import time
 from collections.abc import Iterator, Sequence
 from functools import partial
@@ -56,7 +57,7 @@ def partitions(count: int) -> Iterator[list[tuple[int, int]]]:
     """All ways to cut `count` things in a row into pieces."""
     for pattern in range(2 ** max(0, count - 1)):
         edges = [0, *(i + 1 for i in range(count - 1) if pattern >> i & 1), count]
-        yield list(zip(edges, edges[1:], strict=False))
+        yield list(itertools.pairwise(edges))
 
 
 def merged(tags: Sequence[Tag]) -> list[tuple[int, int]]:
@@ -78,7 +79,9 @@ def brute_force(area: str, tags: Sequence[Tag], seconds: partial[float], cuts: C
         for i, j in pieces:
             start, end = items[i][0], items[j - 1][1]
             fenced = j - i > 1 and any(
-                a[1] <= n <= b[0] for a, b in zip(items[i:j], items[i + 1 : j], strict=False) for n in fences
+                a[1] <= n <= b[0]
+                for a, b in zip(items[i:j], items[i + 1 : j], strict=False)
+                for n in fences
             )
             costs.append(None if fenced else DRIVER.cost(Span(area, start, end - start)))
         if None not in costs:
@@ -131,7 +134,9 @@ def test_the_plan_does_not_depend_on_the_order_of_the_tags(tags: list[Tag], chan
 
 
 @settings(max_examples=100, deadline=None)
-@given(st.sets(st.integers(0, 60), min_size=1, max_size=20), st.sets(st.integers(0, 61), max_size=5))
+@given(
+    st.sets(st.integers(0, 60), min_size=1, max_size=20), st.sets(st.integers(0, 61), max_size=5)
+)
 def test_no_block_of_words_holds_both_sides_of_a_cut(numbers: set[int], fences: set[int]) -> None:
     tags = [make_tag(f"D{n}") for n in sorted(numbers)]
     for start, size in spans(plan(tags, DRIVER, at(9600), frozenset(("D", n) for n in fences))):
@@ -143,7 +148,9 @@ def test_a_cut_in_a_gap_is_kept() -> None:
     assert spans(plan(tags, DRIVER, at(9600))) == [(0, 7)]
     for n in range(1, 7):
         assert spans(plan(tags, DRIVER, at(9600), frozenset({("D", n)}))) == [(0, 1), (6, 1)]
-    assert spans(plan(tags, DRIVER, at(9600), frozenset({("D", 0), ("D", 7), ("M", 3)}))) == [(0, 7)]
+    assert spans(plan(tags, DRIVER, at(9600), frozenset({("D", 0), ("D", 7), ("M", 3)}))) == [
+        (0, 7)
+    ]
 
 
 def test_how_far_it_reads_over_a_gap_depends_on_the_baud_rate() -> None:
@@ -161,7 +168,12 @@ def test_a_slower_tag_inside_a_faster_block_rides_along() -> None:
 
 
 def test_bits_and_words_of_one_place_share_a_block() -> None:
-    tags = [make_tag("D7"), make_tag("D7.3"), make_tag("D7.4"), make_tag("D7", type="float32", name="f")]
+    tags = [
+        make_tag("D7"),
+        make_tag("D7.3"),
+        make_tag("D7.4"),
+        make_tag("D7", type="float32", name="f"),
+    ]
     (block,) = plan(tags, DRIVER, at(9600))
     assert block.span == Span("D", 7, 2)
     samples = block.decode([0b1000, 0], 5)
@@ -170,7 +182,9 @@ def test_bits_and_words_of_one_place_share_a_block() -> None:
 
 
 def test_what_is_no_value_of_its_type_is_bad() -> None:
-    (block,) = plan([make_tag("D0", type="float32"), make_tag("D2", type="bcd16")], DRIVER, at(9600))
+    (block,) = plan(
+        [make_tag("D0", type="float32"), make_tag("D2", type="bcd16")], DRIVER, at(9600)
+    )
     samples = block.decode([0xFFFF, 0xFFFF, 0x00AB], 1)
     assert [(s.value, s.quality, s.reason) for s in samples] == [
         (None, Quality.BAD, Reason.NOT_A_NUMBER)

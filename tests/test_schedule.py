@@ -347,7 +347,9 @@ class AnyOrder(RuleBasedStateMachine):
         super().__init__()
         self.now = 0.0
         self.devices = [
-            device([make_tag(f"D{n}", every=e) for n, e in ((0, 0.5), (1, 0.5), (900, 2.0))], station=s)
+            device(
+                [make_tag(f"D{n}", every=e) for n, e in ((0, 0.5), (1, 0.5), (900, 2.0))], station=s
+            )
             for s in (1, 2, 3)
         ]
         self.schedule = Schedule(self.devices, self.now)
@@ -448,9 +450,9 @@ class AnyOrder(RuleBasedStateMachine):
     def _queues(self, poll: Poll) -> int:
         schedule = self.schedule
         heaps = [*schedule._waiting, *schedule._ready]
-        return sum(
-            one is poll and ticket == poll.ticket for _, ticket, one in heaps
-        ) + sum(one is poll for one in schedule._urgent)
+        return sum(one is poll and ticket == poll.ticket for _, ticket, one in heaps) + sum(
+            one is poll for one in schedule._urgent
+        )
 
     def _due(self) -> list[Poll]:
         return [

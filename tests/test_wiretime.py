@@ -10,7 +10,9 @@ from gateway.wiretime import Wire, character_bits
     ("serial_format", "bits"),
     [("7E1", 10), ("8N1", 10), ("8E1", 11), ("8N2", 11), ("7N1", 9), ("8O2", 12)],
 )
-def test_a_character_has_a_start_bit_data_parity_and_stop_bits(serial_format: str, bits: int) -> None:
+def test_a_character_has_a_start_bit_data_parity_and_stop_bits(
+    serial_format: str, bits: int
+) -> None:
     assert character_bits(serial_format) == bits
 
 

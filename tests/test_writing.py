@@ -114,7 +114,7 @@ async def test_verify_and_repeat_send_again_only_what_was_not_done() -> None:
 @on_virtual_time
 async def test_a_refusal_of_the_repetition_says_nothing_of_the_first_try() -> None:
     """The first was obeyed, only its acknowledgement was lost: "refused" would be a lie."""
-    line, _, tag = one(WriteRule(repeat=True))
+    line, _, _tag = one(WriteRule(repeat=True))
     async with running(line):
         await asyncio.sleep(1)
         station = line.stations[0].inner

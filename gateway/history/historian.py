@@ -17,6 +17,7 @@ from gateway.tags import Sample, Tag
 
 LONGEST_RUN = 32_768  # samples
 OLDEST_RUN = 600.0  # seconds
+MOST_ASKED = 1_000_000_000  # samples, by `limit`
 
 
 class Historian:
@@ -80,7 +81,7 @@ class Historian:
         middle, when the file cannot be read now: what came until then is not all there is.
         """
         wanted = self._range(time_range, limit)
-        return islice(self._samples(tag, wanted), limit)
+        return islice(self._samples(tag, wanted, limit), limit)
 
     def writes(self, time_range: str, limit: int | None = None) -> Iterator[str]:
         """Outcomes of writes as on the `writes` key (JSON), by the time they ended. Raises as
@@ -89,8 +90,8 @@ class Historian:
         return islice(self._writes(wanted), limit)
 
     def _range(self, text: str, limit: int | None) -> TimeRange:
-        if limit is not None and limit < 1:
-            raise BadValue(f"limit={limit} is not 1 or more")
+        if limit is not None and not 1 <= limit <= MOST_ASKED:
+            raise BadValue("limit is not between 1 and 1000000000")
         wanted = time_range(text, self._wall())
         if not self._writer.readable:
             raise Busy(f"history cannot be read: {self._writer.trouble}")
@@ -102,19 +103,22 @@ class Historian:
         except sqlite3.Error as error:
             raise Busy(f"history cannot be read: {error}") from error
 
-    def _samples(self, tag: Tag, wanted: TimeRange) -> Iterator[Sample]:
+    def _samples(self, tag: Tag, wanted: TimeRange, limit: int | None) -> Iterator[Sample]:
         shelf, newest = self._recent.of(tag.key)
         runs = [run for run in shelf if run.first <= wanted.last and run.last >= wanted.first]
+
+        def part(number: int, run: Shelved) -> Part:
+            return Part(
+                run.first, lambda: self._reader.samples(tag, number, run.number, wanted, limit)
+            )
+
         try:
             number = self._reader.tag(tag.key) if runs else None
-            parts = [] if number is None else [self._part(tag, number, run, wanted) for run in runs]
+            parts = [] if number is None else [part(number, run) for run in runs]
             parts += [_part_of(run, wanted) for run in newest]
             yield from in_order(parts)
         except sqlite3.Error as error:
             raise Busy(f"history cannot be read: {error}") from error
-
-    def _part(self, tag: Tag, number: int, run: Shelved, wanted: TimeRange) -> Part:
-        return Part(run.first, lambda: self._reader.samples(tag, number, run.number, wanted))
 
 
 def _part_of(run: list[Sample], wanted: TimeRange) -> Part:

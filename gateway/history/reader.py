@@ -63,12 +63,15 @@ class Reader:
             row = database.execute("SELECT id FROM tag WHERE key = ?", (key,)).fetchone()
         return None if row is None else int(row[0])
 
-    def samples(self, tag: Tag, number: int, run: int, wanted: TimeRange) -> list[Sample]:
+    def samples(
+        self, tag: Tag, number: int, run: int, wanted: TimeRange, limit: int | None
+    ) -> list[Sample]:
+        """The first of one run: all of them without a limit."""
         with self._connection() as database:
             rows = database.execute(
                 "SELECT time, value, kind, bad FROM sample"
-                " WHERE run = ? AND tag = ? AND time BETWEEN ? AND ? ORDER BY time, n",
-                (run, number, *wanted),
+                " WHERE run = ? AND tag = ? AND time BETWEEN ? AND ? ORDER BY time, n LIMIT ?",
+                (run, number, *wanted, -1 if limit is None else limit),
             ).fetchall()
         return [from_row(tag, row) for row in rows]
 

@@ -60,10 +60,9 @@ def _bound(text: str, now: int) -> int:
         return now - _duration(duration) if sign == "-" else now + _duration(duration)
     if match := _RFC3339.match(text):
         date, clock, fraction, zone = match.groups()
+        zone = "+00:00" if zone in (None, "Z") else zone
         try:
-            moment = datetime.fromisoformat(
-                f"{date}T{clock}{'+00:00' if zone == 'Z' else zone or ''}"
-            )
+            moment = datetime.fromisoformat(f"{date}T{clock}{zone}")
         except ValueError:
             raise BadValue(f"{_short(text)} is no time of the calendar") from None
         since = moment - datetime(1970, 1, 1, tzinfo=UTC)

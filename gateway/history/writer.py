@@ -146,26 +146,26 @@ class Writer:
             if not file.is_there():
                 raise FileNotFoundError(0, "the file was taken away")
             file.sync(full=True)
-        self._store(file)
         self._store_writes(file)
+        self._recent.close_old()
+        for run in self._recent.runs():
+            self._store(file, run)
+            self._sort(file)
+            self._make_room(file)
         file.sync(full=False)
-        self._sort(file)
-        self._make_room(file)
         if self.trouble is not None:
             log.info("history is written", path=str(self._path))
             self.trouble = None
 
-    def _store(self, file: HistoryFile) -> None:
-        self._recent.close_old()
-        for run in self._recent.runs():
-            while (count := len(run.samples)) > run.stored:
-                if not run.number:
-                    run.number = file.new_run()
-                    self._begun.append(run)
-                upto = min(count, run.stored + MOST_AT_ONCE)
-                file.store(run.number, run.stored, run.samples[run.stored : upto])
-                self.stored += upto - run.stored
-                self._recent.stored(run, upto)
+    def _store(self, file: HistoryFile, run: Run) -> None:
+        while (count := len(run.samples)) > run.stored:
+            if not run.number:
+                run.number = file.new_run()
+                self._begun.append(run)
+            upto = min(count, run.stored + MOST_AT_ONCE)
+            file.store(run.number, run.stored, run.samples[run.stored : upto])
+            self.stored += upto - run.stored
+            self._recent.stored(run, upto)
 
     def _store_writes(self, file: HistoryFile) -> None:
         with self._writes_lock:

@@ -119,7 +119,7 @@ class Queries:
         result: Written | Failure = Failure(Problem.UNCLEAR, "the gateway is ending")
         try:
             result = await self._writes.write(
-                key, None if data is None else data.to_bytes(), asker(query.source_info)
+                key, None if data is None else data.to_bytes(), asker(query)
             )
         finally:
             self._soon(query, partial(self._replies.outcome, result))

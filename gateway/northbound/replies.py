@@ -60,14 +60,14 @@ class Replies:
         # Stamped before it is looked up: a newer value that is put meanwhile has the newer stamp.
         stamp = self._stamp()
         sample = self._plant.sample(tag)
-        self._reply(query, self._keys.value(tag.key), payload.value(sample), stamp)
+        forms.reply(query, self._keys.value(tag.key), sample, stamp)
 
     def fresh(self, samples: Iterable[Sample], query: zenoh.Query) -> None:
         """What was just read, or what has been read since."""
         for sample in samples:
             stamp = self._stamp()
             newest = max(sample, self._plant.sample(sample.tag), key=lambda of: of.time)
-            self._reply(query, self._keys.value(sample.tag.key), payload.value(newest), stamp)
+            forms.reply(query, self._keys.value(sample.tag.key), newest, stamp)
 
     def history(self, wanted: Asked, query: zenoh.Query) -> None:
         tags = self._directory.find(wanted.of)

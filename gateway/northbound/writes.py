@@ -17,6 +17,7 @@ from gateway.errors import Busy, GatewayError
 from gateway.keys import Keys, asked
 from gateway.northbound.directory import Directory
 from gateway.northbound.plant import Plant
+from gateway.northbound.writers import LONGEST_TOKEN, Asker, NotAllowed, Writers
 from gateway.payload import Failure, Problem, WriteOutcome
 from gateway.tags import Tag, Written
 from gateway.values import Value
@@ -37,20 +38,25 @@ class Writes:
         plant: Plant,
         directory: Directory,
         wrote: Callable[[WriteOutcome], None],
+        writers: Writers | None = None,
     ) -> None:
         self._keys = keys
         self._plant = plant
         self._directory = directory
         self._wrote = wrote
+        self._writers = writers
         self._waiting = 0
 
-    async def write(self, key: str, data: bytes | None, by: str | None) -> Written | Failure:
+    async def write(self, key: str, data: bytes | None, asker: Asker) -> Written | Failure:
         """`key` is the `@set` key as it came, wildcards and all; `data` its payload."""
+        by = asker.session
         started = time.monotonic()
         value: Value | None = None
         result: Written | Failure = Failure(Problem.UNCLEAR, "the gateway ended before the write")
         self._waiting += 1
         try:
+            if self._writers is not None:
+                by = self._writers.owner(asker.token)
             target = self._target(key)
             if isinstance(target, Failure):
                 result = target
@@ -61,6 +67,8 @@ class Writes:
             result = Failure(
                 Problem.UNCLEAR, f"not acknowledged within {ANSWER_WITHIN:g} s: it may yet be done"
             )
+        except NotAllowed as error:
+            result = Failure(Problem.NOT_ALLOWED, str(error))
         except GatewayError as error:
             result = payload.failure(error)
         finally:
@@ -105,10 +113,7 @@ class PutWrites:
         key = str(put.key_expr)
         if "*" not in key and not self._directory.owns(asked(key).of):
             return  # another gateway's
-        if put.kind == zenoh.SampleKind.DELETE:
-            log.warning("a delete on a write key means nothing", key=key[:300])
-            return
-        work = self._writes.write(key, put.payload.to_bytes(), asker(put.source_info))
+        work = self._writes.write(key, _payload(put), asker(put))
         task: asyncio.Task[object] = asyncio.get_running_loop().create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._ended)
@@ -127,6 +132,15 @@ class PutWrites:
             log.error("a write failed", exc_info=error)
 
 
-def asker(source: zenoh.SourceInfo | None) -> str | None:
-    """Who asked, where Zenoh tells: most clients do not say."""
-    return None if source is None else str(source.source_id.zid)
+def asker(asking: zenoh.Query | zenoh.Sample) -> Asker:
+    """Who asked, where Zenoh or a token tells: most clients do not say."""
+    source, token = asking.source_info, asking.attachment
+    return Asker(
+        None if source is None else str(source.source_id.zid),
+        None if token is None or len(token) > LONGEST_TOKEN else token.to_bytes(),
+    )
+
+
+def _payload(put: zenoh.Sample) -> bytes | None:
+    """None for a delete, which is refused as a write of nothing."""
+    return None if put.kind == zenoh.SampleKind.DELETE else put.payload.to_bytes()

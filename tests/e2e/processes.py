@@ -16,6 +16,10 @@ PATIENCE = 20.0  # seconds; never waited for when all is well
 ROOT = Path(__file__).parents[2]
 _ENVIRONMENT = {**os.environ, "PYTHONUNBUFFERED": "1", "NO_COLOR": "1", "COLUMNS": "120"}
 
+# Shells start what runs in the background deaf to Ctrl-C, and children inherit that.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
 
 class Done(NamedTuple):
     """A program that came to its end by itself."""
@@ -148,31 +152,28 @@ def gateway(*arguments: object, merged: bool = True) -> Program:
 
 def started(config: Path) -> Program:
     """A gateway that is on Zenoh."""
-    program = gateway("run", config)
-    try:
-        program.says("on Zenoh")
-    except BaseException:
-        program.__exit__()
-        raise
-    return program
+    return _ready(gateway("run", config), "on Zenoh")
 
 
 def station(*where: str, stations: tuple[int, ...] = (1,)) -> Program:
     """Simulated Vigor PLCs that obey commands (tests/e2e/station.py), ready to be spoken to."""
     numbers = ",".join(map(str, stations))
-    program = Program(sys.executable, "-m", "tests.e2e.station", numbers, *where)
-    try:
-        program.says("ready")
-    except BaseException:
-        program.__exit__()
-        raise
-    return program
+    return _ready(Program(sys.executable, "-m", "tests.e2e.station", numbers, *where), "ready")
 
 
 def cable(socat: str, link: Path, far_end: str) -> Program:
     """A pty at `link` with a cable to `far_end`, as socat writes it. Killed, it is pulled out."""
-    program = Program(socat, "-d", "-d", f"pty,raw,echo=0,link={link}", far_end)
-    program.says("starting data transfer loop")
+    ends = f"pty,raw,echo=0,link={link}", far_end
+    return _ready(Program(socat, "-d", "-d", *ends), "starting data transfer loop")
+
+
+def _ready(program: Program, words: str) -> Program:
+    """The program once it has said so; ended if it never does."""
+    try:
+        program.says(words)
+    except BaseException:
+        program.__exit__()
+        raise
     return program
 
 

@@ -130,6 +130,20 @@ async def test_a_write_in_flight_is_answered_and_so_is_the_one_behind_it(
             assert errors == {"7": "unclear", "0": "line-down"}
 
 
+def test_a_client_without_its_router_ends_in_time_too(tmp_path: Path) -> None:
+    """It waits for the router, and polls; nobody has to wait for it."""
+    lines = {"hall": vigor_line("simulator", {"speed": {"address": "D10"}})}
+    zenoh = {"mode": "client", "listen": [], "connect": [free_endpoint()]}
+    path = write_config(tmp_path / "config.yaml", "", lines, zenoh=zenoh)
+    with gateway("run", path) as program:
+        program.says("device answers")
+        program.says("no Zenoh router yet")
+        told = time.monotonic()
+        assert program.end() == 0
+        assert time.monotonic() - told < WITHIN
+        assert not program.has_said("Traceback")
+
+
 async def test_after_kill_9_the_next_one_starts_at_once(plant: Plant) -> None:
     with started(plant.config) as first:
         first.says("device answers")

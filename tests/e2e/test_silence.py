@@ -4,6 +4,7 @@ The configuration says `every: 1s` and `reply_timeout: 200ms`, and leaves `retri
 `late_guard` (as long as the reply time-out) as they are.
 """
 
+import signal
 from collections.abc import Iterator
 from datetime import datetime
 from itertools import pairwise
@@ -108,14 +109,18 @@ async def test_a_write_whose_answer_is_lost_is_unclear(plant: Plant) -> None:
 
 
 async def test_the_gateways_own_token_goes_with_it(plant: Plant) -> None:
-    async with ZenohPeer("router", listen=[endpoint := free_endpoint()], connect=[plant.endpoint]):
-        async with ZenohPeer("client", connect=[endpoint]) as client:
-            alive = await client.liveliness("plant/@gateway/*")
-            came = await alive.next(lambda t: t.kind == "PUT")
-            assert came.key == "plant/@gateway/demo"
-            plant.gateway.end()
-            gone = await alive.next(lambda t: t.kind == "DELETE")
-            assert gone.key == "plant/@gateway/demo"
+    """Seen through a router between gateway and client, killed without a word."""
+    endpoint = free_endpoint()
+    async with (
+        ZenohPeer("router", listen=[endpoint], connect=[plant.endpoint]),
+        ZenohPeer("client", connect=[endpoint]) as client,
+    ):
+        alive = await client.liveliness("plant/@gateway/*")
+        came = await alive.next(lambda t: t.kind == "PUT")
+        assert came.key == "plant/@gateway/demo"
+        plant.gateway.end(signal.SIGKILL)
+        gone = await alive.next(lambda t: t.kind == "DELETE")
+        assert gone.key == "plant/@gateway/demo"
 
 
 def _good(sample: Heard) -> bool:

@@ -1,4 +1,4 @@
-"""A line with simulated Vigor stations, and everything that can go wrong with it at the turn of a knob.
+"""A line with simulated Vigor stations, and knobs for everything that can go wrong with it.
 
 What the line tells, sends and hears is kept with its time, so that a test can ask afterwards.
 """
@@ -17,7 +17,7 @@ from gateway.protocols.driver import AnyDriver, Span, Timing, Unit
 from gateway.protocols.vigor import Vigor
 from gateway.stations.station import Memory
 from gateway.stations.vigor import VigorStation
-from gateway.tags import Quality, Reason, Sample, Tag, WriteRule, Written
+from gateway.tags import Quality, Reason, Sample, Tag, Written
 from gateway.transport import Ear, Port, open_simulator
 from gateway.values import Layout, Value, parse_type
 from gateway.wiretime import Wire
@@ -28,7 +28,12 @@ SECOND = 1_000_000_000
 
 
 def make_tag(
-    text: str, driver: AnyDriver | None = None, *, device: str = "plc", name: str = "", **settings: Any
+    text: str,
+    driver: AnyDriver | None = None,
+    *,
+    device: str = "plc",
+    name: str = "",
+    **settings: Any,
 ) -> Tag:
     """A tag as the file would make it: `D100`, `M12`, `D7.3`; `type="float32"`."""
     driver = driver or Vigor(station=1)
@@ -213,9 +218,7 @@ class Plant:
     # What tests ask
 
     def good(self, device: Device) -> bool:
-        return all(
-            tag in self.now and self.now[tag].quality is Quality.GOOD for tag in device.tags
-        )
+        return all(tag in self.now and self.now[tag].quality is Quality.GOOD for tag in device.tags)
 
     def reads(self, device: Device, since: float = 0.0) -> list[float]:
         """When the device's first tag was read well."""

@@ -1,0 +1,117 @@
+"""What must stay secret, and who could reach this session: looked at before it is opened.
+
+No message here ever shows the content of a file.
+"""
+
+import ipaddress
+import json
+import os
+import re
+import stat
+from pathlib import Path
+
+import zenoh
+
+from gateway.errors import ConfigError
+
+PASSWORD_VARIABLE = "PLC_GATEWAY_ZENOH_PASSWORD"  # noqa: S105  (the name of a variable)
+_SECRET = re.compile(r"""["']?(password|\w*_base64)["']?\s*:\s*["'\d]""")
+_LOCAL_PROTOCOLS = ("unixsock-stream",)
+_ENCRYPTED_PROTOCOLS = ("tls", "quic", *_LOCAL_PROTOCOLS)
+
+
+def closed_to_others(path: Path, called: str) -> None:
+    """Raises `ConfigError` if everybody on this machine could read or change the file."""
+    try:
+        mode = path.stat().st_mode
+    except OSError as error:
+        raise ConfigError(f"{called} {path}: {error.strerror}") from None
+    if os.name == "posix" and mode & (stat.S_IROTH | stat.S_IWOTH):
+        raise ConfigError(
+            f"{called} {path} is open to everybody on this machine: run chmod o-rwx {path}"
+        )
+
+
+def readable_secret(path: Path, called: str) -> str:
+    """The text of a file that is closed to others. Raises `ConfigError`."""
+    closed_to_others(path, called)
+    try:
+        return path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"{called} {path}: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise ConfigError(f"{called} {path} is no UTF-8 text") from None
+
+
+def password(file: Path | None) -> str | None:
+    """From the file (its first line), or else from the environment. Raises `ConfigError`."""
+    if file is None:
+        return os.environ.get(PASSWORD_VARIABLE) or None
+    found = readable_secret(file, "zenoh.password_file").partition("\n")[0].strip()
+    if not found:
+        raise ConfigError(f"zenoh.password_file {file} has an empty first line")
+    return found
+
+
+def holds_secret(zenoh_file: str) -> bool:
+    """Whether a Zenoh JSON5 file has a password or a private key in itself."""
+    return _SECRET.search(zenoh_file) is not None
+
+
+def where(error: zenoh.ZError, zenoh_file: str) -> str:
+    """What is wrong with a Zenoh file, without quoting from one that holds a secret."""
+    text = str(error)
+    if not holds_secret(zenoh_file):
+        return text
+    place = re.search(r"(?:at |line ?:? ?)\D{0,10}(\d+)(?:\D{1,12}(\d+))?", text)
+    return "something is wrong" + (f" at {place[0][-40:]}" if place else "") + " (not shown here)"
+
+
+def exposures(config: zenoh.Config) -> list[str]:
+    """What somebody should know who lets other machines reach this session: sentences."""
+    endpoints = [str(endpoint) for endpoint in _endpoints(config)]
+    reachable = [endpoint for endpoint in endpoints if not _is_local(endpoint)]
+    if not reachable:
+        return []
+    told, places = [], ", ".join(reachable)
+    asks_who = (
+        _setting(config, "transport/auth/usrpwd/dictionary_file") is not None
+        or _setting(config, "transport/link/tls/enable_mtls") is True
+        or _setting(config, "transport/auth/pubkey/known_keys_file") is not None
+    )
+    rules = _setting(config, "access_control/enabled") is True and (
+        _setting(config, "access_control/default_permission") == "deny"
+    )
+    if not asks_who and not rules:
+        told.append(
+            f"other machines can reach {places}, and nothing protects it: whoever does may read "
+            "every value and write every tag that can be written; see docs/security.md"
+        )
+    open_wire = [one for one in reachable if one.partition("/")[0] not in _ENCRYPTED_PROTOCOLS]
+    if asks_who and open_wire:
+        told.append(f"passwords and values travel in the clear on {', '.join(open_wire)}: use tls/")
+    return told
+
+
+def _endpoints(config: zenoh.Config) -> list[object]:
+    found = _setting(config, "listen/endpoints")
+    if isinstance(found, dict):  # by mode
+        mode = _setting(config, "mode")
+        found = found.get(mode) if isinstance(mode, str) else None
+    return found if isinstance(found, list) else []
+
+
+def _setting(config: zenoh.Config, path: str) -> object:
+    found: object = json.loads(config.get_json(path))
+    return found
+
+
+def _is_local(endpoint: str) -> bool:
+    protocol, _, address = endpoint.partition("/")
+    if protocol in _LOCAL_PROTOCOLS:
+        return True
+    host = address.partition("?")[0].partition("#")[0].rpartition(":")[0].strip("[]")
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"

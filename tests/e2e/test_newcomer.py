@@ -1,0 +1,52 @@
+"""The first five minutes: the example runs, says what to type next, and that works."""
+
+import shlex
+import signal
+import subprocess
+from pathlib import Path
+
+from tests.e2e.processes import PATIENCE, ROOT, Done, Program, started
+from tests.zenoh_peer import free_endpoint
+
+
+def test_the_example_runs_and_what_it_says_to_type_works(tmp_path: Path) -> None:
+    text = (ROOT / "config.example.yaml").read_text()
+    assert text.count("listen: [tcp/127.0.0.1:7447]") == 1
+    path = tmp_path / "config.yaml"  # as it is, but for the port, which may be taken here
+    path.write_text(text.replace("tcp/127.0.0.1:7447", free_endpoint()))
+    with started(path) as program:
+        program.says("Ctrl-C ends it.")
+        for _ in range(3):
+            program.says("device answers")
+        first = next(i for i, line in enumerate(program.lines) if "In a second terminal:" in line)
+        said = program.lines[first + 1 :]
+        steps = [shlex.split(line) for line in said if line.startswith("  ") and str(path) in line]
+        assert [_verb(step) for step in steps] == ["watch", "read", "write"]
+        watch, read, write = steps
+
+        with Program(*watch) as watching:
+            shown = watching.says("mixer/speed", "good")
+            after = watching.lines.index(shown) + 1
+            assert watching.says("mixer/speed", "good", after=after) != shown
+            assert watching.end(signal.SIGINT) == 0
+        done = _typed(read)
+        assert done.code == 0
+        assert "good" in done.out
+        done = _typed(write)
+        assert (done.code, done.err) == (0, "")
+        assert "acknowledged" in done.out
+        everything = _typed([*read[: read.index("read") + 1], str(path)])
+        assert everything.code == 0
+        assert everything.out.count(" good ") == 16
+        assert program.end(signal.SIGINT) == 0
+
+
+def _verb(step: list[str]) -> str:
+    return next(word for word in step if word in ("watch", "read", "write"))
+
+
+def _typed(words: list[str]) -> Done:
+    done = subprocess.run(
+        words, capture_output=True, text=True, timeout=PATIENCE, check=False, cwd=ROOT
+    )
+    return Done(done.returncode, done.stdout, done.stderr)

@@ -1,0 +1,176 @@
+"""From a configuration to a running gateway, without Zenoh: samples up, writes down."""
+
+import asyncio
+import time
+from collections.abc import AsyncIterator, Sequence
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gateway.app import Gateway, forecasts, zenoh_settings
+from gateway.config import load
+from gateway.errors import BadValue, LineDown
+from gateway.northbound import Mode
+from gateway.tags import Quality, Reason, Sample
+from tests.e2e.processes import vigor_line, write_config
+
+TAGS = {
+    "speed": {"address": "D10"},
+    "door": {"address": "M12"},
+    "recipe": {"address": "D500", "write": {"min": 1, "max": 40, "verify": True}},
+}
+
+
+class Watched:
+    """A gateway, and all it published."""
+
+    def __init__(self, gateway: Gateway) -> None:
+        self.gateway = gateway
+        self.told: list[Sample] = []
+        self.alive: list[tuple[str, bool]] = []
+        self._news = asyncio.Event()
+        gateway.publish = self._publish
+        gateway.show_alive = self._show_alive
+
+    def _publish(self, samples: Sequence[Sample]) -> None:
+        self.told += samples
+        self._news.set()
+
+    def _show_alive(self, device: str, alive: bool) -> None:
+        self.alive.append((device, alive))
+        self._news.set()
+
+    def latest(self, key: str) -> Sample | None:
+        return next((s for s in reversed(self.told) if s.tag.key == key), None)
+
+    async def until_good(self, *keys: str) -> None:
+        def good(key: str) -> bool:
+            sample = self.latest(key)
+            return sample is not None and sample.quality is Quality.GOOD
+
+        async with asyncio.timeout(10):
+            while not all(good(key) for key in keys):
+                self._news.clear()
+                await self._news.wait()
+
+
+def made(folder: Path, **device: Any) -> Watched:
+    every = device.pop("every", "200ms")
+    lines = {"hall": vigor_line("simulator", TAGS, **device)}
+    path = write_config(folder / "c.yaml", "tcp/127.0.0.1:7447", lines, defaults={"every": every})
+    return Watched(Gateway(load(path)))
+
+
+@asynccontextmanager
+async def running(watched: Watched) -> AsyncIterator[Watched]:
+    tasks = [asyncio.create_task(line.run()) for line in watched.gateway.lines]
+    yield watched
+    for task in tasks:
+        task.cancel()
+    await asyncio.gather(*tasks, return_exceptions=True)
+
+
+def tag(watched: Watched, name: str) -> Any:
+    found = watched.gateway.tag(f"mixer/{name}")
+    assert found is not None
+    return found
+
+
+def test_before_it_runs_everything_is_starting(tmp_path: Path) -> None:
+    watched = made(tmp_path)
+    for name in TAGS:
+        sample = watched.gateway.sample(tag(watched, name))
+        assert (sample.value, sample.quality, sample.reason) == (None, Quality.BAD, Reason.STARTING)
+    assert watched.gateway.tag("mixer/nobody") is None
+
+
+async def test_values_are_published_and_kept(tmp_path: Path) -> None:
+    async with running(made(tmp_path)) as watched:
+        await watched.until_good(*(f"mixer/{name}" for name in TAGS))
+        assert watched.alive == [("mixer", True)]
+        for name in TAGS:
+            sample = watched.gateway.sample(tag(watched, name))
+            assert sample.quality is Quality.GOOD
+            assert abs(sample.time - time.time_ns()) < 5e9
+
+
+async def test_a_write_ends_with_what_the_device_holds(tmp_path: Path) -> None:
+    async with running(made(tmp_path)) as watched:
+        await watched.until_good("mixer/recipe")
+        written = await watched.gateway.write(tag(watched, "recipe"), 7)
+        assert (written.value, written.verified, written.acknowledged) == (7, True, True)
+        assert 0 < written.took < 5
+        fresh = await watched.gateway.fresh(tag(watched, "recipe"), 0.0)
+        assert fresh.value == 7
+
+
+@pytest.mark.parametrize("value", [0, 41, 1.5, "AB", True])
+async def test_a_bad_value_is_never_sent(tmp_path: Path, value: Any) -> None:
+    async with running(made(tmp_path)) as watched:
+        await watched.until_good("mixer/recipe")
+        with pytest.raises(BadValue):
+            await watched.gateway.write(tag(watched, "recipe"), value)
+        [line] = watched.gateway.lines
+        assert line.devices[0].record.writes == 0
+
+
+async def test_a_write_to_a_line_that_is_not_open_fails_at_once(tmp_path: Path) -> None:
+    watched = made(tmp_path)
+    with pytest.raises(LineDown):
+        await watched.gateway.write(tag(watched, "recipe"), 7)
+
+
+async def test_a_disabled_device_is_never_spoken_to(tmp_path: Path) -> None:
+    async with running(made(tmp_path, enabled=False)) as watched:
+        gateway = watched.gateway
+        assert {gateway.sample(tag(watched, name)).reason for name in TAGS} == {Reason.DISABLED}
+        with pytest.raises(BadValue, match="device mixer is disabled"):
+            await gateway.write(tag(watched, "recipe"), 7)
+        assert (await gateway.fresh(tag(watched, "speed"), 0.0)).reason is Reason.DISABLED
+        assert [line.devices for line in gateway.lines] == [[]]
+
+
+async def test_a_fresh_value_is_read_now(tmp_path: Path) -> None:
+    async with running(made(tmp_path, every="1h")) as watched:
+        await watched.until_good("mixer/speed")
+        known = watched.gateway.sample(tag(watched, "speed"))
+        assert await watched.gateway.fresh(tag(watched, "speed"), 3600.0) is known
+        before = time.time_ns()
+        fresh = await watched.gateway.fresh(tag(watched, "speed"), 0.0)
+        assert (fresh.quality, fresh.time > known.time) == (Quality.GOOD, True)
+        assert fresh.time >= before
+
+
+async def test_simultaneous_askers_share_one_exchange(tmp_path: Path) -> None:
+    async with running(made(tmp_path, every="1h")) as watched:
+        await watched.until_good(*(f"mixer/{name}" for name in TAGS))
+        [device] = watched.gateway.lines[0].devices
+        before = device.record.exchanges
+        speed = tag(watched, "speed")
+        samples = await asyncio.gather(*(watched.gateway.fresh(speed, 0.0) for _ in range(50)))
+        assert len({id(sample) for sample in samples}) == 1
+        assert device.record.exchanges == before + 1
+
+
+async def test_a_fresh_value_of_a_line_that_is_not_open_is_what_is_known(tmp_path: Path) -> None:
+    watched = made(tmp_path)
+    sample = await watched.gateway.fresh(tag(watched, "speed"), 0.0)
+    assert (sample.value, sample.quality) == (None, Quality.BAD)
+
+
+def test_zenoh_gets_the_files_settings(tmp_path: Path) -> None:
+    watched = made(tmp_path)
+    settings = zenoh_settings(watched.gateway.config)
+    assert (settings.prefix, settings.mode) == ("plant", Mode.PEER)
+    assert settings.listen == ("tcp/127.0.0.1:7447",)
+
+
+def test_the_plan_is_that_of_the_running_lines(tmp_path: Path) -> None:
+    watched = made(tmp_path)
+    [expected] = forecasts(watched.gateway.config)
+    [line] = watched.gateway.lines
+    assert [row.block.span for row in expected.blocks] == [
+        block.span for device in line.devices for block in device.blocks
+    ]
