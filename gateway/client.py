@@ -80,21 +80,29 @@ class Client:
                 stack.enter_context(self._subscribed(want, news.put))
             for watcher in self._gateway_seen(news.put):
                 stack.enter_context(watcher)
-            # What arrived meanwhile is handed on after this, however old this is.
-            event: Shown | bool = True
+            rows = self._all(wanted)
+            if not rows:
+                raise GatewayError(NOTHING)
+            there = True
             while True:
-                match event:
-                    case True:
-                        rows = [row for want in wanted for row in self.values(want)]
-                        if not rows and not seen:
-                            raise GatewayError(NOTHING)
-                    case False:
-                        rows = [_lost(tag) for tag in sorted(seen)]
-                    case row:
-                        rows = [row]
                 seen.update(row.tag for row in rows)
                 yield from rows
-                event = news.get()
+                match news.get():
+                    case True:  # what arrives meanwhile is newer, and handed on after this
+                        there = True
+                        try:
+                            rows = self._all(wanted)
+                        except GatewayError:
+                            rows = []
+                            news.put(True)
+                    case False:
+                        there = False
+                        rows = [_lost(tag) for tag in sorted(seen)]
+                    case row:  # without a gateway it is one that came late
+                        rows = [row] if there else []
+
+    def _all(self, wanted: Sequence[str]) -> list[Shown]:
+        return [row for want in wanted for row in self.values(want)]
 
     def _subscribed(self, wanted: str, told: Callable[[Shown], None]) -> zenoh.Subscriber[None]:
         def arrived(sample: zenoh.Sample) -> None:

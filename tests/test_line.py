@@ -15,7 +15,6 @@ from gateway.tags import Quality, Reason, Tag, WriteRule, Written
 from gateway.wiretime import Wire
 from tests.sim.plant import (
     WIRE,
-    Outcome,
     Plant,
     clock_word,
     clockwork,
@@ -733,6 +732,3 @@ async def test_above_19200_baud_the_clock_is_watched() -> None:
     async with running(line):
         await asyncio.sleep(5)
     assert len(line.reads(dev)) > 200
-
-
-__all__ = ["Outcome"]

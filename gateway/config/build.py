@@ -20,6 +20,7 @@ from gateway.config.plain import (
     DeviceConfig,
     HistoryConfig,
     LineConfig,
+    TlsConfig,
     WebConfig,
     ZenohConfig,
 )
@@ -64,6 +65,9 @@ class Builder:
         self._check_history(top, lines)
         return Config(
             name=top.gateway.name,
+            standby=top.gateway.standby,
+            standby_alone=top.gateway.standby_alone,
+            writers_file=self._file(top.writers.file, ("writers", "file")) if top.writers else None,
             zenoh=self._zenoh(top),
             history=self._history(top),
             web=WebConfig(host=top.web.listen[0], port=top.web.listen[1]) if top.web else None,
@@ -214,17 +218,35 @@ class Builder:
             )
 
     def _zenoh(self, top: FileSection) -> ZenohConfig:
-        found = top.zenoh
-        file = self.folder / found.config_file if found.config_file else None
-        if file is not None and not file.is_file():
-            self.mistakes.add(("zenoh", "config_file"), f"there is no file {file}")
+        found, own = top.zenoh, ("zenoh",)
+        tls = found.tls
         return ZenohConfig(
             prefix=found.prefix,
             mode=found.mode,
             listen=tuple(found.listen),
             connect=tuple(found.connect),
-            config_file=file,
+            config_file=self._file(found.config_file, (*own, "config_file")),
+            tls=None
+            if tls is None
+            else TlsConfig(
+                ca=self._file(tls.ca, (*own, "tls", "ca")),
+                certificate=self._file(tls.certificate, (*own, "tls", "certificate")),
+                key=self._file(tls.key, (*own, "tls", "key")),
+                mutual=tls.mutual,
+            ),
+            user=found.user,
+            password_file=self._file(found.password_file, (*own, "password_file")),
+            users_file=self._file(found.users_file, (*own, "users_file")),
         )
+
+    def _file(self, name: FilePath | None, path: Path) -> FilePath | None:
+        """A file that must be there."""
+        if name is None:
+            return None
+        file = self.folder / name
+        if not file.is_file():
+            self.mistakes.add(path, f"there is no file {file}")
+        return file
 
     def _history(self, top: FileSection) -> HistoryConfig | None:
         if top.history is None:

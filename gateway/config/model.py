@@ -20,7 +20,7 @@ from pydantic import (
 from pydantic import Tag as Choice
 
 from gateway.config import written
-from gateway.tags import Deadband, Publish
+from gateway.tags import Deadband, Form, Publish
 from gateway.transport.port import PortAddress
 from gateway.values import Kind, Order, ValueType
 
@@ -84,6 +84,37 @@ class GatewaySection(Section):
 
     name: Name = "gateway"
     """This gateway's own chunk in the key space."""
+    standby: Name | None = None
+    """A name shared by two gateways of one plant: one serves, the other stands by."""
+    standby_alone: Interval | None = None
+    """Go on the wire after so long without any Zenoh link; left out: wait for the network."""
+
+    @model_validator(mode="after")
+    def _together(self) -> Self:
+        if self.standby_alone is not None and self.standby is None:
+            raise ValueError("standby_alone means nothing without standby")
+        return self
+
+
+class TlsSection(Section):
+    """Certificates, as PEM files."""
+
+    ca: FilePath | None = None
+    """Whose certificates are believed."""
+    certificate: FilePath | None = None
+    """This gateway's own."""
+    key: FilePath | None = None
+    """The private key of the certificate; closed to other users of this machine."""
+    mutual: bool = False
+    """Both sides show a certificate: who has none cannot connect."""
+
+    @model_validator(mode="after")
+    def _together(self) -> Self:
+        if (self.certificate is None) is not (self.key is None):
+            raise ValueError("certificate and key belong together")
+        if self.mutual and (self.ca is None or self.certificate is None):
+            raise ValueError("mutual needs ca, certificate and key")
+        return self
 
 
 class ZenohSection(Section):
@@ -99,6 +130,27 @@ class ZenohSection(Section):
     """Endpoints to connect to."""
     config_file: FilePath | None = None
     """A Zenoh JSON5 file for everything else, laid under these settings."""
+    tls: TlsSection | None = None
+    """For endpoints that begin with tls/ or quic/."""
+    user: Text | None = None
+    """Our own name where we connect to."""
+    password_file: FilePath | None = None
+    """Its first line is our password; without it: the variable PLC_GATEWAY_ZENOH_PASSWORD."""
+    users_file: FilePath | None = None
+    """Who may connect to us: a line `user:password` each, as Zenoh has it."""
+
+    @model_validator(mode="after")
+    def _with_user(self) -> Self:
+        if self.password_file is not None and self.user is None:
+            raise ValueError("password_file means nothing without user")
+        return self
+
+
+class WritersSection(Section):
+    """Who may write, by tokens."""
+
+    file: FilePath
+    """A line `name:salt:hash` each; see docs/security.md."""
 
 
 class HistorySection(Section):
@@ -185,6 +237,12 @@ class TagDefaults(Section):
     """Publish at least so often, changed or not."""
     history: bool = False
     """Keep the values on disk."""
+    payload: Annotated[
+        Form,
+        PlainValidator(written.form),
+        WithJsonSchema({"type": "string", "enum": ["json", "raw"]}),
+    ] = Form.JSON
+    """json: value, quality and time; raw: the bare value as text."""
     write: Annotated[
         Annotated[bool, Choice("flag")] | Annotated[WriteSection, Choice("rule")],
         Discriminator(_write_shape),
@@ -250,6 +308,7 @@ class FileSection(Section):
 
     gateway: GatewaySection = GatewaySection()
     zenoh: ZenohSection = ZenohSection()
+    writers: WritersSection | None = None
     history: HistorySection | None = None
     web: WebSection | None = None
     defaults: dict[str, Any] = {}

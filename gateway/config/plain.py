@@ -10,6 +10,16 @@ from gateway.wiretime import Wire
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class TlsConfig:
+    """Certificates (PEM files). `mutual`: both sides show one."""
+
+    ca: Path | None = None  # whose certificates are believed
+    certificate: Path | None = None
+    key: Path | None = None
+    mutual: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ZenohConfig:
     """How to join the Zenoh network. `config_file` lies under these settings."""
 
@@ -18,6 +28,10 @@ class ZenohConfig:
     listen: tuple[str, ...] = ()
     connect: tuple[str, ...] = ()
     config_file: Path | None = None
+    tls: TlsConfig | None = None
+    user: str | None = None  # our own, where we connect to
+    password_file: Path | None = None
+    users_file: Path | None = None  # who may connect to us
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -77,6 +91,9 @@ class Config:
     """One whole file. `history` and `web` are None where the file has no such section."""
 
     name: str
+    standby: str | None = None  # the group of gateways that stand in for one another
+    standby_alone: float | None = None  # seconds without a link until it goes on the wire anyway
+    writers_file: Path | None = None  # None: whoever Zenoh lets through may write
     zenoh: ZenohConfig
     history: HistoryConfig | None
     web: WebConfig | None

@@ -82,6 +82,7 @@ def build_tag(source: TagSource, driver: AnyDriver, mistakes: Mistakes) -> Tag |
         publish=settings.publish,
         heartbeat=settings.heartbeat,
         history=settings.history,
+        payload=settings.payload,
         write=write,
     )
     _check_bounds(source, tag, mistakes)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from gateway.config.messages import one_of, shown
 from gateway.errors import ConfigError
-from gateway.tags import Deadband, Publish
+from gateway.tags import Deadband, Form, Publish
 from gateway.transport.port import PortAddress, parse_port
 from gateway.values import Order, ValueType, parse_type
 
@@ -182,6 +182,12 @@ def publish(text: object) -> Publish:
     if text not in list(Publish):
         raise ConfigError(f"{shown(text)} is not known: use {one_of(Publish)}")
     return Publish(str(text))
+
+
+def form(text: object) -> Form:
+    if text not in list(Form):
+        raise ConfigError(f"{shown(text)} is not known: use {one_of(Form)}")
+    return Form(str(text))
 
 
 def path(text: object) -> Path:

@@ -4,8 +4,18 @@
 cancelled. Nothing it does holds the event loop, and nothing below it knows Zenoh.
 """
 
+from gateway.northbound.duty import StandbySettings
 from gateway.northbound.northbound import Northbound
 from gateway.northbound.plant import Device, History, Plant
-from gateway.northbound.session import Mode, ZenohSettings
+from gateway.northbound.session import Mode, ZenohSettings, zenoh_settings
 
-__all__ = ["Device", "History", "Mode", "Northbound", "Plant", "ZenohSettings"]
+__all__ = [
+    "Device",
+    "History",
+    "Mode",
+    "Northbound",
+    "Plant",
+    "StandbySettings",
+    "ZenohSettings",
+    "zenoh_settings",
+]

@@ -32,17 +32,21 @@ class Duty:
 
     def __init__(
         self,
-        settings: StandbySettings,
+        settings: StandbySettings | None,
         keys: Keys,
         links: Links,
         *,
         needs_link: bool,
         routed: bool,
     ) -> None:
-        """`routed`: a client, which sees others only through whatever it is linked to."""
+        """Without settings on duty at once, and for ever. `routed`: a client, which sees others
+        only through whatever it is linked to."""
+        self.stands_by = settings is not None
         self.on = asyncio.Event()
         self.relieved = asyncio.Event()
-        self._settings = settings
+        self._settings = settings or StandbySettings("")
+        if not self.stands_by:
+            self.on.set()
         self._keys = keys
         self._links = links
         self._needs_link = needs_link
@@ -50,14 +54,23 @@ class Duty:
         self._standby: Standby | None = None
         self._tokens: dict[Role, zenoh.LivelinessToken] = {}
 
-    def document(self) -> dict[str, object]:
-        """For the status."""
+    def documents(self) -> dict[str, dict[str, object]]:
+        """For the status; nothing where nobody stands by."""
+        if not self.stands_by:
+            return {}
         stand = Stand.WAITING if self._standby is None else self._standby.stand
         others = [] if self._standby is None else self._standby.others()
-        return {"group": self._settings.group, "stand": stand.value, "active": others}
+        shown: dict[str, object] = {
+            "group": self._settings.group,
+            "stand": stand.value,
+            "others_active": others,
+        }
+        return {"standby": shown}
 
     async def run(self, session: zenoh.Session) -> None:
-        """Until cancelled; the links must not have been declared before. Raises `ZError`."""
+        """Until cancelled. The links are declared after this was begun. Raises `ZError`."""
+        if not self.stands_by:
+            return
         own = str(session.zid())
         standby = self._standby = Standby(
             self._keys.gateway,
@@ -95,9 +108,7 @@ class Duty:
                 await off_loop(look)
             await asyncio.sleep(_LOOK_EVERY)
 
-    async def _change(
-        self, session: zenoh.Session, own: str, before: Stand, stand: Stand
-    ) -> None:
+    async def _change(self, session: zenoh.Session, own: str, before: Stand, stand: Stand) -> None:
         log.info("standby", group=self._settings.group, stand=stand.value)
         match stand:
             case Stand.CLAIMING:
@@ -124,9 +135,9 @@ class Duty:
             self._standby.heard(sign, sample.kind == zenoh.SampleKind.PUT)
 
     def _find(self, reply: zenoh.Reply) -> None:
-        if reply.ok is not None and self._standby:
-            if sign := _sign(str(reply.ok.key_expr)):
-                self._standby.glimpsed(sign, time.monotonic())
+        sign = None if reply.ok is None else _sign(str(reply.ok.key_expr))
+        if sign is not None and self._standby:
+            self._standby.glimpsed(sign, time.monotonic())
 
     def _link(self, there: str, what: str, came: bool) -> None:
         if self._standby:
@@ -138,5 +149,3 @@ def _sign(key: str) -> Sign | None:
     """`…/@standby/<group>/<role>/<name>/<session>`"""
     *_, role, name, session = key.split("/")
     return Sign(Role(role), name, session) if role in list(Role) else None
-
-

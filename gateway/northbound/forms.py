@@ -13,14 +13,16 @@ from gateway.tags import Form, Sample
 _DROP = zenoh.CongestionControl.DROP
 
 
-def put(session: zenoh.Session, key: str, sample: Sample, stamp: zenoh.Timestamp) -> None:
+def put(
+    session: zenoh.Session, key: str | zenoh.KeyExpr, sample: Sample, stamp: zenoh.Timestamp
+) -> None:
     """Raises `ZError`."""
     if sample.tag.payload is Form.JSON:
         put_json(session, key, payload.value(sample), stamp)
         return
     bare, about = payload.bare(sample), payload.about(sample)
     if bare is None:
-        session.delete(key, congestion_control=_DROP, timestamp=stamp, attachment=about)  # type: ignore[no-untyped-call]  # Zenoh's stub lacks it
+        session.delete(key, congestion_control=_DROP, timestamp=stamp, attachment=about)
         return
     session.put(
         key,
@@ -32,7 +34,9 @@ def put(session: zenoh.Session, key: str, sample: Sample, stamp: zenoh.Timestamp
     )
 
 
-def put_json(session: zenoh.Session, key: str, data: bytes, stamp: zenoh.Timestamp) -> None:
+def put_json(
+    session: zenoh.Session, key: str | zenoh.KeyExpr, data: bytes, stamp: zenoh.Timestamp
+) -> None:
     """Raises `ZError`."""
     session.put(
         key,
@@ -50,7 +54,7 @@ def reply(query: zenoh.Query, key: str, sample: Sample, stamp: zenoh.Timestamp) 
         return
     bare, about = payload.bare(sample), payload.about(sample)
     if bare is None:
-        query.reply_del(key, timestamp=stamp, attachment=about)  # type: ignore[no-untyped-call]  # Zenoh's stub lacks it
+        query.reply_del(key, timestamp=stamp, attachment=about)
         return
     query.reply(key, bare, encoding=zenoh.Encoding.TEXT_PLAIN, timestamp=stamp, attachment=about)
 

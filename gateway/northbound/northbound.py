@@ -1,10 +1,14 @@
 """The gateway as Zenoh sees it: values out, questions answered, writes taken, signs of life."""
 
 import asyncio
+import json
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import TypeVar
 
 import structlog
 import zenoh
@@ -12,8 +16,12 @@ import zenoh
 from gateway import payload
 from gateway.errors import GatewayError
 from gateway.keys import Keys
+from gateway.northbound import secrets
+from gateway.northbound.audit import Audit
 from gateway.northbound.directory import Directory
+from gateway.northbound.duty import Duty, StandbySettings
 from gateway.northbound.inbox import Inbox
+from gateway.northbound.links import Links
 from gateway.northbound.plant import History, Plant
 from gateway.northbound.publisher import Publisher
 from gateway.northbound.queries import Queries
@@ -26,26 +34,33 @@ from gateway.northbound.session import (
     off_loop,
     opened,
 )
+from gateway.northbound.writers import Writers
 from gateway.northbound.writes import PutWrites, Writes
-from gateway.payload import Failure, Problem, WriteOutcome
-from gateway.tags import Sample, Written
+from gateway.payload import WriteOutcome
+from gateway.tags import Sample
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
+T = TypeVar("T")
 
 STATUS_EVERY = 5.0  # seconds
 # After a link returned: first its declarations arrive, and only then does a put reach anyone.
 _SETTLE = 0.3
 # A router that was restarted gets its other clients back later than us: once more for them.
 _LATECOMERS = 5.0
-_REMEMBERED = 256  # lost links
 _REPUBLISH_AT_ONCE = 500  # samples in one turn of the loop
+MANY = 20  # devices, from which on the keys of busy tags are declared
 _PATIENCE = 0.5  # seconds for what still waits to be put when the gateway ends
 
 
 class Northbound:
     """One Zenoh session and what is declared on it. Every method belongs to the event loop.
 
-    Raises `ConfigError` when made with a bad prefix, name, endpoint or Zenoh file.
+    With `standby` it first waits, served by nobody but its own status, until it is on duty:
+    `on_duty` is set when the lines may be opened, `relieved` when they must be closed and this
+    ended. Without, it is on duty from the beginning.
+
+    Raises `ConfigError` when made with a bad prefix, name, endpoint, Zenoh or writers file, or
+    with a secret that everybody on this machine could read.
     """
 
     def __init__(
@@ -55,23 +70,30 @@ class Northbound:
         plant: Plant,
         *,
         history: History | None = None,
+        record_write: Callable[[WriteOutcome], None] | None = None,
+        writers: Path | None = None,
+        standby: StandbySettings | None = None,
         status_every: float = STATUS_EVERY,
     ) -> None:
+        """`record_write` gets every outcome that is told, on the event loop; it must not block.
+        `writers` is the file of those who may write; without it all that Zenoh lets through.
+        """
         self.keys = Keys(settings.prefix, name)
         self.opened = asyncio.Event()  # everything is declared, all current values are queued
         self._config = configure(settings)
         self._retry = settings.mode is Mode.CLIENT
+        self._writers = None if writers is None else Writers(writers)
+        self._links = Links()
+        self._duty = self._duty_of(standby, settings)
         self._plant = plant
         self._history = history
         self._status_every = status_every
         self._publisher = Publisher(self.keys)
+        self._audit = Audit(partial(self._publisher.document, self.keys.writes), record_write)
         self._directory = Directory(self.keys, ())
         self._declared: list[object] = []
         self._queries: Queries | None = None
         self._with_blocks: frozenset[str] = frozenset()
-        self._links: dict[str, str] = {}  # what is at the other end, by its id
-        self._lost: dict[str, None] = {}  # the ids of links that went, oldest first
-        self._returned = asyncio.Event()
         self._puts: PutWrites | None = None
         self._documents: tuple[float, dict[str, bytes]] = (float("-inf"), {})
 
@@ -100,32 +122,6 @@ class Northbound:
         """Whether the device answers: its liveliness token."""
         self._publisher.alive(device, alive)
 
-    def wrote(self, outcome: WriteOutcome) -> None:
-        """Tells log and network how a write ended."""
-        match outcome.result:
-            case Written(verified=verified):
-                log.info(
-                    "written",
-                    key=outcome.key,
-                    value=outcome.value,
-                    verified=verified,
-                    took=round(outcome.took, 4),
-                    by=outcome.by,
-                )
-            case Failure(problem=Problem.BUSY):
-                log.debug("not written: busy", key=outcome.key, by=outcome.by)
-            case failed:
-                log.warning(
-                    "perhaps written" if failed.problem is Problem.UNCLEAR else "not written",
-                    key=outcome.key,
-                    value=outcome.value,
-                    error=failed.problem.value,
-                    code=failed.code,
-                    reason=failed.reason,
-                    by=outcome.by,
-                )
-        self._publisher.document(self.keys.writes, payload.write_outcome(outcome))
-
     def counters(self) -> dict[str, int]:
         """What went out, came in and was dropped since the start."""
         counted = asdict(self._publisher.counters)
@@ -133,7 +129,22 @@ class Northbound:
             counted |= asdict(self._queries.counters)
         if self._puts is not None:
             counted["puts_refused"] = self._puts.refused
-        return counted | {"links": len(self._links)}
+        return counted | {"links": len(self._links), "refusals_untold": self._audit.untold}
+
+    @property
+    def on_duty(self) -> asyncio.Event:
+        """Set when this gateway may go on the wire: at once without `standby`."""
+        return self._duty.on
+
+    @property
+    def relieved(self) -> asyncio.Event:
+        """Set when another gateway of the group is active: leave the wire, then end this."""
+        return self._duty.relieved
+
+    def _duty_of(self, standby: StandbySettings | None, settings: ZenohSettings) -> Duty:
+        connects = json.loads(self._config.get_json("connect/endpoints"))
+        routed = settings.mode is Mode.CLIENT
+        return Duty(standby, self.keys, self._links, needs_link=bool(connects), routed=routed)
 
     # -- life --
 
@@ -144,6 +155,8 @@ class Northbound:
         session cannot be opened (a client waits for its router), and an `ExceptionGroup` with
         whatever ended it later.
         """
+        for exposure in secrets.exposures(self._config):
+            log.warning(exposure)
         session = await opened(self._config, retry=self._retry)
         try:
             await self._serve(session)
@@ -159,7 +172,8 @@ class Northbound:
         devices = list(self._plant.devices())
         self._directory = Directory(self.keys, devices)
         self._with_blocks = frozenset(device.name for device in devices if device.blocks)
-        writes = Writes(self.keys, self._plant, self._directory, self.wrote)
+        self._publisher.start(session, many_devices=len(devices) > MANY)
+        writes = Writes(self.keys, self._plant, self._directory, self._audit, self._writers)
         replies = Replies(
             self.keys, self._plant, self._directory, session.new_timestamp, self._history
         )
@@ -167,41 +181,45 @@ class Northbound:
         queries = Inbox(self._queries.take, self._queries.refuse)
         self._puts = PutWrites(writes, self._directory)
         puts = Inbox(self._puts.take, self._puts.refuse)
-        links = Inbox(self._link, lambda _: None)
-        # Kept, for what is forgotten is undeclared.
-        self._declared = await off_loop(self._declare, session, queries, puts, links)
-        self._publisher.start(session)
-        await self._publish_all()
-        self._publish_status()
-        self.opened.set()
-        log.info("on Zenoh", prefix=self.keys.prefix, id=str(session.zid()))
+        links = Inbox(self._links.take, lambda _: None)
         async with asyncio.TaskGroup() as tasks:
-            tasks.create_task(self._tell_status())
-            tasks.create_task(self._republish())
             tasks.create_task(self._watch())
+            tasks.create_task(self._duty.run(session))
+            # Kept, for what is forgotten is undeclared.
+            self._declared += await off_loop(self._declare_own, session, queries, links)
+            tasks.create_task(self._tell_status())
+            await self._duty.on.wait()
+            self._declared += await off_loop(self._declare_plant, session, queries, puts)
+            await self._publish_all()
+            self._publish_status()
+            self.opened.set()
+            log.info("on Zenoh", prefix=self.keys.prefix, id=str(session.zid()))
+            tasks.create_task(self._republish())
 
-    def _declare(
+    def _declare_own(
         self,
         session: zenoh.Session,
         queries: Inbox[zenoh.Query],
-        puts: Inbox[zenoh.Sample],
         links: Inbox[zenoh.TransportEvent],
     ) -> list[object]:
-        """Everything that others find of us. They live as long as the session.
+        """What is there also while another gateway is active. It lives as long as the session."""
+        return [
+            self._links.declare(session, links),
+            session.declare_queryable(self.keys.statuses, _directly(queries), complete=False),
+            *([self._declare_token(session)] if self._duty.stands_by else []),
+        ]
 
-        Values are not `complete`: others may share the prefix, and all are to be asked. A device
-        has one gateway, and its writes go to one queryable, however many would take them.
+    def _declare_plant(
+        self, session: zenoh.Session, queries: Inbox[zenoh.Query], puts: Inbox[zenoh.Sample]
+    ) -> list[object]:
+        """Values are not `complete`: others may share the prefix, and all are to be asked. A
+        device has one gateway, and its writes go to one queryable, however many would take them.
         """
-        # Directly on Zenoh's receiving thread: an inbox only appends, and a thread for each
-        # declaration would be needed otherwise.
-        ask = zenoh.handlers.Callback(queries, indirect=False)
+        ask = _directly(queries)
         mine = self._directory.devices
-        shared = (self.keys.values, self.keys.late, self.keys.metas, self.keys.statuses)
+        shared = (self.keys.values, self.keys.late, self.keys.metas)
         blocks = (self.keys.blocks,) if self._with_blocks else ()
         return [
-            session.info.declare_transport_events_listener(
-                zenoh.handlers.Callback(links, indirect=False), history=True
-            ),
             *(session.declare_queryable(key, ask, complete=False) for key in (*shared, *blocks)),
             *(
                 session.declare_queryable(self.keys.sets(device.name), ask, complete=True)
@@ -209,12 +227,15 @@ class Northbound:
             ),
             session.declare_subscriber(
                 f"{self.keys.values}/@set",
-                zenoh.handlers.Callback(puts, indirect=False),
+                _directly(puts),
                 allowed_origin=zenoh.Locality.REMOTE,
             ),
             # Last: whoever sees it may ask at once.
-            session.liveliness().declare_token(self.keys.own),
+            *([] if self._duty.stands_by else [self._declare_token(session)]),
         ]
+
+    def _declare_token(self, session: zenoh.Session) -> object:
+        return session.liveliness().declare_token(self.keys.own)
 
     async def _close(self, session: zenoh.Session) -> None:
         if self._puts is not None:
@@ -245,13 +266,13 @@ class Northbound:
     async def _republish(self) -> None:
         """All current values again after each return to the network."""
         while True:
-            await self._returned.wait()
+            await self._links.returned.wait()
             await asyncio.sleep(_SETTLE)
-            self._returned.clear()
+            self._links.returned.clear()
             await self._publish_all()
             with suppress(TimeoutError):
                 async with asyncio.timeout(_LATECOMERS):
-                    await self._returned.wait()
+                    await self._links.returned.wait()
                     continue
             await self._publish_all()
 
@@ -262,6 +283,7 @@ class Northbound:
     async def _tell_status(self) -> None:
         while True:
             await asyncio.sleep(self._status_every)
+            self._audit.tell_rest()
             self._publish_status()
 
     def _publish_status(self) -> None:
@@ -273,7 +295,10 @@ class Northbound:
         made, documents = self._documents
         now = time.monotonic()
         if now - made > 0.2:
-            own = {"zenoh": {**self.counters(), "to": sorted(self._links.values())}}
+            own = {
+                "zenoh": {**self.counters(), "to": self._links.kinds()},
+                **self._duty.documents(),
+            }
             documents = {
                 self.keys.status(path): payload.document(fields)
                 for path, fields in {**self._plant.status(), **own}.items()
@@ -281,20 +306,8 @@ class Northbound:
             self._documents = (now, documents)
         return documents
 
-    # -- coming in --
 
-    def _link(self, event: zenoh.TransportEvent) -> None:
-        """A router that appears, and whoever was here before, may have missed something."""
-        there, what = str(event.transport.zid), str(event.transport.whatami)
-        if event.kind == zenoh.SampleKind.DELETE:
-            self._links.pop(there, None)
-            self._lost[there] = None
-            if len(self._lost) > _REMEMBERED:
-                del self._lost[next(iter(self._lost))]
-            log.info("Zenoh link down", to=what, id=there)
-            return
-        self._links[there] = what
-        log.info("Zenoh link up", to=what, id=there)
-        if what == "router" or there in self._lost:
-            self._lost.pop(there, None)
-            self._returned.set()
+def _directly(inbox: Callable[[T], None]) -> zenoh.handlers.Callback[T]:
+    """On Zenoh's receiving thread: an inbox only appends, and a thread for each declaration would
+    be needed otherwise."""
+    return zenoh.handlers.Callback(inbox, indirect=False)

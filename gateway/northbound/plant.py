@@ -51,5 +51,6 @@ class History(Protocol):
     """Samples of the past, by Zenoh's own time ranges."""
 
     def samples(self, tag: Tag, time_range: str, limit: int | None) -> Iterator[Sample]:
-        """In the order of time; called from an answering thread. Raises `BadValue` for a range
-        that cannot be understood."""
+        """In the order of time, the first `limit`; called from an answering thread. Raises
+        `BadValue` for a range that cannot be understood, and `Busy`, also in the middle, when
+        the past cannot be read now."""

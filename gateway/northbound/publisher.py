@@ -19,6 +19,8 @@ import zenoh
 
 from gateway import payload
 from gateway.keys import Keys
+from gateway.northbound import forms
+from gateway.northbound.names import MOST_DECLARED, Names
 from gateway.tags import Sample
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
@@ -74,8 +76,10 @@ class Publisher:
 
     # -- event loop --
 
-    def start(self, session: zenoh.Session) -> None:
+    def start(self, session: zenoh.Session, *, many_devices: bool = False) -> None:
+        """`many_devices`: it pays to declare the keys of what is published again and again."""
         self._session = session
+        self._names = Names(session, MOST_DECLARED if many_devices else 0)
         self._loop = asyncio.get_running_loop()
         for device, alive in self._alive.items():
             self.alive(device, alive)
@@ -185,18 +189,12 @@ class Publisher:
                 self._token(session, key, declared)
                 return
             case _Put(stamp, key, bytes() as data):
-                pass
+                forms.put_json(session, key, data, stamp)
             case _Put(stamp, key, Sample() as sample):
-                data = payload.value(sample)
+                forms.put(session, self._names(key), sample, stamp)
             case _Block(stamp, key, samples):
                 data = payload.block(samples.values())
-        session.put(
-            key,
-            data,
-            encoding=zenoh.Encoding.APPLICATION_JSON,
-            congestion_control=zenoh.CongestionControl.DROP,
-            timestamp=stamp,
-        )
+                forms.put_json(session, self._names(key), data, stamp)
         self.counters.published += 1
 
     def _token(self, session: zenoh.Session, key: str, declared: bool) -> None:

@@ -5,7 +5,9 @@ from collections.abc import Callable, Iterable
 import zenoh
 
 from gateway import payload
+from gateway.errors import BadValue, Busy, GatewayError
 from gateway.keys import Asked, Family, Keys
+from gateway.northbound import forms
 from gateway.northbound.directory import Directory
 from gateway.northbound.plant import History, Plant
 from gateway.payload import Failure, Problem
@@ -76,16 +78,18 @@ class Replies:
                 self.outcome(_NO_HISTORY, query)
             return
         try:
-            limit = query.parameters.get("limit")
+            limit = _limit(query.parameters.get("limit"))
+            asked = query.parameters.get("_time") or ""
             for tag in tags:
-                for sample in self._history.samples(
-                    tag, query.parameters.get("_time") or "", None if limit is None else int(limit)
-                ):
-                    self._reply(
-                        query, self._keys.value(tag.key), payload.value(sample), self._stamp()
-                    )
-        except ValueError as error:
+                key = self._keys.value(tag.key)
+                for sample in self._history.samples(tag, asked, limit):
+                    if self._ended:
+                        raise Busy("the gateway is ending: this is not all")
+                    forms.reply(query, key, sample, self._stamp())
+        except BadValue as error:
             self.outcome(Failure(Problem.BAD_QUERY, str(error)), query)
+        except GatewayError as error:
+            self.outcome(payload.failure(error), query)
 
     def status(self, documents: dict[str, bytes], query: zenoh.Query) -> None:
         for key, document in documents.items():
@@ -100,4 +104,12 @@ class Replies:
             self._reply(query, str(query.key_expr), data, self._stamp())
 
     def _reply(self, query: zenoh.Query, key: str, data: bytes, stamp: zenoh.Timestamp) -> None:
-        query.reply(key, data, encoding=zenoh.Encoding.APPLICATION_JSON, timestamp=stamp)
+        forms.reply_json(query, key, data, stamp)
+
+
+def _limit(text: str | None) -> int | None:
+    if text is None:
+        return None
+    if not (text.isascii() and text.isdigit() and len(text) <= 9):
+        raise BadValue(f"limit={text[:40]} is no count such as 100")
+    return int(text)

@@ -16,6 +16,7 @@ from gateway.errors import ConfigError
 
 PASSWORD_VARIABLE = "PLC_GATEWAY_ZENOH_PASSWORD"  # noqa: S105  (the name of a variable)
 _SECRET = re.compile(r"""["']?(password|\w*_base64)["']?\s*:\s*["'\d]""")
+_MAY_HOLD_SECRET = re.compile(r"passw|usrpwd|_base64", re.IGNORECASE)
 _LOCAL_PROTOCOLS = ("unixsock-stream",)
 _ENCRYPTED_PROTOCOLS = ("tls", "quic", *_LOCAL_PROTOCOLS)
 
@@ -54,17 +55,20 @@ def password(file: Path | None) -> str | None:
 
 
 def holds_secret(zenoh_file: str) -> bool:
-    """Whether a Zenoh JSON5 file has a password or a private key in itself."""
+    """Whether the text of a Zenoh file has a password or a private key in itself."""
     return _SECRET.search(zenoh_file) is not None
 
 
 def where(error: zenoh.ZError, zenoh_file: str) -> str:
     """What is wrong with a Zenoh file, without quoting from one that holds a secret."""
     text = str(error)
-    if not holds_secret(zenoh_file):
+    if not _MAY_HOLD_SECRET.search(zenoh_file):
         return text
-    place = re.search(r"(?:at |line ?:? ?)\D{0,10}(\d+)(?:\D{1,12}(\d+))?", text)
-    return "something is wrong" + (f" at {place[0][-40:]}" if place else "") + " (not shown here)"
+    place = re.search(r"--> (\d+):\d+", text)
+    return (
+        "it is wrong" + (f" in line {place[1]}" if place else "") + "; it may hold a password, "
+        "so no more is shown"
+    )
 
 
 def exposures(config: zenoh.Config) -> list[str]:

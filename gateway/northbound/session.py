@@ -13,7 +13,9 @@ from typing import TypeVar
 import structlog
 import zenoh
 
+from gateway.config.plain import TlsConfig, ZenohConfig
 from gateway.errors import ConfigError, GatewayError
+from gateway.northbound import secrets
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 
@@ -33,7 +35,9 @@ class ZenohSettings:
     """`zenoh:` of the configuration file.
 
     `config_file` is a Zenoh JSON5 file for everything else. `mode` here always counts; `listen`
-    and `connect` here replace the file's unless they are empty.
+    and `connect` here replace the file's unless they are empty, as do the others where given.
+    `user` and its password are how we are known elsewhere; `users_file` is Zenoh's dictionary of
+    those who may connect to us, a line `user:password` each.
     """
 
     prefix: str = "plant"
@@ -41,6 +45,25 @@ class ZenohSettings:
     listen: tuple[str, ...] = ()
     connect: tuple[str, ...] = ()
     config_file: Path | None = None
+    tls: TlsConfig | None = None
+    user: str | None = None
+    password_file: Path | None = None
+    users_file: Path | None = None
+
+
+def zenoh_settings(zenoh: ZenohConfig) -> ZenohSettings:
+    """What the configuration file says."""
+    return ZenohSettings(
+        prefix=zenoh.prefix,
+        mode=Mode(zenoh.mode),
+        listen=zenoh.listen,
+        connect=zenoh.connect,
+        config_file=zenoh.config_file,
+        tls=zenoh.tls,
+        user=zenoh.user,
+        password_file=zenoh.password_file,
+        users_file=zenoh.users_file,
+    )
 
 
 # What a gateway needs other than Zenoh's own defaults. A value that the user's file sets wins.
@@ -74,6 +97,8 @@ def configure(settings: ZenohSettings) -> zenoh.Config:
     if settings.mode is Mode.CLIENT:
         # It would wait for ever in a thread that nobody can stop: `opened` tries again instead.
         config.insert_json5("connect/timeout_ms", "1000")
+    for path, value in (_tls(settings.tls) | _users(settings)).items():
+        config.insert_json5(path, json.dumps(value))
     for side, endpoints in (("listen", settings.listen), ("connect", settings.connect)):
         for endpoint in endpoints:
             _check(side, endpoint)
@@ -85,14 +110,55 @@ def configure(settings: ZenohSettings) -> zenoh.Config:
 
 
 def _from_file(path: Path) -> zenoh.Config:
+    called = "zenoh config_file"
+    text = ""
     try:
-        return zenoh.Config.from_json5(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8")
+        config = zenoh.Config.from_json5(text)
     except OSError as error:
-        raise ConfigError(f"zenoh config_file {path}: {error.strerror}") from None
+        raise ConfigError(f"{called} {path}: {error.strerror}") from None
     except UnicodeDecodeError:
-        raise ConfigError(f"zenoh config_file {path} is no UTF-8 text") from None
+        raise ConfigError(f"{called} {path} is no UTF-8 text") from None
     except zenoh.ZError as error:
-        raise ConfigError(f"zenoh config_file {path}: {error}") from None
+        raise ConfigError(f"{called} {path}: {secrets.where(error, text)}") from None
+    if secrets.holds_secret(text):
+        secrets.closed_to_others(path, f"{called} holds a secret, and")
+    return config
+
+
+def _tls(tls: TlsConfig | None) -> dict[str, object]:
+    """Zenoh's settings; our one certificate is shown to those who connect and where we do."""
+    if tls is None:
+        return {}
+    if tls.key is not None:
+        secrets.closed_to_others(tls.key, "zenoh.tls.key")
+    files = {
+        "root_ca_certificate": tls.ca,
+        "listen_certificate": tls.certificate,
+        "listen_private_key": tls.key,
+        "connect_certificate": tls.certificate if tls.mutual else None,
+        "connect_private_key": tls.key if tls.mutual else None,
+    }
+    found: dict[str, object] = {name: str(file) for name, file in files.items() if file}
+    found["enable_mtls"] = tls.mutual
+    return {f"transport/link/tls/{name}": value for name, value in found.items()}
+
+
+def _users(settings: ZenohSettings) -> dict[str, object]:
+    found: dict[str, object] = {}
+    if settings.users_file is not None:
+        secrets.closed_to_others(settings.users_file, "zenoh.users_file")
+        found["transport/auth/usrpwd/dictionary_file"] = str(settings.users_file)
+    if settings.user is not None:
+        password = secrets.password(settings.password_file)
+        if password is None:
+            raise ConfigError(
+                f"zenoh.user {settings.user} has no password: name a password_file, or set "
+                f"{secrets.PASSWORD_VARIABLE}"
+            )
+        found["transport/auth/usrpwd/user"] = settings.user
+        found["transport/auth/usrpwd/password"] = password
+    return found
 
 
 _WITH_PORT = ("tcp", "udp", "tls", "quic", "ws")

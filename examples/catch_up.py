@@ -1,0 +1,173 @@
+"""A Zenoh consumer that misses nothing: `python examples/catch_up.py --connect tcp/127.0.0.1:7447`.
+
+It prints every sample of the tags with `history: true` once: `time key value`, in the order of
+time. When a router, the network or a gateway was away, it asks for what it missed by `_time`. Copy
+it, and put your own work where `main` prints.
+
+How it works:
+
+1. It subscribes first and asks for history afterwards, so that nothing falls between the two.
+2. Whenever something may have been missed (a link or a gateway came or went, and once a minute in
+   any case, for a network may also drop samples when it is overloaded), it holds what arrives,
+   asks for everything since the last time all was well, sorts, and leaves out what it knows.
+3. An answer counts only if it is whole: some sample came, no error came, every gateway is still
+   there afterwards, and no link changed meanwhile. Otherwise it asks again.
+"""
+
+import argparse
+import json
+import queue
+import time
+from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
+from typing import NamedTuple
+
+import zenoh
+
+CHECK_EVERY = 60.0  # seconds between two checks when nothing seems to be wrong
+RETRY_EVERY = 1.0  # seconds until an answer that was not whole is asked for again
+# Samples of different lines may reach history a moment later than their time says.
+MARGIN = timedelta(seconds=5)
+MISSED = object()  # in the queue: something may have been missed
+
+
+class Sample(NamedTuple):
+    """Sorts by time: the gateway writes times so that their texts sort."""
+
+    time: str
+    key: str
+    payload: str  # JSON: value, quality, time, and the reason of a bad one
+    late: bool = False  # found by a check, after newer samples of its tag were given out
+
+    @property
+    def value(self) -> object:
+        return json.loads(self.payload)["value"]
+
+
+class Gap(Exception):
+    """The answer was not whole."""
+
+
+class CatchUp:
+    """All samples under a prefix, each once. `since`: RFC 3339, from when on they are wanted."""
+
+    def __init__(self, session: zenoh.Session, prefix: str, since: str) -> None:
+        self.since = since  # everything before was given out: keep it to go on after a restart
+        self._session = session
+        self._prefix = prefix
+        self._arrived: queue.Queue[object] = queue.Queue()
+        self._gateways: set[str] = set()
+        self._links = 0  # changes so far
+        self._known: set[Sample] = set()  # given out, and not older than `since`
+        self._last: dict[str, Sample] = {}  # given out last, by key
+        self._declared = [
+            session.declare_subscriber(f"{prefix}/**", self._arrived.put),
+            session.liveliness().declare_subscriber(
+                f"{prefix}/@gateway/*", self._gateway, history=True
+            ),
+            session.info.declare_transport_events_listener(self._link),
+        ]
+
+    # Zenoh's threads: they only take note.
+
+    def _gateway(self, token: zenoh.Sample) -> None:
+        key = str(token.key_expr)
+        if token.kind == zenoh.SampleKind.PUT:
+            self._gateways.add(key)
+        else:
+            self._gateways.discard(key)
+        self._links += 1
+        self._arrived.put(MISSED)
+
+    def _link(self, _event: zenoh.TransportEvent) -> None:
+        self._links += 1
+        self._arrived.put(MISSED)
+
+    # Your thread.
+
+    def samples(self) -> Iterator[Sample]:
+        """Never ends."""
+        due = time.monotonic()
+        while True:
+            if time.monotonic() >= due:
+                try:
+                    yield from self._news(self._missed())
+                except Gap:
+                    due = time.monotonic() + RETRY_EVERY
+                else:
+                    due = time.monotonic() + CHECK_EVERY
+                    self._all_is_well()
+            try:
+                arrived = self._arrived.get(timeout=max(0.0, due - time.monotonic()))
+            except queue.Empty:
+                continue
+            if arrived is MISSED:
+                due = min(due, time.monotonic() + RETRY_EVERY)  # links come in twos and threes
+            elif isinstance(arrived, zenoh.Sample):
+                if due - time.monotonic() <= RETRY_EVERY:
+                    # A gap is suspected: this one is in history too, and will come in its place.
+                    continue
+                yield from self._news([_sample(arrived)])
+
+    def _missed(self) -> list[Sample]:
+        """Everything since all was well. Raises `Gap` unless it is certain to be everything."""
+        links, gateways = self._links, set(self._gateways)
+        found: list[Sample] = []
+        asked = f"{self._prefix}/**?_time=[{self.since}..]"
+        for reply in self._session.get(asked, timeout=60.0):
+            if reply.ok is None:
+                raise Gap(reply.err)
+            found.append(_sample(reply.ok))
+        # Nobody says how many samples there are: that the gateways are still there tells that
+        # none of them ended in the middle of its answer.
+        for gateway in gateways:
+            if not any(reply.ok for reply in self._session.get(f"{gateway}/status", timeout=5.0)):
+                raise Gap(gateway)
+        if not found or not gateways or links != self._links:
+            raise Gap
+        return sorted(found)
+
+    def _news(self, samples: list[Sample]) -> Iterator[Sample]:
+        for sample in samples:
+            last = self._last.get(sample.key)
+            if sample in self._known or sample == last:
+                continue
+            self._known.add(sample)
+            late = last is not None and sample.time < last.time
+            if not late:
+                self._last[sample.key] = sample
+            yield sample._replace(late=late)
+
+    def _all_is_well(self) -> None:
+        newest = datetime.fromisoformat(max(sample.time for sample in self._last.values()))
+        since = (newest - MARGIN).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
+        self.since = max(self.since, since)
+        self._known = {sample for sample in self._known if sample.time >= self.since}
+
+
+def _sample(received: zenoh.Sample) -> Sample:
+    payload = received.payload.to_string()
+    return Sample(json.loads(payload)["time"], str(received.key_expr), payload)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--connect", required=True, help="e.g. tcp/127.0.0.1:7447")
+    parser.add_argument("--prefix", default="plant")
+    parser.add_argument("--since", help="e.g. 2026-11-20T12:00:00Z (now, when left out)")
+    given = parser.parse_args()
+    config = zenoh.Config()
+    config.insert_json5("mode", '"peer"')  # unlike a client it opens while its router is away
+    config.insert_json5("connect/endpoints", json.dumps([given.connect]))
+    config.insert_json5("listen/endpoints", "[]")
+    config.insert_json5("scouting/multicast/enabled", "false")
+    config.insert_json5("connect/retry", '{"period_init_ms": 500, "period_max_ms": 2000}')
+    since = given.since or datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
+    with zenoh.open(config) as session:
+        for sample in CatchUp(session, given.prefix, since).samples():
+            late = " late" if sample.late else ""
+            print(f"{sample.time} {sample.key} {sample.value}{late}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
