@@ -17,6 +17,7 @@ How it works:
 import argparse
 import json
 import queue
+import sys
 import time
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
@@ -25,6 +26,7 @@ from typing import NamedTuple
 import zenoh
 
 CHECK_EVERY = 60.0  # seconds between two checks when nothing seems to be wrong
+ANSWER_WITHIN = 60.0  # seconds for all that was missed
 RETRY_EVERY = 1.0  # seconds until an answer that was not whole is asked for again
 # Samples of different lines may reach history a moment later than their time says.
 MARGIN = timedelta(seconds=5)
@@ -112,20 +114,33 @@ class CatchUp:
     def _missed(self) -> list[Sample]:
         """Everything since all was well. Raises `Gap` unless it is certain to be everything."""
         links, gateways = self._links, set(self._gateways)
-        found: list[Sample] = []
         asked = f"{self._prefix}/**?_time=[{self.since}..]"
-        for reply in self._session.get(asked, timeout=60.0):
-            if reply.ok is None:
-                raise Gap(reply.err)
-            found.append(_sample(reply.ok))
+        found = [_sample(answer) for answer in self._answers(asked, links)]
         # Nobody says how many samples there are: that the gateways are still there tells that
         # none of them ended in the middle of its answer.
         for gateway in gateways:
-            if not any(reply.ok for reply in self._session.get(f"{gateway}/status", timeout=5.0)):
+            if not any(self._answers(f"{gateway}/status", links)):
                 raise Gap(gateway)
         if not found or not gateways or links != self._links:
             raise Gap
         return sorted(found)
+
+    def _answers(self, selector: str, links: int) -> Iterator[zenoh.Sample]:
+        """Gives up as soon as a link changes: what was on its way may never come."""
+        answers: queue.Queue[zenoh.Reply | None] = queue.Queue()
+        handler = zenoh.handlers.Callback(answers.put, lambda: answers.put(None), indirect=False)
+        self._session.get(selector, handler, timeout=ANSWER_WITHIN)
+        while links == self._links:
+            try:
+                reply = answers.get(timeout=0.1)
+            except queue.Empty:
+                continue
+            if reply is None:
+                return
+            if reply.ok is None:
+                raise Gap(reply.err)
+            yield reply.ok
+        raise Gap
 
     def _news(self, samples: list[Sample]) -> Iterator[Sample]:
         for sample in samples:
@@ -156,17 +171,26 @@ def main() -> None:
     parser.add_argument("--prefix", default="plant")
     parser.add_argument("--since", help="e.g. 2026-11-20T12:00:00Z (now, when left out)")
     given = parser.parse_args()
-    config = zenoh.Config()
-    config.insert_json5("mode", '"peer"')  # unlike a client it opens while its router is away
-    config.insert_json5("connect/endpoints", json.dumps([given.connect]))
-    config.insert_json5("listen/endpoints", "[]")
-    config.insert_json5("scouting/multicast/enabled", "false")
-    config.insert_json5("connect/retry", '{"period_init_ms": 500, "period_max_ms": 2000}')
     since = given.since or datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
-    with zenoh.open(config) as session:
+    with opened(given.connect) as session:
         for sample in CatchUp(session, given.prefix, since).samples():
             late = " late" if sample.late else ""
             print(f"{sample.time} {sample.key} {sample.value}{late}", flush=True)
+
+
+def opened(endpoint: str) -> zenoh.Session:
+    """Waits for the router; once open, a session comes back by itself."""
+    config = zenoh.Config()
+    config.insert_json5("mode", '"client"')
+    config.insert_json5("connect/endpoints", json.dumps([endpoint]))
+    config.insert_json5("connect/retry", '{"period_init_ms": 500, "period_max_ms": 2000}')
+    config.insert_json5("scouting/multicast/enabled", "false")
+    while True:
+        try:
+            return zenoh.open(config)
+        except zenoh.ZError as error:
+            print(f"waiting for {endpoint}: {error}", file=sys.stderr)
+            time.sleep(RETRY_EVERY)
 
 
 if __name__ == "__main__":

@@ -9,8 +9,9 @@ import structlog
 
 from gateway.device import Device, Standing
 from gateway.errors import Evidence, Garbled, Refusal, Refused, Unclear
+from gateway.jobs import Poll
 from gateway.protocols.driver import Span
-from gateway.schedule import Poll, Schedule
+from gateway.schedule import Schedule
 from gateway.tags import Reason, Sample, Tag, bad
 
 log = structlog.get_logger("gateway.line")

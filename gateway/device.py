@@ -1,18 +1,18 @@
 """One device on a line as the gateway knows it: its plan, its standing, its record."""
 
+import math
 from collections import Counter
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 
-from gateway.errors import DeviceError, Evidence, Garbled, GatewayError, NoReply
+from gateway.errors import DeviceError, Evidence, Garbled, NoReply
 from gateway.planner import Block, plan
 from gateway.protocols.driver import AnyDriver, Cost, Span, Timing
 from gateway.refusals import RETRY, Refusals
-from gateway.tags import Reason, Tag, Written
+from gateway.tags import Reason, Tag
 from gateway.wiretime import Wire
 
-Done = Callable[[Written | GatewayError], None]
+HALF_LIFE = 10.0  # seconds in which use of the wire is half forgotten
 
 
 class Standing(StrEnum):
@@ -73,6 +73,7 @@ class Device:
     next_probe: float = 0.0
     trouble: DeviceError | None = None
     record: Record = field(default_factory=Record)
+    _use: tuple[float, float] = (0.0, 0.0)  # seconds of the wire, and when that was reckoned
     refusals: Refusals = field(init=False)
     broadcast: bool = field(init=False)  # nobody answers: it is written to, never asked
 
@@ -144,6 +145,15 @@ class Device:
         trouble = self.trouble
         return isinstance(trouble, Garbled) and trouble.evidence is Evidence.SLOW
 
+    def used(self, now: float, seconds: float) -> None:
+        """A conversation with it took so long on the wire."""
+        self._use = (self.recent_use(now) + seconds, now)
+
+    def recent_use(self, now: float) -> float:
+        """Seconds it had the wire in about the last ten."""
+        use, when = self._use
+        return use * math.exp2((when - now) / HALF_LIFE)
+
     def measured(self, turnaround: float) -> None:
         """A station's own time in one exchange, smoothed over about ten."""
         known = self.record.turnaround
@@ -181,15 +191,3 @@ _ADVICE = {
     Evidence.SLOW: "It answers, but too late: raise reply_timeout",
     Evidence.TRUNCATED: "Answers break off: noise, or a device server that cuts packets",
 }
-
-
-@dataclass(slots=True, eq=False)
-class Write:
-    """A write on its way to the device; `done` is called exactly once."""
-
-    device: Device
-    tag: Tag
-    units: Sequence[int]
-    submitted: float
-    expires: float  # not sent any more after this: whoever asked has given up
-    done: Done

@@ -8,16 +8,18 @@ from contextlib import contextmanager, suppress
 import structlog
 
 from gateway.consequences import Consequences, Upstairs
-from gateway.device import Device, Done, LineRecord, Standing, Write
-from gateway.errors import Busy, GatewayError, LineDown, Offline, Refused, Unclear
+from gateway.device import Device, LineRecord, Standing
+from gateway.errors import Busy, LineDown, Offline, Refused, Unclear
+from gateway.jobs import Idle, Poll, Probe
+from gateway.orders import Command, Done, Order, Told, Write
 from gateway.protocols.driver import Span
 from gateway.recorder import Recorder
-from gateway.schedule import Idle, Poll, Probe, Schedule
-from gateway.tags import Tag, Written
+from gateway.schedule import Schedule
+from gateway.tags import Tag
 from gateway.transport import Ear, Port
 from gateway.turn import Clock, Turn
 from gateway.wiretime import Wire
-from gateway.writing import Differs, carry_out, look_again
+from gateway.writing import Writer, together
 
 log = structlog.get_logger("gateway.line")
 REOPEN_FIRST, REOPEN_LONGEST = 0.2, 10.0
@@ -56,6 +58,7 @@ class Line:
         self._clock = Clock(spin=0.001 if wire.baudrate > FAST else 0.0)
         self._schedule = Schedule(devices, 0.0, seed)
         self._then = Consequences(name, self._schedule, upstairs, wall)
+        self._writer = Writer(self, self._then, wall)
         self._port: Port | None = None
         self._turn: Turn | None = None
         self._down: LineDown | None = None
@@ -65,14 +68,22 @@ class Line:
 
     def submit(self, device: Device, tag: Tag, units: Sequence[int], done: Done) -> None:
         """Write as soon as the current exchange ends. `done` gets the outcome, exactly once."""
-        now = _now()
-        write = Write(device, tag, units, now, now + PATIENCE, done)
+        write = Write(device, tag, units, _now(), _now() + PATIENCE, done)
+        for older in self._schedule.superseded(write):
+            older.done(Busy("a newer value took its place; not sent"))
+        self._accept(write)
+
+    def command(self, device: Device, name: str, argument: str, done: Told) -> None:
+        """Have the device run, stop, ...: one of its driver's controls. `done` as in `submit`."""
+        self._accept(Command(device, name, argument, _now(), _now() + PATIENCE, done))
+
+    def _accept(self, order: Order) -> None:
         if not self.is_open:
-            done(LineDown(self.record.trouble or f"line {self.name} is not open"))
-        elif not self._schedule.reachable(device, now):
-            done(_offline(device))
-        elif not self._schedule.submit(write):
-            done(Busy(f"line {self.name}: too many writes are waiting; not sent"))
+            order.done(LineDown(self.record.trouble or f"line {self.name} is not open"))
+        elif not self._schedule.reachable(order.device, _now()):
+            order.done(_offline(order.device))
+        elif not self._schedule.submit(order):
+            order.done(Busy(f"line {self.name}: too many orders are waiting; not sent"))
         else:
             self._wake.set()
 
@@ -152,7 +163,10 @@ class Line:
                 case Poll() as poll:
                     await self._poll(poll)
                 case Write() as write:
-                    await self._write(write)
+                    others = self._schedule.companions(write, together)
+                    await self._writer.write(write, others)
+                case Command() as command:
+                    await self._writer.command(command)
                 case Probe(device):
                     await self._probe(device)
                 case Idle(until):
@@ -168,7 +182,7 @@ class Line:
     # Conversations
 
     @contextmanager
-    def _turn_with(self, device: Device) -> Iterator[Turn]:
+    def turn_with(self, device: Device) -> Iterator[Turn]:
         if self._port is None or self._down is not None:
             raise self._down or LineDown(f"line {self.name} is not open")
         turn = self._turn = Turn(
@@ -182,6 +196,7 @@ class Line:
             device.driver.station,
             self._echo,
         )
+        begun = _now()
         try:
             yield turn
         finally:
@@ -192,19 +207,20 @@ class Line:
             device.record.exchanges += turn.exchanges
             device.record.unasked += turn.passed
             device.record.wire_time += characters + turn.turnaround
+            device.used(_now(), _now() - begun)
             if turn.exchanges:
                 device.measured(turn.turnaround / turn.exchanges)
 
     async def _poll(self, poll: Poll) -> None:
         device, span = poll.device, poll.block.span
-        with self._turn_with(device) as turn:
+        with self.turn_with(device) as turn:
             try:
                 units = await device.driver.read(turn, span)
             except Refused as error:
                 self._then.answered(device)
                 self._then.refused(poll, error)
             except Unclear as error:
-                await self._unclear(device, turn, error, span)
+                await self.unclear(device, turn, error, span)
                 self._then.unread(poll, error)
             except LineDown:
                 device.doubt = span
@@ -214,73 +230,17 @@ class Line:
                 self._then.read(poll, units)
 
     async def _probe(self, device: Device) -> None:
-        with self._turn_with(device) as turn:
+        with self.turn_with(device) as turn:
             device.salt += 1
             try:
                 with suppress(Refused):  # that is an answer too
                     await device.driver.resync(turn, device.doubt, device.salt)
             except Unclear as error:
-                await self._unclear(device, turn, error, None)
+                await self.unclear(device, turn, error, None)
             else:
                 self._then.answered(device)
 
-    async def _write(self, write: Write) -> None:
-        device = write.device
-        outcome: Written | GatewayError = Unclear("the gateway stopped; it may have been done")
-        try:
-            outcome = await self._try_to_write(write)
-        except LineDown as error:
-            outcome = Unclear(f"{error}; nobody knows whether the write was done")
-            device.doubt = write.tag.span
-            raise
-        finally:
-            device.record.writes += 1
-            device.record.slowest_write = max(device.record.slowest_write, _now() - write.submitted)
-            write.done(outcome)
-        self._then.hasten(device, write.tag)
-
-    async def _try_to_write(self, write: Write) -> Written | GatewayError:
-        """Never simply sent again: what may follow an unclear end is the tag's own rule."""
-        device, span = write.device, write.tag.span
-        with self._turn_with(device) as turn:
-            try:
-                return self._noted(device, await carry_out(turn, write, self._wall))
-            except Refused as error:
-                return self._denied(device, error)
-            except Differs as error:
-                self._then.answered(device)
-                return error
-            except Unclear as error:
-                unclear = error
-                await self._unclear(device, turn, error, span)
-        with self._turn_with(device) as turn:
-            try:
-                settled = await look_again(turn, write, self._wall)
-                return unclear if settled is None else self._noted(device, settled)
-            except Refused as error:  # not what became of the first try
-                self._denied(device, error)
-            except Differs as error:
-                self._then.answered(device)
-                return error
-            except Unclear as error:
-                await self._unclear(device, turn, error, span)
-        return unclear
-
-    def _denied(self, device: Device, error: Refused) -> Refused:
-        self._then.answered(device)
-        device.record.refusals[error.code] += 1
-        return error
-
-    def _noted(self, device: Device, done: Written) -> Written:
-        if done.acknowledged:
-            self._then.answered(device)
-        else:  # a broadcast: stations need time to take it in
-            self._clock.quiet_since += device.turnaround or BROADCAST_PAUSE
-        return done
-
-    async def _unclear(
-        self, device: Device, turn: Turn, error: Unclear, asked: Span | None
-    ) -> None:
+    async def unclear(self, device: Device, turn: Turn, error: Unclear, asked: Span | None) -> None:
         """Note what was heard and keep quiet until nothing of it can disturb what comes next."""
         before = self._then.doubt(device, error, asked)
         guard = 0.0 if before is Standing.SILENT else device.late_guard
@@ -289,6 +249,10 @@ class Line:
         if device.standing is Standing.SILENT:
             for write in self._schedule.withdraw(device):
                 write.done(_offline(device))
+
+    def hold(self, device: Device) -> None:
+        """After a broadcast: the stations need time to take it in."""
+        self._clock.quiet_since += device.turnaround or BROADCAST_PAUSE
 
 
 def _offline(device: Device) -> Offline:

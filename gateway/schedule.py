@@ -5,68 +5,23 @@ import itertools
 import random
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
 
-from gateway.device import Device, Standing, Write
+from gateway.device import Device, Standing
+from gateway.jobs import NOWHERE, PAUSE_FIRST, PAUSE_LONGEST, URGENT, Idle, Job, Poll, Probe
+from gateway.orders import Order, Write
 from gateway.planner import Block
 
-PAUSE_FIRST = 1.0
-PAUSE_LONGEST = 60.0
 SILENT_SHARE = 0.05  # of the wire's time, for all silent stations together
-WAITING_WRITES = 1000
-URGENT, NOWHERE = -1, -2  # tickets of polls that are in no heap
-
-
-@dataclass(slots=True, eq=False)
-class Poll:
-    """A block and when it is due. Times in seconds of the loop's clock."""
-
-    device: Device
-    block: Block
-    due: float
-    tries: int = 0
-    setbacks: int = 0  # rounds in a row that got no answer, though the device answers otherwise
-    last_good: float | None = None
-    asked: float = 0.0  # when it was handed out last
-    live: bool = True  # False once the device was planned anew
-    ticket: int = NOWHERE  # its one valid place in the queues
-
-    @property
-    def every(self) -> float:
-        """How often it is asked: less and less where no answer comes."""
-        every = self.device.interval(self.block)
-        if self.setbacks:
-            every = max(every, min(PAUSE_FIRST * 2.0 ** min(self.setbacks, 10), PAUSE_LONGEST))
-        return every
-
-    @property
-    def deadline(self) -> float:
-        return self.due + self.every
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Probe:
-    """Ask a device we are in doubt about something harmless."""
-
-    device: Device
-
-
-@dataclass(frozen=True, slots=True)
-class Idle:
-    """Nothing to say until then, unless a write comes."""
-
-    until: float
-
-
-Job = Poll | Write | Probe | Idle
+WAITING_ORDERS = 1000
 
 
 class Schedule:
     """Decides who speaks next on one line.
 
-    Writes go first, but not twice in a row while a poll is due. Polls go by earliest deadline,
-    over all devices. What somebody wants to see now goes before other polls, but not twice in
-    a row while one is due. A late poll is done once, not once per missed period. A device in
+    Orders go first, but not twice in a row while a poll is due. Polls go by earliest deadline,
+    over all devices; when the line is asked for more than it carries, the devices that have had
+    the wire for the shortest time of late go first. What somebody wants to see now goes before
+    other polls, but not twice in a row while one is due. A late poll is done once, not once per missed period. A device in
     doubt is probed before anything else is asked of it or written to it. A device that was not
     heard yet is probed at once. While polls of others are due, such probes and those of devices
     that have just failed get half of the wire's time. A silent device is left alone but for
@@ -82,7 +37,7 @@ class Schedule:
         self._ready: list[tuple[float, int, Poll]] = []  # due, by deadline
         self._urgent: deque[Poll] = deque()
         self._polls: dict[Device, list[Poll]] = {}
-        self._writes: deque[Write] = deque()
+        self._orders: deque[Order] = deque()
         self._wrote = False
         self._hurried = False
         self._failed_lane = now  # when, with polls of others due, the next may fail
@@ -119,12 +74,34 @@ class Schedule:
         self._polls[poll.device] = kept + polls
         self._push(polls)
 
-    def submit(self, write: Write) -> bool:
-        """False when too many writes wait already."""
-        if len(self._writes) >= WAITING_WRITES:
+    def submit(self, order: Order) -> bool:
+        """False when too many orders wait already."""
+        if len(self._orders) >= WAITING_ORDERS:
             return False
-        self._writes.append(write)
+        self._orders.append(order)
         return True
+
+    def superseded(self, write: Write) -> list[Order]:
+        """The waiting writes that need not be sent, as `write` follows: its tag says `latest`."""
+        if not write.latest:
+            return []
+        return self._take(lambda other: isinstance(other, Write) and other.tag is write.tag)
+
+    def companions(self, write: Write, fit: Callable[[Sequence[Write]], bool]) -> list[Write]:
+        """The next orders of its device as far as all can go out with it; they are taken out.
+
+        What a device is told stays in the order it was asked for.
+        """
+        found: list[Write] = []
+        for order in self._orders:
+            if order.device is not write.device:
+                continue
+            if not isinstance(order, Write) or not fit([write, *found, order]):
+                break
+            found.append(order)
+        if found:
+            self._take(lambda order: order in found)
+        return found
 
     def reachable(self, device: Device, now: float) -> bool:
         """False for a silent device whose next probe is not allowed yet."""
@@ -146,8 +123,8 @@ class Schedule:
     def next(self, now: float) -> Job:
         self._ripen(now)
         due = bool(self._ready or self._urgent)
-        if self._writes and not (self._wrote and due):
-            return self._next_write()
+        if self._orders and not (self._wrote and due):
+            return self._next_order()
         self._wrote = False
         until = self._waiting[0][0] if self._waiting else float("inf")
         for device, allowed in self._strangers(now):
@@ -156,31 +133,36 @@ class Schedule:
             until = min(until, allowed)
         return self._next_poll(now) if due else Idle(until)
 
-    def _next_write(self) -> Job:
-        write = self._writes[0]
-        if write.device.doubtful:
-            return Probe(write.device)
-        self._writes.popleft()
+    def _next_order(self) -> Job:
+        order = self._orders[0]
+        if order.device.doubtful:
+            return Probe(order.device)
+        self._orders.popleft()
         self._wrote = True
-        return write
+        return order
 
     def _next_poll(self, now: float) -> Job:
         hurry = bool(self._urgent) and not (self._hurried and self._ready)
         poll = self._urgent[0] if hurry else self._ready[0][2]
+        if not hurry and poll.deadline < now and len(self.devices) > 1:
+            poll = self._fairest(now)
         if poll.device.doubtful:
             other = self._undoubted() if now < self._failed_lane else None
             if other is None:
                 return Probe(poll.device)
-            poll = other  # its place in the heap is void with its ticket
+            poll = other
         elif hurry:
             self._urgent.popleft()
-        else:
-            heapq.heappop(self._ready)
         self._hurried = hurry
-        poll.ticket = NOWHERE
+        poll.ticket = NOWHERE  # with it its place in the heap is void
         poll.due = min(poll.due, now)
         poll.asked = now
         return poll
+
+    def _fairest(self, now: float) -> Poll:
+        """Of the polls that are late the one whose device has had the wire least of late."""
+        late = (p for _, ticket, p in self._ready if self._valid(p, ticket) and p.deadline < now)
+        return min(late, key=lambda poll: (poll.device.recent_use(now), poll.deadline))
 
     def _undoubted(self) -> Poll | None:
         """Of the polls that are due the earliest of a device not in doubt."""
@@ -188,7 +170,7 @@ class Schedule:
             (
                 poll
                 for _, ticket, poll in self._ready
-                if poll.ticket == ticket and poll.live and not poll.device.doubtful
+                if self._valid(poll, ticket) and not poll.device.doubtful
             ),
             key=lambda poll: poll.deadline,
             default=None,
@@ -227,13 +209,13 @@ class Schedule:
         poll.tries += 1
         self._push([poll])
 
-    def withdraw(self, device: Device | None = None) -> list[Write]:
-        """The waiting writes (of one device) that will not be sent any more."""
-        return self._take_writes(lambda write: device is None or write.device is device)
+    def withdraw(self, device: Device | None = None) -> list[Order]:
+        """The waiting orders (to one device) that will not be sent any more."""
+        return self._take(lambda order: device is None or order.device is device)
 
-    def expired(self, now: float) -> list[Write]:
-        """The waiting writes nobody waits for any longer; they are forgotten here."""
-        return self._take_writes(lambda write: write.expires <= now) if self._writes else []
+    def expired(self, now: float) -> list[Order]:
+        """The waiting orders nobody waits for any longer; they are forgotten here."""
+        return self._take(lambda order: order.expires <= now) if self._orders else []
 
     def failed(self, now: float, took: float) -> None:
         """A conversation with a device not silent yet ended unclear after `took` seconds."""
@@ -260,10 +242,10 @@ class Schedule:
         self._failed_lane = self._silent_lane = now
         self._wrote = self._hurried = False
 
-    def _take_writes(self, which: Callable[[Write], bool]) -> list[Write]:
-        taken = [write for write in self._writes if which(write)]
+    def _take(self, which: Callable[[Order], bool]) -> list[Order]:
+        taken = [order for order in self._orders if which(order)]
         if taken:
-            self._writes = deque(write for write in self._writes if not which(write))
+            self._orders = deque(order for order in self._orders if not which(order))
         return taken
 
     def _push(self, polls: Iterable[Poll]) -> None:
@@ -280,9 +262,11 @@ class Schedule:
             _, ticket, poll = heapq.heappop(waiting)
             if poll.ticket == ticket and poll.live:
                 heapq.heappush(ready, (poll.deadline, ticket, poll))
-        while ready and not (
-            ready[0][2].ticket == ready[0][1] and ready[0][2].live and ready[0][2].device.served
-        ):
+        while ready and not self._valid(ready[0][2], ready[0][1]):
             heapq.heappop(ready)
         while urgent and not (urgent[0].live and urgent[0].device.served):
             urgent.popleft()
+
+    @staticmethod
+    def _valid(poll: Poll, ticket: int) -> bool:
+        return poll.ticket == ticket and poll.live and poll.device.served

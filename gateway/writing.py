@@ -1,16 +1,22 @@
-"""One write as a conversation: bits of words, acknowledgement, reading back."""
+"""Orders as conversations: writes alone and together, bits of words, reading back, commands."""
 
 import asyncio
 from collections.abc import Callable, Sequence
-from typing import Any
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from typing import Any, Protocol
 
-from gateway.device import Write
-from gateway.errors import Refused, Unclear
-from gateway.protocols.driver import Talk
+from gateway.consequences import Consequences
+from gateway.device import Device
+from gateway.errors import BadValue, GatewayError, LineDown, Refused, Unclear
+from gateway.orders import Command, Write
+from gateway.protocols.driver import Controllable, ScatteredWriter, Span, Talk
 from gateway.tags import Written
+from gateway.turn import Turn
 from gateway.values import Value
 
 Wall = Callable[[], int]
+STOPPED = "the gateway stopped before the acknowledgement came; it may have been done"
 
 
 class Differs(Unclear):
@@ -58,6 +64,14 @@ async def look_again(talk: Talk[Any], write: Write, wall: Wall) -> Written | Non
     return await carry_out(talk, write, wall) if rule.repeat and in_time else None
 
 
+def together(writes: Sequence[Write]) -> bool:
+    """Whether all these writes to one device can go out in one exchange."""
+    driver = writes[0].device.driver
+    if not isinstance(driver, ScatteredWriter) or not all(write.plain for write in writes):
+        return False
+    return driver.scattered_write_cost([write.tag.span for write in writes]) is not None
+
+
 def holds(write: Write, units: Sequence[int]) -> bool:
     """Whether units read from the device are what was written."""
     bit = write.tag.address.bit
@@ -72,3 +86,147 @@ def written(
     value: Value | None = write.tag.from_units(write.units)
     took = asyncio.get_running_loop().time() - write.submitted
     return Written(False if value is None else value, wall(), took, verified, acknowledged)
+
+
+class Wire(Protocol):
+    """What carrying out orders needs of the line."""
+
+    def turn_with(self, device: Device) -> AbstractContextManager[Turn]: ...
+
+    async def unclear(
+        self, device: Device, turn: Turn, error: Unclear, asked: Span | None
+    ) -> None: ...
+
+    def hold(self, device: Device) -> None:
+        """Keep quiet for a while: a broadcast has gone out."""
+
+
+@dataclass(slots=True)
+class Writer:
+    """Carries out orders, and tells each asker what became of it, exactly once."""
+
+    wire: Wire
+    then: Consequences
+    wall: Wall
+
+    async def write(self, write: Write, others: Sequence[Write] = ()) -> None:
+        """One write; `others` go out in the same exchange, and alone if that is refused."""
+        group = [write, *others]
+        outcomes: dict[Write, Written | GatewayError] = {}
+        try:
+            if others and await self._all_at_once(group, outcomes):
+                return
+            for one in group:
+                outcomes[one] = Unclear(STOPPED)
+                outcomes[one] = await self._one(one)
+        except LineDown as error:
+            for one in outcomes:
+                if isinstance(outcomes[one], Unclear):
+                    outcomes[one] = Unclear(f"{error}; nobody knows whether the write was done")
+                    one.device.doubt = one.tag.span
+            raise
+        finally:
+            for one in group:
+                self._tell(one, outcomes.get(one, LineDown("the line went down; not sent")))
+
+    async def command(self, command: Command) -> None:
+        device = command.device
+        outcome: str | GatewayError = Unclear(STOPPED)
+        try:
+            outcome = await self._obeyed(command)
+        except LineDown as error:
+            outcome = Unclear(f"{error}; nobody knows whether {command.name} was done")
+            device.doubtful = True
+            raise
+        finally:
+            command.done(outcome)
+
+    async def _obeyed(self, command: Command) -> str | GatewayError:
+        device, driver = command.device, command.device.driver
+        if not isinstance(driver, Controllable):
+            return BadValue(f"{device.name} takes no commands")
+        with self.wire.turn_with(device) as turn:
+            try:
+                answer = await driver.control(turn, command.name, command.argument)
+            except BadValue as error:
+                return error
+            except Refused as error:
+                return self._denied(device, error)
+            except Unclear as error:
+                await self.wire.unclear(device, turn, error, None)
+                return error
+            if turn.exchanges:
+                self.then.answered(device)
+            return answer
+
+    async def _all_at_once(
+        self, group: Sequence[Write], outcomes: dict[Write, Written | GatewayError]
+    ) -> bool:
+        """False when the device refused the whole: then nothing of it was done."""
+        device = group[0].device
+        driver = device.driver
+        if not isinstance(driver, ScatteredWriter):
+            return False
+        parts = [(one.tag.span, one.units) for one in group]
+        with self.wire.turn_with(device) as turn:
+            outcomes.update((one, Unclear(STOPPED)) for one in group)
+            try:
+                await driver.write_scattered(turn, parts)
+            except Refused as error:
+                self._denied(device, error)
+                outcomes.clear()
+                return False
+            except Unclear as error:
+                outcomes.update((one, error) for one in group)
+                await self.wire.unclear(device, turn, error, group[0].tag.span)
+                return True
+            self.then.answered(device)
+            outcomes.update((one, written(one, self.wall)) for one in group)
+            return True
+
+    async def _one(self, write: Write) -> Written | GatewayError:
+        """Never simply sent again: what may follow an unclear end is the tag's own rule."""
+        device, span = write.device, write.tag.span
+        with self.wire.turn_with(device) as turn:
+            try:
+                return self._noted(device, await carry_out(turn, write, self.wall))
+            except Refused as error:
+                return self._denied(device, error)
+            except Differs as error:
+                self.then.answered(device)
+                return error
+            except Unclear as error:
+                unclear = error
+                await self.wire.unclear(device, turn, error, span)
+        with self.wire.turn_with(device) as turn:
+            try:
+                settled = await look_again(turn, write, self.wall)
+                return unclear if settled is None else self._noted(device, settled)
+            except Refused as error:  # not what became of the first try
+                self._denied(device, error)
+            except Differs as error:
+                self.then.answered(device)
+                return error
+            except Unclear as error:
+                await self.wire.unclear(device, turn, error, span)
+        return unclear
+
+    def _tell(self, write: Write, outcome: Written | GatewayError) -> None:
+        record = write.device.record
+        record.writes += 1
+        took = asyncio.get_running_loop().time() - write.submitted
+        record.slowest_write = max(record.slowest_write, took)
+        write.done(outcome)
+        self.then.hasten(write.device, write.tag)
+
+    def _denied(self, device: Device, error: Refused) -> Refused:
+        self.then.answered(device)
+        device.record.refusals[error.code] += 1
+        return error
+
+    def _noted(self, device: Device, done: Written) -> Written:
+        if done.acknowledged:
+            self.then.answered(device)
+        else:  # a broadcast: stations need time to take it in
+            self.wire.hold(device)
+        return done

@@ -499,7 +499,9 @@ async def test_a_put_writes_too_and_its_outcome_is_told() -> None:
         await client.put("plant/mixer/recipe/@set", b"7")
         assert (await audit.next(lambda _: True)).json["outcome"] == "written"
         audit.forget()
-        await client.delete("plant/mixer/recipe/@set")
+        await client.delete("plant/mixer/recipe/@set")  # a write of nothing
+        assert (await audit.next(lambda _: True)).json["outcome"] == "bad-value"
+        audit.forget()
         await client.put("plant/nobody/recipe/@set", b"7")
         for key, sent, word in (
             ("plant/mixer/recipe/@set", b"", "bad-value"),

@@ -6,18 +6,11 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from gateway.device import Device, Standing, Write
+from gateway.device import Device, Standing
 from gateway.errors import NoReply
-from gateway.schedule import (
-    PAUSE_FIRST,
-    PAUSE_LONGEST,
-    SILENT_SHARE,
-    WAITING_WRITES,
-    Idle,
-    Poll,
-    Probe,
-    Schedule,
-)
+from gateway.jobs import PAUSE_FIRST, PAUSE_LONGEST, Idle, Poll, Probe
+from gateway.orders import Write
+from gateway.schedule import SILENT_SHARE, WAITING_ORDERS, Schedule
 from gateway.tags import WriteRule
 from tests.sim.plant import device, make_tag
 
@@ -336,7 +329,7 @@ def test_writes_are_withdrawn_by_device_and_expire() -> None:
 def test_too_many_waiting_writes_are_not_taken() -> None:
     dev = up(0)
     schedule = Schedule([dev], 0.0)
-    assert all(schedule.submit(write(dev)) for _ in range(WAITING_WRITES))
+    assert all(schedule.submit(write(dev)) for _ in range(WAITING_ORDERS))
     assert not schedule.submit(write(dev))
 
 
@@ -475,7 +468,7 @@ class AnyOrder(RuleBasedStateMachine):
 
     @invariant()
     def no_write_is_lost(self) -> None:
-        assert len(self.schedule._writes) == self.submitted - self.written
+        assert len(self.schedule._orders) == self.submitted - self.written
 
 
 AnyOrder.TestCase.settings = settings(max_examples=60, stateful_step_count=40, deadline=None)

@@ -20,51 +20,24 @@ from pydantic import (
 from pydantic import Tag as Choice
 
 from gateway.config import written
+from gateway.config.settings import (
+    DEADBAND_SCHEMA,
+    FORMAT_SCHEMA,
+    PORT_SCHEMA,
+    TEXT_SCHEMA,
+    TYPE_SCHEMA,
+    Duration,
+    Endpoint,
+    FilePath,
+    Finite,
+    Interval,
+    Name,
+    OrderName,
+    Text,
+)
 from gateway.tags import Deadband, Form, Publish
 from gateway.transport.port import PortAddress
-from gateway.values import Kind, Order, ValueType
-
-DURATION_SCHEMA: dict[str, Any] = {
-    "type": "string",
-    "pattern": r"^[0-9]+(\.[0-9]+)? ?(ms|s|min|h|d)$",
-    "examples": ["500ms", "2s", "15min", "1h", "7d"],
-}
-# `40101` as an address and `7E1` as a format look like numbers to an editor.
-_TEXT_SCHEMA = {"type": ["string", "number"]}
-_FORMAT_SCHEMA = {
-    "anyOf": [
-        {"type": "string", "enum": [f"{d}{p}{s}" for d in "78" for p in "NEO" for s in "12"]},
-        {"type": "number", "enum": [70, 700, 80, 800]},
-    ]
-}
-_KINDS = [kind.value for kind in Kind if kind is not Kind.STRING]
-_TYPE_SCHEMA = {
-    "anyOf": [
-        {"type": "string", "enum": _KINDS},
-        {"type": "string", "pattern": r"^string\[[0-9]+\]$"},
-    ]
-}
-_DEADBAND_SCHEMA = {
-    "anyOf": [
-        {"type": "number", "minimum": 0},
-        {"type": "string", "pattern": r"^[0-9]+(\.[0-9]+)? ?%$"},
-    ]
-}
-_ENDPOINT_SCHEMA = {"type": "string", "examples": ["tcp/127.0.0.1:7447"]}
-_ORDER_SCHEMA = {"type": "string", "enum": [order.value for order in Order]}
-_PORT_SCHEMA = {
-    "type": "string",
-    "examples": ["/dev/ttyUSB0", "COM3", "tcp://10.0.0.7:4001", "rfc2217://host:port", "simulator"],
-}
-
-Duration = Annotated[float, PlainValidator(written.duration), WithJsonSchema(DURATION_SCHEMA)]
-Interval = Annotated[float, PlainValidator(written.interval), WithJsonSchema(DURATION_SCHEMA)]
-Text = Annotated[str, Field(strict=True), WithJsonSchema(_TEXT_SCHEMA)]
-Name = Annotated[str, PlainValidator(written.name), WithJsonSchema(_TEXT_SCHEMA)]
-FilePath = Annotated[Path, PlainValidator(written.path), WithJsonSchema({"type": "string"})]
-OrderName = Annotated[Order, PlainValidator(written.order), WithJsonSchema(_ORDER_SCHEMA)]
-Endpoint = Annotated[str, PlainValidator(written.endpoint), WithJsonSchema(_ENDPOINT_SCHEMA)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
+from gateway.values import Order, ValueType
 
 
 class Section(BaseModel):
@@ -120,7 +93,7 @@ class TlsSection(Section):
 class ZenohSection(Section):
     """How to join the Zenoh network."""
 
-    prefix: Annotated[str, PlainValidator(written.prefix), WithJsonSchema(_TEXT_SCHEMA)] = "plant"
+    prefix: Annotated[str, PlainValidator(written.prefix), WithJsonSchema(TEXT_SCHEMA)] = "plant"
     """Every key starts with it."""
     mode: Literal["peer", "client", "router"] = "peer"
     """How this session takes part in the network."""
@@ -206,7 +179,7 @@ class TagDefaults(Section):
     """Tag settings for a whole file, line or device."""
 
     type: Annotated[
-        ValueType | None, PlainValidator(written.value_type), WithJsonSchema(_TYPE_SCHEMA)
+        ValueType | None, PlainValidator(written.value_type), WithJsonSchema(TYPE_SCHEMA)
     ] = None
     """What the words mean; left out: bool for a bit, a whole number otherwise."""
     every: Interval = 1.0
@@ -220,7 +193,7 @@ class TagDefaults(Section):
     description: Text = ""
     """What it is, for people."""
     deadband: Annotated[
-        Deadband | None, PlainValidator(written.deadband), WithJsonSchema(_DEADBAND_SCHEMA)
+        Deadband | None, PlainValidator(written.deadband), WithJsonSchema(DEADBAND_SCHEMA)
     ] = None
     """A smaller change is not published: 0.5 (in the tag's unit) or 2%."""
     word_order: OrderName = Order.LOW_FIRST
@@ -284,7 +257,7 @@ class DeviceSection(Section):
 class LineSection(Section):
     """One wire and the devices on it."""
 
-    port: Annotated[PortAddress, PlainValidator(written.port), WithJsonSchema(_PORT_SCHEMA)]
+    port: Annotated[PortAddress, PlainValidator(written.port), WithJsonSchema(PORT_SCHEMA)]
     """A serial port, tcp://host:port, rfc2217://host:port, or simulator."""
     baudrate: Annotated[
         int | None,
@@ -293,7 +266,7 @@ class LineSection(Section):
     ] = None
     """Of the wire, also of the one behind a device server; the protocol's custom if left out."""
     format: Annotated[
-        str | None, PlainValidator(written.serial_format), WithJsonSchema(_FORMAT_SCHEMA)
+        str | None, PlainValidator(written.serial_format), WithJsonSchema(FORMAT_SCHEMA)
     ] = None
     """Data bits, parity, stop bits: 7E1, 8N1; the protocol's custom if left out."""
     echo: bool = False

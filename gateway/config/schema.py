@@ -5,7 +5,6 @@ from typing import Any, get_type_hints
 from pydantic import TypeAdapter
 
 from gateway.config.model import (
-    DURATION_SCHEMA,
     DeviceSection,
     FileSection,
     LineSection,
@@ -13,6 +12,7 @@ from gateway.config.model import (
     TagDefaults,
     TagSection,
 )
+from gateway.config.settings import DURATION_SCHEMA
 from gateway.config.validate import DRIVERS
 
 _PARTS: dict[str, type[Section]] = {"Line": LineSection, "Tag": TagSection, "Defaults": TagDefaults}

@@ -33,6 +33,6 @@ class Names:
             self._used[key] = used
             return key
         self._used.pop(key, None)
-        declared: zenoh.KeyExpr = self._session.declare_keyexpr(key)  # type: ignore[no-untyped-call]  # Zenoh's stub lacks it
+        declared: zenoh.KeyExpr = self._session.declare_keyexpr(key)
         self._declared[key] = declared
         return declared

@@ -4,7 +4,6 @@ import asyncio
 import json
 import time
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import suppress
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -25,6 +24,7 @@ from gateway.northbound.links import Links
 from gateway.northbound.plant import History, Plant
 from gateway.northbound.publisher import Publisher
 from gateway.northbound.queries import Queries
+from gateway.northbound.repeater import Repeater
 from gateway.northbound.replies import Replies
 from gateway.northbound.session import (
     CLOSE_WITHIN,
@@ -43,11 +43,6 @@ log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 T = TypeVar("T")
 
 STATUS_EVERY = 5.0  # seconds
-# After a link returned: first its declarations arrive, and only then does a put reach anyone.
-_SETTLE = 0.3
-# A router that was restarted gets its other clients back later than us: once more for them.
-_LATECOMERS = 5.0
-_REPUBLISH_AT_ONCE = 500  # samples in one turn of the loop
 MANY = 20  # devices, from which on the keys of busy tags are declared
 _PATIENCE = 0.5  # seconds for what still waits to be put when the gateway ends
 
@@ -190,11 +185,12 @@ class Northbound:
             tasks.create_task(self._tell_status())
             await self._duty.on.wait()
             self._declared += await off_loop(self._declare_plant, session, queries, puts)
-            await self._publish_all()
+            repeater = Repeater(self._publisher, self._plant, self._directory, self._links)
+            await repeater.publish_all()
             self._publish_status()
             self.opened.set()
             log.info("on Zenoh", prefix=self.keys.prefix, id=str(session.zid()))
-            tasks.create_task(self._republish())
+            tasks.create_task(repeater.run())
 
     def _declare_own(
         self,
@@ -256,26 +252,6 @@ class Northbound:
 
     # -- going out by itself --
 
-    async def _publish_all(self) -> None:
-        tags = self._directory.all()
-        for start in range(0, len(tags), _REPUBLISH_AT_ONCE):
-            chunk = tags[start : start + _REPUBLISH_AT_ONCE]
-            self._publisher.values(self._plant.sample(tag) for tag in chunk)
-            await asyncio.sleep(0)
-
-    async def _republish(self) -> None:
-        """All current values again after each return to the network."""
-        while True:
-            await self._links.returned.wait()
-            await asyncio.sleep(_SETTLE)
-            self._links.returned.clear()
-            await self._publish_all()
-            with suppress(TimeoutError):
-                async with asyncio.timeout(_LATECOMERS):
-                    await self._links.returned.wait()
-                    continue
-            await self._publish_all()
-
     async def _watch(self) -> None:
         await self._publisher.ended.wait()
         raise GatewayError("the publishing thread has ended: nothing would be published any more")
@@ -307,7 +283,7 @@ class Northbound:
         return documents
 
 
-def _directly(inbox: Callable[[T], None]) -> zenoh.handlers.Callback[T]:
+def _directly(inbox: Callable[[T], None]) -> "zenoh.handlers.Callback[T]":
     """On Zenoh's receiving thread: an inbox only appends, and a thread for each declaration would
     be needed otherwise."""
     return zenoh.handlers.Callback(inbox, indirect=False)

@@ -1,7 +1,8 @@
 """A station that falls silent and comes back, as Zenoh clients in another process see it.
 
-The configuration says `every: 1s` and `reply_timeout: 200ms`, and leaves `retries` (2) and
-`late_guard` (as long as the reply time-out) as they are.
+The configuration says `every: 1s`, `reply_timeout: 200ms` and `retries: 5`, and leaves
+`late_guard` as long as the reply time-out: a station is given up after 2.4 s, so that its values
+have to turn bad before. Silent, it is probed at most every 8 s, as its neighbour is served.
 """
 
 import signal
@@ -31,7 +32,13 @@ def plant(tmp_path: Path) -> Iterator[Plant]:
     """Two PLCs on one line."""
     tags = {"speed": {"address": "D10"}, "fault": {"address": "M5"}}
     devices: dict[str, Any] = {
-        name: {"protocol": "vigor", "station": number, "reply_timeout": "200ms", "tags": tags}
+        name: {
+            "protocol": "vigor",
+            "station": number,
+            "reply_timeout": "200ms",
+            "retries": 5,
+            "tags": tags,
+        }
         for name, number in (("mixer", 1), ("oven", 2))
     }
     devices["mixer"]["tags"] = {**tags, "recipe": {"address": "D500", "write": True}}
@@ -85,7 +92,7 @@ async def test_quality_goes_bad_within_two_intervals_and_good_again(plant: Plant
         heard.forget()
         alive.forget()
         plant.plc.tell("speak 1")
-        back = await heard.next(lambda s: s.key == "plant/mixer/speed" and _good(s))
+        back = await heard.next(lambda s: s.key == "plant/mixer/speed" and _good(s), timeout=20)
         assert back.json["value"] > last_good.json["value"]
         await heard.next(lambda s: s.key == "plant/mixer/fault" and _good(s))
         came = await alive.next(lambda t: t.kind == "PUT")

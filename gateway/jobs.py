@@ -1,0 +1,55 @@
+"""What a line can have to do next."""
+
+from dataclasses import dataclass
+
+from gateway.device import Device
+from gateway.orders import Order
+from gateway.planner import Block
+
+PAUSE_FIRST = 1.0
+PAUSE_LONGEST = 60.0
+URGENT, NOWHERE = -1, -2  # tickets of polls that are in no heap
+
+
+@dataclass(slots=True, eq=False)
+class Poll:
+    """A block and when it is due. Times in seconds of the loop's clock."""
+
+    device: Device
+    block: Block
+    due: float
+    tries: int = 0
+    setbacks: int = 0  # rounds in a row that got no answer, though the device answers otherwise
+    last_good: float | None = None
+    asked: float = 0.0  # when it was handed out last
+    live: bool = True  # False once the device was planned anew
+    ticket: int = NOWHERE  # its one valid place in the queues
+
+    @property
+    def every(self) -> float:
+        """How often it is asked: less and less where no answer comes."""
+        every = self.device.interval(self.block)
+        if self.setbacks:
+            every = max(every, min(PAUSE_FIRST * 2.0 ** min(self.setbacks, 10), PAUSE_LONGEST))
+        return every
+
+    @property
+    def deadline(self) -> float:
+        return self.due + self.every
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Probe:
+    """Ask a device we are in doubt about something harmless."""
+
+    device: Device
+
+
+@dataclass(frozen=True, slots=True)
+class Idle:
+    """Nothing to say until then, unless a write comes."""
+
+    until: float
+
+
+Job = Poll | Order | Probe | Idle

@@ -1,0 +1,49 @@
+"""What people want of a device: writes and commands, on their way down the line."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from gateway.device import Device
+from gateway.errors import GatewayError
+from gateway.tags import Tag, Written
+
+Done = Callable[[Written | GatewayError], None]
+Told = Callable[[str | GatewayError], None]
+
+
+@dataclass(slots=True, eq=False)
+class Write:
+    """A value for a tag; `done` is called exactly once. Times by the loop's clock."""
+
+    device: Device
+    tag: Tag
+    units: Sequence[int]
+    submitted: float
+    expires: float  # not sent any more after this: whoever asked has given up
+    done: Done
+
+    @property
+    def plain(self) -> bool:
+        """One exchange and no more: it may share that exchange with others."""
+        rule = self.tag.write
+        return self.tag.address.bit is None and not (rule and (rule.verify or rule.repeat))
+
+    @property
+    def latest(self) -> bool:
+        """Of several that wait, only the last is to be sent."""
+        return self.tag.write is not None and self.tag.write.latest
+
+
+@dataclass(slots=True, eq=False)
+class Command:
+    """Run, stop, loopback, model ...; `done` is called exactly once."""
+
+    device: Device
+    name: str
+    argument: str
+    submitted: float
+    expires: float
+    done: Told
+
+
+Order = Write | Command
