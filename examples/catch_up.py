@@ -161,7 +161,11 @@ class CatchUp:
 
 
 def _sample(received: zenoh.Sample) -> Sample:
-    payload = received.payload.to_string()
+    """Tags with `payload: raw` have quality and time in the attachment, and are gone when bad."""
+    payload, about = received.payload.to_string(), received.attachment
+    if about is not None:
+        known = payload if received.kind == zenoh.SampleKind.PUT else None
+        payload = json.dumps({"value": known, **json.loads(about.to_string())})
     return Sample(json.loads(payload)["time"], str(received.key_expr), payload)
 
 

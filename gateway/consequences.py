@@ -8,13 +8,14 @@ from typing import Protocol
 import structlog
 
 from gateway.device import Device, Standing
-from gateway.errors import Evidence, Garbled, Refusal, Refused, Unclear
+from gateway.errors import Evidence, Garbled, GatewayError, Refusal, Refused, Unclear
 from gateway.jobs import Poll
 from gateway.protocols.driver import Span
 from gateway.schedule import Schedule
 from gateway.tags import Reason, Sample, Tag, bad
 
 log = structlog.get_logger("gateway.line")
+BUSY_PAUSE = 0.2  # seconds left to a device that said it was busy, doubled each time
 
 
 class Upstairs(Protocol):
@@ -48,6 +49,9 @@ class Consequences:
                 log.info("address is there now", device=device.name, block=_spell(poll))
                 self._replan(device)
             self._settle(device)
+        elif device.learn():
+            log.info("planned anew", device=device.name, turnaround=device.turnaround)
+            self.schedule.plan(device, now)
 
     def answered(self, device: Device) -> None:
         """The device said something to the point, good or bad news."""
@@ -93,7 +97,7 @@ class Consequences:
             self.upstairs.alive(device, False)
             log.warning("device silent", device=device.name, why=device.diagnosis())
 
-    def unread(self, poll: Poll, error: Unclear) -> None:
+    def unread(self, poll: Poll, error: GatewayError) -> None:
         """A poll ended unclear: again in its turn, or its tags are bad."""
         device = poll.device
         if device.standing is Standing.SILENT:
@@ -112,6 +116,12 @@ class Consequences:
         if error.refusal is Refusal.DAMAGED and poll.tries < device.timing.retries:
             self.schedule.again(poll)
             return
+        if error.refusal is Refusal.BUSY and poll.tries < device.timing.retries:
+            self.schedule.again(poll, _now() + BUSY_PAUSE * 2**poll.tries)
+            return
+        if block.listed:
+            self._unlisted(poll, error)
+            return
         if error.refusal is Refusal.ADDRESS:
             halves = device.refusals.refused(block, self.wall(), error.code)
             if halves:
@@ -121,6 +131,15 @@ class Consequences:
         self.bad(block.tags, Reason.REFUSED, str(error))
         self.schedule.polled(poll, _now())
         self._settle(device)
+
+    def _unlisted(self, poll: Poll, error: Refused) -> None:
+        """A list was refused: the device forgot it, or it names an address that is not there."""
+        if poll.tries < 1:
+            self.schedule.again(poll)
+            return
+        log.warning("no list any more", device=poll.device.name, why=str(error))
+        poll.device.lists = False
+        self._replan(poll.device)
 
     def hasten(self, device: Device, tag: Tag) -> None:
         """Read the tag's block before all other polls."""

@@ -6,12 +6,15 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 
 from gateway.errors import DeviceError, Evidence, Garbled, NoReply
+from gateway.lists import with_list
 from gateway.planner import Block, plan
 from gateway.protocols.driver import AnyDriver, Cost, Span, Timing
 from gateway.refusals import RETRY, Refusals
 from gateway.tags import Reason, Tag
 from gateway.wiretime import Wire
 
+LEARN_EVERY = 50  # exchanges between two looks at the measured turnaround
+WORTH_WHILE = 0.1  # of the wire's time, to be planned anew
 HALF_LIFE = 10.0  # seconds in which use of the wire is half forgotten
 
 
@@ -62,23 +65,28 @@ class Device:
     timing: Timing
     tags: tuple[Tag, ...]
     late_guard: float
-    turnaround: float | None = None  # set in the file; measured when None
+    turnaround: float | None = None  # set in the file, or measured; None: the protocol's usual
     blocks: tuple[Block, ...] = ()
     standing: Standing = Standing.STARTING
     failures: int = 0  # conversations in a row that ended unclear
     doubt: Span | None = None  # the question whose answer may still come
     doubtful: bool = True  # what is heard next may answer an older question
     salt: int = 0
+    lists: bool = True  # whether it may be read by a registered list
+    registered: tuple[Span, ...] = ()  # the list it holds, as far as we know
     pause: float = 0.0
     next_probe: float = 0.0
     trouble: DeviceError | None = None
     record: Record = field(default_factory=Record)
     _use: tuple[float, float] = (0.0, 0.0)  # seconds of the wire, and when that was reckoned
     refusals: Refusals = field(init=False)
+    turnaround_fixed: bool = field(init=False)  # set in the file
+    _learn_at: int = LEARN_EVERY
     broadcast: bool = field(init=False)  # nobody answers: it is written to, never asked
 
     def __post_init__(self) -> None:
         self.refusals = Refusals(self.driver.cost)
+        self.turnaround_fixed = self.turnaround is not None
         self.broadcast = not any(self.driver.areas[tag.span.area].readable for tag in self.tags)
         self.doubtful = not self.broadcast
         self.plan()
@@ -99,7 +107,22 @@ class Device:
 
     def plan(self) -> None:
         """Decide anew what to ask, around what the device has refused."""
-        self.blocks = plan(self.tags, self.driver, self.seconds, self.refusals.cuts)
+        blocks = plan(self.tags, self.driver, self.seconds, self.refusals.cuts)
+        self.blocks = with_list(blocks, self.driver, self.seconds) if self.lists else blocks
+
+    def learn(self) -> bool:
+        """Plan anew where the turnaround measured makes that worth while; True if it was done."""
+        measured = self.record.turnaround
+        if self.turnaround_fixed or measured is None or self.record.exchanges < self._learn_at:
+            return False
+        self._learn_at = self.record.exchanges + LEARN_EVERY
+        self.turnaround = measured
+        now, blocks = self.load, self.blocks
+        self.plan()
+        if self.load < (1 - WORTH_WHILE) * now:
+            return True
+        self.blocks = blocks
+        return False
 
     def interval(self, block: Block) -> float:
         """How often the block is asked: refused addresses only rarely."""
@@ -112,6 +135,7 @@ class Device:
         self.standing = Standing.STARTING
         self.failures = 0
         self.doubtful = not self.broadcast
+        self.registered = ()
 
     def answered(self) -> None:
         """A conversation ended well."""
@@ -127,6 +151,7 @@ class Device:
         `doubt`: what was asked; None for a probe, which leaves an older doubt as it was.
         """
         self.failures += 1
+        self.registered = ()  # it may have been switched off
         if not (self._slow and isinstance(error, NoReply)):
             self.trouble = error  # who is known to be slow is not called dead: nobody waits for it
         self.doubtful = not self.broadcast

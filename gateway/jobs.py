@@ -22,6 +22,7 @@ class Poll:
     setbacks: int = 0  # rounds in a row that got no answer, though the device answers otherwise
     last_good: float | None = None
     asked: float = 0.0  # when it was handed out last
+    phased: bool = True  # it has found its place in the period
     live: bool = True  # False once the device was planned anew
     ticket: int = NOWHERE  # its one valid place in the queues
 

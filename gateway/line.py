@@ -12,7 +12,8 @@ from gateway.device import Device, LineRecord, Standing
 from gateway.errors import Busy, LineDown, Offline, Refused, Unclear
 from gateway.jobs import Idle, Poll, Probe
 from gateway.orders import Command, Done, Order, Told, Write
-from gateway.protocols.driver import Span
+from gateway.protocols.driver import Span, Windowed
+from gateway.reading import read_block
 from gateway.recorder import Recorder
 from gateway.schedule import Schedule
 from gateway.tags import Tag
@@ -212,22 +213,38 @@ class Line:
                 device.measured(turn.turnaround / turn.exchanges)
 
     async def _poll(self, poll: Poll) -> None:
-        device, span = poll.device, poll.block.span
+        device, polls = poll.device, [poll]
+        if isinstance(device.driver, Windowed) and device.driver.window > 1:
+            polls += self._schedule.beside(poll, device.driver.window - 1, _now())
         with self.turn_with(device) as turn:
-            try:
-                units = await device.driver.read(turn, span)
-            except Refused as error:
-                self._then.answered(device)
-                self._then.refused(poll, error)
-            except Unclear as error:
-                await self.unclear(device, turn, error, span)
-                self._then.unread(poll, error)
-            except LineDown:
-                device.doubt = span
-                raise
+            if len(polls) == 1:
+                failed = await self._read(turn, poll)
             else:
-                self._then.answered(device)
-                self._then.read(poll, units)
+                ends = await asyncio.gather(*(self._read(turn, one) for one in polls))
+                failed = [failure for end in ends for failure in end]
+            if failed:
+                first, error = failed[0]
+                if isinstance(error, LineDown):
+                    device.doubt = first.block.span
+                    raise error
+                await self.unclear(device, turn, error, first.block.span)
+            for one, error in failed:
+                self._then.unread(one, error)
+
+    async def _read(self, turn: Turn, poll: Poll) -> list[tuple[Poll, Unclear | LineDown]]:
+        """Empty when it was answered."""
+        device = poll.device
+        try:
+            units = await read_block(turn, device, poll.block)
+        except Refused as error:
+            self._then.answered(device)
+            self._then.refused(poll, error)
+        except (Unclear, LineDown) as error:
+            return [(poll, error)]
+        else:
+            self._then.answered(device)
+            self._then.read(poll, units)
+        return []
 
     async def _probe(self, device: Device) -> None:
         with self.turn_with(device) as turn:

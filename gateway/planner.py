@@ -26,21 +26,30 @@ Cuts = frozenset[tuple[str, int]]  # (area, n): no block may hold both n - 1 and
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Block:
-    """One request and the tags it feeds."""
+    """One request and the tags it feeds.
+
+    `listed`: the spans of a list registered in the PLC, where the block is read by one.
+    """
 
     span: Span
     every: float
     tags: tuple[Tag, ...]
     cost: Cost
+    listed: tuple[Span, ...] = ()
     parts: tuple[tuple[Decode, slice], ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        start = self.span.start
-        parts = tuple(
-            (tag.decode, slice(tag.span.start - start, tag.span.start - start + tag.span.size))
-            for tag in self.tags
-        )
-        object.__setattr__(self, "parts", parts)
+        object.__setattr__(self, "parts", tuple(self._parts()))
+
+    def _parts(self) -> Iterator[tuple[Decode, slice]]:
+        """For each tag its decoder and where its units stand among those that are read."""
+        begins, place = {}, 0
+        for span in self.listed:
+            begins[span] = place
+            place += span.size
+        for tag in self.tags:
+            begin = begins.get(tag.span, tag.span.start - self.span.start)
+            yield tag.decode, slice(begin, begin + tag.span.size)
 
     def decode(self, units: Sequence[int], time: int) -> list[Sample]:
         """The samples of all tags; `time` is when the reply arrived (ns since 1970)."""

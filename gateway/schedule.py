@@ -11,6 +11,7 @@ from gateway.jobs import NOWHERE, PAUSE_FIRST, PAUSE_LONGEST, URGENT, Idle, Job,
 from gateway.orders import Order, Write
 from gateway.planner import Block
 
+GOLDEN = 0.6180339887498949  # its multiples spread evenly, however many there are
 SILENT_SHARE = 0.05  # of the wire's time, for all silent stations together
 WAITING_ORDERS = 1000
 
@@ -21,7 +22,8 @@ class Schedule:
     Orders go first, but not twice in a row while a poll is due. Polls go by earliest deadline,
     over all devices; when the line is asked for more than it carries, the devices that have had
     the wire for the shortest time of late go first. What somebody wants to see now goes before
-    other polls, but not twice in a row while one is due. A late poll is done once, not once per missed period. A device in
+    other polls, but not twice in a row while one is due. A late poll is done once, not once per
+    missed period. After their first round the polls are spread over their periods. A device in
     doubt is probed before anything else is asked of it or written to it. A device that was not
     heard yet is probed at once. While polls of others are due, such probes and those of devices
     that have just failed get half of the wire's time. A silent device is left alone but for
@@ -33,6 +35,9 @@ class Schedule:
         self.devices = devices
         self._random = random.Random(seed)  # noqa: S311  (jitter, not a secret)
         self._order = itertools.count()
+        self._phases = (
+            n * GOLDEN % 1 / 2 for n in itertools.count()
+        )  # of a period, to begin early
         self._waiting: list[tuple[float, int, Poll]] = []  # by due time
         self._ready: list[tuple[float, int, Poll]] = []  # due, by deadline
         self._urgent: deque[Poll] = deque()
@@ -154,6 +159,16 @@ class Schedule:
         elif hurry:
             self._urgent.popleft()
         self._hurried = hurry
+        return self._hand_out(poll, now)
+
+    def beside(self, poll: Poll, most: int, now: float) -> list[Poll]:
+        """Polls of the same device that are due too, for one that takes several at once."""
+        ready = sorted(self._ready)
+        alike = [p for _, ticket, p in ready if p.device is poll.device and self._valid(p, ticket)]
+        return [self._hand_out(other, now) for other in alike[:most]]
+
+    @staticmethod
+    def _hand_out(poll: Poll, now: float) -> Poll:
         poll.ticket = NOWHERE  # with it its place in the heap is void
         poll.due = min(poll.due, now)
         poll.asked = now
@@ -201,12 +216,17 @@ class Schedule:
         if missed:
             poll.device.record.overruns += missed
         poll.due = (poll.asked if missed or poll.setbacks else poll.due) + every
+        if not poll.phased:
+            poll.phased = True
+            poll.due -= every * next(self._phases)
         poll.tries = 0
         self._push([poll])
 
-    def again(self, poll: Poll) -> None:
-        """It ended unclear and may be asked again in its turn."""
+    def again(self, poll: Poll, when: float | None = None) -> None:
+        """It is to be asked again in its turn, or from `when` on."""
         poll.tries += 1
+        if when is not None:
+            poll.due = when
         self._push([poll])
 
     def withdraw(self, device: Device | None = None) -> list[Order]:
@@ -236,6 +256,8 @@ class Schedule:
             poll.due = now
             poll.setbacks = 0
         self.plan(device, now)
+        for poll in self._polls[device]:
+            poll.phased = False
 
     def opened(self, now: float) -> None:
         """The line has been opened: every device is to be heard anew."""

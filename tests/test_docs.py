@@ -7,7 +7,9 @@ import shlex
 import sys
 from collections import Counter
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
+from textwrap import dedent
 from typing import Any, NamedTuple
 
 import pytest
@@ -31,6 +33,8 @@ PAGES = [README, *DOCS]
 TEXT = {page.name if page != README else "/README.md": page.read_text("utf-8") for page in PAGES}
 EXAMPLE = ROOT / "config.example.yaml"
 ENDPOINT = "tcp/127.0.0.1:7447"
+# Indented where it stands in a list.
+FENCED = re.compile(r"^( *)```(\w+)\n(.*?)^\1```$", re.DOTALL | re.MULTILINE)
 # Its blocks are single devices, for they go into files like those of the other pages.
 OF_DEVICES = "no-protocol.md"
 
@@ -52,20 +56,54 @@ def blocks(*languages: str) -> list[Block]:
 
 
 def _blocks(page: str) -> Iterator[Block]:
-    for match in re.finditer(r"^```(\w+)\n(.*?)^```$", TEXT[page], re.DOTALL | re.MULTILINE):
+    for match in FENCED.finditer(TEXT[page]):
         line = TEXT[page].count("\n", 0, match.start()) + 2
-        yield Block(page, match[1], line, match[2])
+        yield Block(page, match[2], line, dedent(match[3]))
 
 
 def prose(page: str) -> str:
     """The page without its blocks of code."""
-    return re.sub(r"^```.*?^```$", "", TEXT[page], flags=re.DOTALL | re.MULTILINE)
+    return FENCED.sub("", TEXT[page])
+
+
+# ---- a gateway to try it on --------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """The file of the example gateway, which runs: as it is, but for the port and `blocks`."""
+    text = EXAMPLE.read_text("utf-8")
+    for old, new in ((ENDPOINT, free_endpoint()), ("# blocks: true ", "blocks: true ")):
+        assert text.count(old) == 1
+        text = text.replace(old, new)
+    path = tmp_path_factory.mktemp("docs") / "config.yaml"
+    path.write_text(text, encoding="utf-8")
+    with started(path) as program:
+        for _ in range(3):
+            program.says("device answers")
+        until(lambda: plc_gateway("read", path).code == 0, "every value is good")
+        yield path
+
+
+@pytest.fixture(scope="module")
+def endpoint(running: Path) -> str:
+    return load(running).zenoh.listen[0]
+
+
+def shape(line: str) -> str:
+    """The line without what differs from one run to the next."""
+    line = re.sub(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d+Z", "TIME", line)
+    line = re.sub(r"\b(True|False|true|false)\b", "BOOL", line)
+    return re.sub(r"(?<![\w.])-?\d+(\.\d+)?(?![\w.])", "N", line)
 
 
 # ---- YAML --------------------------------------------------------------------------------------
 
+TOP = schema()["properties"]
 FILES = [block for block in blocks("yaml") if re.search(r"^lines:", block.text, re.MULTILINE)]
-DEVICES = [block for block in blocks("yaml") if block not in FILES]
+_PARTS = [block for block in blocks("yaml") if block not in FILES]
+SECTIONS_ALONE = [block for block in _PARTS if set(yaml.safe_load(block.text)) <= set(TOP)]
+DEVICES = [block for block in _PARTS if block not in SECTIONS_ALONE]
 
 
 def test_every_page_with_files_is_checked() -> None:
@@ -84,11 +122,17 @@ def test_a_file_in_the_pages_loads(block: Block, tmp_path: Path) -> None:
     assert loaded(block.text, tmp_path).devices
 
 
+@pytest.mark.parametrize("block", SECTIONS_ALONE, ids=str)
+def test_a_section_in_the_pages_loads_with_lines_below(block: Block, tmp_path: Path) -> None:
+    lines = yaml.safe_load(EXAMPLE.read_text("utf-8"))["lines"]
+    assert loaded(block.text + "\n" + json.dumps({"lines": lines})[1:-1], tmp_path).devices
+
+
 @pytest.mark.parametrize("block", DEVICES, ids=str)
 def test_a_device_in_the_pages_loads_as_soon_as_its_protocol_is_there(
     block: Block, tmp_path: Path
 ) -> None:
-    devices = yaml.safe_load(block.text)
+    devices = yaml.safe_load(block.text)  # no settings of a file: each device on a line of its own
     assert {device["protocol"] for device in devices.values()} == {"frames"}
     serial = {"port": "simulator", "baudrate": 9600, "format": "8N1"}
     lines = {name: {**serial, "devices": {name: made}} for name, made in devices.items()}
@@ -98,8 +142,8 @@ def test_a_device_in_the_pages_loads_as_soon_as_its_protocol_is_there(
         return
     with pytest.raises(ConfigErrors) as told:
         loaded(text, tmp_path)
-    assert len(told.value.messages) == len(devices)
-    assert all("'frames' is no protocol" in message for message in told.value.messages)
+    unknown = [told for told in told.value.messages if "'frames' is no protocol" in told]
+    assert len(unknown) == len(devices)
 
 
 def loaded(text: str, folder: Path) -> Any:
@@ -138,14 +182,14 @@ def settings(heading: str) -> dict[str, str]:
 
 def properties(*names: str) -> set[str]:
     shapes = schema()["$defs"]
-    found = set[str].union(*(set(shapes[name]["properties"]) for name in names))
-    return found
+    return set[str].union(*(set(shapes[name]["properties"]) for name in names))
 
 
 @pytest.mark.parametrize(
     ("heading", "shape"),
     [
-        *(("gateway", "GatewaySection"), ("zenoh", "ZenohSection"), ("history", "HistorySection")),
+        *(("gateway", "GatewaySection"), ("zenoh", "ZenohSection"), ("tls", "TlsSection")),
+        *(("writers", "WritersSection"), ("history", "HistorySection")),
         *(("web", "WebSection"), ("A line", "Line"), ("A tag", "Tag"), ("write", "WriteSection")),
     ],
 )
@@ -179,6 +223,8 @@ def _plant(section: str, name: str, text: str) -> dict[str, Any]:
     match section:
         case "gateway" | "zenoh" | "history" | "web":
             top = {section: setting}
+        case "tls":
+            top = {"zenoh": {"tls": setting}}
         case "A line":
             line |= setting
         case "A device":
@@ -201,7 +247,7 @@ def _plant(section: str, name: str, text: str) -> dict[str, Any]:
     }
 
 
-SECTIONS = [*("gateway", "zenoh", "history", "web", "A line", "A device", "A tag", "write")]
+SECTIONS = ["gateway", "zenoh", "tls", "history", "web", "A line", "A device", "A tag", "write"]
 DEFAULTS = [
     (section, name, default)
     for section in [*SECTIONS, "vigor", "computer-link", "modbus-rtu", "modbus-tcp"]
@@ -271,7 +317,8 @@ def test_what_the_page_calls_refused_is_refused_in_these_words(
     tag = f"{{address: D1, {bare(written)}}}"
     if bare(written).startswith("adress"):
         tag = f"{{{bare(written)}}}"
-    text = f"lines: {{a: {{port: simulator, devices: {{m: {{protocol: vigor, tags: {{t: {tag}}}}}}}}}}}"
+    device = f"{{protocol: vigor, tags: {{t: {tag}}}}}"
+    text = f"lines: {{a: {{port: simulator, devices: {{m: {device}}}}}}}"
     with pytest.raises(ConfigErrors, match=re.escape(because)):
         loaded(text, tmp_path)
 
@@ -286,7 +333,7 @@ def test_the_schema_beside_the_example_is_the_gateways() -> None:
 
 def _commands() -> Iterator[tuple[str, str]]:
     for page in TEXT:
-        shown = [code for code in re.findall(r"`([^`]+)`", prose(page))]
+        shown: list[str] = re.findall(r"`([^`]+)`", prose(page))
         for block in _blocks(page):
             if block.language in ("console", "ini"):
                 shown += re.findall(r"^(?:\$ |ExecStart=)(.*)$", block.text, re.MULTILINE)
@@ -307,7 +354,8 @@ def test_commands_are_found() -> None:
 @pytest.mark.parametrize(("page", "command"), COMMANDS)
 def test_a_command_in_the_pages_is_one_with_its_options(page: str, command: str) -> None:
     _, name, *arguments = shlex.split(command)
-    commands = typer.main.get_command(cli.cli).commands  # type: ignore[attr-defined]  # a group
+    group: Any = typer.main.get_command(cli.cli)
+    commands = group.commands
     assert name in commands, f"{page}: there is no command {name}"
     # Parsed, and not carried out; where it is mentioned without its arguments, these are missing.
     commands[name].make_context(name, arguments or ["plant.yaml"] * _wants(commands[name]))
@@ -327,6 +375,14 @@ def test_the_plan_in_the_readme_is_the_one_that_check_prints(tmp_path: Path) -> 
     shown = [line.strip() for line in plan.text.splitlines() if line.strip()]
     printed = [line.strip() for line in plc_gateway("check", path).out.splitlines()]
     assert shown == printed[: len(shown)]
+
+
+def test_the_write_in_the_readme_is_answered_as_shown(running: Path) -> None:
+    [console] = [block for block in _blocks("/README.md") if " write config" in block.text]
+    command, shown = console.text.strip().splitlines()[-2:]
+    name, *arguments = shlex.split(command)[2:]
+    done = plc_gateway(name, *(running if word == EXAMPLE.name else word for word in arguments))
+    assert (done.code, shape(done.out.strip())) == (0, shape(shown))
 
 
 # ---- links and keys ----------------------------------------------------------------------------
@@ -380,7 +436,7 @@ def test_every_key_in_the_pages_is_one_of_the_examples() -> None:
     shown = {
         (page, key)
         for page, text in TEXT.items()
-        for key in re.findall(r"(?<![\w/.-])plant/[^\s`\"?,)}]+", text)
+        for key in re.findall(r"(?<![\w/.-])plant/[^\s`\"'?,)}]+", text)
     }
     assert len(shown) >= 30
     wrong = [
@@ -408,35 +464,12 @@ def _snippets() -> list[Snippet]:
     found = list(_blocks("zenoh.md"))
     return [
         Snippet(block, after.text.splitlines())
-        for block, after in zip(found, found[1:], strict=False)
+        for block, after in pairwise(found)
         if block.language == "python"
     ]
 
 
 SNIPPETS = _snippets()
-
-
-@pytest.fixture(scope="module")
-def endpoint(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """Where the example gateway listens: as it is, but for the port, and `blocks: true`."""
-    place = free_endpoint()
-    text = EXAMPLE.read_text("utf-8")
-    for old, new in ((ENDPOINT, place), ("# blocks: true ", "blocks: true ")):
-        assert text.count(old) == 1
-        text = text.replace(old, new)
-    path = tmp_path_factory.mktemp("docs") / "config.yaml"
-    path.write_text(text, encoding="utf-8")
-    with started(path) as program:
-        for _ in range(3):
-            program.says("device answers")
-        yield place
-
-
-def shape(line: str) -> str:
-    """The line without what differs from one run to the next."""
-    line = re.sub(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d+Z", "TIME", line)
-    line = re.sub(r"\b(True|False|true|false)\b", "BOOL", line)
-    return re.sub(r"(?<![\w.])-?\d+(\.\d+)?(?![\w.])", "N", line)
 
 
 def test_every_program_is_run_and_says_what_it_prints() -> None:

@@ -102,8 +102,9 @@ class Writer:
             if started >= self._next_try or ending:
                 self._try()
             self._closing.wait(max(0.0, started + COMMIT_EVERY - time.monotonic()))
-        if self._file is not None:
-            self._let_go()
+        self._let_go()
+        if (waiting := self._recent.waiting) or self._writes:
+            log.error("history ends with samples that no disk took", samples=waiting)
 
     def _try(self) -> None:
         try:

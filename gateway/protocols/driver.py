@@ -174,6 +174,15 @@ class Monitor(Protocol[F]):
 
 
 @runtime_checkable
+class Windowed(Protocol):
+    """A driver whose answers carry a number, so that several questions may be open at once."""
+
+    @property
+    def window(self) -> int:
+        """How many."""
+
+
+@runtime_checkable
 class Controllable(Protocol[F]):
     """A driver whose device takes commands: run, stop, loopback, model."""
 

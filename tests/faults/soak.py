@@ -56,16 +56,13 @@ def plant() -> dict[str, Any]:
         }
         return {"port": f"tcp://127.0.0.1:{free_port()}", **wire, "devices": devices}
 
-    lines = {
+    return {
         "vigor": line("vigor", "D", 8, {"baudrate": 19200, "format": "7E1"}),
         "link": line("computer-link", "D", 4, {"baudrate": 19200, "format": "7E1"}),
         "rtu": line("modbus-rtu", "holding:", 8, {"baudrate": 115200, "format": "8E1"}),
         "ascii": line("modbus-ascii", "holding:", 4, {"baudrate": 19200, "format": "7E1"}),
         "tcp": line("modbus-tcp", "holding:", 1, {}),
     }
-    silent = lines["vigor"]["devices"]["vigor-8"]
-    silent["tags"] = {"v": {"address": "D1"}}
-    return lines
 
 
 class Customers:
