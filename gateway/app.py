@@ -1,20 +1,16 @@
-"""From a configuration to a running gateway: lines, mirror and Zenoh in one task group."""
+"""Everything below Zenoh, made from a configuration: lines, and what is known of every tag."""
 
 import asyncio
-import signal
 import time
 from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
-
-import structlog
 
 from gateway import __version__
 from gateway.config import Config, DeviceConfig, LineConfig
 from gateway.device import Device
-from gateway.errors import BadValue, GatewayError
+from gateway.errors import Busy, GatewayError, Offline
 from gateway.forecast import LineForecast, forecast
 from gateway.line import Line
 from gateway.mirror import Mirror
-from gateway.northbound import Mode, Northbound, ZenohSettings
 from gateway.payload import rfc3339
 from gateway.simulation import station_for
 from gateway.status import Document, device_document, line_document
@@ -22,7 +18,6 @@ from gateway.tags import Quality, Reason, Sample, Tag, Written, bad
 from gateway.transport import Ear, Port, SimulatorAddress, open_port, open_simulator
 from gateway.values import Value
 
-log = structlog.get_logger("gateway")
 FRESH_WITHIN = 5.0  # seconds a read-through may take before what is known is answered
 
 
@@ -61,14 +56,21 @@ def forecasts(config: Config) -> list[LineForecast]:
 class Gateway:
     """Everything below Zenoh: the lines, and what is known of every tag."""
 
-    def __init__(self, config: Config, wall: Callable[[], int] = time.time_ns) -> None:
-        """`wall`: nanoseconds since 1970."""
+    def __init__(
+        self,
+        config: Config,
+        wall: Callable[[], int] = time.time_ns,
+        open_line: Callable[[LineConfig], Callable[[Ear], Awaitable[Port]]] = opener,
+    ) -> None:
+        """`wall`: nanoseconds since 1970. `open_line`: what opens a line's port."""
         self.config = config
         self.lines: list[Line] = []
         self.mirror = Mirror((tag for device in config.devices for tag in device.tags), wall())
         self.publish: Callable[[Sequence[Sample]], None] = lambda samples: None
         self.show_alive: Callable[[str, bool], None] = lambda device, alive: None
+        self.documents: dict[str, Callable[[], Document]] = {}  # what others add to the status
         self._wall = wall
+        self._open_line = open_line
         self._started = wall()
         self._tags = {tag.key: tag for device in config.devices for tag in device.tags}
         self._places: dict[str, tuple[Line, Device]] = {}
@@ -86,7 +88,7 @@ class Gateway:
             config.name,
             devices,
             config.wire,
-            opener(config),
+            self._open_line(config),
             self,
             self._wall,
             echo=config.echo,
@@ -126,7 +128,7 @@ class Gateway:
     async def write(self, tag: Tag, value: Value) -> Written:
         """Returns when the device has acknowledged. Raises `GatewayError`, `BadValue` first."""
         if tag.device not in self._places:
-            raise BadValue(f"device {tag.device} is disabled")
+            raise Offline(f"device {tag.device} is disabled; nothing was sent")
         units = tag.encode(value)
         line, device = self._places[tag.device]
         outcome: asyncio.Future[Written] = asyncio.get_running_loop().create_future()
@@ -143,7 +145,10 @@ class Gateway:
         return await outcome
 
     async def fresh(self, tag: Tag, max_age: float) -> Sample:
-        """A sample at most `max_age` seconds old; simultaneous askers share one exchange."""
+        """A sample at most `max_age` seconds old; simultaneous askers share one exchange.
+
+        Bad where the device does not answer. Raises `Busy` when the line did not get to it.
+        """
         known = self.mirror[tag]
         young = self._wall() - known.time <= max_age * 1e9
         if tag.device not in self._places or (known.quality is Quality.GOOD and young):
@@ -158,7 +163,9 @@ class Gateway:
             async with asyncio.timeout(FRESH_WITHIN):
                 return await asked
         except TimeoutError:
-            return self.mirror[tag]
+            if self.mirror[tag].quality is Quality.BAD:
+                return self.mirror[tag]
+            raise Busy(f"{tag.key} could not be read within {FRESH_WITHIN:g} s") from None
 
     def status(self) -> Mapping[str, Document]:
         """Documents by path: `status`, `lines/<line>`, `devices/<device>`."""
@@ -178,53 +185,4 @@ class Gateway:
             documents[f"lines/{line.name}"] = line_document(line, self._forecasts[line.name], now)
         for name, (_, device) in self._places.items():
             documents[f"devices/{name}"] = device_document(device, device.driver.protocol)
-        return documents
-
-
-def zenoh_settings(config: Config) -> ZenohSettings:
-    zenoh = config.zenoh
-    return ZenohSettings(
-        prefix=zenoh.prefix,
-        mode=Mode(zenoh.mode),
-        listen=zenoh.listen,
-        connect=zenoh.connect,
-        config_file=zenoh.config_file,
-    )
-
-
-async def run(config: Config, started: Callable[[], None] = lambda: None) -> None:
-    """The service, until SIGTERM or SIGINT. Raises `GatewayError` when it cannot start.
-
-    `started` is called once when everything is open on Zenoh.
-    """
-    gateway = Gateway(config)
-    northbound = Northbound(zenoh_settings(config), config.name, gateway)
-    gateway.publish = northbound.publish
-    gateway.show_alive = northbound.alive
-    stop = asyncio.Event()
-    loop = asyncio.get_running_loop()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        loop.add_signal_handler(number, stop.set)
-    face = asyncio.create_task(northbound.run(), name="zenoh")
-    lines = [asyncio.create_task(line.run(), name=line.name) for line in gateway.lines]
-    opened = asyncio.create_task(northbound.opened.wait())
-    stopping = asyncio.create_task(stop.wait())
-    try:
-        await asyncio.wait([opened, face, stopping], return_when=asyncio.FIRST_COMPLETED)
-        if opened.done():
-            started()
-        await asyncio.wait([face, stopping, *lines], return_when=asyncio.FIRST_COMPLETED)
-    finally:
-        opened.cancel()
-        stopping.cancel()
-        await _ended(lines)  # the wire first, so that the last outcomes still go out
-        await _ended([face])
-
-
-async def _ended(tasks: Sequence[asyncio.Task[None]]) -> None:
-    """Cancel and await; what a task failed with by itself is raised here."""
-    for task in tasks:
-        task.cancel()
-    for outcome in await asyncio.gather(*tasks, return_exceptions=True):
-        if isinstance(outcome, Exception):
-            raise outcome
+        return documents | {path: document() for path, document in self.documents.items()}

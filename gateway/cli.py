@@ -14,7 +14,7 @@ import structlog
 import typer
 from rich.console import Console
 
-from gateway import __version__, app, direct, show, simulate
+from gateway import __version__, app, direct, service, show, simulate
 from gateway.client import NOTHING, Shown, connected, matches, parse_value, wanted_keys
 from gateway.config import Config, load
 from gateway.config import schema as config_schema
@@ -87,7 +87,8 @@ def run(
     """The service: poll, mirror onto Zenoh, take writes. SIGTERM or Ctrl-C ends it."""
     loaded = load(config)
     _log(log_format, log_level)
-    asyncio.run(app.run(loaded, lambda: err.print(show.next_steps(loaded, config, show.typed()))))
+    hint = show.next_steps(loaded, config, show.typed())
+    asyncio.run(service.run(loaded, lambda: err.print(hint)))
 
 
 @cli.command()

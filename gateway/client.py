@@ -5,6 +5,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
+from dataclasses import replace
 from queue import SimpleQueue
 from typing import NamedTuple
 
@@ -14,7 +15,7 @@ import zenoh
 from gateway.config import Config
 from gateway.errors import ConfigError, GatewayError
 from gateway.keys import Keys
-from gateway.northbound import Mode, ZenohSettings
+from gateway.northbound import Mode, zenoh_settings
 from gateway.northbound.session import configure
 from gateway.payload import rfc3339
 from gateway.values import Value
@@ -157,11 +158,12 @@ def connected(config: Config) -> Iterator[Client]:
     endpoints = own.connect if own.mode == "client" else own.listen or own.connect
     if not endpoints:
         raise GatewayError("zenoh.listen and zenoh.connect are empty: no way to the gateway")
-    settings = ZenohSettings(
-        prefix=own.prefix,
+    settings = replace(
+        zenoh_settings(own),
         mode=Mode.CLIENT,
+        listen=(),
         connect=tuple(_reachable(endpoint) for endpoint in endpoints),
-        config_file=own.config_file,
+        users_file=None,
     )
     setup = configure(settings)
     setup.insert_json5("listen/endpoints", "[]")

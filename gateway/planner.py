@@ -15,7 +15,7 @@ from itertools import pairwise
 from gateway.cover import Request, cover
 from gateway.errors import ConfigError
 from gateway.protocols.driver import AnyDriver, Cost, Span, Unit
-from gateway.tags import Quality, Reason, Sample, Tag, bad
+from gateway.tags import Quality, Reason, Sample, Tag, bad, of_field
 from gateway.values import Value
 
 Seconds = Callable[[Cost], float]
@@ -53,6 +53,9 @@ class Block:
 
     def decode(self, units: Sequence[int], time: int) -> list[Sample]:
         """The samples of all tags; `time` is when the reply arrived (ns since 1970)."""
+        if self.tags[0].shape is not None:
+            places = zip(self.tags, self.parts, strict=True)
+            return [of_field(tag, units[part.start], time) for tag, (_, part) in places]
         good, new = Quality.GOOD, tuple.__new__  # half of what the constructor takes: it is much
         values = [decode(units[part]) for decode, part in self.parts]
         return [

@@ -5,9 +5,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple, Protocol
 
-from gateway.errors import BadValue
+from gateway.errors import BadValue, Garbled
 from gateway.protocols.driver import Address, Span, Unit
 from gateway.values import Kind, Layout, Value, from_words, to_words
 
@@ -62,6 +62,16 @@ class WriteRule:
     latest: bool = False  # of several waiting writes only the last is sent
 
 
+class Shape(Protocol):
+    """How a value lies in a frame of a no-protocol device, which has no words."""
+
+    def put(self, value: Value) -> bytes:
+        """Its bytes. Raises `BadValue`."""
+
+    def take(self, raw: bytes) -> Value:
+        """What such bytes mean. Raises `Garbled`."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Tag:
     """One value of one device: where it lives, how to read it, how often, who may write it."""
@@ -84,12 +94,17 @@ class Tag:
     history: bool = False
     payload: Form = Form.JSON
     write: WriteRule | None = None
-    decode: Callable[[Sequence[int]], Value | None] = field(init=False, repr=False)
+    shape: Shape | None = None  # of a field of a frame: what is read is its value itself
+    event: bool = False  # every value counts, also one that is equal to the last
+    decode: Callable[[Sequence[Any]], Value | None] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        decode = _decoder(
-            self.layout, self.unit_kind, self.address.bit, float(self.scale), float(self.offset)
-        )
+        scale, offset = float(self.scale), float(self.offset)
+        decode: Callable[[Sequence[Any]], Value | None]
+        if self.shape is None:
+            decode = _decoder(self.layout, self.unit_kind, self.address.bit, scale, offset)
+        else:
+            decode = _passed_on(self.layout, scale, offset)
         object.__setattr__(self, "decode", decode)
 
     @property
@@ -105,6 +120,8 @@ class Tag:
         if isinstance(value, int) and value.bit_length() > _MOST_BITS:
             raise BadValue("the number is too large")
         self._keep_limits(value, str(value))
+        if self.shape is not None:
+            return self._octets(self.shape, value)
         words = to_words(self.layout)(self._unscaled(value))
         if self.unit_kind is Unit.DWORD:
             units = [low | high << 16 for low, high in zip(words[::2], words[1::2], strict=True)]
@@ -113,6 +130,15 @@ class Tag:
         if self._rounds and (real := self.from_units(units)) is not None:
             self._keep_limits(real, f"{value} (the device holds {real})")
         return units
+
+    def _octets(self, shape: Shape, value: Value) -> list[int]:
+        """The bytes of the value in its frame, whose digits may say a little less than it."""
+        octets = list(shape.put(self._unscaled(value)))
+        real = self.from_units(octets)
+        if real is None:
+            raise BadValue(f"{value!r} cannot be written so that it could be read again")
+        self._keep_limits(real, f"{value} (what is sent is {real})")
+        return octets
 
     @property
     def _rounds(self) -> bool:
@@ -130,6 +156,11 @@ class Tag:
 
     def from_units(self, units: Sequence[int]) -> Value | None:
         """The value that `encode` made these units from: what really goes to the device."""
+        if self.shape is not None:
+            try:
+                return self.decode([self.shape.take(bytes(units))])
+            except Garbled:
+                return None
         if self.address.bit is not None:
             return bool(units[0])
         return self.decode(units)
@@ -197,6 +228,30 @@ def _decoder(
     return scaled
 
 
+@lru_cache(maxsize=4096)
+def _passed_on(
+    layout: Layout, scale: float, offset: float
+) -> Callable[[Sequence[Any]], Value | None]:
+    """For what is a value already, or the `Garbled` that says why there is none."""
+    scales = layout.type.is_number and not (scale == 1 and offset == 0)
+    exact = not _is_float(layout)
+    decimals = max(_decimals(scale), _decimals(offset))
+
+    def value(units: Sequence[Any]) -> Value | None:
+        raw: Value | Garbled = units[0]
+        if isinstance(raw, Garbled):
+            return None
+        if not scales or isinstance(raw, str):
+            return raw
+        scaled = raw * scale + offset
+        if not math.isfinite(scaled):
+            return None
+        # Written in digits, as its device did: 600.0 x 0.1 is 60, not 60.00000000000001.
+        return round(scaled, decimals) if exact else float(f"{scaled:.15g}")
+
+    return value
+
+
 class Sample(NamedTuple):
     """What is known of a tag: a value that was in the device at `time`, or why there is none.
 
@@ -213,6 +268,14 @@ class Sample(NamedTuple):
 
 def good(tag: Tag, value: Value, time: int) -> Sample:
     return Sample(tag, value, Quality.GOOD, time)
+
+
+def of_field(tag: Tag, value: Value | Garbled, time: int) -> Sample:
+    """What a frame said of a tag."""
+    if isinstance(value, Garbled):
+        return bad(tag, Reason.GARBLED, time, str(value))
+    known = tag.decode([value])
+    return bad(tag, Reason.NOT_A_NUMBER, time) if known is None else good(tag, known, time)
 
 
 def bad(tag: Tag, reason: Reason, time: int, detail: str = "") -> Sample:

@@ -74,6 +74,8 @@ def together(writes: Sequence[Write]) -> bool:
 
 def holds(write: Write, units: Sequence[int]) -> bool:
     """Whether units read from the device are what was written."""
+    if write.tag.shape is not None:  # what is written is bytes, what is read is a value
+        return write.tag.decode(units) == write.tag.from_units(write.units)
     bit = write.tag.address.bit
     if bit is not None:
         return (units[0] >> bit & 1) == write.units[0]

@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
-from gateway.app import Gateway, forecasts, zenoh_settings
+from gateway.app import Gateway, forecasts
 from gateway.config import load
-from gateway.errors import BadValue, LineDown
-from gateway.northbound import Mode
+from gateway.errors import BadValue, LineDown, Offline
+from gateway.northbound import Mode, zenoh_settings
 from gateway.tags import Quality, Reason, Sample
 from tests.e2e.processes import vigor_line, write_config
 
@@ -126,7 +126,7 @@ async def test_a_disabled_device_is_never_spoken_to(tmp_path: Path) -> None:
     async with running(made(tmp_path, enabled=False)) as watched:
         gateway = watched.gateway
         assert {gateway.sample(tag(watched, name)).reason for name in TAGS} == {Reason.DISABLED}
-        with pytest.raises(BadValue, match="device mixer is disabled"):
+        with pytest.raises(Offline, match="device mixer is disabled"):
             await gateway.write(tag(watched, "recipe"), 7)
         assert (await gateway.fresh(tag(watched, "speed"), 0.0)).reason is Reason.DISABLED
         assert [line.devices for line in gateway.lines] == [[]]
@@ -162,7 +162,7 @@ async def test_a_fresh_value_of_a_line_that_is_not_open_is_what_is_known(tmp_pat
 
 def test_zenoh_gets_the_files_settings(tmp_path: Path) -> None:
     watched = made(tmp_path)
-    settings = zenoh_settings(watched.gateway.config)
+    settings = zenoh_settings(watched.gateway.config.zenoh)
     assert (settings.prefix, settings.mode) == ("plant", Mode.PEER)
     assert settings.listen == ("tcp/127.0.0.1:7447",)
 

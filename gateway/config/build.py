@@ -6,6 +6,7 @@ from pathlib import Path as FilePath
 from typing import Any
 
 from gateway.config import written
+from gateway.config.field_rules import field_tag
 from gateway.config.line_rules import check_line, line_wire
 from gateway.config.messages import Mistakes, Path, meant, shown
 from gateway.config.model import (
@@ -35,6 +36,7 @@ from gateway.config.validate import (
 )
 from gateway.errors import ConfigError
 from gateway.protocols.driver import AnyDriver, Timing
+from gateway.protocols.frames import FrameDriver
 from gateway.tags import Tag
 
 
@@ -179,7 +181,10 @@ class Builder:
                 continue
             doubt = isinstance(raw, dict) and "type" in raw and own.type is None
             source = TagSource(device, name, own, defaults, place, type_unknown=doubt)
-            tag = build_tag(source, driver, self.mistakes)
+            if isinstance(driver, FrameDriver):
+                tag = field_tag(source, driver, self.mistakes)
+            else:
+                tag = build_tag(source, driver, self.mistakes)
             if tag is not None:
                 yield tag
 

@@ -21,6 +21,7 @@ _CUSTOMS = {
     "computer-link": Custom(9600, "7E1", Kind.INT16),
     "modbus-rtu": Custom(9600, "8E1", Kind.UINT16, eight_bits=True),
     "modbus-ascii": Custom(9600, "7E1", Kind.UINT16),
+    "frames": Custom(9600, "8N1", Kind.INT16),
     "modbus-tcp": Custom(None, "8N1", Kind.UINT16),
 }
 

@@ -6,6 +6,7 @@ from gateway.config.customs import custom
 from gateway.config.messages import Mistakes, Path
 from gateway.config.model import LineSection
 from gateway.config.plain import DeviceConfig
+from gateway.protocols.frames import FrameDriver
 from gateway.transport.port import SerialSettings, SimulatorAddress, TcpAddress
 from gateway.wiretime import NETWORK_BAUD, Wire, character_bits
 
@@ -15,9 +16,12 @@ def check_line(
 ) -> None:
     """Note what cannot live together on this line."""
     stations: dict[int, str] = {}
+    _check_listening(devices, path, mistakes)
     for device in devices:
         place = (*path, "devices", device.name)
         number = device.driver.station
+        if isinstance(device.driver, FrameDriver):
+            continue  # it has no number, and no habits that others could disturb
         other = stations.setdefault(number, device.name)
         if other != device.name:
             mistakes.add(
@@ -32,6 +36,21 @@ def check_line(
                 f"{line.format} has 7 data bits, but {device.name} speaks "
                 f"{device.driver.protocol}, which needs 8, such as 8{line.format[1:]}",
             )
+
+
+def _check_listening(devices: Sequence[DeviceConfig], path: Path, mistakes: Mistakes) -> None:
+    """Of what comes unasked nobody could tell which of two devices said it."""
+    speakers = [
+        device.name
+        for device in devices
+        if isinstance(device.driver, FrameDriver) and device.driver.listens
+    ]
+    for name in speakers[1:]:
+        mistakes.add(
+            (*path, "devices", name, "listen"),
+            f"{speakers[0]} on this line speaks unasked already, and nobody could tell which of "
+            "them did: give it a line of its own, or write both as one device",
+        )
 
 
 def _check_network(

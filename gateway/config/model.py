@@ -227,7 +227,9 @@ class TagSection(TagDefaults):
     """One value of a device."""
 
     address: Text
-    """As the maker writes it: D100, X17, D7.3, holding:100."""
+    """As the maker writes it: D100, X17, D7.3, holding:100; of frames the name of a field."""
+    event: bool = False
+    """Every frame counts, also one that says the same as the last: a bar code."""
 
 
 class DeviceSection(Section):

@@ -1,6 +1,8 @@
 """The JSON schema of the file, for editors that complete and check."""
 
-from typing import Any, get_type_hints
+import dataclasses
+from collections.abc import Iterator
+from typing import Any, get_args, get_type_hints
 
 from pydantic import TypeAdapter
 
@@ -12,6 +14,7 @@ from gateway.config.model import (
     TagDefaults,
     TagSection,
 )
+from gateway.config.nested import is_duration
 from gateway.config.settings import DURATION_SCHEMA
 from gateway.config.validate import DRIVERS
 
@@ -49,9 +52,10 @@ def schema() -> dict[str, Any]:
 def _device(protocol: str, shared: dict[str, Any]) -> dict[str, Any]:
     driver = DRIVERS[protocol]
     settings = _hoisted(TypeAdapter(driver).json_schema(), shared)["properties"]
-    for name, hint in get_type_hints(driver).items():
-        if hint is float and name in settings:  # every float among them is a time
-            settings[name] = dict(DURATION_SCHEMA)
+    _mend(driver, settings)
+    for inner in set(_dataclasses_in(driver)):
+        shared[inner.__name__] |= {"additionalProperties": False}
+        _mend(inner, shared[inner.__name__]["properties"])
     common = _hoisted(DeviceSection.model_json_schema(), shared)["properties"]
     common["tags"] |= {"additionalProperties": _ref("Tag")}
     common["defaults"] = _defaults("device")
@@ -62,6 +66,23 @@ def _device(protocol: str, shared: dict[str, Any]) -> dict[str, Any]:
         "required": ["protocol"],
         "additionalProperties": False,
     }
+
+
+def _mend(kind: type[Any], properties: dict[str, Any]) -> None:
+    """Say of a dataclass's settings what the file knows and pydantic does not."""
+    for name, hint in get_type_hints(kind).items():
+        if name in properties and is_duration(hint):
+            properties[name] = dict(DURATION_SCHEMA)
+
+
+def _dataclasses_in(kind: type[Any]) -> Iterator[type[Any]]:
+    """Those that a dataclass's settings are made of, to any depth."""
+    hints = get_type_hints(kind)
+    for hint in (hints[field.name] for field in dataclasses.fields(kind) if field.init):
+        for part in (hint, *get_args(hint)):
+            if isinstance(part, type) and dataclasses.is_dataclass(part):
+                yield part
+                yield from _dataclasses_in(part)
 
 
 def _hoisted(part: dict[str, Any], shared: dict[str, Any]) -> dict[str, Any]:

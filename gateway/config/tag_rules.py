@@ -85,7 +85,7 @@ def build_tag(source: TagSource, driver: AnyDriver, mistakes: Mistakes) -> Tag |
         payload=settings.payload,
         write=write,
     )
-    _check_bounds(source, tag, mistakes)
+    check_bounds(source, tag, mistakes)
     return tag
 
 
@@ -151,6 +151,8 @@ def _unsuited(
     source: TagSource, area: Area, first: str, kind: ValueType
 ) -> Iterator[tuple[str, str]]:
     """Settings that such a tag cannot have."""
+    if source.own.event:
+        yield "event", f"{first} is polled: events are what a device says unasked"
     if area.unit is Unit.DWORD:
         for setting in filter(source.says, ("word_order", "byte_order")):
             yield setting, f"{first} has 32 bits by nature: it needs no {setting}"
@@ -181,11 +183,18 @@ def _write(
         if own:
             mistakes.add(path, f"{spelt} cannot be written in one exchange")
         return None
+    return write_rule(source, setting, kind, mistakes)
+
+
+def write_rule(
+    source: TagSource, setting: bool | WriteSection, kind: ValueType, mistakes: Mistakes
+) -> WriteRule:
+    """What `write:` says of a tag that can be written."""
     if not isinstance(setting, WriteSection):
         return WriteRule()
     bounded = setting.min is not None or setting.max is not None
-    if bounded and not kind.is_number and own:
-        mistakes.add(path, f"a {kind} has no min and max: only numbers have")
+    if bounded and not kind.is_number and source.says("write"):
+        mistakes.add((*source.path, "write"), f"a {kind} has no min and max: only numbers have")
     number = kind.is_number
     return WriteRule(
         min=setting.min if number else None,
@@ -196,7 +205,7 @@ def _write(
     )
 
 
-def _check_bounds(source: TagSource, tag: Tag, mistakes: Mistakes) -> None:
+def check_bounds(source: TagSource, tag: Tag, mistakes: Mistakes) -> None:
     """A bound that the device cannot hold would be refused at the first write: say so now."""
     if tag.write is None or not source.says("write"):
         return

@@ -8,16 +8,17 @@ from typing import Any, TypeVar, get_args, get_type_hints
 from pydantic import TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
 
-from gateway.config import written
 from gateway.config.messages import Mistakes, Path, meant, one_of, shown
 from gateway.config.model import Section
-from gateway.errors import ConfigError
-from gateway.protocols import PlcDriver
+from gateway.config.nested import plain_settings
+from gateway.protocols import Frames, PlcDriver
 from gateway.protocols.driver import AnyDriver
+from gateway.protocols.frames import FrameDriver
 
 S = TypeVar("S", bound=Section)
 
-DRIVERS: dict[str, type[AnyDriver]] = {
+# What is in the file for each protocol: drivers, and the settings that one is made of.
+DRIVERS: dict[str, type[Any]] = {
     get_args(get_type_hints(driver)["protocol"])[0]: driver for driver in get_args(PlcDriver)
 }
 _ADAPTERS = {name: TypeAdapter(driver) for name, driver in DRIVERS.items()}
@@ -56,24 +57,25 @@ def driver_of(
     protocol: str, settings: Mapping[str, Any], path: Path, mistakes: Mistakes
 ) -> AnyDriver | None:
     """The driver with these settings; one with the settings that are right if some are wrong."""
-    values: dict[str, Any] = {}
-    hints = get_type_hints(DRIVERS[protocol])
-    for name, value in settings.items():
-        try:
-            # Every float among a driver's settings is a time.
-            values[name] = written.duration(value) if hints[name] is float else value
-        except ConfigError as error:
-            mistakes.add((*path, name), str(error))
+    before = len(mistakes)
+    values = plain_settings(DRIVERS[protocol], settings, path, mistakes)
+    framed = DRIVERS[protocol] is Frames
+    if framed and len(mistakes) > before:
+        return None  # of fields that are not what they should be nothing more can be said
     try:
         return _driver(protocol, values)
     except ValidationError as error:
         for detail in error.errors():
             place = detail["loc"]
-            text = _sentence(detail, f"a {protocol} device", ())
+            owner = str(place[-2]) if len(place) > 1 else f"a {protocol} device"
+            text = _sentence(detail, owner, ())
             first = text.split(maxsplit=1)[0].rstrip(":,")
-            place = (first,) if not place and first in values else place
+            if not place and first in values:
+                place, text = (first,), text.removeprefix(f"{first}: ")
             mistakes.add((*path, *place), text)
             values.pop(str(place[0]) if place else "station", None)
+    if framed:
+        return None
     try:
         return _driver(protocol, values)
     except ValidationError:
@@ -82,16 +84,14 @@ def driver_of(
 
 def driver_settings(protocol: str) -> set[str]:
     """The names of its own settings in the file."""
-    # mypy: that drivers are dataclasses is more than a Protocol can say.
-    fields = dataclasses.fields(DRIVERS[protocol])  # type: ignore[arg-type]
-    return {field.name for field in fields if field.init}
+    return {field.name for field in dataclasses.fields(DRIVERS[protocol]) if field.init}
 
 
 def _driver(protocol: str, values: Mapping[str, Any]) -> AnyDriver:
     # As JSON, because pydantic is strict there (true is no number) and still builds dataclasses.
     text = json.dumps({"protocol": protocol, **values}, default=str)
-    driver: AnyDriver = _ADAPTERS[protocol].validate_json(text, strict=True)
-    return driver
+    made: AnyDriver | Frames = _ADAPTERS[protocol].validate_json(text, strict=True)
+    return FrameDriver(made) if isinstance(made, Frames) else made
 
 
 def _known(kind: type[Section], place: Path) -> Collection[str]:
@@ -120,6 +120,7 @@ _NOT = {
     "list_type": "is no list: write it as [first, second]",
     "tuple_type": "is no list: write it as [first, second]",
     "dict_type": "stands where settings are expected, each as `name: value`",
+    "dataclass_type": "stands where settings are expected, each as `name: value`",
     "model_type": "stands where settings are expected, each as `name: value`",
 }
 

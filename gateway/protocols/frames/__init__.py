@@ -6,6 +6,7 @@ manual 8.4.
 
 from gateway.protocols.frames.codec import FrameCodec, FrameReader
 from gateway.protocols.frames.device import Frames, Heard
+from gateway.protocols.frames.driver import FrameDriver
 from gateway.protocols.frames.fields import Field
 from gateway.protocols.frames.framing import Framing
 from gateway.protocols.frames.listener import Listener, Said, Stale
@@ -15,6 +16,7 @@ __all__ = [
     "Ask",
     "Field",
     "FrameCodec",
+    "FrameDriver",
     "FrameReader",
     "Frames",
     "Framing",

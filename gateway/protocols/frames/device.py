@@ -60,8 +60,15 @@ class Frames:
 
     @property
     def timing(self) -> Timing:
-        """Customary times; the silence lets a device finish that speaks unasked."""
-        return Timing(reply_timeout=0.5, turnaround=0.02, silence=0.01)
+        """Customary times; the silence lets a device finish that speaks unasked.
+
+        Where only a gap ends a reply, that gap is waited for each time.
+        """
+        framing = written_out(self.framing)
+        gap = 0.0
+        if not framing.mark and framing.length is None:
+            gap = framing.gap_timeout or 0.0
+        return Timing(reply_timeout=0.5 + gap, turnaround=0.02 + gap, silence=0.01)
 
     @property
     def listened(self) -> frozenset[str]:
@@ -93,10 +100,14 @@ class Frames:
         request = self._send.encode(octets(self.ask[question].send))
         return Cost(len(request), self._longest_reply)
 
-    def write_cost(self, name: str, value: Value) -> Cost:
-        """The characters of a write and of the longest reply to it. Raises `BadValue`."""
-        request = self._send.encode(self.write[name].frame(value))
-        return Cost(len(request), 0 if self.write[name].match is None else self._longest_reply)
+    def write_cost(self, name: str) -> Cost:
+        """The characters of the longest write and of the longest reply to it."""
+        one, send = self.write[name], self._send
+        around = one.frame(b"")
+        most = send.longest - len(around)
+        value = (most if one.value.widest is None else one.value.widest) * (1 + send.conversion)
+        reply = 0 if one.match is None else self._longest_reply
+        return Cost(len(send.encode(around)) + value, reply)
 
     def hear(self, frame: bytes) -> Heard | None:
         """What an unasked frame says; None for a frame that `listen` does not know.
@@ -118,14 +129,22 @@ class Frames:
         one = self.ask[question]
         return await talk.ask(octets(one.send), self._longest_reply, one.answers)
 
-    async def tell(self, talk: Talk[bytes], name: str, value: Value) -> bool:
-        """Write. True when the device acknowledged it, False where it never does.
+    def put(self, name: str, value: Value) -> bytes:
+        """A value's own bytes in the frame that writes it.
 
-        Raises as `read`, and `BadValue` before anything is sent.
+        Raises `BadValue`, also for what the framing cannot carry: before the line is taken.
         """
         one = self.write[name]
-        frame = one.frame(value)
-        self._send.encode(frame)  # refused here, before the line is taken
+        raw = one.value.put(value)
+        self._send.encode(one.frame(raw))
+        return raw
+
+    async def tell(self, talk: Talk[bytes], name: str, raw: bytes) -> bool:
+        """Write what `put` has made. True when the device acknowledged it, False where it never
+        does. Raises as `read`.
+        """
+        one = self.write[name]
+        frame = one.frame(raw)
         if one.match is None:
             await talk.tell(frame)
             return False

@@ -46,6 +46,7 @@ _FLOATS = ("float32", "float64")
 _COLUMNS = re.compile(r"([1-9][0-9]{0,2})-([1-9][0-9]{0,2})\Z")
 _FORMAT = re.compile(r"[+ ]?0?(?P<width>[1-9][0-9]?)?(?:\.[0-9]{1,2}f|d)\Z")
 _NUMBER = re.compile(rb"(?P<sign>[+-]?) *(?P<number>[0-9]{1,18}(?:\.[0-9]{0,18})?|\.[0-9]{1,18})\Z")
+_LONGEST_NUMBER = 24  # characters, where the file does not say
 _HEX = re.compile(rb"(?:[0-9A-Fa-f]{2})+\Z")
 
 
@@ -145,6 +146,14 @@ class Field:
         if self.type in _BCD or self.type in _STRUCT:
             return self._octets * (2 if self.hex else 1)
         return None
+
+    @property
+    def widest(self) -> int | None:
+        """The most characters that a value takes when it is written; None for a text."""
+        if self.size is not None or self.type == "text":
+            return self.size
+        match = _FORMAT.match(self.format or "")
+        return int(match["width"]) if match and match["width"] else _LONGEST_NUMBER
 
     def cut(self, frame: bytes) -> bytes:
         """The field's own bytes, by offset or columns. Raises `Garbled` if not all there."""

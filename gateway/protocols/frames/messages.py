@@ -99,9 +99,8 @@ class Write:
         elif self.refused is not None:
             raise ConfigError("refused needs a match: how does the device say yes?")
 
-    def frame(self, value: Value) -> bytes:
-        """The data of the frame that writes `value`. Raises `BadValue`."""
-        raw = self.value.put(value)
+    def frame(self, raw: bytes) -> bytes:
+        """The data of the frame that writes a value whose own bytes are `raw`."""
         return filled(self.send, lambda _: raw)
 
     def answers(self, frame: bytes) -> bool | None:

@@ -1,0 +1,108 @@
+"""The service: lines, Zenoh and history together, from start to SIGTERM."""
+
+import asyncio
+import signal
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import structlog
+
+from gateway.app import Gateway
+from gateway.config import Config
+from gateway.history import Historian
+from gateway.northbound import Northbound, StandbySettings, zenoh_settings
+from gateway.tags import Sample
+
+log = structlog.get_logger("gateway")
+
+
+async def run(config: Config, started: Callable[[], None] = lambda: None) -> None:
+    """The service, until SIGTERM or SIGINT. Raises `GatewayError` when it cannot start.
+
+    `started` is called when everything is open on Zenoh: once, or whenever this gateway of a
+    standby group goes on duty.
+    """
+    stop = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, stop.set)
+    while await _serve(config, stop, started):
+        log.warning("from now on this gateway stands by")
+
+
+async def _serve(config: Config, stop: asyncio.Event, started: Callable[[], None]) -> bool:
+    """Until it is to stop, or another gateway of its group took over: then True, to start over."""
+    gateway = Gateway(config)
+    history = _history(config)
+    northbound = _northbound(config, gateway, history)
+    gateway.show_alive = northbound.alive
+    gateway.publish = northbound.publish
+    if history is not None:
+        gateway.publish = _both(history, northbound)
+        gateway.documents["history"] = history.document
+        history.start()
+    face = asyncio.create_task(northbound.run(), name="zenoh")
+    on_duty, opened, relieved, stopping = events = [
+        asyncio.create_task(event.wait())
+        for event in (northbound.on_duty, northbound.opened, northbound.relieved, stop)
+    ]
+    lines: list[asyncio.Task[None]] = []
+    try:
+        await _first(on_duty, face, stopping)
+        if on_duty.done():
+            if history is not None:
+                history.record(list(gateway.mirror.samples()))  # "starting" marks the restart
+            lines = [asyncio.create_task(line.run(), name=line.name) for line in gateway.lines]
+        await _first(opened, face, stopping, relieved)
+        if opened.done():
+            started()
+        await _first(face, stopping, relieved, *lines)
+    finally:
+        for event in events:
+            event.cancel()
+        await _ended(lines)  # the wire first, so that the last outcomes still go out
+        await _ended([face])
+        if history is not None:
+            await asyncio.to_thread(history.close)
+    return northbound.relieved.is_set() and not stop.is_set()
+
+
+async def _first(*tasks: asyncio.Task[Any]) -> None:
+    await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+
+
+def _northbound(config: Config, gateway: Gateway, history: Historian | None) -> Northbound:
+    group = config.standby
+    return Northbound(
+        zenoh_settings(config.zenoh),
+        config.name,
+        gateway,
+        history=history,
+        record_write=None if history is None else history.record_write,
+        writers=config.writers_file,
+        standby=None if group is None else StandbySettings(group, config.standby_alone),
+    )
+
+
+def _history(config: Config) -> Historian | None:
+    kept = config.history
+    return None if kept is None else Historian(kept.path, kept.keep, kept.max_size)
+
+
+def _both(history: Historian, northbound: Northbound) -> Callable[[Sequence[Sample]], None]:
+    """What is published is kept first, so that whoever misses it can ask for it."""
+
+    def publish(news: Sequence[Sample]) -> None:
+        history.record(news)
+        northbound.publish(news)
+
+    return publish
+
+
+async def _ended(tasks: Sequence[asyncio.Task[None]]) -> None:
+    """Cancel and await; what a task failed with by itself is raised here."""
+    for task in tasks:
+        task.cancel()
+    for outcome in await asyncio.gather(*tasks, return_exceptions=True):
+        if isinstance(outcome, Exception):
+            raise outcome
