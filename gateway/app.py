@@ -99,6 +99,11 @@ class Gateway:
         for device in devices:
             self._places[device.name] = (line, device)
 
+    @property
+    def spoken_to(self) -> Sequence[Device]:
+        """The devices that are not disabled."""
+        return [device for _, device in self._places.values()]
+
     # What the lines tell
 
     def samples(self, samples: Sequence[Sample]) -> None:
@@ -184,5 +189,6 @@ class Gateway:
         for line in self.lines:
             documents[f"lines/{line.name}"] = line_document(line, self._forecasts[line.name], now)
         for name, (_, device) in self._places.items():
-            documents[f"devices/{name}"] = device_document(device, device.driver.protocol)
+            polls = self._places[name][0].polls(device)
+            documents[f"devices/{name}"] = device_document(device, polls)
         return documents | {path: document() for path, document in self.documents.items()}

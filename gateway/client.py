@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
@@ -20,6 +21,7 @@ from gateway.northbound.session import configure
 from gateway.payload import rfc3339
 from gateway.values import Value
 
+TOKEN_VARIABLE = "PLC_GATEWAY_WRITE_TOKEN"  # noqa: S105  (the name of a variable)
 PATIENCE = 10.0  # seconds a question may take
 NOTHING = "nothing was answered: is the gateway of this file running?"
 
@@ -61,7 +63,8 @@ class Client:
 
         Raises `GatewayError` when nobody answered: then nobody knows whether it was done.
         """
-        replies = self._ask(self._keys.set(tag), orjson.dumps(value))
+        token = os.environ.get(TOKEN_VARIABLE)
+        replies = self._ask(self._keys.set(tag), orjson.dumps(value), token)
         for reply in replies:
             answer = reply.ok or reply.err
             if answer is not None:
@@ -130,12 +133,15 @@ class Client:
             self._session.info.declare_transport_events_listener(link),
         )
 
-    def _ask(self, selector: str, payload: bytes | None) -> list[zenoh.Reply]:
+    def _ask(
+        self, selector: str, payload: bytes | None, token: str | None = None
+    ) -> list[zenoh.Reply]:
         try:
             return list(
                 self._session.get(
                     selector,
                     payload=payload,
+                    attachment=token,
                     timeout=PATIENCE,
                     consolidation=zenoh.ConsolidationMode.NONE,
                 )
@@ -146,6 +152,8 @@ class Client:
     def _shown(self, sample: zenoh.Sample) -> Shown | None:
         tag = self._keys.tag(str(sample.key_expr))
         with suppress(orjson.JSONDecodeError):
+            if tag is not None and sample.attachment is not None:
+                return Shown(tag, _raw(sample, sample.attachment.to_bytes()))
             if tag is not None and sample.kind == zenoh.SampleKind.PUT:
                 return Shown(tag, _document(sample.payload.to_bytes()))
         return None
@@ -225,6 +233,13 @@ def _lost(tag: str) -> Shown:
 def _reachable(endpoint: str) -> str:
     """An endpoint that listens everywhere is reached on this machine."""
     return endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
+
+
+def _raw(sample: zenoh.Sample, about: bytes) -> dict[str, object]:
+    """What a tag with `payload: raw` says, as the others say it."""
+    known = sample.kind == zenoh.SampleKind.PUT
+    text = sample.payload.to_bytes().decode("utf-8", "replace")
+    return {"value": parse_value(text) if known else None, **_document(about)}
 
 
 def _document(data: bytes) -> dict[str, object]:

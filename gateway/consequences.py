@@ -3,13 +3,14 @@
 import asyncio
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import structlog
 
 from gateway.device import Device, Standing
 from gateway.errors import Evidence, Garbled, GatewayError, Refusal, Refused, Unclear
 from gateway.jobs import Poll
+from gateway.planner import spell
 from gateway.protocols.driver import Span
 from gateway.schedule import Schedule
 from gateway.tags import Reason, Sample, Tag, bad
@@ -40,18 +41,28 @@ class Consequences:
         """A block was read well."""
         device, block = poll.device, poll.block
         now = _now()
-        poll.last_good = now
+        poll.read(now)
         self.upstairs.samples(block.decode(units, self.wall()))
+        if block.tags[0].shape is not None:
+            self._note_garbled(device, units)
         self.schedule.polled(poll, now)
         refusals = device.refusals
         if refusals.searching or refusals.bad:
             if refusals.read(block):
-                log.info("address is there now", device=device.name, block=_spell(poll))
+                log.info("address is there now", device=device.name, block=spell(poll.block))
                 self._replan(device)
             self._settle(device)
         elif device.learn():
             log.info("planned anew", device=device.name, turnaround=device.turnaround)
             self.schedule.plan(device, now)
+
+    def _note_garbled(self, device: Device, fields: Sequence[Any]) -> None:
+        """A good frame may hold a field that cannot be read."""
+        for value in fields:
+            if isinstance(value, Garbled):
+                device.record.failures[value.evidence] += 1
+                heard = value.data.hex(" ")
+                log.info("not understood", device=device.name, why=str(value), bytes=heard)
 
     def answered(self, device: Device) -> None:
         """The device said something to the point, good or bad news."""
@@ -91,8 +102,13 @@ class Consequences:
         unknown = before in (Standing.STARTING, Standing.SILENT)
         if not unknown and device.failures <= device.timing.retries:
             return
+        if device.broadcast:  # no question could bring it back: only its own word can
+            device.start()
+            if not unknown:
+                self.upstairs.alive(device, False)
+            return
         self.schedule.silent(device, _now(), took)
-        self.bad(device.tags, device.reason, device.diagnosis())
+        self.bad(device.asked, device.reason, device.diagnosis())
         if before is not Standing.SILENT:
             self.upstairs.alive(device, False)
             log.warning("device silent", device=device.name, why=device.diagnosis())
@@ -127,7 +143,9 @@ class Consequences:
             if halves:
                 self.schedule.replace(poll, halves, _now())
                 return
-            log.warning("address refused", device=device.name, block=_spell(poll), why=str(error))
+            log.warning(
+                "address refused", device=device.name, block=spell(poll.block), why=str(error)
+            )
         self.bad(block.tags, Reason.REFUSED, str(error))
         self.schedule.polled(poll, _now())
         self._settle(device)
@@ -165,6 +183,7 @@ class Consequences:
 
     def _settle(self, device: Device) -> None:
         if device.refusals.settle():
+            device.lists = True  # what a list was refused for may be known now
             self._replan(device)
 
     def _replan(self, device: Device) -> None:
@@ -211,8 +230,3 @@ class Consequences:
 
 def _now() -> float:
     return asyncio.get_running_loop().time()
-
-
-def _spell(poll: Poll) -> str:
-    first, last = poll.block.tags[0].text, poll.block.tags[-1].text
-    return first if first == last else f"{first}..{last}"

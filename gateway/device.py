@@ -8,7 +8,7 @@ from enum import StrEnum
 from gateway.errors import DeviceError, Evidence, Garbled, NoReply
 from gateway.lists import with_list
 from gateway.planner import Block, plan
-from gateway.protocols.driver import AnyDriver, Cost, Span, Timing
+from gateway.protocols.driver import AnyDriver, Cost, Overhearing, Span, Timing, Windowed
 from gateway.refusals import RETRY, Refusals
 from gateway.tags import Reason, Tag
 from gateway.wiretime import Wire
@@ -36,6 +36,7 @@ class Record:
     wire_time: float = 0.0
     late: int = 0  # replies that came after the time-out
     unasked: int = 0  # frames that answered nothing
+    heard: int = 0  # frames that came unasked and were understood
     overruns: int = 0  # polls left out because the one before was late
     failures: Counter[str] = field(default_factory=Counter)  # by evidence
     refusals: Counter[str] = field(default_factory=Counter)  # by the maker's code
@@ -49,6 +50,7 @@ class LineRecord:
 
     opened: int = 0
     since: float = 0.0  # when it was opened last, by the loop's clock
+    open_before: float = 0.0  # how long it was open the times before
     busy: float = 0.0  # characters on the wire, both ways
     turnarounds: float = 0.0  # waiting for stations that answered
     unasked: int = 0  # bytes that nobody had asked for
@@ -66,6 +68,7 @@ class Device:
     tags: tuple[Tag, ...]
     late_guard: float
     turnaround: float | None = None  # set in the file, or measured; None: the protocol's usual
+    control: bool = False  # it may be told to run, stop ...
     blocks: tuple[Block, ...] = ()
     standing: Standing = Standing.STARTING
     failures: int = 0  # conversations in a row that ended unclear
@@ -82,14 +85,21 @@ class Device:
     refusals: Refusals = field(init=False)
     turnaround_fixed: bool = field(init=False)  # set in the file
     _learn_at: int = LEARN_EVERY
-    broadcast: bool = field(init=False)  # nobody answers: it is written to, never asked
+    broadcast: bool = field(init=False)  # written or listened to, but never asked anything
+    window: int = field(init=False)  # questions that may be open at once
 
     def __post_init__(self) -> None:
         self.refusals = Refusals(self.driver.cost)
         self.turnaround_fixed = self.turnaround is not None
         self.broadcast = not any(self.driver.areas[tag.span.area].readable for tag in self.tags)
         self.doubtful = not self.broadcast
+        self.window = self.driver.window if isinstance(self.driver, Windowed) else 1
         self.plan()
+
+    @property
+    def asked(self) -> list[Tag]:
+        """The tags whose values it is asked for."""
+        return [tag for tag in self.tags if self.driver.areas[tag.span.area].readable]
 
     @property
     def served(self) -> bool:
@@ -108,7 +118,11 @@ class Device:
     def plan(self) -> None:
         """Decide anew what to ask, around what the device has refused."""
         blocks = plan(self.tags, self.driver, self.seconds, self.refusals.cuts)
-        self.blocks = with_list(blocks, self.driver, self.seconds) if self.lists else blocks
+        if self.lists:  # nothing that is refused: that would refuse the whole list
+            known = [block for block in blocks if block.span not in self.refusals.bad]
+            refused = (block for block in blocks if block.span in self.refusals.bad)
+            blocks = (*with_list(known, self.driver, self.seconds), *refused)
+        self.blocks = blocks
 
     def learn(self) -> bool:
         """Plan anew where the turnaround measured makes that worth while; True if it was done."""
@@ -197,14 +211,16 @@ class Device:
             case Garbled() as error:
                 return f"{_ADVICE.get(error.evidence, 'not understood')} ({error})"
             case NoReply():
-                return (
-                    "No byte came back: check power, wiring (A and B), station number, "
-                    "baud rate and that no other master is on the line."
-                )
+                causes = self.driver.silent_causes if isinstance(self.driver, Overhearing) else ""
+                return f"{_SILENCE} {causes}".strip()
             case error:
                 return str(error)
 
 
+_SILENCE = (
+    "No byte came back: check power, wiring (A and B), station number, baud rate and that no "
+    "other master is on the line."
+)
 _ADVICE = {
     Evidence.ECHO: "Only our own request came back: the adapter echoes; set `echo: true`, "
     "and the station itself is silent",

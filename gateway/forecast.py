@@ -2,10 +2,10 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from gateway.device import Device
-from gateway.planner import Block
+from gateway.planner import Block, plan
 from gateway.tags import Tag
 from gateway.wiretime import Wire
 
@@ -33,6 +33,7 @@ class LineForecast:
     cycle: float  # one round of every block
     worst_write: float  # from asking to the acknowledgement
     worst_write_silent: float  # the same while a station has just gone silent
+    shortest: float  # the shortest interval at which all tags could be polled alike
 
     @property
     def overloaded(self) -> bool:
@@ -42,7 +43,7 @@ class LineForecast:
         """What would fit, in one sentence; empty when the file's wishes do."""
         if not self.overloaded:
             return ""
-        shortest = math.ceil(self.cycle * 100) / 100
+        shortest = math.ceil(self.shortest * 100) / 100
         return (
             f"line {self.name} is asked for {self.load:.0%} of what it can carry at "
             f"{self.wire.baudrate} baud: multiply the intervals by {self.load:.2f}, or poll all "
@@ -52,20 +53,21 @@ class LineForecast:
 
 def forecast(name: str, devices: Sequence[Device], wire: Wire) -> LineForecast:
     """Reckon a line from its plan."""
-    plan = [
+    asked = [
         (device, block, device.seconds(block.cost)) for device in devices for block in device.blocks
     ]
-    load = sum(seconds / block.every for _, block, seconds in plan)
-    longest = max((seconds for _, _, seconds in plan), default=0.0)
+    load = sum(seconds / block.every for _, block, seconds in asked)
+    longest = max((seconds for _, _, seconds in asked), default=0.0)
     write = max((_longest_write(device) for device in devices), default=0.0)
     silence = max(
         (device.timing.reply_timeout + device.late_guard for device in devices), default=0.0
     )
-    rates = [(block.every, seconds) for _, block, seconds in plan]
+    rates = [(block.every, seconds) for _, block, seconds in asked]
+    cycle = sum(seconds for _, seconds in rates)
     wait = _longest_wait(rates, longest, load)
     blocks = tuple(
         BlockForecast(device, block, seconds, _worst_age(block.every, seconds, wait, load))
-        for device, block, seconds in plan
+        for device, block, seconds in asked
     )
     return LineForecast(
         name=name,
@@ -73,11 +75,19 @@ def forecast(name: str, devices: Sequence[Device], wire: Wire) -> LineForecast:
         blocks=blocks,
         load=load,
         requests=sum(1 / every for every, _ in rates),
-        characters=sum(sum(block.cost) / block.every for _, block, _ in plan),
-        cycle=sum(seconds for _, seconds in rates),
+        characters=sum(sum(block.cost) / block.every for _, block, _ in asked),
+        cycle=cycle,
         worst_write=longest + write,
         worst_write_silent=longest + write + silence,
+        shortest=sum(_round(device) for device in devices) if load > 1 else cycle,
     )
+
+
+def _round(device: Device) -> float:
+    """One reading of all tags, planned as if all had the same interval."""
+    alike = [replace(tag, every=1.0) for tag in device.tags]
+    blocks = plan(alike, device.driver, device.seconds, device.refusals.cuts)
+    return sum(device.seconds(block.cost) for block in blocks)
 
 
 def _longest_wait(rates: Sequence[tuple[float, float]], longest: float, load: float) -> float:

@@ -24,7 +24,20 @@ class Poll:
     asked: float = 0.0  # when it was handed out last
     phased: bool = True  # it has found its place in the period
     live: bool = True  # False once the device was planned anew
+    reads: int = 0  # good ones
+    overruns: int = 0  # rounds left out because the one before was late
+    mean_gap: float = 0.0  # seconds between two good reads, smoothed over about ten
+    worst_gap: float = 0.0
     ticket: int = NOWHERE  # its one valid place in the queues
+
+    def read(self, now: float) -> None:
+        """Its values have just come."""
+        if self.last_good is not None:
+            gap = now - self.last_good
+            self.worst_gap = max(self.worst_gap, gap)
+            self.mean_gap += (gap - self.mean_gap) / max(1, min(10, self.reads))
+        self.reads += 1
+        self.last_good = now
 
     @property
     def every(self) -> float:

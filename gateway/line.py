@@ -11,8 +11,9 @@ from gateway.consequences import Consequences, Upstairs
 from gateway.device import Device, LineRecord, Standing
 from gateway.errors import Busy, LineDown, Offline, Refused, Unclear
 from gateway.jobs import Idle, Poll, Probe
+from gateway.listening import Answer, Listening
 from gateway.orders import Command, Done, Order, Told, Write
-from gateway.protocols.driver import Span, Windowed
+from gateway.protocols.driver import Span
 from gateway.reading import read_block
 from gateway.recorder import Recorder
 from gateway.schedule import Schedule
@@ -60,6 +61,7 @@ class Line:
         self._schedule = Schedule(devices, 0.0, seed)
         self._then = Consequences(name, self._schedule, upstairs, wall)
         self._writer = Writer(self, self._then, wall)
+        self._listening = Listening(devices, self._then)
         self._port: Port | None = None
         self._turn: Turn | None = None
         self._down: LineDown | None = None
@@ -93,15 +95,21 @@ class Line:
         self._then.hasten(device, tag)
         self._wake.set()
 
+    def polls(self, device: Device) -> Sequence[Poll]:
+        """What is asked of it, with what was measured."""
+        return self._schedule.polls(device)
+
     # The ear of the port
 
     def received(self, data: bytes) -> None:
         self.recorder.heard(data)
-        if self._turn is not None:
+        if self._turn is not None and self._turn.sent:
             self._turn.received(data)
-        else:
+        else:  # before the first question there is nothing to answer
             self._clock.quiet_since = _now()
             self.record.unasked += len(data)
+            self._listening.received(data, _now())
+            self._wake.set()
 
     def lost(self, error: Exception) -> None:
         self._down = error if isinstance(error, LineDown) else LineDown(str(error))
@@ -119,6 +127,7 @@ class Line:
                 trouble = await self._open_and_serve()
                 served = _now() - self.record.since if self.is_open else 0.0
                 self.record.trouble = trouble
+                self.record.open_before += served
                 self._then.line_down(trouble)  # told before closing, which may take a while
             finally:
                 await self._close()
@@ -138,6 +147,7 @@ class Line:
             self.record.trouble = ""
             log.info("line open", line=self.name)
             self._then.line_up()
+            self._listening.opened(_now())
             await self._serve()
         except LineDown as error:
             log.warning("line down", line=self.name, why=str(error))
@@ -160,7 +170,10 @@ class Line:
             now = _now()
             for write in self._schedule.expired(now):
                 write.done(Busy(f"waited {now - write.submitted:.1f} s for the line; not sent"))
-            match self._schedule.next(now):
+            match self._listening.next(now) or self._schedule.next(now):
+                case Answer() as answer:
+                    with self.turn_with(answer.device) as turn:
+                        await answer.give(turn)
                 case Poll() as poll:
                     await self._poll(poll)
                 case Write() as write:
@@ -176,6 +189,7 @@ class Line:
 
     async def _idle(self, until: float) -> None:
         self._wake.clear()
+        until = min(until, self._listening.due)
         with suppress(TimeoutError):
             async with asyncio.timeout_at(None if until == float("inf") else until):
                 await self._wake.wait()
@@ -208,14 +222,15 @@ class Line:
             device.record.exchanges += turn.exchanges
             device.record.unasked += turn.passed
             device.record.wire_time += characters + turn.turnaround
+            self._listening.ended(device, turn, _now())
             device.used(_now(), _now() - begun)
             if turn.exchanges:
                 device.measured(turn.turnaround / turn.exchanges)
 
     async def _poll(self, poll: Poll) -> None:
         device, polls = poll.device, [poll]
-        if isinstance(device.driver, Windowed) and device.driver.window > 1:
-            polls += self._schedule.beside(poll, device.driver.window - 1, _now())
+        if device.window > 1:
+            polls += self._schedule.beside(poll, device.window - 1, _now())
         with self.turn_with(device) as turn:
             if len(polls) == 1:
                 failed = await self._read(turn, poll)

@@ -21,12 +21,13 @@ class Write:
     submitted: float
     expires: float  # not sent any more after this: whoever asked has given up
     done: Done
+    alone: bool = False  # it was refused together with others
 
     @property
     def plain(self) -> bool:
         """One exchange and no more: it may share that exchange with others."""
         rule = self.tag.write
-        return self.tag.address.bit is None and not (rule and (rule.verify or rule.repeat))
+        return not self.alone and self.tag.address.bit is None and not (rule and (rule.verify or rule.repeat))
 
     @property
     def latest(self) -> bool:

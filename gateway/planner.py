@@ -156,3 +156,10 @@ def items_of(tags: Iterable[Tag]) -> list[Item]:
         else:
             items.append(Item(tag.span.start, end, tag.every, [tag]))
     return items
+
+
+def spell(block: Block) -> str:
+    """`D7.3..D10`: the first and the last address of a block as the file writes them."""
+    first = min(block.tags, key=lambda tag: tag.span)
+    last = max(block.tags, key=lambda tag: (tag.span.area, tag.span.start + tag.span.size))
+    return first.text if first is last else f"{first.text}..{last.text}"

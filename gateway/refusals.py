@@ -5,8 +5,9 @@ whole. The block is cut in two, and the refused half again, until the culprit st
 then everything else is planned together again around it.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from gateway.planner import Block, Cuts, items_of
 from gateway.protocols.driver import Cost, Span
@@ -24,6 +25,13 @@ class BadRange:
     since: int  # ns since 1970
     code: str
     tags: tuple[Tag, ...]
+
+
+class Learned(NamedTuple):
+    """What is worth knowing after a restart."""
+
+    refused: tuple[tuple[Span, int, str], ...]  # the addresses, since when, the maker's code
+    cuts: tuple[tuple[str, int], ...]
 
 
 @dataclass(slots=True)
@@ -46,6 +54,12 @@ class _Node:
         if all(half.good for half in self.halves):  # each is there, but not both in one request
             return {(self.span.area, self.halves[1].span.start)}
         return set().union(*(half.cuts() for half in self.halves))
+
+
+def _within(inner: Span, outer: Span) -> bool:
+    return inner.area == outer.area and (
+        outer.start <= inner.start and inner.start + inner.size <= outer.start + outer.size
+    )
 
 
 def _bounds(span: Span) -> set[tuple[str, int]]:
@@ -112,6 +126,21 @@ class Refusals:
         """The blocks are about to be other ones: what is still searched for will be again."""
         self._roots.clear()
         self._leaves.clear()
+
+    def learned(self) -> Learned:
+        refused = tuple((bad.span, bad.since, bad.code) for bad in self.bad.values())
+        return Learned(tuple(sorted(refused)), tuple(sorted(self._cuts)))
+
+    def recall(self, learned: Learned, tags: Iterable[Tag]) -> None:
+        """Begin with what an earlier run found, as far as there are still tags for it."""
+        self._cuts |= set(learned.cuts)
+        by_area = {span.area for span, _, _ in learned.refused}
+        known = [tag for tag in tags if tag.span.area in by_area]
+        for span, since, code in learned.refused:
+            there = tuple(tag for tag in known if _within(tag.span, span))
+            if there:
+                self.bad[span] = BadRange(span, since, code, there)
+                self._cuts |= _bounds(span)
 
     def _halves(self, block: Block, node: _Node) -> tuple[Block, ...]:
         items = items_of(block.tags)

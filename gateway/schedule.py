@@ -54,7 +54,9 @@ class Schedule:
 
     def plan(self, device: Device, now: float) -> None:
         """Take over the device's blocks; what is already known of a block is kept."""
-        old = {poll.block.span: poll for poll in self._polls.get(device, ())}
+        before = self._polls.get(device, ())
+        old = {poll.block.span: poll for poll in before}
+        read = {tag: poll.last_good for poll in before for tag in poll.block.tags}
         polls = []
         for block in device.blocks:
             known = old.get(block.span)
@@ -62,9 +64,9 @@ class Schedule:
                 polls.append(Poll(device, block, now))
             else:
                 polls.append(Poll(device, block, known.due, setbacks=known.setbacks))
-            if known is not None:
-                polls[-1].last_good = known.last_good
-        for poll in old.values():
+            ages = (at for tag in block.tags if (at := read.get(tag)) is not None)
+            polls[-1].last_good = min(ages, default=None)
+        for poll in before:
             poll.live = False
         self._polls[device] = polls
         self._push(polls)
@@ -107,6 +109,12 @@ class Schedule:
         if found:
             self._take(lambda order: order in found)
         return found
+
+    def each_alone(self, writes: Sequence[Write]) -> None:
+        """They were refused together, so nothing of them was done: they are next, one by one."""
+        for write in reversed(writes):
+            write.alone = True
+            self._orders.appendleft(write)
 
     def reachable(self, device: Device, now: float) -> bool:
         """False for a silent device whose next probe is not allowed yet."""
@@ -215,6 +223,7 @@ class Schedule:
         missed = int((poll.asked - poll.due) / every)
         if missed:
             poll.device.record.overruns += missed
+            poll.overruns += missed
         poll.due = (poll.asked if missed or poll.setbacks else poll.due) + every
         if not poll.phased:
             poll.phased = True

@@ -11,9 +11,12 @@ from gateway.app import Gateway
 from gateway.config import Config
 from gateway.history import Historian
 from gateway.northbound import Northbound, StandbySettings, zenoh_settings
+from gateway.notebook import Notebook
 from gateway.tags import Sample
 
 log = structlog.get_logger("gateway")
+
+KEEP_EVERY = 10.0  # seconds
 
 
 async def run(config: Config, started: Callable[[], None] = lambda: None) -> None:
@@ -35,6 +38,9 @@ async def _serve(config: Config, stop: asyncio.Event, started: Callable[[], None
     gateway = Gateway(config)
     history = _history(config)
     northbound = _northbound(config, gateway, history)
+    notebook = None if config.state_file is None else Notebook(config.state_file)
+    if notebook is not None:
+        notebook.recall(gateway.spoken_to)
     gateway.show_alive = northbound.alive
     gateway.publish = northbound.publish
     if history is not None:
@@ -82,6 +88,16 @@ def _northbound(config: Config, gateway: Gateway, history: Historian | None) -> 
         writers=config.writers_file,
         standby=None if group is None else StandbySettings(group, config.standby_alone),
     )
+
+
+async def _keep(notebook: Notebook, gateway: Gateway) -> None:
+    """Write down what was learned, now and then and at the end."""
+    try:
+        while True:
+            await asyncio.sleep(KEEP_EVERY)
+            await asyncio.to_thread(notebook.save, notebook.page(gateway.spoken_to))
+    finally:
+        notebook.save(notebook.page(gateway.spoken_to))
 
 
 def _history(config: Config) -> Historian | None:

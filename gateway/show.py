@@ -15,7 +15,7 @@ from gateway.client import Shown
 from gateway.config import Config
 from gateway.forecast import LineForecast
 from gateway.payload import rfc3339
-from gateway.planner import Block
+from gateway.planner import spell
 from gateway.tags import Quality, Sample, Tag, WriteRule
 from gateway.values import Kind
 
@@ -120,7 +120,7 @@ def _blocks(line: LineForecast) -> Table:
         block = row.block
         table.add_row(
             f"  {row.device.name}",
-            _span(block),
+            spell(block),
             str(len(block.tags)),
             seconds(block.every),
             f"{block.cost.request} + {block.cost.reply}",
@@ -128,12 +128,6 @@ def _blocks(line: LineForecast) -> Table:
             seconds(row.worst_age),
         )
     return table
-
-
-def _span(block: Block) -> str:
-    first = min(block.tags, key=lambda tag: tag.span.start)
-    last = max(block.tags, key=lambda tag: tag.span.start + tag.span.size)
-    return first.text if first is last else f"{first.text}..{last.text}"
 
 
 def seconds(time: float) -> str:

@@ -6,12 +6,13 @@ from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 from gateway.errors import DeviceError, Evidence, Garbled, LineDown, NoReply
-from gateway.protocols.driver import Codec
+from gateway.protocols.driver import Codec, EndedByGap
 from gateway.recorder import Recorder
 from gateway.transport import Port
 from gateway.wiretime import Wire
 
 T = TypeVar("T")
+MOST_OVERHEARD = 32  # frames of one conversation
 KEPT = 64  # bytes of a failed conversation kept for the log
 
 
@@ -56,6 +57,7 @@ class Turn:
     exchanges: int = 0  # questions answered
     turnaround: float = 0.0  # of all of them together, beyond the characters' own time
     passed: int = 0  # frames that answered nothing
+    overheard: list[Any] = field(default_factory=list)  # the first of them
     _foreign: bool = False
     _expired: Callable[[Any], Any] | None = None  # what the timed-out question takes for an answer
     _late: "asyncio.Future[bool] | None" = None  # whether it came
@@ -67,9 +69,15 @@ class Turn:
     _broken: Garbled | None = None
     _lost: LineDown | None = None
     _codec: Codec[Any] = field(init=False)
+    _gap: asyncio.TimerHandle | None = None  # when a silence ends a frame
 
     def __post_init__(self) -> None:
         self._codec = self.new_codec()
+
+    @property
+    def unreturned(self) -> bytes:
+        """What an echo has still to bring back."""
+        return self._echo
 
     async def tell(self, frame: Any) -> None:
         data = self._codec.encode(frame)
@@ -81,9 +89,12 @@ class Turn:
     async def ask(self, frame: Any, reply: int, answers: Callable[[Any], T | None]) -> T:
         if not self._open:
             await self._quiet()
-            # What was heard until now answers nothing: not a byte of it may be read as an answer.
-            self._codec = self.new_codec()
-            self._broken = None
+            if self.heard:
+                # It answers nothing: not a byte of it may be read as an answer.
+                self._codec = self.new_codec()
+                self._broken = None
+            if self._gap is not None:
+                self._gap.cancel()
         data = self._codec.encode(frame)
         loop = asyncio.get_running_loop()
         self._rest = b""
@@ -113,8 +124,18 @@ class Turn:
             self._rest += data
         if self._broken is not None:
             return
+        if self._gap is not None:
+            self._gap.cancel()
+        codec = self._codec
+        self._take(lambda: codec.feed(data))
+        gap = getattr(codec, "gap_timeout", None)  # before isinstance, which is slow
+        if gap and isinstance(codec, EndedByGap) and self._broken is None:
+            loop = asyncio.get_running_loop()
+            self._gap = loop.call_later(gap, self._take, codec.expire)
+
+    def _take(self, frames: Callable[[], list[Any]]) -> None:
         try:
-            for frame in self._codec.feed(data):
+            for frame in frames():
                 self._offer(frame)
         except Garbled as error:
             self._broken = error
@@ -175,6 +196,8 @@ class Turn:
                 self._late.set_result(True)
             return
         self.passed += 1
+        if len(self.overheard) < MOST_OVERHEARD:
+            self.overheard.append(frame)
         self._foreign = self._foreign or getattr(frame, "station", self.station) != self.station
 
     def _send(self, data: bytes) -> None:

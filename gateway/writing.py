@@ -10,7 +10,7 @@ from gateway.consequences import Consequences
 from gateway.device import Device
 from gateway.errors import BadValue, GatewayError, LineDown, Refused, Unclear
 from gateway.orders import Command, Write
-from gateway.protocols.driver import Controllable, ScatteredWriter, Span, Talk
+from gateway.protocols.driver import AnyDriver, Controllable, ScatteredWriter, Span, Talk
 from gateway.tags import Written
 from gateway.turn import Turn
 from gateway.values import Value
@@ -72,6 +72,16 @@ def together(writes: Sequence[Write]) -> bool:
     return driver.scattered_write_cost([write.tag.span for write in writes]) is not None
 
 
+def not_obeyed(driver: AnyDriver, command: str, *, control: bool) -> str:
+    """Why a device does not take this command; empty where it does."""
+    known = driver.controls if isinstance(driver, Controllable) else frozenset()
+    if not known:
+        return f"a {driver.protocol} device takes no commands"
+    if command not in known:
+        return f"{command!r} is none of its commands: {', '.join(sorted(known))}"
+    return "" if control else "the file does not say `control: true` of it"
+
+
 def holds(write: Write, units: Sequence[int]) -> bool:
     """Whether units read from the device are what was written."""
     if write.tag.shape is not None:  # what is written is bytes, what is read is a value
@@ -112,20 +122,19 @@ class Writer:
     wall: Wall
 
     async def write(self, write: Write, others: Sequence[Write] = ()) -> None:
-        """One write; `others` go out in the same exchange, and alone if that is refused."""
+        """One write; `others` go out in the same exchange, and each alone if that is refused."""
         group = [write, *others]
         outcomes: dict[Write, Written | GatewayError] = {}
         try:
-            if others and await self._all_at_once(group, outcomes):
-                return
-            for one in group:
-                outcomes[one] = Unclear(STOPPED)
-                outcomes[one] = await self._one(one)
+            if others:
+                group = await self._all_at_once(group, outcomes)
+            else:
+                outcomes[write] = Unclear(STOPPED)
+                outcomes[write] = await self._one(write)
         except LineDown as error:
             for one in outcomes:
-                if isinstance(outcomes[one], Unclear):
-                    outcomes[one] = Unclear(f"{error}; nobody knows whether the write was done")
-                    one.device.doubt = one.tag.span
+                outcomes[one] = Unclear(f"{error}; nobody knows whether the write was done")
+                one.device.doubt = one.tag.span
             raise
         finally:
             for one in group:
@@ -144,12 +153,12 @@ class Writer:
             command.done(outcome)
 
     async def _obeyed(self, command: Command) -> str | GatewayError:
-        device, driver = command.device, command.device.driver
+        device = command.device
         if not isinstance(driver, Controllable):
             return BadValue(f"{device.name} takes no commands")
         with self.wire.turn_with(device) as turn:
             try:
-                answer = await driver.control(turn, command.name, command.argument)
+                answer = await device.driver.control(turn, command.name, command.argument)
             except BadValue as error:
                 return error
             except Refused as error:
@@ -159,16 +168,18 @@ class Writer:
                 return error
             if turn.exchanges:
                 self.then.answered(device)
+            else:  # as after a broadcast
+                self.wire.hold(device)
             return answer
 
     async def _all_at_once(
-        self, group: Sequence[Write], outcomes: dict[Write, Written | GatewayError]
-    ) -> bool:
-        """False when the device refused the whole: then nothing of it was done."""
+        self, group: list[Write], outcomes: dict[Write, Written | GatewayError]
+    ) -> list[Write]:
+        """Those whose outcome is known: none when the device refused the whole."""
         device = group[0].device
         driver = device.driver
         if not isinstance(driver, ScatteredWriter):
-            return False
+            raise TypeError(f"{device.name} takes one write at a time")
         parts = [(one.tag.span, one.units) for one in group]
         with self.wire.turn_with(device) as turn:
             outcomes.update((one, Unclear(STOPPED)) for one in group)
@@ -176,15 +187,15 @@ class Writer:
                 await driver.write_scattered(turn, parts)
             except Refused as error:
                 self._denied(device, error)
-                outcomes.clear()
-                return False
+                self.then.schedule.each_alone(group)
+                return []
             except Unclear as error:
                 outcomes.update((one, error) for one in group)
                 await self.wire.unclear(device, turn, error, group[0].tag.span)
-                return True
+                return group
             self.then.answered(device)
             outcomes.update((one, written(one, self.wall)) for one in group)
-            return True
+            return group
 
     async def _one(self, write: Write) -> Written | GatewayError:
         """Never simply sent again: what may follow an unclear end is the tag's own rule."""

@@ -103,3 +103,33 @@ def test_the_load_is_the_share_of_the_lines_time(dev: Device) -> None:
 def test_a_device_without_a_readable_tag_is_a_broadcast() -> None:
     assert device([]).broadcast
     assert not device([make_tag("D0")]).broadcast
+
+
+def test_a_measured_turnaround_that_changes_the_optimum_plans_anew() -> None:
+    tags = [make_tag("D0"), make_tag("D14"), make_tag("D28"), make_tag("D42")]
+    dev = device(tags)  # reckoned with the protocol's 5 ms
+    assert len(dev.blocks) == 4
+    dev.measured(0.060)
+    dev.record.exchanges = 49
+    assert not dev.learn()
+    dev.record.exchanges = 50
+    assert dev.learn()
+    assert len(dev.blocks) < 4
+    assert not dev.learn()
+
+
+def test_a_turnaround_set_in_the_file_is_not_learned_over() -> None:
+    known = device([make_tag("D0"), make_tag("D14"), make_tag("D28")])
+    dev = Device("plc", known.driver, known.wire, known.timing, known.tags, 0.5, turnaround=0.005)
+    dev.measured(0.5)
+    dev.record.exchanges = 1000
+    assert not dev.learn()
+
+
+def test_use_of_the_wire_is_forgotten_by_halves() -> None:
+    dev = device([make_tag("D0")])
+    dev.used(100.0, 4.0)
+    assert dev.recent_use(100.0) == 4.0
+    assert dev.recent_use(110.0) == pytest.approx(2.0)
+    dev.used(110.0, 1.0)
+    assert dev.recent_use(110.0) == pytest.approx(3.0)

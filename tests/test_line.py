@@ -733,3 +733,35 @@ async def test_above_19200_baud_the_clock_is_watched() -> None:
     async with running(line):
         await asyncio.sleep(5)
     assert len(line.reads(dev)) > 200
+
+
+@on_virtual_time
+async def test_on_a_full_line_devices_share_the_wire_by_time_not_by_number_of_blocks() -> None:
+    """One asks for eight long blocks, the other for one short one: both get half of the time."""
+    greedy = device(
+        [tag for n in range(8) for tag in words(n * 500, 60, every=0.2)], name="greedy", station=1
+    )
+    modest = device(
+        [make_tag(f"D{n * 300}", every=0.02, device="modest") for n in range(3)],
+        name="modest",
+        station=2,
+    )
+    line = plant([greedy, modest])
+    async with running(line):
+        await asyncio.sleep(60)
+        before = greedy.record.wire_time, modest.record.wire_time
+        await asyncio.sleep(120)
+    spent = [dev.record.wire_time - was for dev, was in zip((greedy, modest), before, strict=True)]
+    # The silence before each request counts for the schedule and not in wire_time.
+    assert 0.6 < spent[1] / spent[0] < 1.1, spent
+
+
+@on_virtual_time
+async def test_polls_are_spread_over_their_period_after_the_first_round() -> None:
+    dev = device([make_tag(f"D{n * 300}", every=10.0) for n in range(8)])
+    line = plant([dev])
+    async with running(line):
+        await asyncio.sleep(45)
+        dues = sorted(poll.due % 10 for poll in line.line.polls(dev))
+    gaps = [b - a for a, b in itertools.pairwise(dues)]
+    assert sum(gap > 0.2 for gap in gaps) >= 6, dues

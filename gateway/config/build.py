@@ -67,6 +67,7 @@ class Builder:
         self._check_history(top, lines)
         return Config(
             name=top.gateway.name,
+            state_file=None if top.gateway.state is None else self.folder / top.gateway.state,
             standby=top.gateway.standby,
             standby_alone=top.gateway.standby_alone,
             writers_file=self._file(top.writers.file, ("writers", "file")) if top.writers else None,

@@ -57,6 +57,8 @@ class GatewaySection(Section):
 
     name: Name = "gateway"
     """This gateway's own chunk in the key space."""
+    state: FilePath | None = None
+    """A file for what was learned of the devices (refused addresses), kept across restarts."""
     standby: Name | None = None
     """A name shared by two gateways of one plant: one serves, the other stands by."""
     standby_alone: Interval | None = None

@@ -91,6 +91,7 @@ class Config:
     """One whole file. `history` and `web` are None where the file has no such section."""
 
     name: str
+    state_file: Path | None = None  # what was learned of the devices, kept across restarts
     standby: str | None = None  # the group of gateways that stand in for one another
     standby_alone: float | None = None  # seconds without a link until it goes on the wire anyway
     writers_file: Path | None = None  # None: whoever Zenoh lets through may write

@@ -1,7 +1,13 @@
-"""Hot standby on Zenoh: shows and sees the signs that `gateway.standby` decides by."""
+"""Hot standby on Zenoh: shows and sees the signs that `gateway.standby` decides by.
+
+A router does not pass on what one peer says to another, and gateways are peers. So a gateway that
+connects to somebody sends and sees its signs in a session of its own, as a client.
+"""
 
 import asyncio
+import json
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 
 import structlog
@@ -9,14 +15,14 @@ import zenoh
 
 from gateway.keys import Keys
 from gateway.northbound.inbox import Inbox
-from gateway.northbound.links import Links
-from gateway.northbound.session import off_loop
+from gateway.northbound.session import as_client, off_loop, opened
 from gateway.standby import Role, Sign, Stand, Standby
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 
 _LOOK_EVERY = 0.2  # seconds
 _LOOK_FOR = 400  # ms
+_SHOWN = {Stand.CLAIMING: (Role.CLAIM,), Stand.ACTIVE: (Role.CLAIM, Role.ACTIVE)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,19 +34,13 @@ class StandbySettings:
 
 
 class Duty:
-    """`on` is set when this gateway may go on the wire, `relieved` when it must leave it."""
+    """`on` is set when this gateway may go on the wire, `relieved` when it must leave it.
 
-    def __init__(
-        self,
-        settings: StandbySettings | None,
-        keys: Keys,
-        links: Links,
-        *,
-        needs_link: bool,
-        routed: bool,
-    ) -> None:
-        """Without settings on duty at once, and for ever. `routed`: a client, which sees others
-        only through whatever it is linked to."""
+    Without settings it is on duty at once and for ever.
+    """
+
+    def __init__(self, settings: StandbySettings | None, keys: Keys, config: zenoh.Config) -> None:
+        """`config`: of the gateway's own session."""
         self.stands_by = settings is not None
         self.on = asyncio.Event()
         self.relieved = asyncio.Event()
@@ -48,11 +48,12 @@ class Duty:
         if not self.stands_by:
             self.on.set()
         self._keys = keys
-        self._links = links
-        self._needs_link = needs_link
-        self._routed = routed
+        connects = json.loads(config.get_json("connect/endpoints")) not in ([], {}, None)
+        self._config = as_client(config) if connects and self.stands_by else None
         self._standby: Standby | None = None
+        self._seen_through: zenoh.Session | None = None
         self._tokens: dict[Role, zenoh.LivelinessToken] = {}
+        self._kept: list[object] = []
 
     def documents(self) -> dict[str, dict[str, object]]:
         """For the status; nothing where nobody stands by."""
@@ -60,75 +61,93 @@ class Duty:
             return {}
         stand = Stand.WAITING if self._standby is None else self._standby.stand
         others = [] if self._standby is None else self._standby.others()
-        shown: dict[str, object] = {
-            "group": self._settings.group,
-            "stand": stand.value,
-            "others_active": others,
-        }
-        return {"standby": shown}
+        group = self._settings.group
+        return {"standby": {"group": group, "stand": stand.value, "others_active": others}}
 
     async def run(self, session: zenoh.Session) -> None:
-        """Until cancelled. The links are declared after this was begun. Raises `ZError`."""
+        """Until cancelled. `session` is the gateway's own. Raises `GatewayError`, `ZError`."""
         if not self.stands_by:
             return
-        own = str(session.zid())
-        standby = self._standby = Standby(
+        self._standby = Standby(
             self._keys.gateway,
-            own,
+            str(session.zid()),
             time.monotonic(),
-            needs_link=self._needs_link,
+            needs_link=self._config is not None,
             alone=self._settings.alone,
         )
-        self._links.listener = self._link
-        under = f"{self._keys.group(self._settings.group)}/**"
+        opening = asyncio.create_task(self._open(session))
+        try:
+            await self._decide(self._standby, opening)
+        finally:
+            opening.cancel()
+            with suppress(asyncio.CancelledError):
+                await opening
+            own = self._seen_through
+            if own is not None and own is not session:
+                await off_loop(own.close)
+
+    async def _open(self, session: zenoh.Session) -> None:
+        """The session the signs travel in, once there is somebody to connect to."""
+        found = session if self._config is None else await opened(self._config, retry=True)
         heard = Inbox(self._hear, lambda _: None)
+        links = Inbox(self._link, lambda _: None)
+        self._seen_through = found
+
+        def declare() -> list[object]:
+            signs = zenoh.handlers.Callback(heard, indirect=False)
+            events = zenoh.handlers.Callback(links, indirect=False)
+            return [
+                found.info.declare_transport_events_listener(events, history=True),
+                found.liveliness().declare_subscriber(self._under, signs, history=True),
+            ]
+
+        self._kept = await off_loop(declare)  # what is forgotten is undeclared
+
+    async def _decide(self, standby: Standby, opening: asyncio.Task[None]) -> None:
         found = Inbox(self._find, lambda _: None)
-        live = session.liveliness()
-
-        def subscribe() -> object:
-            events = zenoh.handlers.Callback(heard, indirect=False)
-            return live.declare_subscriber(under, events, history=True)
-
-        def look() -> None:
-            # Beside the subscription: what is there is then found in two ways.
-            answers = zenoh.handlers.Callback(found, indirect=False)
-            live.get(under, answers, timeout=_LOOK_FOR / 1000)
-
-        subscriber = await off_loop(subscribe)  # kept: what is forgotten is undeclared
-        told = None
-        while subscriber is not None:
+        was_blind = False
+        while True:
+            if opening.done():
+                opening.result()
             before, stand = standby.stand, standby.decide(time.monotonic())
             if stand is not before:
-                await self._change(session, own, before, stand)
-            if told is not (blind := standby.is_blind) and not self.on.is_set():
-                told = blind
-                if blind:
-                    log.warning("standby: no link, so nobody can be seen: waiting for the network")
-            if standby.is_looking:
-                await off_loop(look)
+                log.info("standby", group=self._settings.group, stand=stand.value)
+            await self._show(stand)
+            if stand is Stand.ACTIVE:
+                self.on.set()
+            if stand is Stand.RELIEVED and not self.relieved.is_set():
+                log.error("this gateway leaves the wire: another of its group may be on it")
+                self.relieved.set()
+            if standby.is_blind and not was_blind:
+                log.warning("standby: no link, so nobody can be seen: waiting for the network")
+            was_blind = standby.is_blind
+            if standby.is_looking and self._seen_through is not None:
+                await off_loop(self._look, self._seen_through, found)
             await asyncio.sleep(_LOOK_EVERY)
 
-    async def _change(self, session: zenoh.Session, own: str, before: Stand, stand: Stand) -> None:
-        log.info("standby", group=self._settings.group, stand=stand.value)
-        match stand:
-            case Stand.CLAIMING:
-                await self._show(session, Role.CLAIM, own)
-            case Stand.WAITING:
-                await self._withdraw(Role.CLAIM)
-            case Stand.ACTIVE:
-                await self._show(session, Role.ACTIVE, own)
-                self.on.set()
-            case Stand.RELIEVED:
-                log.error("another gateway of the group is active: this one leaves the wire")
-                self.relieved.set()
+    async def _show(self, stand: Stand) -> None:
+        """Shows and takes back tokens until they are those of the stand."""
+        session = self._seen_through
+        if session is None or stand is Stand.RELIEVED:
+            return  # relieved: the sign stays until the wire is really left
+        wanted = _SHOWN.get(stand, ())
+        for role in [role for role in self._tokens if role not in wanted]:
+            await off_loop(self._tokens.pop(role).undeclare)
+        for role in wanted:
+            if role not in self._tokens:
+                life = "" if self._standby is None else self._standby.session
+                group, name = self._settings.group, self._keys.gateway
+                key = self._keys.sign(group, role.value, name, life)
+                self._tokens[role] = await off_loop(session.liveliness().declare_token, key)
 
-    async def _show(self, session: zenoh.Session, role: Role, own: str) -> None:
-        key = self._keys.sign(self._settings.group, role.value, self._keys.gateway, own)
-        self._tokens[role] = await off_loop(session.liveliness().declare_token, key)
+    @property
+    def _under(self) -> str:
+        return f"{self._keys.group(self._settings.group)}/**"
 
-    async def _withdraw(self, role: Role) -> None:
-        if token := self._tokens.pop(role, None):
-            await off_loop(token.undeclare)
+    def _look(self, session: zenoh.Session, found: Inbox[zenoh.Reply]) -> None:
+        """Beside the subscription: what is there is found in two ways."""
+        answers = zenoh.handlers.Callback(found, indirect=False)
+        session.liveliness().get(self._under, answers, timeout=_LOOK_FOR / 1000)
 
     def _hear(self, sample: zenoh.Sample) -> None:
         if (sign := _sign(str(sample.key_expr))) and self._standby:
@@ -139,10 +158,11 @@ class Duty:
         if sign is not None and self._standby:
             self._standby.glimpsed(sign, time.monotonic())
 
-    def _link(self, there: str, what: str, came: bool) -> None:
+    def _link(self, event: zenoh.TransportEvent) -> None:
         if self._standby:
-            router = self._routed or what == "router"
-            self._standby.link(there, came, router, time.monotonic())
+            there, what = str(event.transport.zid), str(event.transport.whatami)
+            came = event.kind != zenoh.SampleKind.DELETE
+            self._standby.link(there, came, what == "router", time.monotonic())
 
 
 def _sign(key: str) -> Sign | None:

@@ -2,7 +2,6 @@
 
 import asyncio
 import time
-from collections.abc import Callable
 
 import structlog
 import zenoh
@@ -14,15 +13,12 @@ log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 
 _REMEMBERED = 256  # lost links
 
-Listener = Callable[[str, str, bool], None]  # session, what it is, whether it came
-
 
 class Links:
     """`returned` is set when a router, or one that was here before, has come."""
 
     def __init__(self) -> None:
         self.returned = asyncio.Event()
-        self.listener: Listener | None = None
         self._up: dict[str, str] = {}  # what is at the other end, by its session
         self._lost: dict[str, None] = {}  # the sessions of links that went, oldest first
         self._lines = Limiter(100, 1.0)  # anybody can come and go as often as he likes
@@ -52,8 +48,6 @@ class Links:
             self._lost[there] = None
             if len(self._lost) > _REMEMBERED:
                 del self._lost[next(iter(self._lost))]
-        if self.listener is not None:
-            self.listener(there, what, came)
 
     def _came(self, there: str, what: str) -> None:
         self._up[there] = what

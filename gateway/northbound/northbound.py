@@ -1,7 +1,6 @@
 """The gateway as Zenoh sees it: values out, questions answered, writes taken, signs of life."""
 
 import asyncio
-import json
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict
@@ -79,7 +78,7 @@ class Northbound:
         self._retry = settings.mode is Mode.CLIENT
         self._writers = None if writers is None else Writers(writers)
         self._links = Links()
-        self._duty = self._duty_of(standby, settings)
+        self._duty = Duty(standby, self.keys, self._config)
         self._plant = plant
         self._history = history
         self._status_every = status_every
@@ -135,11 +134,6 @@ class Northbound:
     def relieved(self) -> asyncio.Event:
         """Set when another gateway of the group is active: leave the wire, then end this."""
         return self._duty.relieved
-
-    def _duty_of(self, standby: StandbySettings | None, settings: ZenohSettings) -> Duty:
-        connects = json.loads(self._config.get_json("connect/endpoints"))
-        routed = settings.mode is Mode.CLIENT
-        return Duty(standby, self.keys, self._links, needs_link=bool(connects), routed=routed)
 
     # -- life --
 

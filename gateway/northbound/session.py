@@ -109,6 +109,15 @@ def configure(settings: ZenohSettings) -> zenoh.Config:
     return config
 
 
+def as_client(config: zenoh.Config) -> zenoh.Config:
+    """The same as a client that listens to nobody, for another session beside the first."""
+    copy = zenoh.Config.from_json5(str(config))
+    copy.insert_json5("mode", '"client"')
+    copy.insert_json5("listen/endpoints", "[]")
+    copy.insert_json5("connect/timeout_ms", "1000")
+    return copy
+
+
 def _from_file(path: Path) -> zenoh.Config:
     called = "zenoh config_file"
     text = ""

@@ -72,6 +72,18 @@ class Codec(Protocol[F]):
         """
 
 
+@runtime_checkable
+class EndedByGap(Protocol[F]):
+    """A codec whose frames may also be ended by a silence of `gap_timeout` seconds."""
+
+    @property
+    def gap_timeout(self) -> float | None:
+        """None: no silence ends a frame."""
+
+    def expire(self) -> list[F]:
+        """The frames that the silence has ended. Raises as `feed`."""
+
+
 class Talk(Protocol[F]):
     """One turn on the line: all that a driver can do to the world."""
 
@@ -180,6 +192,18 @@ class Windowed(Protocol):
     @property
     def window(self) -> int:
         """How many."""
+
+
+@runtime_checkable
+class Overhearing(Protocol):
+    """A driver whose device may speak without being asked, or keep silent for known reasons."""
+
+    @property
+    def silent_causes(self) -> str:
+        """Why it may not answer at all, in a sentence or two for people."""
+
+    def unasked(self, frame: Any) -> str | None:
+        """What to say of a frame that answers no question; None for nothing."""
 
 
 @runtime_checkable

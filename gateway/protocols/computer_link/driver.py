@@ -28,7 +28,7 @@ from gateway.protocols.computer_link.lists import (
     monitored_ways,
     scattered_ways,
 )
-from gateway.protocols.computer_link.refusals import model_name, refused
+from gateway.protocols.computer_link.refusals import SILENT_CAUSES, model_name, refused
 from gateway.protocols.computer_link.ways import Way, read_way, write_way
 from gateway.protocols.devices import parse_device, spell_device
 from gateway.protocols.driver import Address, Area, Cost, Span, Talk, Timing
@@ -203,6 +203,8 @@ class ComputerLink:
     async def resync(self, talk: LinkTalk, doubt: Span | None, salt: int) -> None:
         """A loopback: its text has a letter that no data reply has, and changes with `salt`."""
         await self._loopback(talk, f"Z{salt & 0xFFFF:04X}")
+
+    silent_causes = SILENT_CAUSES
 
     def unasked(self, frame: Frame) -> str | None:
         """What to say of a block that answers no question: on-demand data, an echo."""

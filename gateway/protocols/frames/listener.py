@@ -3,6 +3,7 @@
 Pure: the line gives it the bytes and the time, wakes it when `due`, and sends its answers.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from gateway.errors import Evidence, Garbled
@@ -50,6 +51,19 @@ class Listener:
         return min(times, default=None)
 
     @property
+    def busy_until(self) -> float | None:
+        """While it is in the middle of a frame: until when its next byte may come."""
+        if not self._reader.pending:
+            return None
+        gap = self._reader.gap_timeout
+        return self._last_byte + (_QUIET if gap is None else max(gap, _QUIET))
+
+    @property
+    def silent(self) -> bool:
+        """Whether all that it should say again and again is overdue."""
+        return not self._stale_at
+
+    @property
     def _gap(self) -> float:
         gap = self._reader.gap_timeout
         return _LONGEST_PAUSE if gap is None else gap
@@ -67,6 +81,11 @@ class Listener:
         for name in stale:
             del self._stale_at[name]
         return [*said, Stale(stale)] if stale else said
+
+    def overheard(self, frames: Iterable[bytes], now: float) -> list[Said]:
+        """Whole frames that came while the device was asked for something else."""
+        heard = (self._understood(frame, now) for frame in frames)
+        return [news for news in heard if not isinstance(news, Garbled)]
 
     def disturbed(self, now: float) -> None:
         """Others have spoken on the line: what was half heard is void."""

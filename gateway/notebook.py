@@ -1,0 +1,107 @@
+"""What was learned of the devices, kept in a small file across restarts.
+
+The file says which addresses each device refuses and where its requests must be cut, so that a
+search is made once and not after every start. Lost or spoilt it costs nothing but a new search.
+"""
+
+import os
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import orjson
+import structlog
+
+from gateway.device import Device
+from gateway.protocols.driver import Span
+from gateway.refusals import Learned
+
+log = structlog.get_logger("gateway")
+FORM = 1
+
+
+class Notebook:
+    """One file. Reading and writing block: `save` belongs on a thread."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._written: bytes | None = None
+
+    def recall(self, devices: Iterable[Device]) -> None:
+        """Plan the devices around what is known. A file that cannot be read is moved aside."""
+        known = self._read()
+        for device in devices:
+            if (learned := known.get(device.name)) is not None:
+                device.refusals.recall(learned, device.tags)
+                device.plan()
+
+    def page(self, devices: Iterable[Device]) -> bytes:
+        """What there is to keep now."""
+        return orjson.dumps(
+            {
+                "form": FORM,
+                "devices": {d.name: _written(d.refusals.learned()) for d in devices},
+            },
+            option=orjson.OPT_INDENT_2 | orjson.OPT_SORT_KEYS,
+        )
+
+    def save(self, page: bytes) -> None:
+        """Put the page in the file's place, whole or not at all. Trouble is logged, once."""
+        if page == self._written:
+            return
+        beside = self._path.with_name(self._path.name + ".new")
+        try:
+            with beside.open("wb") as file:
+                file.write(page)
+                file.flush()
+                os.fsync(file.fileno())
+            beside.replace(self._path)
+        except OSError as error:
+            log.warning("nothing kept for a restart", file=str(self._path), why=str(error))
+        self._written = page
+
+    def _read(self) -> Mapping[str, Learned]:
+        try:
+            data = self._path.read_bytes()
+        except FileNotFoundError:
+            return {}
+        except OSError as error:
+            log.warning("nothing known from before", file=str(self._path), why=str(error))
+            return {}
+        try:
+            return _pages(orjson.loads(data))
+        except (ValueError, TypeError, KeyError, AttributeError) as error:
+            aside = self._path.with_name(self._path.name + ".bad")
+            log.warning("spoilt, moved aside", file=str(self._path), to=str(aside), why=repr(error))
+            self._path.replace(aside)
+            return {}
+
+
+def _pages(document: Mapping[str, Any]) -> dict[str, Learned]:
+    if document["form"] != FORM:
+        raise ValueError(f"form {document['form']} is not {FORM}")
+    return {name: _learned(page) for name, page in document["devices"].items()}
+
+
+def _written(learned: Learned) -> dict[str, object]:
+    return {
+        "refused": [
+            {"area": area, "start": start, "size": size, "since": since, "code": code}
+            for (area, start, size), since, code in learned.refused
+        ],
+        "cuts": [[area, number] for area, number in learned.cuts],
+    }
+
+
+def _learned(page: Mapping[str, list[Mapping[str, object]]]) -> Learned:
+    """Raises ValueError, TypeError, KeyError for what is no page of ours."""
+    refused = tuple(
+        (
+            Span(str(row["area"]), int(str(row["start"])), int(str(row["size"]))),
+            int(str(row["since"])),
+            str(row["code"]),
+        )
+        for row in page["refused"]
+    )
+    cuts = tuple((str(area), int(number)) for area, number in page["cuts"])
+    return Learned(refused, cuts)

@@ -1,0 +1,107 @@
+"""Two gateways of one plant: never both on the wire, and one of them soon after a crash."""
+
+import asyncio
+import json
+import signal
+import sys
+from collections.abc import AsyncIterator
+from contextlib import ExitStack, asynccontextmanager
+from pathlib import Path
+
+from tests.e2e.processes import Program, free_port
+from tests.zenoh_peer import ZenohPeer, free_endpoint
+
+# The command itself; only the longest wait is shorter, so that the suite is.
+RUN = "import gateway.standby as s; s.HOLD = 3.0; from gateway.cli import main; main()"
+HOLD, CLAIM = 3.0, 1.5
+
+
+class Wire:
+    """A device server that nobody answers from: it counts who is connected."""
+
+    def __init__(self) -> None:
+        self.open = 0
+        self.most = 0
+        self.changed = asyncio.Event()
+
+    async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self._now(self.open + 1)
+        while await reader.read(4096):
+            pass
+        self._now(self.open - 1)
+        writer.close()
+
+    def _now(self, count: int) -> None:
+        self.open = count
+        self.most = max(self.most, count)
+        self.changed.set()
+
+    async def until(self, count: int, within: float) -> None:
+        """Waits until so many are connected."""
+        async with asyncio.timeout(within):
+            while self.open != count:
+                self.changed.clear()
+                await self.changed.wait()
+
+
+@asynccontextmanager
+async def wire() -> AsyncIterator[tuple[Wire, int]]:
+    line, port = Wire(), free_port()
+    async with await asyncio.start_server(line.serve, "127.0.0.1", port) as server:
+        yield line, port
+        server.close()
+
+
+def gateway(folder: Path, name: str, router: str, port: int) -> Program:
+    tags = {"speed": {"address": "D100"}, "run": {"address": "Y20", "write": True}}
+    device = {"protocol": "vigor", "station": 1, "tags": tags}
+    line = {"port": f"tcp://127.0.0.1:{port}", "baudrate": 19200, "devices": {"mixer": device}}
+    text = {
+        "gateway": {"name": name, "standby": "hall"},
+        "zenoh": {"listen": [], "connect": [router]},
+        "lines": {"hall-1": line},
+    }
+    file = folder / f"{name}.yaml"
+    file.write_text(json.dumps(text))
+    return Program(sys.executable, "-c", RUN, "run", file)
+
+
+async def stand(client: ZenohPeer, name: str) -> str:
+    [reply] = await client.get(f"plant/@gateway/{name}/standby")
+    return str(reply.json["stand"])
+
+
+async def test_two_gateways_of_a_group_share_one_wire(tmp_path: Path) -> None:
+    router_at = free_endpoint()
+    with ExitStack() as programs:
+        async with wire() as (line, port), ZenohPeer("router", listen=[router_at]) as router:
+            b = programs.enter_context(gateway(tmp_path, "b", router_at, port))
+            a = programs.enter_context(gateway(tmp_path, "a", router_at, port))
+            async with ZenohPeer("client", connect=[router_at]) as client:
+                # Both start at once: the first by name goes.
+                await line.until(1, within=15)
+                assert [await stand(client, name) for name in "ab"] == ["active", "waiting"]
+                # One answers for the plant, and takes its writes; both say that they are there.
+                replies = await client.get("plant/mixer/speed", consolidation="NONE")
+                assert len(replies) == 1
+                assert len(await client.get("plant/mixer/run/@set", b"true", target="ALL")) == 1
+                await client.until_alive("plant/@gateway/*", [f"plant/@gateway/{n}" for n in "ab"])
+                # The network goes and comes: nobody moves.
+                await router.kill()
+                async with ZenohPeer("router", listen=[router_at]):
+                    await asyncio.sleep(HOLD + 2 * CLAIM + 1)
+                    assert [await stand(client, name) for name in "ab"] == ["active", "waiting"]
+                    assert (line.open, line.most) == (1, 1)
+                    # A crash.
+                    await asyncio.to_thread(a.end, signal.SIGKILL)
+                    await line.until(0, within=1)
+                    await line.until(1, within=3)
+                    assert await stand(client, "b") == "active"
+                    # Whoever comes back later stands by, until the other is ended in order.
+                    a = programs.enter_context(gateway(tmp_path, "a", router_at, port))
+                    await asyncio.sleep(HOLD + CLAIM + 1.5)
+                    assert [await stand(client, name) for name in "ab"] == ["waiting", "active"]
+                    assert await asyncio.to_thread(b.end) == 0
+                    await line.until(1, within=3)
+                    assert line.most == 1
+                    assert await asyncio.to_thread(a.end) == 0
