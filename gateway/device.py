@@ -118,10 +118,8 @@ class Device:
     def plan(self) -> None:
         """Decide anew what to ask, around what the device has refused."""
         blocks = plan(self.tags, self.driver, self.seconds, self.refusals.cuts)
-        if self.lists:  # nothing that is refused: that would refuse the whole list
-            known = [block for block in blocks if block.span not in self.refusals.bad]
-            refused = (block for block in blocks if block.span in self.refusals.bad)
-            blocks = (*with_list(known, self.driver, self.seconds), *refused)
+        if self.lists:
+            blocks = with_list(blocks, self.driver, self.seconds, self.refusals.bad.keys())
         self.blocks = blocks
 
     def learn(self) -> bool:

@@ -4,6 +4,7 @@ import asyncio
 import time
 from collections.abc import Sequence
 from collections.abc import Set as AbstractSet
+from contextlib import suppress
 
 import orjson
 
@@ -13,8 +14,11 @@ from gateway.config import Config, DeviceConfig, LineConfig
 from gateway.device import Device
 from gateway.errors import BadValue, GatewayError, LineDown
 from gateway.line import Line
+from gateway.listening import listened
 from gateway.tags import Reason, Sample, Tag, Written, bad
 from gateway.values import Value
+
+LISTEN_FOR = 5.0  # seconds, for what comes unasked
 
 
 class _Once:
@@ -27,9 +31,9 @@ class _Once:
 
     def samples(self, samples: Sequence[Sample]) -> None:
         for sample in samples:
-            if sample.tag in self.wanted and sample.reason is not Reason.STARTING:
+            if sample.reason is not Reason.STARTING:
                 self.heard[sample.tag] = sample
-        if len(self.heard) == len(self.wanted):
+        if self.wanted <= self.heard.keys():
             self.all_heard.set()
 
     def alive(self, device: Device, alive: bool) -> None:
@@ -53,12 +57,25 @@ async def _read(config: LineConfig, tags: Sequence[Tag]) -> dict[Tag, Sample]:
     """What is not in any block (nobody can read it) is not in the answer either."""
     line = _line(config, tags, once := _Once())
     asked = {tag for device in line.devices for block in device.blocks for tag in block.tags}
-    if asked:
+    unasked = {tag for device in line.devices for tag in listened(device)}
+    if asked | unasked:
         once.wanted = asked
         task = asyncio.create_task(line.run())
-        await once.all_heard.wait()
+        if asked:
+            await once.all_heard.wait()
+        await _listen(once, unasked)
         await _end(task)
     return once.heard
+
+
+async def _listen(once: _Once, unasked: AbstractSet[Tag]) -> None:
+    """What comes unasked is waited for a while: a scale streams, a bar code may never come."""
+    once.all_heard.clear()
+    once.wanted |= unasked
+    once.samples(())
+    with suppress(TimeoutError):
+        async with asyncio.timeout(LISTEN_FOR):
+            await once.all_heard.wait()
 
 
 async def write(config: Config, tag: Tag, value: Value) -> Written:

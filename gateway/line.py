@@ -13,6 +13,7 @@ from gateway.errors import Busy, LineDown, Offline, Refused, Unclear
 from gateway.jobs import Idle, Poll, Probe
 from gateway.listening import Answer, Listening
 from gateway.orders import Command, Done, Order, Told, Write
+from gateway.overheard import Overheard
 from gateway.protocols.driver import Span
 from gateway.reading import read_block
 from gateway.recorder import Recorder
@@ -62,6 +63,7 @@ class Line:
         self._then = Consequences(name, self._schedule, upstairs, wall)
         self._writer = Writer(self, self._then, wall)
         self._listening = Listening(devices, self._then)
+        self._overheard = Overheard(name, devices)
         self._port: Port | None = None
         self._turn: Turn | None = None
         self._down: LineDown | None = None
@@ -108,6 +110,7 @@ class Line:
         else:  # before the first question there is nothing to answer
             self._clock.quiet_since = _now()
             self.record.unasked += len(data)
+            self._overheard.idle(data)
             self._listening.received(data, _now())
             self._wake.set()
 
@@ -221,9 +224,11 @@ class Line:
             self.record.turnarounds += turn.turnaround
             device.record.exchanges += turn.exchanges
             device.record.unasked += turn.passed
+            self._overheard.frames(device, turn.overheard)
             device.record.wire_time += characters + turn.turnaround
-            self._listening.ended(device, turn, _now())
-            device.used(_now(), _now() - begun)
+            ended = _now()
+            self._listening.ended(device, turn, ended)
+            device.used(ended, ended - begun)
             if turn.exchanges:
                 device.measured(turn.turnaround / turn.exchanges)
 

@@ -15,6 +15,7 @@ from gateway.errors import BadValue, Garbled
 from gateway.jobs import Idle
 from gateway.protocols.driver import Talk
 from gateway.protocols.frames import FrameDriver, Heard, Listener, Stale
+from gateway.protocols.frames.driver import LISTENED
 from gateway.protocols.frames.listener import Said
 from gateway.tags import Reason, Sample, Tag, bad, of_field
 from gateway.turn import Turn
@@ -53,6 +54,13 @@ class _Speaker:
             name = self.driver.spell(tag.address)
             if name in listened:
                 self.tags.setdefault(name, []).append(tag)
+
+
+def listened(device: Device) -> list[Tag]:
+    """Its tags whose values come unasked and in no other way."""
+    if not isinstance(device.driver, FrameDriver):
+        return []
+    return [tag for tag in device.tags if tag.span.area == LISTENED]
 
 
 class Listening:

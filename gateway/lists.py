@@ -3,14 +3,19 @@
 A PLC keeps one list: the one is chosen that saves the most wire time.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 from gateway.planner import Block, Seconds
 from gateway.protocols.driver import AnyDriver, Monitor, Span, Unit
 
 
-def with_list(blocks: Sequence[Block], driver: AnyDriver, seconds: Seconds) -> tuple[Block, ...]:
-    """The plan, with the blocks that a list reads cheaper put together in one."""
+def with_list(
+    blocks: Sequence[Block], driver: AnyDriver, seconds: Seconds, refused: Collection[Span] = ()
+) -> tuple[Block, ...]:
+    """The plan, with the blocks that a list reads cheaper put together in one.
+
+    Blocks that are `refused` stay apart: one of their addresses would have the list refused.
+    """
     if not isinstance(driver, Monitor):
         return tuple(blocks)
     best: tuple[float, Block, list[Block]] | None = None
@@ -19,7 +24,9 @@ def with_list(blocks: Sequence[Block], driver: AnyDriver, seconds: Seconds) -> t
             alike = [
                 block
                 for block in blocks
-                if block.every == every and (driver.areas[block.span.area].unit is Unit.BIT) is bits
+                if block.every == every
+                and block.span not in refused
+                and (driver.areas[block.span.area].unit is Unit.BIT) is bits
             ]
             found = _listed(alike, driver, seconds)
             if found is not None and (best is None or found[0] > best[0]):

@@ -157,7 +157,7 @@ class Schedule:
     def _next_poll(self, now: float) -> Job:
         hurry = bool(self._urgent) and not (self._hurried and self._ready)
         poll = self._urgent[0] if hurry else self._ready[0][2]
-        if not hurry and poll.deadline < now and len(self.devices) > 1:
+        if not hurry and len(self.devices) > 1 and poll.deadline < now:
             poll = self._fairest(now)
         if poll.device.doubtful:
             other = self._undoubted() if now < self._failed_lane else None

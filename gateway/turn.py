@@ -32,6 +32,7 @@ class Clock:
 class _Question:
     answers: Callable[[Any], Any]
     future: "asyncio.Future[Any]"
+    heard: int = 0  # characters that came for it
 
 
 @dataclass(slots=True, eq=False)
@@ -62,7 +63,8 @@ class Turn:
     _expired: Callable[[Any], Any] | None = None  # what the timed-out question takes for an answer
     _late: "asyncio.Future[bool] | None" = None  # whether it came
     _came_late: bool = False
-    _rest: bytes = b""  # what was heard since the last question
+    _rest: bytes = b""  # what was heard since the last question or answer
+    _answered: float = 0.0  # when the last answer came
     _echo: bytes = b""  # what must still come back
     _unechoed: bytes = b""  # what came instead, so far
     _open: list[_Question] = field(default_factory=list)
@@ -95,11 +97,11 @@ class Turn:
                 self._broken = None
             if self._gap is not None:
                 self._gap.cancel()
+            self._rest = b""
         data = self._codec.encode(frame)
         loop = asyncio.get_running_loop()
-        self._rest = b""
-        started = loop.time()
         self._send(data)
+        started = self.clock.quiet_since
         question = _Question(answers, loop.create_future())
         self._open.append(question)
         spoken = (len(data) * (2 if self.echo else 1) + reply) * self.wire.character
@@ -109,9 +111,11 @@ class Turn:
         finally:
             timer.cancel()
             self._open.remove(question)
-        busy = (len(data) + len(self._rest)) * self.wire.character
+        busy = (len(data) + question.heard) * self.wire.character
+        alone = max(started, self._answered)  # where several are open, each has its own part
+        self._answered = self.clock.quiet_since
         self.exchanges += 1
-        self.turnaround += max(0.0, self.clock.quiet_since - started - busy)
+        self.turnaround += max(0.0, self._answered - alone - busy)
         return answer
 
     def received(self, data: bytes) -> None:
@@ -187,6 +191,7 @@ class Turn:
                 _fail(question, error)
                 return
             if answer is not None:
+                question.heard, self._rest = len(self._rest), b""
                 question.future.set_result(answer)
                 return
         if self._expired is not None and _accepts(self._expired, frame):

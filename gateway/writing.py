@@ -153,12 +153,14 @@ class Writer:
             command.done(outcome)
 
     async def _obeyed(self, command: Command) -> str | GatewayError:
-        device = command.device
+        device, driver = command.device, command.device.driver
+        if why := not_obeyed(driver, command.name, control=device.control):
+            return BadValue(why)
         if not isinstance(driver, Controllable):
-            return BadValue(f"{device.name} takes no commands")
+            raise TypeError(f"{device.name} takes no commands")
         with self.wire.turn_with(device) as turn:
             try:
-                answer = await device.driver.control(turn, command.name, command.argument)
+                answer = await driver.control(turn, command.name, command.argument)
             except BadValue as error:
                 return error
             except Refused as error:

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from benchmarks import peers_requests
 from gateway.errors import ConfigError
 from gateway.planner import Block, Cuts, plan
 from gateway.protocols.driver import Cost, Span
@@ -216,3 +217,11 @@ def test_ten_times_the_tags_take_about_ten_times_as_long() -> None:
 
     took(100)
     assert took(10_000) <= 15 * took(1_000)
+
+
+@pytest.mark.parametrize("baud", [9600, 19200, 38400, 115200])
+def test_the_two_hundred_register_set_is_planned_at_the_optimum(baud: int) -> None:
+    wire = Wire(baud, 11)
+    found = peers_requests.ours(wire)
+    spent = sum(peers_requests.seconds(wire, size) for size in found)
+    assert spent == pytest.approx(peers_requests.optimum(wire), rel=1e-9)

@@ -22,6 +22,7 @@ log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 
 _LOOK_EVERY = 0.2  # seconds
 _LOOK_FOR = 400  # ms
+_TOLD_AFTER = 15  # looks without a link
 _SHOWN = {Stand.CLAIMING: (Role.CLAIM,), Stand.ACTIVE: (Role.CLAIM, Role.ACTIVE)}
 
 
@@ -105,7 +106,7 @@ class Duty:
 
     async def _decide(self, standby: Standby, opening: asyncio.Task[None]) -> None:
         found = Inbox(self._find, lambda _: None)
-        was_blind = False
+        blind = 0
         while True:
             if opening.done():
                 opening.result()
@@ -118,9 +119,9 @@ class Duty:
             if stand is Stand.RELIEVED and not self.relieved.is_set():
                 log.error("this gateway leaves the wire: another of its group may be on it")
                 self.relieved.set()
-            if standby.is_blind and not was_blind:
+            blind = blind + 1 if standby.is_blind else 0
+            if blind == _TOLD_AFTER:
                 log.warning("standby: no link, so nobody can be seen: waiting for the network")
-            was_blind = standby.is_blind
             if standby.is_looking and self._seen_through is not None:
                 await off_loop(self._look, self._seen_through, found)
             await asyncio.sleep(_LOOK_EVERY)

@@ -96,9 +96,14 @@ class Northbound:
     def publish(self, samples: Sequence[Sample]) -> None:
         """Sends samples out, and per device with blocks all of them in one. Never blocks.
 
-        One call is one scan. The plant's own samples must be updated before.
+        One call is one scan. The plant's own samples must be updated before. Those of event tags
+        all go out, in order, none replaced by the next.
         """
-        self._publisher.values(samples)
+        if any(sample.tag.event for sample in samples):
+            self.publish_events(sample for sample in samples if sample.tag.event)
+            self._publisher.values(sample for sample in samples if not sample.tag.event)
+        else:
+            self._publisher.values(samples)
         if not self._with_blocks:
             return
         scans: dict[str, list[Sample]] = {}

@@ -27,7 +27,7 @@ class Repeater:
         self._links = links
 
     async def publish_all(self) -> None:
-        tags = self._directory.all()
+        tags = [tag for tag in self._directory.all() if not tag.event]  # an event is told once
         for start in range(0, len(tags), _AT_ONCE):
             chunk = tags[start : start + _AT_ONCE]
             self._publisher.values(self._plant.sample(tag) for tag in chunk)

@@ -28,8 +28,8 @@ class Watch(Protocol):
     def sent(self, data: bytes, start: float, end: float) -> None:
         """The gateway begins to speak."""
 
-    def overlapped(self, reply_start: float) -> None:
-        """The gateway speaks while a reply is on the wire that began at that moment."""
+    def overlapped(self, station: Speaker | None) -> None:
+        """The gateway and this station speak at once."""
 
     def damaged(self, data: bytes) -> None:
         """Not what was sent has just arrived, at either end, by noise or collision."""
@@ -65,7 +65,7 @@ class _Sending:
     start: float
     end: float
     data: bytes
-    by_gateway: bool
+    station: Speaker | None  # None: the gateway
     spoilt: bool = False
 
 
@@ -107,14 +107,14 @@ class SimWire:
             raise LineDown(self.gone or "closed")
         now = _now()
         start = max(now, self._ours_until)
-        sending = _Sending(start, start + len(data) * self.wire.character, data, by_gateway=True)
+        sending = _Sending(start, start + len(data) * self.wire.character, data, None)
         self._ours_until = sending.end
         self.watch.sent(data, start, sending.end)
         if self.hanging:
             return
         for other in self._collide(sending):
-            if not other.by_gateway:
-                self.watch.overlapped(other.start)
+            if other.station is not None:
+                self.watch.overlapped(other.station)
         self._at(sending.end, lambda: self._reach_stations(sending))
         if self.echo:
             self._at(sending.end, lambda: self._deliver(sending, sending.data))
@@ -161,7 +161,7 @@ class SimWire:
                 self._say(said[0], request.end + said[1], station)
 
     def _say(self, data: bytes, start: float, station: Speaker) -> None:
-        sending = _Sending(start, start + len(data) * self.wire.character, data, by_gateway=False)
+        sending = _Sending(start, start + len(data) * self.wire.character, data, station)
         if start <= _now():
             self._begin(sending)
         else:
@@ -170,8 +170,8 @@ class SimWire:
     def _begin(self, sending: _Sending) -> None:
         """Not before it begins is it known whom it collides with."""
         for other in self._collide(sending):
-            if other.by_gateway:
-                self.watch.overlapped(sending.start)
+            if other.station is None:
+                self.watch.overlapped(sending.station)
         chunk = self.chunk or len(sending.data)
         for first in range(0, len(sending.data), chunk):
             piece = sending.data[first : first + chunk]

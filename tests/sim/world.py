@@ -31,11 +31,12 @@ from tests.sim.draw import CALM, Drawn, Episode, draw
 from tests.sim.oracle import CHECKS
 from tests.sim.stations import Troubled, set_holes, station_of
 from tests.sim.virtual import run_virtual
-from tests.sim.wire import Format, Noise, SimWire
+from tests.sim.wire import Format, Noise, SimWire, Speaker
 
 SECOND = 1_000_000_000
 SPOKEN = 0.35  # seconds: the longest frames of a seed, there and back
 LONGEST_PAUSE = 66.0  # between two probes of a silent device
+UNTIMELY = ("very-late", "foreign", "junk", "noise", "noise-after", "vanish", "hang", "flicker")
 MOST_TROUBLES = 20  # noted in one run
 
 
@@ -90,13 +91,16 @@ class Bus:
             return "computer-link"
         return self.protocol
 
-    def overlapped(self, reply_start: float) -> None:
-        world, device = self.world, self.asked
+    def overlapped(self, station: Speaker | None) -> None:
+        world = self.world
         world.story.counts["overlaps"] += 1
-        if device is None or self.excused(world.now - 30.0):
+        device = next(
+            (d for d in self.line.devices if self.stations[d.name] is station), self.asked
+        )
+        if device is None or self._excused(world.passed - 30.0):
             return
         if device.standing in (Standing.SILENT, Standing.STARTING):
-            return  # nobody waits for its late answers: that is the rule
+            return  # nobody waits for late answers to a probe: that is the rule
         world.broke(f"{self.line.name}: spoke while {device.name} did")
 
     def damaged(self, data: bytes) -> None:
@@ -112,13 +116,15 @@ class Bus:
 
     # What excuses it
 
-    def excused(self, since: float) -> bool:
+    def _excused(self, since: float) -> bool:
         """Whether an answer may come at any time: later than any guard, or in another's name."""
-        kinds = ("very-late", "foreign", "junk", "noise", "noise-after", "vanish", "hang", "flicker")
         return any(
-            e.line == self.line.name and e.kind in kinds and e.end + 5 > since and e.start <= self.world.passed
+            e.line == self.line.name
+            and e.kind in UNTIMELY
+            and e.end > since
+            and e.start <= self.world.passed
             for e in self.world.drawn.episodes
-        ) and True
+        )
 
     def blind(self, since: float) -> bool:
         """Something was damaged since then, and its own check sum agrees."""

@@ -1,0 +1,148 @@
+"""Many lines in one process, on virtual time: `python -m benchmarks.many_lines`.
+
+64 lines of 32 stations of 50 tags, each line paced at its baud rate, for a simulated minute; then
+200,000 tags in memory alone. Both again at a tenth of the size: growth should be linear. Memory is
+what the process grew by, processor time is per sample.
+"""
+
+import argparse
+import asyncio
+import gc
+import logging
+import os
+import resource
+import time
+from collections.abc import Awaitable, Callable, Sequence
+from pathlib import Path
+
+import structlog
+
+from gateway.device import Device
+from gateway.line import Line
+from gateway.mirror import Mirror
+from gateway.protocols.vigor import Vigor
+from gateway.stations.vigor import VigorStation
+from gateway.tags import Sample
+from gateway.transport import Ear, Port, open_simulator
+from gateway.wiretime import Wire
+from tests.sim.plant import make_tag
+from tests.sim.virtual import run_virtual
+
+WIRE = Wire(115200, 10)
+TAGS = 50
+
+
+class Watching:
+    """Upstairs with a mirror, as the gateway has one."""
+
+    def __init__(self, mirror: Mirror) -> None:
+        self._mirror = mirror
+        self.samples_seen = 0
+
+    def samples(self, samples: Sequence[Sample]) -> None:
+        self.samples_seen += len(samples)
+        self._mirror.update(samples)
+
+    def alive(self, device: Device, alive: bool) -> None:
+        pass
+
+
+def megabytes() -> float:
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * resource.getpagesize() / 1e6
+
+
+def devices(line: int, stations: int) -> list[Device]:
+    found = []
+    for station in range(1, stations + 1):
+        name = f"line{line}-plc{station}"
+        tags = tuple(make_tag(f"D{n}", every=5.0, device=name) for n in range(TAGS))
+        driver = Vigor(station=station)
+        found.append(Device(name, driver, WIRE, driver.timing, tags, 0.5, turnaround=0.005))
+    return found
+
+
+def opener(stations: Sequence[VigorStation]) -> Callable[[Ear], Awaitable[Port]]:
+    return lambda ear: open_simulator(stations, WIRE, ear)
+
+
+def run(lines: int, stations: int, seconds: float) -> tuple[float, float, float, int]:
+    """Megabytes, seconds to build, microseconds of CPU per sample, samples."""
+    gc.collect()
+    before, begun = megabytes(), time.process_time()
+    plants = [devices(number, stations) for number in range(lines)]
+    mirror = Mirror((tag for plant in plants for device in plant for tag in device.tags), 0)
+    watching = Watching(mirror)
+    built = time.process_time() - begun
+    grown = megabytes() - before
+
+    async def play() -> None:
+        tasks = []
+        for number, plant in enumerate(plants):
+            served = [VigorStation(device.driver.station) for device in plant]
+
+            line = Line(
+                f"line{number}", plant, WIRE, opener(served), watching, lambda: 0, seed=number
+            )
+            tasks.append(asyncio.create_task(line.run()))
+        await asyncio.sleep(seconds)
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+    begun = time.process_time()
+    run_virtual(play())
+    spent = time.process_time() - begun
+    return grown, built, spent / watching.samples_seen * 1e6, watching.samples_seen
+
+
+def memory_of(count: int) -> tuple[float, float]:
+    """Megabytes and seconds for so many tags in the mirror."""
+    gc.collect()
+    before, begun = megabytes(), time.process_time()
+    tags = [make_tag(f"D{n % 8000}", device=f"plc{n // 8000}") for n in range(count)]
+    mirror = Mirror(tags, 0)
+    grown, spent = megabytes() - before, time.process_time() - begun
+    assert mirror[tags[-1]].value is None
+    return grown, spent
+
+
+def in_child(function: str, *arguments: float) -> None:
+    """A fresh process for each row, so that one does not live off another's memory."""
+    if (child := os.fork()) == 0:
+        rows[function](*arguments)
+        os._exit(0)
+    os.waitpid(child, 0)
+
+
+def show_run(lines: float, stations: float, seconds: float) -> None:
+    grown, built, cpu, samples = run(int(lines), int(stations), seconds)
+    count = int(lines) * int(stations) * TAGS
+    print(
+        f"{int(lines):5} lines x {int(stations)} stations, {count:7} tags: {grown:7.1f} MB, "
+        f"planned in {built:5.2f} s, {cpu:5.1f} us of CPU per sample ({samples} samples)",
+        flush=True,
+    )
+
+
+def show_memory(count: float) -> None:
+    grown, spent = memory_of(int(count))
+    print(f"{int(count):7} tags in memory: {grown:7.1f} MB, {spent:5.2f} s", flush=True)
+
+
+rows = {"run": show_run, "memory": show_memory}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seconds", type=float, default=20.0, help="of simulated time")
+    seconds = parser.parse_args().seconds
+    structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.WARNING))
+    in_child("run", 6, 32, seconds)
+    in_child("run", 64, 32, seconds)
+    in_child("memory", 20_000)
+    in_child("memory", 200_000)
+
+
+if __name__ == "__main__":
+    main()
