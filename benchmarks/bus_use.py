@@ -3,12 +3,15 @@
 The gateway's own line talks to a wire paced in another process, over a pty. `busy` is the time
 characters were on the wire, as a share of the time that the station's turnaround and the
 protocol's silences leave. `cycle` compares one round of all blocks with what `check` predicts.
+A second run writes a register three times a second meanwhile; `write` is the longest time from
+asking to the acknowledgement, beside the bound that `check` prints.
 """
 
 import argparse
 import asyncio
 import json
 import logging
+import random
 import subprocess
 import sys
 import time
@@ -19,6 +22,7 @@ from typing import NamedTuple
 import structlog
 
 from gateway.device import Device
+from gateway.errors import GatewayError
 from gateway.forecast import forecast
 from gateway.line import Line
 from gateway.protocols.computer_link import ComputerLink
@@ -29,7 +33,7 @@ from gateway.stations.computer_link import ComputerLinkStation
 from gateway.stations.modbus import ModbusStation
 from gateway.stations.station import Station
 from gateway.stations.vigor import VigorStation
-from gateway.tags import Sample, Tag
+from gateway.tags import Sample, Tag, WriteRule, Written
 from gateway.transport import SerialPath, SerialSettings, open_port
 from gateway.values import Layout, parse_type
 from gateway.wiretime import Wire, character_bits
@@ -79,6 +83,8 @@ class Result:
     cycle: float
     predicted: float
     exchanges: int
+    write: float = 0.0
+    bound: float = 0.0
 
 
 def tags(area: str) -> tuple[Tag, ...]:
@@ -96,12 +102,30 @@ def tags(area: str) -> tuple[Tag, ...]:
                 unit_kind=Unit.WORD,
                 layout=Layout(parse_type("int16")),
                 every=0.01,
+                write=WriteRule() if number == 0 else None,
             )
         )
     return tuple(found)
 
 
-async def measure(name: str, baud: int, seconds: float) -> Result:
+async def writing(line: Line, device: Device, tag: Tag, took: list[float]) -> None:
+    """Three times a second, at moments that have nothing to do with the polls."""
+    number = 0
+    while True:
+        await asyncio.sleep(0.29 + 0.13 * random.random())
+        number += 1
+        told = asyncio.Event()
+
+        def done(outcome: Written | GatewayError, told: asyncio.Event = told) -> None:
+            if isinstance(outcome, Written):
+                took.append(outcome.took)
+            told.set()
+
+        line.submit(device, tag, tag.encode(number), done)
+        await told.wait()
+
+
+async def measure(name: str, baud: int, seconds: float, *, writes: bool = False) -> Result:
     setting = SETTINGS[name]
     child = subprocess.Popen(
         [sys.executable, "-m", "benchmarks.paced_wire", name, str(baud), str(TURNAROUND)],
@@ -126,20 +150,28 @@ async def measure(name: str, baud: int, seconds: float) -> Result:
         Counting(),
         time.time_ns,
     )
-    task = asyncio.create_task(line.run())
+    tasks = [asyncio.create_task(line.run())]
+    took: list[float] = []
+    if writes:
+        await asyncio.sleep(0.5)  # the line is open by then
+        tasks.append(asyncio.create_task(writing(line, device, device.tags[0], took)))
     await asyncio.sleep(seconds)
-    task.cancel()
-    await asyncio.gather(task, return_exceptions=True)
+    for task in tasks:
+        task.cancel()
+    await asyncio.gather(*tasks, return_exceptions=True)
     child.stdin.close()
     passed = json.loads(child.stdout.readline())
     child.wait()
     exchanges = passed["exchanges"]
     silences = (exchanges - 1) * wire.silence(driver.timing)
     free = passed["elapsed"] - passed["turnarounds"] - silences
+    promised = forecast("bench", [device], wire)
     return Result(
+        write=max(took, default=0.0),
+        bound=promised.worst_write,
         busy=passed["characters"] * wire.character / free,
         cycle=passed["elapsed"] / exchanges * len(device.blocks),
-        predicted=forecast("bench", [device], wire).cycle,
+        predicted=promised.cycle,
         exchanges=exchanges,
     )
 
@@ -151,14 +183,17 @@ def main() -> None:
     parser.add_argument("--bauds", nargs="*", type=int, default=[9600, 19200, 38400, 115200])
     arguments = parser.parse_args()
     structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.WARNING))
-    print(f"{'protocol':14} {'baud':>7} {'exchanges':>9} {'busy':>7} {'cycle':>9} {'predicted':>9}")
+    columns = "exchanges    busy     cycle  predicted             write"
+    print(f"{'protocol':14} {'baud':>7} {columns}")
     for name in arguments.protocols:
         for baud in arguments.bauds:
             result = asyncio.run(measure(name, baud, arguments.seconds))
+            written = asyncio.run(measure(name, baud, arguments.seconds, writes=True))
             print(
                 f"{name:14} {baud:7} {result.exchanges:9} {result.busy:7.1%} "
                 f"{result.cycle * 1000:6.1f} ms {result.predicted * 1000:6.1f} ms "
-                f"({result.cycle / result.predicted - 1:+.1%})"
+                f"({result.cycle / result.predicted - 1:+.1%})  "
+                f"{written.write * 1000:5.1f} of {written.bound * 1000:5.1f} ms"
             )
 
 

@@ -155,8 +155,9 @@ class Gateway:
         Bad where the device does not answer. Raises `Busy` when the line did not get to it.
         """
         known = self.mirror[tag]
-        young = self._wall() - known.time <= max_age * 1e9
-        if tag.device not in self._places or (known.quality is Quality.GOOD and young):
+        if tag.device not in self._places:
+            return known
+        if known.quality is Quality.GOOD and self._age(tag) <= max_age:
             return known
         line, device = self._places[tag.device]
         if not line.is_open:
@@ -171,6 +172,26 @@ class Gateway:
             if self.mirror[tag].quality is Quality.BAD:
                 return self.mirror[tag]
             raise Busy(f"{tag.key} could not be read within {FRESH_WITHIN:g} s") from None
+        finally:
+            self._forget(tag, asked)
+
+    def _forget(self, tag: Tag, asked: "asyncio.Future[Sample]") -> None:
+        """Of a device that stays silent no sample comes that would."""
+        waiting = self._waiting.get(tag, [])
+        if asked in waiting:
+            waiting.remove(asked)
+            if not waiting:
+                del self._waiting[tag]
+
+    def _age(self, tag: Tag) -> float:
+        """Seconds since the tag was read, by the clock that nobody sets if it is polled."""
+        line, device = self._places[tag.device]
+        read = [poll.last_good for poll in line.polls(device) if tag in poll.block.tags]
+        if not read:
+            age = (self._wall() - self.mirror[tag].time) / 1e9
+            return age if age >= 0 else float("inf")
+        now = asyncio.get_running_loop().time()
+        return min((now - at for at in read if at is not None), default=float("inf"))
 
     def status(self) -> Mapping[str, Document]:
         """Documents by path: `status`, `lines/<line>`, `devices/<device>`."""

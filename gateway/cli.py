@@ -22,6 +22,7 @@ from gateway.errors import BadValue, ConfigError, GatewayError
 from gateway.keys import max_age as age_of
 from gateway.payload import Problem
 from gateway.tags import Tag
+from gateway.transport.loop import new_event_loop
 from gateway.values import Kind
 
 USER_MISTAKE, FAILED = 2, 1
@@ -88,7 +89,8 @@ def run(
     loaded = load(config)
     _log(log_format, log_level)
     hint = show.next_steps(loaded, config, show.typed())
-    asyncio.run(service.run(loaded, lambda: err.print(hint)))
+    with asyncio.Runner(loop_factory=new_event_loop) as runner:
+        runner.run(service.run(loaded, lambda: err.print(hint)))
 
 
 @cli.command()

@@ -138,9 +138,8 @@ class Device:
 
     def interval(self, block: Block) -> float:
         """How often the block is asked: refused addresses only rarely."""
-        if block.span in self.refusals.bad:
-            return max(RETRY, block.every)
-        return block.every
+        bad = self.refusals.bad
+        return max(RETRY, block.every) if bad and block.span in bad else block.every
 
     def start(self) -> None:
         """The line was opened: who knows what is still on its way from before."""

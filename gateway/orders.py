@@ -27,7 +27,8 @@ class Write:
     def plain(self) -> bool:
         """One exchange and no more: it may share that exchange with others."""
         rule = self.tag.write
-        return not self.alone and self.tag.address.bit is None and not (rule and (rule.verify or rule.repeat))
+        conversation = rule is not None and (rule.verify or rule.repeat)
+        return not (self.alone or conversation) and self.tag.address.bit is None
 
     @property
     def latest(self) -> bool:

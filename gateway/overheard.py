@@ -1,4 +1,4 @@
-"""Blocks that nobody had asked for: counted, and told in the words of the driver that knows them."""
+"""Blocks that nobody had asked for: counted, and told as the driver that knows them puts it."""
 
 import asyncio
 from collections.abc import Iterable, Sequence

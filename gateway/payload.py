@@ -1,7 +1,7 @@
 """Samples, descriptions and outcomes <-> the JSON that travels on Zenoh.
 
 A value is `{"value": 12.5, "quality": "good", "time": "2026-11-20T12:00:00.123456Z"}`; one that is
-not known has `"value": null, "quality": "bad"` and a `reason`. Integers stay JSON integers
+not known has `"value": null, "quality": "bad"` and a `reason`, with a sentence in `detail`. Integers stay JSON integers
 whatever their size: beyond 2**53 a reader in JavaScript must parse them itself.
 """
 
@@ -164,6 +164,7 @@ def document(fields: Mapping[str, object]) -> bytes:
     return orjson.dumps(fields, default=str, option=orjson.OPT_NON_STR_KEYS)
 
 
+@lru_cache(maxsize=256)  # samples of one scan have one time
 def rfc3339(time: int) -> str:
     """Nanoseconds since 1970 as `2026-11-20T12:00:00.123456Z`."""
     return f"{_second(time // 1_000_000_000)}.{time // 1000 % 1_000_000:06}Z"
@@ -178,12 +179,15 @@ def _sample(sample: Sample) -> dict[str, Value | None]:
         if known is not None and not (isinstance(known, float) and not math.isfinite(known)):
             return {"value": known, "quality": "good", "time": time}
         reason = Reason.NOT_A_NUMBER
-    return {
+    told: dict[str, Value | None] = {
         "value": None,
         "quality": "bad",
         "reason": None if reason is None else reason.value,
         "time": time,
     }
+    if sample.detail:
+        told["detail"] = _short(sample.detail)
+    return told
 
 
 def _result(result: Written | Failure) -> dict[str, Value | None]:

@@ -40,6 +40,7 @@ class Schedule:
         )  # of a period, to begin early
         self._waiting: list[tuple[float, int, Poll]] = []  # by due time
         self._ready: list[tuple[float, int, Poll]] = []  # due, by deadline
+        self._roomy = 64  # places in `_waiting` before the void ones are looked for
         self._urgent: deque[Poll] = deque()
         self._polls: dict[Device, list[Poll]] = {}
         self._orders: deque[Order] = deque()
@@ -285,6 +286,11 @@ class Schedule:
             if poll.live and poll.device.served and poll.ticket != URGENT:
                 poll.ticket = next(self._order)
                 heapq.heappush(self._waiting, (poll.due, poll.ticket, poll))
+        if len(self._waiting) > self._roomy:
+            # Polls that were hastened left their old places behind, some until tomorrow.
+            self._waiting = [place for place in self._waiting if place[2].ticket == place[1]]
+            heapq.heapify(self._waiting)
+            self._roomy = 2 * len(self._waiting) + 64
 
     def _ripen(self, now: float) -> None:
         """What has come due; what is not to be asked any more is dropped here."""

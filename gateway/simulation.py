@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterable
+from typing import Literal
 
 from gateway.errors import BadValue, ConfigError
 from gateway.protocols.computer_link import ComputerLink
@@ -32,13 +33,24 @@ def _station(driver: AnyDriver) -> Station:
             return ComputerLinkStation(
                 driver.station, driver.profile, driver.frame_format, driver.sum_check
             )
-        case ModbusRtu():
-            return ModbusStation(station=driver.station, framing="rtu", dialect=driver.addressing)
-        case ModbusAscii():
-            return ModbusStation(station=driver.station, framing="ascii", dialect=driver.addressing)
-        case ModbusTcp():
-            return ModbusStation(station=driver.station, framing="tcp", dialect=driver.addressing)
+        case ModbusRtu() | ModbusAscii() | ModbusTcp():
+            return _modbus(driver)
     raise ConfigError(f"there is no simulated device for protocol {driver.protocol}")
+
+
+def _modbus(driver: ModbusRtu | ModbusAscii | ModbusTcp) -> Station:
+    framing: Literal["rtu", "ascii", "tcp"] = "rtu"
+    match driver:
+        case ModbusAscii():
+            framing = "ascii"
+        case ModbusTcp():
+            framing = "tcp"
+    return ModbusStation(
+        station=driver.station,
+        framing=framing,
+        dialect=driver.addressing,
+        counter_word_order=driver.counter_word_order,
+    )
 
 
 def _animate(memory: Memory, tag: Tag, number: int) -> None:

@@ -307,7 +307,7 @@ DEVICES = [
         "no protocol",
         on_mixer("station: 1"),
         f"5: {M}.protocol: missing: a device needs its protocol: "
-        "vigor, computer-link, modbus-rtu, modbus-ascii or modbus-tcp",
+        "vigor, computer-link, modbus-rtu, modbus-ascii, modbus-tcp or frames",
     ),
     bad(
         "unknown protocol",

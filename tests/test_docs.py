@@ -134,8 +134,11 @@ def test_a_device_in_the_pages_loads_as_soon_as_its_protocol_is_there(
 ) -> None:
     devices = yaml.safe_load(block.text)  # no settings of a file: each device on a line of its own
     assert {device["protocol"] for device in devices.values()} == {"frames"}
-    serial = {"port": "simulator", "baudrate": 9600, "format": "8N1"}
-    lines = {name: {**serial, "devices": {name: made}} for name, made in devices.items()}
+    serial = {"baudrate": 9600, "format": "8N1"}
+    lines = {
+        name: {**serial, "port": f"COM{number}", "devices": {name: made}}
+        for number, (name, made) in enumerate(devices.items())
+    }
     text = json.dumps({"lines": lines})
     if "frames" in DRIVERS:
         assert len(loaded(text, tmp_path).devices) == len(devices)
@@ -241,6 +244,12 @@ def _plant(section: str, name: str, text: str) -> dict[str, Any]:
             device = {"protocol": protocol, "station": 1, **setting}
             if not text and name == "station":
                 del device["station"]
+            if protocol == "frames":
+                fields = {"f": {"type": "text"}}
+                ask = {"a": {"send": "A", "match": "(?P<f>.)", "fields": fields}}
+                device = {"protocol": protocol, "framing": {"ending": "CR"}, "ask": ask}
+                tag["address"] = "f"
+                del tag["write"]
     return {
         **top,
         "lines": {"hall": {**line, "devices": {"plc": {**device, "tags": {"tag": tag}}}}},
@@ -281,7 +290,8 @@ def test_the_customs_of_a_protocol_are_what_holds_when_nothing_is_said(
     said = _plant(protocol, "", "")
     line = said["lines"]["hall"]
     device = line["devices"]["plc"]
-    device["tags"]["tag"]["type"] = word
+    if word:
+        device["tags"]["tag"]["type"] = word
     for name, text in zip(TIMES, customs, strict=True):
         if text:
             owner = line if name in ("baudrate", "format") else device

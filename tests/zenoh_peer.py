@@ -202,9 +202,16 @@ class ZenohPeer:
                 pass
 
     async def get(
-        self, selector: str, payload: bytes | None = None, timeout: float = TIMEOUT, **how: str
+        self,
+        selector: str,
+        payload: bytes | None = None,
+        timeout: float = TIMEOUT,
+        attachment: bytes | None = None,
+        **how: str,
     ) -> list[Reply]:
         """`how`: `target="ALL"`, `consolidation="NONE"`."""
+        if attachment is not None:
+            how["attachment"] = base64.b64encode(attachment).decode()
         [replies] = await self.many([(selector, payload)], timeout, **how)
         return replies
 
@@ -222,8 +229,8 @@ class ZenohPeer:
             for replies in result
         ]
 
-    async def put(self, key: str, payload: bytes) -> None:
-        await self._ask("put", key=key, payload=_text(payload))
+    async def put(self, key: str, payload: bytes, attachment: bytes | None = None) -> None:
+        await self._ask("put", key=key, payload=_text(payload), attachment=_text(attachment))
 
     async def delete(self, key: str) -> None:
         await self._ask("delete", key=key)
@@ -319,6 +326,8 @@ def _get(
         options["target"] = getattr(zenoh.QueryTarget, how["target"])
     if "consolidation" in how:
         options["consolidation"] = getattr(zenoh.ConsolidationMode, how["consolidation"])
+    if "attachment" in how:
+        options["attachment"] = _octets(how["attachment"])
     found: list[list[zenoh.Reply]] = [[] for _ in queries]
     ends = [threading.Event() for _ in queries]
     for (selector, payload), replies, end in zip(queries, found, ends, strict=True):
@@ -346,9 +355,10 @@ def _obey(session: zenoh.Session, kept: list[object], ask: dict[str, Any]) -> An
             return sorted(str(answer.ok.key_expr) for answer in found if answer.ok)
         case {"do": "get", "queries": queries, "timeout": timeout, "how": how}:
             return _get(session, queries, timeout, how)
-        case {"do": "put", "key": key, "payload": payload}:
+        case {"do": "put", "key": key, "payload": payload, "attachment": attachment}:
             block = zenoh.CongestionControl.BLOCK
-            session.put(key, _octets(payload) or b"", congestion_control=block)
+            data, beside = _octets(payload) or b"", _octets(attachment)
+            session.put(key, data, congestion_control=block, attachment=beside)
         case {"do": "delete", "key": key}:
             session.delete(key)
         case _:

@@ -20,8 +20,12 @@ def check_line(
     for device in devices:
         place = (*path, "devices", device.name)
         number = device.driver.station
-        if isinstance(device.driver, FrameDriver):
-            continue  # it has no number, and no habits that others could disturb
+        if isinstance(device.driver, FrameDriver):  # it has no number
+            if isinstance(line.port, SimulatorAddress):
+                mistakes.add(
+                    (*path, "port"), f"{device.name} cannot be simulated: it has no protocol"
+                )
+            continue
         other = stations.setdefault(number, device.name)
         if other != device.name:
             mistakes.add(

@@ -60,7 +60,7 @@ def build_tag(source: TagSource, driver: AnyDriver, mistakes: Mistakes) -> Tag |
     units = 1 if address.bit is not None else kind.words // (2 if area.unit is Unit.DWORD else 1)
     span = Span(area.name, address.number, units)
     write = _write(source, settings, driver, span, kind, mistakes)
-    for place, problem in _misfits(source, driver, span, kind, write):
+    for place, problem in _misfits(source, driver, address, span, kind, write):
         mistakes.add((*source.path, place), problem)
     if len(mistakes) > before:
         return None
@@ -129,7 +129,12 @@ def _type_misfit(kind: ValueType, area: Area, address: Address, driver: AnyDrive
 
 
 def _misfits(
-    source: TagSource, driver: AnyDriver, span: Span, kind: ValueType, write: WriteRule | None
+    source: TagSource,
+    driver: AnyDriver,
+    address: Address,
+    span: Span,
+    kind: ValueType,
+    write: WriteRule | None,
 ) -> Iterator[tuple[str, str]]:
     """(setting, what is wrong with it)."""
     area = driver.areas[span.area]
@@ -142,6 +147,8 @@ def _misfits(
         yield "type", f"a {kind} is {span.size} words, more than one exchange can carry"
     if not area.readable and write is None:
         yield "write", f"{first} is never read at station {driver.station}: it needs write: true"
+    if not area.readable and address.bit is not None:
+        yield "address", f"{first} is never read at station {driver.station}: write the whole word"
     if not area.readable and write is not None and write.verify:
         yield "write", f"{first} is never read at station {driver.station}: verify cannot work"
     yield from _unsuited(source, area, first, kind)

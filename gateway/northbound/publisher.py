@@ -21,7 +21,7 @@ from gateway import payload
 from gateway.keys import Keys
 from gateway.northbound import forms
 from gateway.northbound.names import MOST_DECLARED, Names
-from gateway.tags import Sample
+from gateway.tags import Sample, Tag
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 
@@ -69,6 +69,7 @@ class Publisher:
         self._tokens: dict[str, zenoh.LivelinessToken] = {}
         self._waiting: dict[Hashable, _Entry] = {}
         self._serial = count()
+        self._value_keys: dict[Tag, str] = {}  # making one takes as long as queueing it
         self._events = 0
         self._closing = False
         self._filled = threading.Condition()
@@ -79,7 +80,7 @@ class Publisher:
     def start(self, session: zenoh.Session, *, many_devices: bool = False) -> None:
         """`many_devices`: it pays to declare the keys of what is published again and again."""
         self._session = session
-        self._names = Names(session, MOST_DECLARED if many_devices else 0)
+        self._names = Names(session, 10**6)
         self._loop = asyncio.get_running_loop()
         for device, alive in self._alive.items():
             self.alive(device, alive)
@@ -98,12 +99,16 @@ class Publisher:
         stamp = self._session.new_timestamp
         with self._filled:
             for sample in samples:
-                key = self._keys.value(sample.tag.key)
+                key = self._value_keys.get(sample.tag) or self._value_key(sample.tag)
                 # Taken out first, so that it goes to the end: stamps leave in order.
                 if self._waiting.pop(key, None) is not None:
                     self.counters.superseded += 1
                 self._waiting[key] = _Put(stamp(), key, sample)
             self._filled.notify()
+
+    def _value_key(self, tag: Tag) -> str:
+        key = self._value_keys[tag] = self._keys.value(tag.key)
+        return key
 
     def block(self, device: str, samples: Sequence[Sample]) -> None:
         """All that changed in one scan of a device; merged with a block that still waits."""

@@ -68,7 +68,7 @@ def gateway(folder: Path, name: str, router: str, port: int) -> Program:
 
 async def stand_so(client: ZenohPeer, stands: str) -> None:
     """Waits until a and b say that they do: their documents are a moment old."""
-    async with asyncio.timeout(5):
+    async with asyncio.timeout(15):
         while True:
             replies = await client.get("plant/@gateway/*/standby")
             found = {reply.key: reply.json["stand"] for reply in replies if reply.key}
@@ -103,6 +103,7 @@ async def test_two_gateways_of_a_group_share_one_wire(tmp_path: Path) -> None:
                     await line.until(1, within=3)
                     # Whoever comes back later stands by, until the other is ended in order.
                     a = programs.enter_context(gateway(tmp_path, "a", router_at, port))
+                    await stand_so(client, "waiting active")
                     await asyncio.sleep(HOLD + CLAIM + 1)
                     await stand_so(client, "waiting active")
                     assert await asyncio.to_thread(b.end) == 0

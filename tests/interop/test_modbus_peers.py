@@ -1,19 +1,13 @@
 """The Modbus drivers and stations beside programs nobody here wrote.
 
 Drivers ask pymodbus' server, a libmodbus slave and npm's modbus-serial; the simulated slave
-is asked by libmodbus, mbpoll and modbus-serial. What is not installed is skipped.
+is asked by libmodbus, mbpoll and modbus-serial.
 """
 
 import asyncio
 import json
 import re
-import shutil
-import socket
-import subprocess
 import sys
-from asyncio.subprocess import PIPE, Process
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
 from pathlib import Path
 
 import pytest
@@ -22,6 +16,7 @@ from gateway.errors import Refused
 from gateway.protocols.driver import AnyDriver, Span
 from gateway.protocols.modbus import ModbusAscii, ModbusRtu, ModbusTcp
 from gateway.stations.modbus import ModbusStation
+from tests.conftest import needs
 from tests.interop.modbus_wire import (
     PATIENCE,
     End,
@@ -31,83 +26,17 @@ from tests.interop.modbus_wire import (
     station_on_tcp,
     tcp_end,
 )
+from tests.interop.peers import HERE, finished, free_port, pty_pair, running
 
-HERE = Path(__file__).parent
-NPM = pytest.mark.skipif(
-    shutil.which("node") is None or not (HERE / "node_modules" / "modbus-serial").is_dir(),
-    reason="npm's modbus-serial is not installed: npm ci in tests/interop",
-)
-SOCAT = pytest.mark.skipif(shutil.which("socat") is None, reason="socat is not installed")
-MBPOLL = pytest.mark.skipif(shutil.which("mbpoll") is None, reason="mbpoll is not installed")
+NPM = pytest.mark.usefixtures("modbus_serial")
+SOCAT = pytest.mark.usefixtures("socat")
+MBPOLL = pytest.mark.usefixtures("mbpoll")
 HOLE = [("holding", 9000, 65535)]
 
 
-@asynccontextmanager
-async def running(*command: str | Path, ready: bytes) -> AsyncIterator[Process]:
-    """The program, once its output (either stream) has a line with `ready` in it."""
-    process = await asyncio.create_subprocess_exec(
-        *map(str, command), stdout=PIPE, stderr=asyncio.subprocess.STDOUT, cwd=HERE
-    )
-    assert process.stdout is not None
-    try:
-        heard = b""
-        async with asyncio.timeout(20):
-            while ready not in heard:
-                line = await process.stdout.readline()
-                heard += line
-                assert line, f"{command[0]} ended: {heard.decode()}"
-        yield process
-    finally:
-        if process.returncode is None:
-            process.kill()
-        await process.communicate()
-
-
-async def finished(*command: str | Path) -> str:
-    """What the program printed; it must end well."""
-    process = await asyncio.create_subprocess_exec(
-        *map(str, command), stdout=PIPE, stderr=PIPE, cwd=HERE
-    )
-    async with asyncio.timeout(20):
-        out, err = await process.communicate()
-    assert process.returncode == 0, f"{out.decode()}{err.decode()}"
-    return out.decode()
-
-
-@asynccontextmanager
-async def pty_pair(folder: Path) -> AsyncIterator[tuple[Path, Path]]:
-    ours, theirs = folder / "ours", folder / "theirs"
-    ends = [f"pty,raw,echo=0,link={end}" for end in (ours, theirs)]
-    async with running("socat", "-d", "-d", *ends, ready=b"starting data transfer loop"):
-        yield ours, theirs
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
-
-
-@pytest.fixture(scope="session")
-def libmodbus(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder with modbus_slave and modbus_master, built."""
-    folder = tmp_path_factory.mktemp("libmodbus")
-    if shutil.which("gcc") is None or shutil.which("pkg-config") is None:
-        pytest.skip("gcc and pkg-config are not installed")
-    flags = subprocess.run(
-        ["pkg-config", "--cflags", "--libs", "libmodbus"],
-        check=False,
-        capture_output=True,
-        text=True,
-    )
-    if flags.returncode:
-        pytest.skip("libmodbus-dev is not installed")
-    for name in ("modbus_slave", "modbus_master"):
-        source = HERE / f"{name}.c"
-        command = ["gcc", "-O2", "-Wall", "-o", folder / name, source, *flags.stdout.split()]
-        subprocess.run(command, check=True)
-    return folder
+@pytest.fixture
+def mbpoll() -> str:
+    return needs("mbpoll")
 
 
 async def read(end: End, driver: AnyDriver, area: str, start: int, size: int) -> list[int]:

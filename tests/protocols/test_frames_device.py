@@ -70,7 +70,9 @@ async def test_a_status_other_than_00_is_refused_with_its_code(name: str) -> Non
     request = one.codec().encode(one.write["d1"].frame(one.put("d1", 1)))
     (reply,) = station.hear(request, 0.0)
     with pytest.raises(Refused) as caught:
-        await one.tell(script(one, f"> {request.hex(' ')}", f"< {reply.hex(' ')}"), "d1", one.put("d1", 1))
+        await one.tell(
+            script(one, f"> {request.hex(' ')}", f"< {reply.hex(' ')}"), "d1", one.put("d1", 1)
+        )
     assert caught.value.code == "28"
 
 

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gateway.errors import ConfigError
-from gateway.protocols.frames.patterns import check_pattern, pattern
+from gateway.protocols.frames.patterns import check_pattern, longest_match, pattern
 
 
 @pytest.mark.parametrize(
@@ -104,3 +104,19 @@ def test_a_pattern_that_is_taken_is_matched_at_once(text: str, frame: str) -> No
         return
     long = (frame * 30).encode()[:512]
     assert pattern(text).fullmatch(long) is None or re.fullmatch(text.encode(), long)
+
+
+@pytest.mark.parametrize(
+    ("text", "most"),
+    [
+        ("F=[0-9.]{6}", 8),
+        ("OK|ER(?P<code>[0-9]{2})", 4),
+        (r"\x01\x51\x00..", 5),
+        ("(?:ab){1,3}c?$", 7),
+        (".*", 32),
+        ("W[0-9]+", 32),
+        ("", 0),
+    ],
+)
+def test_the_longest_frame_that_matches_is_known_beforehand(text: str, most: int) -> None:
+    assert longest_match(text, 32) == most

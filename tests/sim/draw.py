@@ -8,7 +8,12 @@ from pathlib import Path
 from typing import Any
 
 PROTOCOLS = ("vigor", "computer-link", "modbus-rtu", "modbus-ascii")
-EVERY = ("200ms", "500ms", "1s", "1s", "2s", "2s", "5s", "10s")
+# How often tags are read: `busy` fills the wires, `lean` leaves time for many hours.
+PACES = {
+    "busy": ("200ms", "500ms", "1s", "1s", "2s", "2s", "5s", "10s"),
+    "storm": ("500ms", "1s", "2s"),  # ten times as much goes wrong
+    "lean": ("20s", "30s", "60s", "60s"),
+}
 CALM = 1000.0  # seconds at the end in which nothing goes wrong
 
 
@@ -46,7 +51,7 @@ class Drawn:
         return path
 
 
-def draw(seed: int, seconds: float) -> Drawn:
+def draw(seed: int, seconds: float, pace: str = "busy") -> Drawn:
     chance = random.Random(f"plant {seed}")
     lines: dict[str, Any] = {}
     missing: dict[str, frozenset[int]] = {}
@@ -54,10 +59,11 @@ def draw(seed: int, seconds: float) -> Drawn:
     episodes: list[Episode] = []
     for number in range(chance.choice((1, 1, 1, 2, 2, 3))):
         name = f"line{number}"
-        lines[name] = _line(name, chance, missing)
-        chunks[name] = chance.choice((0, 0, 16, 16, 1))
+        lines[name] = _line(name, chance, missing, PACES[pace])
+        chunks[name] = chance.choice((0, 0, 16, 16, 1) if pace == "busy" else (0, 0, 0, 16))
         zeros[name] = chance.random() < 0.5
-        episodes += _line_episodes(name, lines[name], chance, seconds)
+        haste = 0.1 if pace == "storm" else 1.0
+        episodes += _line_episodes(name, lines[name], chance, seconds, haste)
     jumps = []
     at = chance.expovariate(1 / 1800)
     while at < seconds:
@@ -68,14 +74,21 @@ def draw(seed: int, seconds: float) -> Drawn:
         "defaults": {"publish": chance.choice(("always", "always", "change"))},
         "lines": lines,
     }
-    return Drawn(document, missing, tuple(sorted(episodes, key=_order)), tuple(jumps), chunks, zeros)
+    return Drawn(
+        document, missing, tuple(sorted(episodes, key=_order)), tuple(jumps), chunks, zeros
+    )
 
 
 def _order(episode: Episode) -> tuple[float, str, str, str]:
     return episode.start, episode.line, episode.device, episode.kind
 
 
-def _line(name: str, chance: random.Random, missing: dict[str, frozenset[int]]) -> dict[str, Any]:
+def _line(
+    name: str,
+    chance: random.Random,
+    missing: dict[str, frozenset[int]],
+    intervals: tuple[str, ...],
+) -> dict[str, Any]:
     protocols = [chance.choice(PROTOCOLS)]
     if protocols[0] == "vigor" and chance.random() < 0.2:
         protocols.append("computer-link")
@@ -87,7 +100,7 @@ def _line(name: str, chance: random.Random, missing: dict[str, frozenset[int]]) 
         "echo": chance.random() < 0.15,
         "devices": {},
     }
-    every = chance.choice(EVERY)
+    every = chance.choice(intervals)
     numbers = chance.sample(range(1, 32), chance.choice((1, 2, 2, 3, 4, 6)))
     for i, number in enumerate(numbers):
         device = f"{name}-{i}"
@@ -115,6 +128,7 @@ def _device(
     }
     if protocol == "computer-link":
         device["frame_format"] = chance.choice((1, 4))
+        device["monitor"] = chance.random() < 0.4
     if protocol.startswith("modbus"):
         device["diagnostics"] = chance.random() < 0.3
     if chance.random() < 0.05:
@@ -166,11 +180,11 @@ _LINE_KINDS = ("noise", "noise", "noise-after", "vanish", "vanish", "hang", "fli
 
 
 def _line_episodes(
-    name: str, line: dict[str, Any], chance: random.Random, seconds: float
+    name: str, line: dict[str, Any], chance: random.Random, seconds: float, haste: float
 ) -> list[Episode]:
-    found = _series(name, "", _LINE_KINDS, chance, seconds, 1500.0)
+    found = _series(name, "", _LINE_KINDS, chance, seconds, 1500.0 * haste)
     for device in line["devices"]:
-        found += _series(name, device, _STATION_KINDS, chance, seconds, 700.0)
+        found += _series(name, device, _STATION_KINDS, chance, seconds, 700.0 * haste)
     return found
 
 

@@ -27,7 +27,9 @@ def milliseconds(now: float) -> int:
     return int(now * 1000)
 
 
-def moving(station: int, area: str, number: int, unit: Unit, part: int = 0) -> Callable[[float], int]:
+def moving(
+    station: int, area: str, number: int, unit: Unit, part: int = 0
+) -> Callable[[float], int]:
     """What the unit at `number + part` shows of the clock that begins at `number`."""
     own = offset(station, area, number)
     if unit is Unit.BIT:
@@ -129,7 +131,10 @@ class Troubled:
     def _was_written(self, tag: Tag, value: Value, since: float, until: float) -> bool:
         area, start, size = tag.span
         histories = [self.written.get((area, start + i), [(0.0, 0)]) for i in range(size)]
-        moments = {since, *(at for history in histories for at, _ in history if since < at <= until)}
+        moments = {
+            since,
+            *(at for history in histories for at, _ in history if since < at <= until),
+        }
         for moment in moments:
             units = [
                 next((unit for at, unit in reversed(history) if at <= moment), 0)

@@ -85,6 +85,7 @@ class SimWire:
     hanging: bool = False  # nothing passes, and nobody is told
     opened: int = 0
     closed: int = 0
+    addressed: Callable[[bytes], Sequence[Speaker]] | None = None  # whom a whole request is for
 
     def __post_init__(self) -> None:
         self._ear: Ear | None = None
@@ -155,7 +156,9 @@ class SimWire:
         if not data or self.hanging:
             return
         self.watch.passed(">", data)
-        for station in self.stations:
+        # Where all is well the others would only look away: what they do with it takes long.
+        well = self.addressed is not None and data is request.data
+        for station in self.addressed(data) if well and self.addressed else self.stations:
             said = station.hear(data, request.end)
             if said is not None and said[0]:
                 self._say(said[0], request.end + said[1], station)

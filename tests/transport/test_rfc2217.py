@@ -1,7 +1,6 @@
 """RFC 2217 against pyserial's server, ser2net, and servers that misbehave."""
 
 import asyncio
-import shutil
 import termios
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
@@ -23,6 +22,7 @@ from gateway.transport import (
     rfc2217,
 )
 from gateway.transport.tcp import open_tcp
+from tests.conftest import needs
 from tests.transport.ends import PATIENCE, Heard, Master, free_port
 from tests.vectors import vectors
 
@@ -131,9 +131,7 @@ async def test_every_byte_value_passes_pyserials_server_both_ways() -> None:
 @pytest.fixture
 async def ser2net(tmp_path: Path) -> AsyncIterator[tuple[Rfc2217Address, Master]]:
     """ser2net with a pty for its serial port."""
-    program = shutil.which("ser2net", path="/usr/sbin:/usr/bin:/usr/local/sbin:/usr/local/bin")
-    if program is None:
-        pytest.skip("ser2net is not installed")
+    program = needs("ser2net")
     master, number = Master(), free_port()
     config = tmp_path / "ser2net.yaml"
     config.write_text(

@@ -2,7 +2,9 @@
 
 import asyncio
 import os
-import shutil
+import subprocess
+import sys
+import tempfile
 import termios
 import threading
 from collections.abc import AsyncIterator, Iterator
@@ -12,6 +14,7 @@ import pytest
 
 from gateway.errors import LineDown
 from gateway.transport import SerialPath, SerialSettings, open_port
+from tests.conftest import needs
 from tests.transport.ends import PATIENCE, Heard, Master
 from tests.vectors import vectors
 
@@ -104,13 +107,34 @@ async def test_what_is_no_port_is_said_plainly(path: str, sentence: str) -> None
     assert str(caught.value) == f"{path}: {sentence}"
 
 
-async def test_permission_denied_names_the_group(tmp_path: Path) -> None:
-    if os.geteuid() == 0:
-        pytest.skip("root may open everything")
-    closed = tmp_path / "tty"
-    closed.touch(mode=0)
-    with pytest.raises(LineDown, match="permission denied: is the user in group dialout"):
-        await open_port(SerialPath(str(closed)), SEVEN_EVEN, Heard())
+OPEN_AS_NOBODY = """
+import asyncio, os, sys
+from gateway.errors import LineDown
+from gateway.transport import SerialPath, SerialSettings, open_port
+
+async def told(path):
+    try:
+        await open_port(SerialPath(path), SerialSettings(), None)
+    except LineDown as error:
+        return str(error)
+
+asyncio.run(told("/dev/null"))  # whatever is imported on the way is imported now
+if os.geteuid() == 0:  # root may open everything
+    os.setgroups([])
+    os.setgid(65534)
+    os.setuid(65534)
+print(asyncio.run(told(sys.argv[1])))
+"""
+
+
+def test_permission_denied_names_the_group() -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        Path(folder).chmod(0o755)
+        closed = Path(folder) / "tty"
+        closed.touch(mode=0)
+        command = [sys.executable, "-c", OPEN_AS_NOBODY, str(closed)]
+        said = subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+    assert said == f"{closed}: permission denied: is the user in group dialout?"
 
 
 @pytest.mark.parametrize("path", ["a\0b", "x" * 5000])
@@ -216,11 +240,10 @@ async def test_opening_that_is_cancelled_gives_the_port_back(plug: Master) -> No
 @pytest.fixture
 async def cable(tmp_path: Path) -> AsyncIterator[tuple[str, str, asyncio.subprocess.Process]]:
     """Two ports with a cable between them."""
-    if shutil.which("socat") is None:
-        pytest.skip("socat is not installed")
+    program = needs("socat")
     ends = str(tmp_path / "a"), str(tmp_path / "b")
     socat = await asyncio.create_subprocess_exec(
-        "socat", "-d", "-d", *(f"pty,raw,echo=0,link={end}" for end in ends),
+        program, "-d", "-d", *(f"pty,raw,echo=0,link={end}" for end in ends),
         stderr=asyncio.subprocess.PIPE,
     )  # fmt: skip
     assert socat.stderr is not None

@@ -16,7 +16,7 @@ from gateway.protocols.frames.codec import FrameCodec, FrameReader
 from gateway.protocols.frames.fields import Field
 from gateway.protocols.frames.framing import Framing
 from gateway.protocols.frames.messages import Ask, Listen, Values, Write, filled, listed
-from gateway.protocols.frames.patterns import check_pattern
+from gateway.protocols.frames.patterns import check_pattern, longest_match
 from gateway.protocols.frames.presets import written_out
 from gateway.values import Value
 
@@ -97,8 +97,9 @@ class Frames:
 
     def cost(self, question: str) -> Cost:
         """The characters of a question and of the longest reply to it."""
-        request = self._send.encode(octets(self.ask[question].send))
-        return Cost(len(request), self._longest_reply)
+        one = self.ask[question]
+        request = self._send.encode(octets(one.send))
+        return Cost(len(request), self._longest_reply(one.match, one.refused))
 
     def write_cost(self, name: str) -> Cost:
         """The characters of the longest write and of the longest reply to it."""
@@ -106,7 +107,7 @@ class Frames:
         around = one.frame(b"")
         most = send.longest - len(around)
         value = (most if one.value.widest is None else one.value.widest) * (1 + send.conversion)
-        reply = 0 if one.match is None else self._longest_reply
+        reply = 0 if one.match is None else self._longest_reply(one.match, one.refused)
         return Cost(len(send.encode(around)) + value, reply)
 
     def hear(self, frame: bytes) -> Heard | None:
@@ -127,7 +128,8 @@ class Frames:
         Raises `Refused`, `NoReply`, `Garbled`, `LineDown`.
         """
         one = self.ask[question]
-        return await talk.ask(octets(one.send), self._longest_reply, one.answers)
+        reply = self._longest_reply(one.match, one.refused)
+        return await talk.ask(octets(one.send), reply, one.answers)
 
     def put(self, name: str, value: Value) -> bytes:
         """A value's own bytes in the frame that writes it.
@@ -148,15 +150,17 @@ class Frames:
         if one.match is None:
             await talk.tell(frame)
             return False
-        return await talk.ask(frame, self._longest_reply, one.answers)
+        return await talk.ask(frame, self._longest_reply(one.match, one.refused), one.answers)
 
     @property
     def _send(self) -> Framing:
         return written_out(self.framing if self.send_framing is None else self.send_framing)
 
-    @property
-    def _longest_reply(self) -> int:
-        return written_out(self.framing).longest_on_line
+    def _longest_reply(self, *patterns: str | None) -> int:
+        """The characters of the longest frame that one of the patterns takes."""
+        framing = written_out(self.framing)
+        taken = (longest_match(text, framing.longest) for text in patterns if text is not None)
+        return framing.on_line(framing.length or max(taken))
 
     def _check_framings(self) -> None:
         for name, framing in (("framing", self.framing), ("send_framing", self.send_framing)):

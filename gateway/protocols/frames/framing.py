@@ -109,7 +109,11 @@ class Framing:
     @property
     def longest_on_line(self) -> int:
         """The characters of the longest frame, everything included."""
-        data = self.longest * (2 if self.conversion else 1)
+        return self.on_line(self.longest)
+
+    def on_line(self, count: int) -> int:
+        """The characters of a frame of so many data bytes, everything included."""
+        data = count * (2 if self.conversion else 1)
         around = octets(self.header) + self.mark + self.tail
         return data + len(around) + (2 if self.sum_check else 0)
 

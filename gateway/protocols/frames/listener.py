@@ -94,10 +94,10 @@ class Listener:
 
     def _silence(self, now: float) -> list[Said]:
         """What the silence up to `now` ended, by the time of the bytes, whoever woke us late."""
-        silence = now - self._last_byte
-        if silence >= self._gap:
+        # Reckoned as `due` is: a difference of the same times could fall short of the gap.
+        if now >= self._last_byte + self._gap:
             return self._said(self._reader.expire(), now)
-        if silence >= _QUIET:
+        if now >= self._last_byte + _QUIET:
             self._reader.settle()
         return []
 

@@ -48,6 +48,12 @@ def check_pattern(text: str, longest: int) -> None:
         )
 
 
+@lru_cache(maxsize=1024)
+def longest_match(text: str, longest: int) -> int:
+    """The most bytes that a frame of at most `longest` has if it matches."""
+    return min(longest, _width(_Parser(text, longest).whole()))
+
+
 @dataclass(frozen=True, slots=True)
 class _Atom:
     """One byte out of a set; of an empty set: a place, not a byte (`^`, `$`)."""
@@ -104,6 +110,19 @@ def _empty(node: _Node) -> bool:
             return any(map(_empty, branches))
         case _Repeat(part, least):
             return least == 0 or _empty(part)
+
+
+def _width(node: _Node) -> int:
+    """The most bytes it can match."""
+    match node:
+        case _Atom(octets):
+            return 1 if octets else 0
+        case _Sequence(parts):
+            return sum(map(_width, parts))
+        case _Choice(branches):
+            return max(map(_width, branches), default=0)
+        case _Repeat(part, _, most):
+            return most * _width(part)
 
 
 def _ways(node: _Node, follow: frozenset[int], longest: int) -> int:

@@ -1,0 +1,74 @@
+"""Late replies in real time: what was proven on virtual time, on a pty."""
+
+import asyncio
+import random
+from dataclasses import dataclass
+from typing import Any
+
+import pytest
+
+from gateway.protocols.driver import Timing
+from gateway.protocols.modbus import ModbusAscii, ModbusRtu
+from gateway.stations.modbus import ModbusStation
+from gateway.transport import Ear, SerialPath, SerialSettings, open_port
+from gateway.transport.serve import serve_on_pty
+from gateway.wiretime import Wire
+from tests.sim.plant import Bench, Plant, Unruly, clock_word, make_tag, running
+from tests.test_line import Device, Witness
+
+WIRE = Wire(115200, 10)
+TIMEOUT, SECONDS = 0.05, 6.0
+
+
+@dataclass
+class PtyBench(Bench):
+    """The port is a pty with the stations behind it."""
+
+    path: str = ""
+
+    async def open(self, stations: Any, wire: Wire, ear: Ear) -> "PtyBench":
+        self.ear = ear
+        self.inner = await open_port(SerialPath(self.path), SerialSettings(115200, "8N1"), self)
+        return self
+
+
+@pytest.mark.parametrize("kind", [ModbusRtu, ModbusAscii])
+async def test_late_replies_make_no_wrong_value_in_real_time(
+    kind: type[ModbusRtu | ModbusAscii],
+) -> None:
+    """A quarter of them, 50 to 150 ms beyond the time-out; blocks of the same and another size."""
+    driver = kind(station=1)
+    tags = [
+        make_tag(f"holding:{number}", driver, type="uint16", every=0.02)
+        for block, size in enumerate((3, 3, 5))
+        for number in range(1000 * block, 1000 * block + size)
+    ]
+    inner: Any = ModbusStation(station=1, framing="rtu" if kind is ModbusRtu else "ascii")
+    for tag in tags:
+        n = tag.address.number
+        inner.memory.animate("holding", n, lambda at, n=n: clock_word(at, n))
+    station = Unruly(inner, 3, late=late, wire=WIRE)
+    timing: Timing = driver.timing
+    device = Device(
+        "slave",
+        driver,
+        WIRE,
+        Timing(TIMEOUT, timing.turnaround, timing.silence, timing.silence_chars, retries=9),
+        tuple(tags),
+        0.2,
+    )
+    served = await serve_on_pty([station], WIRE)
+    try:
+        line = Plant([device], [station], PtyBench(path=served.address), WIRE)
+        witness = Witness(line)
+        async with running(line):
+            await asyncio.sleep(SECONDS)  # as long as it runs, not until something happens
+    finally:
+        await served.close()
+    assert witness.wrong == []
+    assert witness.right > 100
+    assert device.record.late > 10
+
+
+def late(chance: random.Random) -> float:
+    return TIMEOUT + chance.uniform(0.05, 0.15) if chance.random() < 0.25 else 0.0

@@ -1,0 +1,183 @@
+"""A whole line of the gateway beside Modbus slaves nobody here wrote, and its commands too."""
+
+import asyncio
+import json
+import sys
+from collections.abc import AsyncIterator, Callable
+from contextlib import AbstractAsyncContextManager, asynccontextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gateway.device import Device
+from gateway.protocols.modbus import ModbusAscii, ModbusRtu, ModbusTcp
+from gateway.tags import Quality, Reason, WriteRule, Written
+from gateway.transport import Ear, SerialPath, SerialSettings, TcpAddress, open_port
+from gateway.wiretime import NETWORK_BAUD, Wire
+from tests.e2e.processes import plc_gateway, write_config
+from tests.interop.peers import HERE, free_port, pty_pair, running
+from tests.sim.plant import Bench, Outcome, Plant, make_tag
+from tests.sim.plant import running as serving
+from tests.zenoh_peer import free_endpoint
+
+Where = SerialPath | TcpAddress
+Peer = Callable[[pytest.FixtureRequest, Path], AbstractAsyncContextManager[Where]]
+SERIAL = Wire(19200, 10)
+NETWORK = Wire(NETWORK_BAUD, 10)
+
+
+@dataclass
+class RealPort(Bench):
+    """What passes is kept; the port is a real one."""
+
+    where: Where = SerialPath("")  # noqa: RUF009 - immutable
+
+    async def open(self, stations: Any, wire: Wire, ear: Ear) -> "RealPort":
+        self.ear = ear
+        self.inner = await open_port(self.where, SerialSettings(19200, "8N1"), self)
+        return self
+
+
+@asynccontextmanager
+async def _pymodbus(folder: Path, framer: str, *, tcp: bool) -> AsyncIterator[Where]:
+    server = (sys.executable, HERE / "pymodbus_server.py", framer)
+    if tcp:
+        port = free_port()
+        async with running(*server, "tcp", str(port), ready=b"ready"):
+            yield TcpAddress("127.0.0.1", port)
+        return
+    async with pty_pair(folder) as (ours, theirs), running(*server, theirs, ready=b"ready"):
+        yield SerialPath(str(ours))
+
+
+@asynccontextmanager
+async def _program(folder: Path, *command: str | Path, tcp: bool) -> AsyncIterator[Where]:
+    """A slave that takes `rtu DEVICE 1` or `tcp PORT`."""
+    if tcp:
+        port = free_port()
+        async with running(*command, "tcp", str(port), ready=b"ready"):
+            yield TcpAddress("127.0.0.1", port)
+        return
+    async with (
+        pty_pair(folder) as (ours, theirs),
+        running(*command, "rtu", theirs, "1", ready=b"ready"),
+    ):
+        yield SerialPath(str(ours))
+
+
+def pymodbus(framer: str, *, tcp: bool) -> Peer:
+    return lambda request, folder: _pymodbus(folder, framer, tcp=tcp)
+
+
+def libmodbus(*, tcp: bool) -> Peer:
+    return lambda request, folder: _program(
+        folder, request.getfixturevalue("libmodbus") / "modbus_slave", tcp=tcp
+    )
+
+
+def modbus_serial(*, tcp: bool) -> Peer:
+    return lambda request, folder: _program(
+        folder, request.getfixturevalue("modbus_serial"), "modbus_serial_server.js", tcp=tcp
+    )
+
+
+PEERS = {
+    "pymodbus-rtu-pty": (ModbusRtu(station=1), pymodbus("rtu", tcp=False)),
+    "pymodbus-ascii-pty": (ModbusAscii(station=1), pymodbus("ascii", tcp=False)),
+    "pymodbus-rtu-over-tcp": (ModbusRtu(station=1), pymodbus("rtu", tcp=True)),
+    "pymodbus-ascii-over-tcp": (ModbusAscii(station=1), pymodbus("ascii", tcp=True)),
+    "pymodbus-tcp": (ModbusTcp(), pymodbus("socket", tcp=True)),
+    "pymodbus-tcp-window": (ModbusTcp(window=4), pymodbus("socket", tcp=True)),
+    "libmodbus-pty": (ModbusRtu(station=1), libmodbus(tcp=False)),
+    "libmodbus-tcp": (ModbusTcp(), libmodbus(tcp=True)),
+    "libmodbus-tcp-window": (ModbusTcp(window=8), libmodbus(tcp=True)),
+    "modbus-serial-pty": (ModbusRtu(station=1), modbus_serial(tcp=False)),
+    "modbus-serial-tcp": (ModbusTcp(), modbus_serial(tcp=True)),
+}
+
+
+def device_of(driver: Any, wire: Wire) -> Device:
+    """Holding n holds n, input n 1000 + n, every third bit is on; 10000 of each."""
+    texts = [f"holding:{n}" for n in (*range(100, 164), 500, 1000, 1500, 2000, 9999, 10000)]
+    texts += [f"input:{n}" for n in range(5, 8)]
+    texts += [f"{area}:{n}" for area in ("coil", "discrete") for n in range(20)]
+    write = WriteRule(verify=True)
+    tags = [make_tag(t, driver, type=_type(t), every=0.05, write=write) for t in texts]
+    timing = replace(driver.timing, reply_timeout=1.0)
+    return Device("peer", driver, wire, timing, tuple(tags), 1.0)
+
+
+def _type(text: str) -> str:
+    return "uint16" if text.startswith(("holding", "input")) else "bool"
+
+
+def expected(text: str) -> int | bool:
+    area, number = text.split(":")[0], int(text.split(":")[1])
+    match area:
+        case "holding":
+            return number
+        case "input":
+            return 1000 + number
+    return number % 3 == 0
+
+
+async def until(happened: Callable[[], bool]) -> None:
+    async with asyncio.timeout(10):
+        while not happened():
+            await asyncio.sleep(0.01)
+
+
+@pytest.mark.usefixtures("socat")
+@pytest.mark.parametrize("name", PEERS)
+async def test_a_whole_line_with(name: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
+    """Every value is right, the register that is not there is found, writes are read back."""
+    driver, peer = PEERS[name]
+    async with peer(request, tmp_path) as where:
+        wire = NETWORK if isinstance(where, TcpAddress) else SERIAL
+        device = device_of(driver, wire)
+        line = Plant([device], [], RealPort(where=where), wire)
+        async with serving(line):
+            missing = next(tag for tag in device.tags if tag.text == "holding:10000")
+            await until(lambda: missing in line.now and line.reason(missing) is Reason.REFUSED)
+            there = [tag for tag in device.tags if tag is not missing]
+            await until(lambda: all(line.now[tag].quality is Quality.GOOD for tag in there))
+            assert {tag.text: line.now[tag].value for tag in there} == {
+                tag.text: expected(tag.text) for tag in there
+            }
+            for text, value in (("holding:100", 0xBEEF), ("coil:4", True), ("coil:3", False)):
+                tag = next(tag for tag in device.tags if tag.text == text)
+                outcome = Outcome(0.0)
+                line.line.submit(device, tag, tag.encode(value), outcome)
+                await until(lambda outcome=outcome: bool(outcome.said))
+                assert isinstance(outcome.once, Written)
+                assert outcome.once.verified
+                await until(lambda tag=tag, value=value: line.now[tag].value == value)
+        assert device.record.failures == {}
+        assert device.record.exchanges > 20
+
+
+@pytest.mark.usefixtures("socat")
+async def test_the_commands_read_and_write_a_slave_directly(
+    request: pytest.FixtureRequest, tmp_path: Path
+) -> None:
+    """In a process of their own, from the file to the exit code."""
+    async with libmodbus(tcp=False)(request, tmp_path) as where:
+        assert isinstance(where, SerialPath)
+        tags = {
+            "n": {"address": "holding:321", "write": True},
+            "third": {"address": "coil:9"},
+            "missing": {"address": "holding:20000"},
+        }
+        slave = {"protocol": "modbus-rtu", "station": 1, "tags": tags}
+        line = {"port": where.path, "baudrate": 19200, "format": "8N1", "devices": {"plc": slave}}
+        config = write_config(tmp_path / "config.yaml", free_endpoint(), {"hall": line})
+        call = asyncio.to_thread
+        done = await call(plc_gateway, "write", config, "plc/n", "77", "--direct", "--json")
+        assert (done.code, json.loads(done.out)["value"]) == (0, 77)
+        done = await call(plc_gateway, "read", config, "--direct", "--json")
+        rows = {row["tag"]: row for row in map(json.loads, done.out.splitlines())}
+        assert (rows["plc/n"]["value"], rows["plc/third"]["value"]) == (77, True)
+        assert (rows["plc/missing"]["quality"], rows["plc/missing"]["reason"]) == ("bad", "refused")
+        assert done.code == 1
