@@ -1,8 +1,9 @@
 """Samples, descriptions and outcomes <-> the JSON that travels on Zenoh.
 
 A value is `{"value": 12.5, "quality": "good", "time": "2026-11-20T12:00:00.123456Z"}`; one that is
-not known has `"value": null, "quality": "bad"` and a `reason`, with a sentence in `detail`. Integers stay JSON integers
-whatever their size: beyond 2**53 a reader in JavaScript must parse them itself.
+not known has `"value": null, "quality": "bad"` and a `reason`, where there is one with a sentence
+for people in `detail`. Integers stay JSON integers whatever their size: beyond 2**53 a reader in
+JavaScript must parse them itself.
 """
 
 import json
@@ -186,7 +187,7 @@ def _sample(sample: Sample) -> dict[str, Value | None]:
         "time": time,
     }
     if sample.detail:
-        told["detail"] = _short(sample.detail)
+        told["detail"] = short(sample.detail)
     return told
 
 

@@ -18,7 +18,7 @@ from gateway.config.yaml_file import read_yaml
 from gateway.errors import ConfigError
 from gateway.protocols import ComputerLink, ModbusRtu, ModbusTcp, Vigor
 from gateway.protocols.driver import Address, Span, Unit
-from gateway.tags import Deadband, Publish, Tag, WriteRule
+from gateway.tags import Deadband, Form, Publish, Tag, WriteRule
 from gateway.transport.port import Rfc2217Address, SerialPath, SimulatorAddress, TcpAddress
 from gateway.values import Kind, Order, ValueType
 from gateway.wiretime import NETWORK_BAUD
@@ -998,3 +998,81 @@ def test_the_schema_offers_the_settings_of_each_protocol_alone() -> None:
 
 def plain(path: Path) -> Any:
     return read_yaml(path, frozenset({"format", "address"}))[0].data
+
+
+# -- who may connect, read and write -----------------------------------------------------------
+
+
+def test_security_settings_are_files_beside_the_configuration(
+    file: Callable[[str | bytes], Config],
+) -> None:
+    for name in ("ca.pem", "gw.pem", "gw.key", "password", "users", "writers"):
+        Path(name).touch()
+    config = file(
+        "gateway: {name: left, standby: hall, standby_alone: 1min}\n"
+        "writers: {file: writers}\n"
+        "zenoh:\n"
+        "  tls: {ca: ca.pem, certificate: gw.pem, key: gw.key, mutual: true}\n"
+        "  user: gateway\n"
+        "  password_file: password\n"
+        "  users_file: users\n" + tags("speed: {address: D1}")
+    )
+    zenoh = config.zenoh
+    assert zenoh.tls is not None
+    assert (zenoh.tls.ca, zenoh.tls.certificate, zenoh.tls.key, zenoh.tls.mutual) == (
+        Path("ca.pem"),
+        Path("gw.pem"),
+        Path("gw.key"),
+        True,
+    )
+    assert (zenoh.user, zenoh.password_file, zenoh.users_file) == (
+        "gateway",
+        Path("password"),
+        Path("users"),
+    )
+    assert (config.standby, config.standby_alone) == ("hall", 60.0)
+    assert config.writers_file == Path("writers")
+
+
+def test_without_security_settings_there_are_none(file: Callable[[str | bytes], Config]) -> None:
+    config = file(tags("speed: {address: D1}"))
+    assert (config.zenoh.tls, config.zenoh.user, config.zenoh.users_file) == (None, None, None)
+    assert (config.standby, config.writers_file) == (None, None)
+
+
+def test_payload_is_json_unless_tag_device_line_or_file_says_raw(
+    file: Callable[[str | bytes], Config],
+) -> None:
+    config = file(
+        "defaults: {payload: raw}\n"
+        + tags("speed: {address: D1}", "level: {address: D2, payload: json}")
+    )
+    assert {tag.name: tag.payload for tag in config.devices[0].tags} == {
+        "speed": Form.RAW,
+        "level": Form.JSON,
+    }
+    assert only_tag(file(tags("speed: {address: D1}"))).payload is Form.JSON
+
+
+@pytest.mark.parametrize(
+    ("rows", "says"),
+    [
+        ("zenoh: {tls: {certificate: a.pem}}", "certificate and key belong together"),
+        ("zenoh: {tls: {mutual: true}}", "mutual needs ca, certificate and key"),
+        ("zenoh: {password_file: p}", "password_file means nothing without user"),
+        ("zenoh: {users_file: nowhere}", "1: zenoh.users_file: there is no file nowhere"),
+        ("zenoh: {tls: {ca: nowhere}}", "1: zenoh.tls.ca: there is no file nowhere"),
+        ("zenoh: {password: x}", "1: zenoh.password: no setting of zenoh"),
+        ("writers: {file: nowhere}", "1: writers.file: there is no file nowhere"),
+        ("writers: {}", "1: writers.file: missing"),
+        ("gateway: {standby_alone: 1min}", "standby_alone means nothing without standby"),
+        ("gateway: {standby: a/b}", "1: gateway.standby: 'a/b' has a `/`"),
+        ("defaults: {payload: xml}", "1: defaults.payload: 'xml' is not known: use json or raw"),
+    ],
+)
+def test_a_mistake_in_them_is_told_with_its_place(
+    file: Callable[[str | bytes], Config], rows: str, says: str
+) -> None:
+    with pytest.raises(ConfigErrors) as raised:
+        file(f"{rows}\n" + tags("speed: {address: D1}"))
+    assert any(says in message for message in raised.value.messages), raised.value.messages

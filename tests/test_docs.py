@@ -250,6 +250,7 @@ def _plant(section: str, name: str, text: str) -> dict[str, Any]:
                 device = {"protocol": protocol, "framing": {"ending": "CR"}, "ask": ask}
                 tag["address"] = "f"
                 del tag["write"]
+                line["port"] = "COM1"
     return {
         **top,
         "lines": {"hall": {**line, "devices": {"plc": {**device, "tags": {"tag": tag}}}}},

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from structlog.testing import capture_logs
 
-from gateway.app import device_of
+from gateway.app import Gateway, device_of
 from gateway.config import Config, load
 from gateway.device import Device, Standing
 from gateway.errors import GatewayError, LineDown, Refused
@@ -22,6 +22,7 @@ from gateway.stations.vigor import VigorStation
 from gateway.tags import Quality, Reason, Sample, Tag, Written
 from gateway.transport import Ear, Port
 from gateway.values import Value
+from gateway.writing import Differs
 from tests.sim.virtual import VirtualLoop, on_virtual_time
 from tests.vectors import vectors
 
@@ -216,6 +217,26 @@ async def test_two_equal_bar_codes_are_two_events_in_order() -> None:
 
 
 @on_virtual_time
+async def test_each_of_two_equal_events_is_news() -> None:
+    config = load(EXAMPLES / "barcode-reader.yaml")
+    news: list[Value | Reason | None] = []
+    bench = Bench()
+    gateway = Gateway(config, lambda: int(now() * SECOND), lambda _: bench.open)
+    gateway.publish = lambda samples: news.extend(s.reason or s.value for s in samples)
+    tasks = [asyncio.create_task(line.run()) for line in gateway.lines]
+    await asyncio.sleep(0.1)
+    bench.say(b"\x02A\x03\x02A\x03")
+    bench.say(b"\x02B\x03\x02A\x03?")
+    bench.say(b"\x02A\x03")
+    assert news == ["A", "A", "B", "A", "A"]
+    bench.say(b"\x02a\x03")  # no such code
+    assert news[5:] == [Reason.GARBLED]
+    for task in tasks:
+        task.cancel()
+    await asyncio.gather(*tasks, return_exceptions=True)
+
+
+@on_virtual_time
 async def test_a_silent_device_costs_nothing() -> None:
     """Nothing is sent, and the line is not even woken."""
     async with running(example("barcode-reader")) as bench:
@@ -227,7 +248,7 @@ async def test_a_silent_device_costs_nothing() -> None:
             rounds += 1
             return looked(at)
 
-        bench.line._schedule.next = counted  # type: ignore[method-assign]  # counting is all
+        bench.line._schedule.next = counted  # type: ignore[method-assign,assignment]  # it counts
         asyncio.get_running_loop().call_later(86400, lambda: None)
         await asyncio.sleep(86400)
         assert rounds == 0
@@ -415,6 +436,48 @@ async def test_b_4_5_both_programs_read_d0_and_write_d1_by_configuration_alone(n
         assert refused.code == "28"
 
 
+READ_BACK = """
+lines:
+  hall:
+    port: COM1
+    devices:
+      drive:
+        protocol: frames
+        framing: {gap: 50ms, max_length: 32}
+        ask:
+          speed: {send: "R", match: 'R(?P<speed>[0-9.]{5})', fields: {speed: {type: decimal}}}
+        write: {speed: {send: "W{value}", value: {type: decimal, format: 05.1f}, match: K}}
+        tags:
+          speed: {address: speed, scale: 0.1, every: 1s, write: {max: 99, verify: true}}
+"""
+
+
+@on_virtual_time
+async def test_a_reply_ends_by_a_silence_and_a_write_is_read_back(tmp_path: Path) -> None:
+    path = tmp_path / "plant.yaml"
+    path.write_text(READ_BACK)
+    held, deaf = b"100.0", False
+
+    def replies(request: bytes) -> bytes:
+        nonlocal held
+        if request == b"R":
+            return b"R" + held
+        assert request[:1] == b"W"
+        held = held if deaf else request[1:]
+        return b"K"
+
+    async with running(load(path), replies=replies) as bench:
+        await asyncio.sleep(3)
+        assert set(bench.values("speed")) == {10.0}
+        done = await bench.write_tag("speed", 60)
+        assert isinstance(done, Written)
+        assert (held, done.value, done.verified) == (b"600.0", 60.0, True)
+        deaf = True  # it says yes, and does nothing
+        assert isinstance(await bench.write_tag("speed", 70), Differs)
+        await asyncio.sleep(2)
+        assert bench.last("speed") == 60.0
+
+
 PRINTER = """
 lines:
   hall:
@@ -590,7 +653,7 @@ async def test_when_the_port_goes_and_comes_back_listening_begins_anew() -> None
 @pytest.mark.parametrize(
     "name", ["scale", "barcode-reader", "inverter", "weighing-machine", "vb-1com"]
 )
-@settings(max_examples=20)
+@settings(max_examples=30, deadline=None)
 @given(
     pieces=st.lists(
         st.tuples(

@@ -174,7 +174,7 @@ async def test_nak_06_to_one_address_in_the_middle_of_a_block() -> None:
 def talkative(*, monitor: bool = False) -> tuple[Plant, Device]:
     addresses = [f"D{n}" for n in range(0, 3000, 400)]
     driver = ComputerLink(station=5, monitor=monitor)
-    dev = link_device(driver, *addresses, every=0.3, type="uint16")
+    dev = link_device(driver, *addresses, every=1.0, type="uint16")
     line = link_plant([dev])
     clockwork(line.stations[0].memory, [int(text[1:]) for text in addresses])
     return line, dev
@@ -207,10 +207,10 @@ async def test_on_demand_blocks_before_replies_are_counted_and_never_taken_for_o
     checks = Check(line)
     async with running(line):
         await asyncio.sleep(60)
-    assert said > 100
+    assert said > 50
     assert dev.record.unasked == said
     assert checks.wrong == []
-    assert checks.right > 1000
+    assert checks.right > 400
     assert dev.record.failures == {}
 
 

@@ -3,6 +3,7 @@
 import asyncio
 import itertools
 import json
+import math
 import os
 import signal
 import sys
@@ -16,6 +17,7 @@ from typing import Any
 
 import pytest
 
+from gateway import payload
 from gateway.errors import (
     BadValue,
     Busy,
@@ -32,7 +34,7 @@ from gateway.northbound.publisher import EVENTS_LIMIT, Publisher
 from gateway.northbound.session import configure
 from gateway.northbound.writes import AT_ONCE
 from gateway.protocols.driver import Address, Span, Unit
-from gateway.tags import Reason, Sample, Tag, WriteRule, Written, bad, good
+from gateway.tags import Form, Reason, Sample, Tag, WriteRule, Written, bad, good
 from gateway.values import Layout, Value, parse_type
 from tests.zenoh_peer import ZenohPeer, free_endpoint
 
@@ -278,6 +280,45 @@ async def test_a_scan_of_a_device_with_blocks_is_one_put() -> None:
         }
         [reply] = await client.get("plant/*/@block")
         assert set(reply.json) == {"speed", "recipe", "alarms/door"}
+
+
+async def test_a_raw_value_travels_bare_and_its_quality_beside_it() -> None:
+    raw = PlainPlant(PlainDevice("mixer", (tag("mixer", "speed", payload=Form.RAW),)))
+    async with together(raw) as (northbound, client):
+        heard = await client.subscribe("plant/**")
+        northbound.publish([raw.now("mixer/speed", 12)])
+        arrived = await heard.next(lambda sample: sample.payload == b"12")
+        assert (arrived.kind, arrived.encoding) == ("PUT", "text/plain")
+        beside = json.loads(arrived.attachment)
+        assert set(beside) == {"quality", "time"}
+        assert beside["quality"] == "good"
+        [reply] = await client.get("plant/mixer/speed")
+        assert (reply.payload, reply.encoding) == (b"12", "text/plain")
+        # What is not known is no text that could be taken for a value.
+        heard.forget()
+        speed = raw.tag("mixer/speed")
+        assert speed is not None
+        raw.samples["mixer/speed"] = bad(speed, Reason.NO_REPLY, time.time_ns())
+        northbound.publish([raw.samples["mixer/speed"]])
+        gone = await heard.next(lambda sample: True)
+        assert (gone.kind, gone.payload) == ("DELETE", b"")
+        beside = json.loads(gone.attachment)
+        assert (beside["quality"], beside["reason"]) == ("bad", "no-reply")
+        [reply] = await client.get("plant/mixer/speed")
+        assert (reply.ok, reply.payload) == (True, b"")
+        [described] = await client.get("plant/mixer/speed/@meta")
+        assert described.json["payload"] == "raw"
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(True, b"true"), (False, b"false"), (-7, b"-7"), (12.5, b"12.5"), ("Ä 1", "Ä 1".encode()),
+     (2**63, b"9223372036854775808"), (math.nan, None), (math.inf, None), (None, None)],
+)  # fmt: skip
+def test_raw_texts(value: Any, text: bytes | None) -> None:
+    sample = good(tag("mixer", "speed"), value, 0)
+    assert payload.bare(sample) == text
+    assert (json.loads(payload.about(sample))["quality"] == "good") == (text is not None)
 
 
 # -- questions ---------------------------------------------------------------------------------

@@ -54,6 +54,7 @@ def test_a_bad_value_is_null_and_says_why(reason: Reason) -> None:
         "quality": "bad",
         "reason": reason.value,
         "time": "2026-11-20T12:00:00.123456Z",
+        "detail": "the station is silent",
     }
 
 

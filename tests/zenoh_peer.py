@@ -59,6 +59,7 @@ class Heard(NamedTuple):
     payload: bytes
     encoding: str
     time: int | None
+    attachment: bytes = b""
 
     @property
     def json(self) -> Any:
@@ -259,9 +260,11 @@ class ZenohPeer:
         async for line in self._process.stdout:
             message = json.loads(line)
             if "heard" in message:
-                key, kind, data, encoding, time = message["sample"]
+                key, kind, data, encoding, time, beside = message["sample"]
                 self._subscriptions[message["heard"]].feed(
-                    Heard(key, kind, base64.b64decode(data), encoding, time)
+                    Heard(
+                        key, kind, base64.b64decode(data), encoding, time, base64.b64decode(beside)
+                    )
                 )
             elif "error" in message:
                 self._asked.pop(message["n"]).set_exception(RuntimeError(message["error"]))
@@ -300,12 +303,13 @@ def _flat(sample: zenoh.Sample) -> list[Any]:
         _text(bytes(sample.payload)),
         str(sample.encoding),
         None if stamp is None else stamp.get_time_as_ntp64().as_nanos(),
+        _text(b"" if sample.attachment is None else bytes(sample.attachment)),
     ]
 
 
 def _reply(answer: zenoh.Reply) -> list[Any]:
     if answer.ok is not None:
-        key, _, data, encoding, time = _flat(answer.ok)
+        key, _, data, encoding, time, _ = _flat(answer.ok)
         return [True, key, data, encoding, time]
     assert answer.err is not None
     return [False, None, _text(bytes(answer.err.payload)), str(answer.err.encoding), None]

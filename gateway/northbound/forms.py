@@ -13,9 +13,7 @@ from gateway.tags import Form, Sample
 _DROP = zenoh.CongestionControl.DROP
 
 
-def put(
-    session: zenoh.Session, key: str | zenoh.KeyExpr, sample: Sample, stamp: zenoh.Timestamp
-) -> None:
+def put(session: zenoh.Session, key: str, sample: Sample, stamp: zenoh.Timestamp) -> None:
     """Raises `ZError`."""
     if sample.tag.payload is Form.JSON:
         put_json(session, key, payload.value(sample), stamp)
@@ -34,9 +32,7 @@ def put(
     )
 
 
-def put_json(
-    session: zenoh.Session, key: str | zenoh.KeyExpr, data: bytes, stamp: zenoh.Timestamp
-) -> None:
+def put_json(session: zenoh.Session, key: str, data: bytes, stamp: zenoh.Timestamp) -> None:
     """Raises `ZError`."""
     session.put(
         key,

@@ -42,7 +42,6 @@ log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 T = TypeVar("T")
 
 STATUS_EVERY = 5.0  # seconds
-MANY = 20  # devices, from which on the keys of busy tags are declared
 _PATIENCE = 0.5  # seconds for what still waits to be put when the gateway ends
 
 
@@ -166,7 +165,7 @@ class Northbound:
         devices = list(self._plant.devices())
         self._directory = Directory(self.keys, devices)
         self._with_blocks = frozenset(device.name for device in devices if device.blocks)
-        self._publisher.start(session, many_devices=len(devices) > MANY)
+        self._publisher.start(session)
         writes = Writes(self.keys, self._plant, self._directory, self._audit, self._writers)
         replies = Replies(
             self.keys, self._plant, self._directory, session.new_timestamp, self._history

@@ -4,6 +4,10 @@ A put can block for as long as the network is congested, so the event loop never
 waits is bounded by the number of tags: a newer value replaces one that has not gone out yet.
 Every entry is stamped when it is queued and leaves in that order, for Zenoh's
 AdvancedSubscriber discards whatever carries an older stamp than what it has seen of us.
+
+Keys are not declared to Zenoh. A put on a plain key is matched against all that is declared beside
+it (of this thread alone: 13 µs with 100 devices, 80 µs with 1,000); one on a declared key is not
+(2 µs), but a declaration takes 0.1 ms and 3 kB, and slows every put on a key without one.
 """
 
 import asyncio
@@ -20,7 +24,6 @@ import zenoh
 from gateway import payload
 from gateway.keys import Keys
 from gateway.northbound import forms
-from gateway.northbound.names import MOST_DECLARED, Names
 from gateway.tags import Sample, Tag
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
@@ -77,10 +80,8 @@ class Publisher:
 
     # -- event loop --
 
-    def start(self, session: zenoh.Session, *, many_devices: bool = False) -> None:
-        """`many_devices`: it pays to declare the keys of what is published again and again."""
+    def start(self, session: zenoh.Session) -> None:
         self._session = session
-        self._names = Names(session, 10**6)
         self._loop = asyncio.get_running_loop()
         for device, alive in self._alive.items():
             self.alive(device, alive)
@@ -196,10 +197,10 @@ class Publisher:
             case _Put(stamp, key, bytes() as data):
                 forms.put_json(session, key, data, stamp)
             case _Put(stamp, key, Sample() as sample):
-                forms.put(session, self._names(key), sample, stamp)
+                forms.put(session, key, sample, stamp)
             case _Block(stamp, key, samples):
                 data = payload.block(samples.values())
-                forms.put_json(session, self._names(key), data, stamp)
+                forms.put_json(session, key, data, stamp)
         self.counters.published += 1
 
     def _token(self, session: zenoh.Session, key: str, declared: bool) -> None:

@@ -16,15 +16,18 @@ from pathlib import Path
 from tests.sim.world import Story, run
 
 
-def seeds(text: str) -> range:
-    """`0-499` or `17`."""
-    first, _, last = text.partition("-")
-    return range(int(first), int(last or first) + 1)
+def seeds(text: str) -> list[int]:
+    """`0-499`, `17` or `3,5,17`."""
+    found: list[int] = []
+    for part in text.split(","):
+        first, _, last = part.partition("-")
+        found += range(int(first), int(last or first) + 1)
+    return found
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=seeds, default=range(20), metavar="FIRST-LAST")
+    parser.add_argument("--seeds", type=seeds, default=seeds("0-19"), metavar="0-19")
     parser.add_argument("--hours", type=float, default=1.0)
     parser.add_argument("--pace", choices=("busy", "lean", "storm"), default="busy")
     parser.add_argument("--workers", type=int, default=multiprocessing.cpu_count())

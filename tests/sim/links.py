@@ -43,7 +43,7 @@ def link_plant(devices: Sequence[Device], wire: Wire = WIRE, seed: int = 0) -> P
 
 def commands(station: Unruly, since: float = 0.0) -> list[str]:
     """The two letters of every request to it."""
-    return [data[5:7].decode() for at, data in station.heard if at >= since]
+    return [data[5:7].decode("latin-1") for at, data in station.heard if at >= since]
 
 
 def spelt(device: Device, text: str) -> Tag:

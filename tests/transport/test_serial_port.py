@@ -1,7 +1,6 @@
 """A local serial port: opened exclusively, and its end told once."""
 
 import asyncio
-import os
 import subprocess
 import sys
 import tempfile

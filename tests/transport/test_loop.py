@@ -1,0 +1,102 @@
+"""uvloop as the event loop of the service: its clock is exact, ports and silences work on it."""
+
+import asyncio
+import importlib
+import time
+from collections.abc import Coroutine
+from typing import Any, TypeVar
+
+import pytest
+
+from gateway.protocols.driver import Span
+from gateway.protocols.modbus import ModbusRtu
+from gateway.recorder import Recorder
+from gateway.transport import SerialPath, SerialSettings, loop, open_port
+from gateway.turn import Clock, Turn
+from gateway.wiretime import Wire
+from tests.conftest import lacking
+from tests.transport.ends import Heard, Master
+from tests.vectors import vectors
+
+T = TypeVar("T")
+REQUEST, REPLY = (vector.frame for vector in vectors("vigor")[:2])
+
+
+@pytest.fixture
+def uvloop() -> Any:
+    try:
+        return importlib.import_module("uvloop")
+    except ImportError:
+        lacking("uvloop is not installed")
+
+
+def run(coroutine: Coroutine[Any, Any, T]) -> T:
+    with asyncio.Runner(loop_factory=loop.new_event_loop) as runner:
+        return runner.run(coroutine)
+
+
+def test_where_it_is_installed_it_is_taken_and_its_clock_moves_while_code_runs(
+    uvloop: Any,
+) -> None:
+    async def within_one_callback() -> float:
+        running = asyncio.get_running_loop()
+        assert isinstance(running, uvloop.Loop)
+        begin = running.time()
+        assert abs(begin - time.monotonic()) < 0.1
+        return max(running.time() - begin for _ in range(100))
+
+    assert 0 < run(within_one_callback()) < 0.1
+
+
+def test_where_it_is_missing_asyncio_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(loop, "_uvloop", lambda: None)
+
+    async def which() -> str:
+        return type(asyncio.get_running_loop()).__module__
+
+    assert run(which()).startswith("asyncio.")
+
+
+@pytest.mark.usefixtures("uvloop")
+def test_the_silence_before_a_request_is_kept_though_its_timers_fire_early() -> None:
+    """They count whole milliseconds: 1.75 ms of RTU silence would be cut to 1 or less."""
+    silence, wire = 0.00175, Wire(115200, 10)
+    kept: list[float] = []
+
+    class Noting:
+        def write(self, data: bytes) -> None:
+            kept.append(asyncio.get_running_loop().time() - quiet_since)
+
+        async def close(self) -> None:
+            pass
+
+    async def broadcasts() -> None:
+        nonlocal quiet_since
+        driver, clock = ModbusRtu(station=0), Clock(spin=0.001)
+        for _ in range(100):
+            quiet_since = clock.quiet_since = asyncio.get_running_loop().time()
+            turn = Turn(
+                Noting(), driver.codec, wire, silence, 0.1, clock, Recorder("line"), station=0
+            )
+            await driver.write(turn, Span("coil", 0, 1), [1])
+
+    quiet_since = 0.0
+    run(broadcasts())
+    assert len(kept) == 100
+    assert min(kept) >= silence
+
+
+@pytest.mark.usefixtures("uvloop")
+def test_a_serial_port_works_on_it() -> None:
+    async def conversation() -> None:
+        plug, ear = Master(), Heard()
+        port = await open_port(SerialPath(plug.path), SerialSettings(19200, "7E1"), ear)
+        port.write(REQUEST)
+        assert await plug.read(len(REQUEST)) == REQUEST
+        plug.write(REPLY)
+        await ear.until(lambda e: len(e.data) >= len(REPLY))
+        plug.unplug()
+        await ear.until(lambda e: bool(e.losses))
+        await port.close()
+
+    run(conversation())
