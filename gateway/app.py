@@ -3,14 +3,18 @@
 import asyncio
 import time
 from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
+from functools import partial
+from typing import TypeVar
 
 from gateway import __version__
 from gateway.config import Config, DeviceConfig, LineConfig
+from gateway.control import check_command, every_command, speaker
 from gateway.device import Device
 from gateway.errors import Busy, GatewayError, Offline
 from gateway.forecast import LineForecast, forecast
 from gateway.line import Line
 from gateway.mirror import Mirror
+from gateway.orders import Obeyed
 from gateway.payload import rfc3339
 from gateway.simulation import station_for
 from gateway.status import Document, device_document, line_document
@@ -18,6 +22,7 @@ from gateway.tags import Quality, Reason, Sample, Tag, Written, bad
 from gateway.transport import Ear, Port, SimulatorAddress, open_port, open_simulator
 from gateway.values import Value
 
+T = TypeVar("T")
 FRESH_WITHIN = 5.0  # seconds a read-through may take before what is known is answered
 
 
@@ -30,6 +35,7 @@ def device_of(config: DeviceConfig, line: LineConfig) -> Device:
         tags=config.tags,
         late_guard=config.late_guard,
         turnaround=config.turnaround_configured,
+        control=config.control,
     )
 
 
@@ -137,17 +143,25 @@ class Gateway:
         units = tag.encode(value)
         line, device = self._places[tag.device]
         outcome: asyncio.Future[Written] = asyncio.get_running_loop().create_future()
-
-        def done(result: Written | GatewayError) -> None:
-            if outcome.done():
-                return
-            if isinstance(result, GatewayError):
-                outcome.set_exception(result)
-            else:
-                outcome.set_result(result)
-
-        line.submit(device, tag, units, done)
+        line.submit(device, tag, units, partial(_end, outcome))
         return await outcome
+
+    def commands(self) -> Mapping[str, frozenset[str]]:
+        return every_command(self.config)
+
+    def speaker(self, line: str) -> str:
+        return speaker(self.config, line)
+
+    async def control(self, device: str, command: str, argument: str = "") -> Obeyed:
+        """Have a device run, stop ...: what it said. Raises `GatewayError`, `BadValue` first."""
+        check_command(self.config, device, command)
+        line, told = self._places[device]
+        loop = asyncio.get_running_loop()
+        started = loop.time()
+        outcome: asyncio.Future[str] = loop.create_future()
+        line.command(told, command, argument, partial(_end, outcome))
+        answer = await outcome
+        return Obeyed(answer, self._wall(), loop.time() - started)
 
     async def fresh(self, tag: Tag, max_age: float) -> Sample:
         """A sample at most `max_age` seconds old; simultaneous askers share one exchange.
@@ -213,3 +227,13 @@ class Gateway:
             polls = self._places[name][0].polls(device)
             documents[f"devices/{name}"] = device_document(device, polls)
         return documents | {path: document() for path, document in self.documents.items()}
+
+
+def _end(outcome: "asyncio.Future[T]", result: T | GatewayError) -> None:
+    """Tell whoever still waits."""
+    if outcome.done():
+        return
+    if isinstance(result, GatewayError):
+        outcome.set_exception(result)
+    else:
+        outcome.set_result(result)

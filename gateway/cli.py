@@ -18,6 +18,7 @@ from gateway import __version__, app, direct, service, show, simulate
 from gateway.client import NOTHING, Shown, connected, matches, parse_value, wanted_keys
 from gateway.config import Config, load
 from gateway.config import schema as config_schema
+from gateway.control import check_command, line_of
 from gateway.errors import BadValue, ConfigError, GatewayError
 from gateway.keys import max_age as age_of
 from gateway.payload import Problem
@@ -186,6 +187,28 @@ def write(
         print(show.outcome(tag, answer))
     if "error" in answer:
         sys.exit(USER_MISTAKE if answer["error"] in _MISTAKES else FAILED)
+
+
+@cli.command(name="control", context_settings={"ignore_unknown_options": True})
+def control_command(
+    config: ConfigPath,
+    device: Annotated[str, typer.Argument(metavar="DEVICE")],
+    command: Annotated[str, typer.Argument(metavar="COMMAND", help="run, stop, model ...")],
+    argument: Annotated[str, typer.Argument(metavar="[ARGUMENT]", help="text; on, off")] = "",
+    without_gateway: Direct = False,
+) -> None:
+    """Have a PLC run, stop ...: what the file allows by `control: true`."""
+    loaded = load(config)
+    check_command(loaded, device, command)
+    if without_gateway:
+        _log(LogFormat.TEXT, LogLevel.ERROR)
+        print(asyncio.run(direct.control(loaded, device, command, argument)).answer)
+        return
+    with connected(loaded) as client:
+        answer = client.control(line_of(loaded, device).name, device, command, argument)
+    if "error" in answer:
+        _end(show.outcome(device, answer), USER_MISTAKE if answer["error"] in _MISTAKES else FAILED)
+    print(answer["answer"])
 
 
 @cli.command()

@@ -14,6 +14,7 @@ import orjson
 import zenoh
 
 from gateway.config import Config
+from gateway.control import TO_ALL
 from gateway.errors import ConfigError, GatewayError
 from gateway.keys import Keys
 from gateway.northbound import Mode, zenoh_settings
@@ -70,6 +71,16 @@ class Client:
             if answer is not None:
                 return _document(answer.payload.to_bytes())
         raise GatewayError(f"no gateway answered for {tag}: is it running?")
+
+    def control(self, line: str, device: str, command: str, argument: str) -> dict[str, object]:
+        """What the device said: `answer ...` or `error ...`. Raises as `write`."""
+        to_all = command == TO_ALL
+        key = self._keys.to_all(line) if to_all else self._keys.command(device, command)
+        for reply in self._ask(key, argument.encode(), os.environ.get(TOKEN_VARIABLE)):
+            answer = reply.ok or reply.err
+            if answer is not None:
+                return _document(answer.payload.to_bytes())
+        raise GatewayError(f"no gateway answered at {key}: is it running?")
 
     def follow(self, wanted: Sequence[str]) -> Iterator[Shown]:
         """The current values, then every change as it comes, without end.

@@ -138,6 +138,9 @@ class Consequences:
         if block.listed:
             self._unlisted(poll, error)
             return
+        if error.refusal is Refusal.ADDRESS and poll.last_good is not None and not poll.tries:
+            self.schedule.again(poll)  # it was there: noise can make a request another one
+            return
         if error.refusal is Refusal.ADDRESS:
             halves = device.refusals.refused(block, self.wall(), error.code)
             if halves:

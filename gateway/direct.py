@@ -11,10 +11,12 @@ import orjson
 from gateway import payload
 from gateway.app import device_of, opener
 from gateway.config import Config, DeviceConfig, LineConfig
+from gateway.control import check_command, line_of
 from gateway.device import Device
 from gateway.errors import BadValue, GatewayError, LineDown
 from gateway.line import Line
 from gateway.listening import listened
+from gateway.orders import Obeyed
 from gateway.tags import Reason, Sample, Tag, Written, bad
 from gateway.values import Value
 
@@ -98,6 +100,27 @@ async def write(config: Config, tag: Tag, value: Value) -> Written:
     if isinstance(result, GatewayError):
         raise result
     return result
+
+
+async def control(config: Config, device: str, command: str, argument: str) -> Obeyed:
+    """Raises `GatewayError`; `BadValue` before anything is sent."""
+    check_command(config, device, command)
+    line_config = line_of(config, device)
+    line = _line(line_config, [tag for tag in line_config.tags if tag.device == device], _Once())
+    (told,) = line.devices
+    told.blocks = ()  # nothing is to be read
+    task = asyncio.create_task(line.run())
+    while not line.is_open and not line.record.trouble:
+        await asyncio.sleep(0.01)
+    loop = asyncio.get_running_loop()
+    started = loop.time()
+    outcome: asyncio.Future[str | GatewayError] = loop.create_future()
+    line.command(told, command, argument, outcome.set_result)
+    result = await outcome
+    await _end(task)
+    if isinstance(result, GatewayError):
+        raise result
+    return Obeyed(result, time.time_ns(), loop.time() - started)
 
 
 def told(config: Config, tag: Tag, value: Value) -> dict[str, object]:

@@ -6,6 +6,7 @@ by name:
     <prefix>/<device>/<tag>             the value
     <prefix>/<device>/<tag>/@set        write it
     <prefix>/<device>/<tag>/@meta       what it is
+    <prefix>/<device>/@run              have it run; so @stop, @loopback, @model
     <prefix>/<device>/@block            all tags of the device that changed in one scan
     <prefix>/@gateway/<name>/…          state and statistics, the outcome of every write
     <prefix>/@standby/<group>/…         tokens of the gateways that stand in for one another
@@ -33,9 +34,11 @@ class Family(StrEnum):
     META = "meta"
     BLOCK = "block"
     STATUS = "status"
+    COMMAND = "command"
 
 
 _BY_LAST_CHUNK = {"@set": Family.SET, "@meta": Family.META, "@block": Family.BLOCK}
+_BY_LAST_CHUNK |= dict.fromkeys(("@run", "@stop", "@loopback", "@model"), Family.COMMAND)
 
 
 class Asked(NamedTuple):
@@ -58,8 +61,9 @@ def asked(key: str) -> Asked:
     stem, late, _ = key.partition("/@adv")
     if late:
         return Asked(Family.LAST, stem)
-    if "@gateway" in key.split("/"):
-        return Asked(Family.STATUS, key)
+    if "@gateway" in (chunks := key.split("/")):
+        tells = chunks[-3:-2] == ["lines"] and chunks[-1] == "global"
+        return Asked(Family.COMMAND if tells else Family.STATUS, key)
     return Asked(Family.VALUE, key)
 
 
@@ -141,6 +145,14 @@ class Keys:
 
     def meta(self, tag: str) -> str:
         return f"{self.prefix}/{tag}/@meta"
+
+    def command(self, device: str, command: str) -> str:
+        """Have a device run, stop ..."""
+        return f"{self.prefix}/{device}/@{command}"
+
+    def to_all(self, line: str) -> str:
+        """What every station of a line is told."""
+        return f"{self.own}/lines/{line}/global"
 
     def block(self, device: str) -> str:
         return f"{self.prefix}/{device}/@block"

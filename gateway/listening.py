@@ -47,6 +47,7 @@ class _Speaker:
     listener: Listener
     tags: dict[str, list[Tag]] = field(default_factory=dict)  # by field
     understood: bool = True  # the last it said
+    unread: set[str] = field(default_factory=set)  # fields that the last frame with them spoilt
 
     def __post_init__(self) -> None:
         listened = self.driver.settings.listened
@@ -158,9 +159,7 @@ class Listening:
         if device.broadcast:  # who is asked too must answer to be believed alive
             device.trouble = None
             self._then.answered(device)
-        for value in heard.values.values():
-            if isinstance(value, Garbled):
-                self._note(device, value)
+        self._look_over(speaker, heard)
         samples = [
             of_field(tag, value, time)
             for name, value in heard.values.items()
@@ -169,6 +168,17 @@ class Listening:
         self._tell(samples)
         if heard.answer is not None:
             self._answer(speaker, heard.answer, now)
+
+    def _look_over(self, speaker: _Speaker, heard: Heard) -> None:
+        """Count the fields that could not be read; told are those that could before."""
+        for name, value in heard.values.items():
+            if not isinstance(value, Garbled):
+                speaker.unread.discard(name)
+                continue
+            speaker.device.record.failures[value.evidence] += 1
+            if name not in speaker.unread:
+                speaker.unread.add(name)
+                self._note(speaker.device, value)
 
     def _garbled(self, speaker: _Speaker, damage: Garbled) -> None:
         device = speaker.device

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from gateway.device import Device
 from gateway.errors import GatewayError
@@ -34,6 +35,14 @@ class Write:
     def latest(self) -> bool:
         """Of several that wait, only the last is to be sent."""
         return self.tag.write is not None and self.tag.write.latest
+
+
+class Obeyed(NamedTuple):
+    """What a device said to a command; `time` in ns since 1970, `took` in seconds."""
+
+    answer: str
+    time: int
+    took: float
 
 
 @dataclass(slots=True, eq=False)

@@ -1,7 +1,9 @@
 """The service: lines, Zenoh and history together, from start to SIGTERM."""
 
 import asyncio
+import gc
 import signal
+import sys
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -15,6 +17,8 @@ from gateway.notebook import Notebook
 from gateway.tags import Sample
 
 log = structlog.get_logger("gateway")
+# Seconds. The publishing thread must not hold up the lines for Python's usual 5 ms.
+SWITCH = 0.0005
 
 KEEP_EVERY = 10.0  # seconds
 
@@ -25,6 +29,7 @@ async def run(config: Config, started: Callable[[], None] = lambda: None) -> Non
     `started` is called when everything is open on Zenoh: once, or whenever this gateway of a
     standby group goes on duty.
     """
+    sys.setswitchinterval(SWITCH)
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -36,6 +41,8 @@ async def run(config: Config, started: Callable[[], None] = lambda: None) -> Non
 async def _serve(config: Config, stop: asyncio.Event, started: Callable[[], None]) -> bool:
     """Until it is to stop, or another gateway of its group took over: then True, to start over."""
     gateway = Gateway(config)
+    gc.collect()
+    gc.freeze()  # tags live as long as the gateway: no need to look at them again and again
     history = _history(config)
     northbound = _northbound(config, gateway, history)
     notebook = None if config.state_file is None else Notebook(config.state_file)
@@ -86,6 +93,7 @@ def _northbound(config: Config, gateway: Gateway, history: Historian | None) -> 
         history=history,
         record_write=None if history is None else history.record_write,
         writers=config.writers_file,
+        commanded=gateway,
         standby=None if group is None else StandbySettings(group, config.standby_alone),
     )
 

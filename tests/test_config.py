@@ -550,10 +550,12 @@ TAGS = [
         "reading a broadcast",
         on_mixer("protocol: modbus-rtu\nstation: 0\ntags:\n"
                  "  a: {address: 'holding:7'}\n  b: {address: 'input:7'}\n"
-                 "  c: {address: 'holding:8', write: {verify: true}}"),
+                 "  c: {address: 'holding:8', write: {verify: true}}\n"
+                 "  d: {address: 'holding:8.3', write: true}"),
         f"9: {M}.tags.a.write: holding:7 is never read at station 0: it needs write: true",
         f"10: {M}.tags.b.address: input:7 can only be read, and station 0 never is",
         f"11: {M}.tags.c.write: holding:8 is never read at station 0: verify cannot work",
+        f"12: {M}.tags.d.address: holding:8 is never read at station 0: write the whole word",
     ),
     bad(
         "tag names",
@@ -951,11 +953,13 @@ def test_whatever_the_file_holds_it_is_loaded_or_its_mistakes_are_told(data: Any
 def test_the_example_loads_and_runs_without_hardware() -> None:
     config = load(EXAMPLE)
     assert config.name == "demo"
-    assert [line.simulated for line in config.lines] == [True, True]
+    assert all(line.simulated for line in config.lines)
     assert [device.driver.protocol for device in config.devices] == [
         "vigor",
         "computer-link",
         "modbus-rtu",
+        "modbus-rtu",
+        "modbus-tcp",
     ]
     assert all(device.enabled and device.tags for device in config.devices)
     assert EXAMPLE.read_text().startswith("# yaml-language-server: $schema=./config.schema.json\n")

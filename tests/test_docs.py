@@ -125,6 +125,8 @@ def test_a_file_in_the_pages_loads(block: Block, tmp_path: Path) -> None:
 @pytest.mark.parametrize("block", SECTIONS_ALONE, ids=str)
 def test_a_section_in_the_pages_loads_with_lines_below(block: Block, tmp_path: Path) -> None:
     lines = yaml.safe_load(EXAMPLE.read_text("utf-8"))["lines"]
+    for name in re.findall(r"[\w.-]+\.(?:pem|key|txt|json5)\b", block.text):
+        (tmp_path / name).touch()  # files that a section names
     assert loaded(block.text + "\n" + json.dumps({"lines": lines})[1:-1], tmp_path).devices
 
 
@@ -439,6 +441,7 @@ def _example_keys() -> set[str]:
         *(keys.status(f"devices/{name}") for name in devices),
         *(keys.status(f"lines/{line.name}") for line in config.lines),
         *(keys.own, keys.status("status"), keys.writes),
+        *(keys.late, f"{keys.group('hall')}/**"),
     }
 
 

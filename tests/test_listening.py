@@ -18,6 +18,7 @@ from gateway.device import Device, Standing
 from gateway.errors import GatewayError, LineDown, Refused
 from gateway.line import Line
 from gateway.listening import ANSWER_WITHIN
+from gateway.northbound.repeater import Repeater
 from gateway.stations.vigor import VigorStation
 from gateway.tags import Quality, Reason, Sample, Tag, Written
 from gateway.transport import Ear, Port
@@ -198,9 +199,10 @@ async def test_one_field_that_does_not_parse_is_bad_alone_and_its_bytes_are_in_t
     with capture_logs() as logs:
         async with running(example("scale")) as bench:
             bench.say(STABLE * 2)
-            bench.say(b"US,+1.2.3.4.  g\r\n")
+            bench.say(b"US,+1.2.3.4.  g\r\n" * 3)
             assert bench.last("weight") is Reason.GARBLED
             assert bench.last("state") == "US"
+            assert bench.line.devices[0].record.failures == {"shape": 3}
     (noted,) = [entry for entry in logs if entry["event"] == "not understood"]
     assert noted["bytes"] == b"US,+1.2.3.4.  g".hex(" ")
 
@@ -234,6 +236,25 @@ async def test_each_of_two_equal_events_is_news() -> None:
     for task in tasks:
         task.cancel()
     await asyncio.gather(*tasks, return_exceptions=True)
+
+
+async def test_an_event_is_not_published_again_when_the_network_comes_back() -> None:
+    tags = [tag for name in ("barcode-reader", "scale") for tag in example(name).devices[0].tags]
+    repeated: list[Any] = []
+
+    class Everything:
+        def all(self) -> list[Tag]:
+            return tags
+
+        def sample(self, tag: Tag) -> Tag:
+            return tag
+
+        def values(self, samples: Any) -> None:
+            repeated.extend(samples)
+
+    everything: Any = Everything()
+    await Repeater(everything, everything, everything, everything).publish_all()
+    assert [tag.key for tag in repeated] == ["scale/weight", "scale/state"]
 
 
 @on_virtual_time

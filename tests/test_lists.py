@@ -67,7 +67,7 @@ def test_a_list_is_never_dearer_and_every_tag_is_read_once() -> None:
     chance = random.Random(7)
     chosen = 0
     for _ in range(60):
-        numbers = chance.sample(range(0, 3999), chance.randint(1, 30))
+        numbers = chance.sample(range(3999), chance.randint(1, 30))
         texts = [chance.choice(["D", "D", "M", "S", "TN"]) + f"{n % 250}" for n in numbers]
         addresses = list(dict.fromkeys(texts))
         _, with_lists = one(*addresses)
@@ -247,8 +247,10 @@ async def test_a_plc_without_these_commands_is_read_without_lists() -> None:
     line, dev = one(*SCATTERED)
     station = line.stations[0]
     original = station.inner._answer
-    station.inner._answer = lambda text, at: (  # type: ignore[method-assign]
-        Nak(5, "03") if text[4:6] == "WM" else original(text, at)
+    station.inner._answer = (
+        lambda text, at: (  # type: ignore[method-assign]
+            Nak(5, "03") if text[4:6] == "WM" else original(text, at)
+        )
     )
     async with running(line):
         await asyncio.sleep(10)

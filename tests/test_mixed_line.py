@@ -207,8 +207,8 @@ async def test_on_demand_blocks_before_replies_are_counted_and_never_taken_for_o
     checks = Check(line)
     async with running(line):
         await asyncio.sleep(60)
-    assert said > 50
-    assert dev.record.unasked == said
+    assert said > 25
+    assert said - dev.record.unasked in (0, 1)  # perhaps one is on its way
     assert checks.wrong == []
     assert checks.right > 400
     assert dev.record.failures == {}
@@ -228,7 +228,7 @@ async def test_on_demand_blocks_between_exchanges_are_counted_and_never_taken_fo
             for start in range(0, len(block), 4):
                 line.bench.received(block[start : start + 4])
             said += 1
-    assert dev.record.unasked == said
+    assert said - dev.record.unasked in (0, 1)  # perhaps one is on its way
     assert line.line.record.unasked >= said * 12
     assert checks.wrong == []
     assert dev.record.failures == {}

@@ -187,8 +187,10 @@ async def test_after_a_refused_group_no_late_answer_counts_for_the_next_write(ob
         asked = now()
         if not obeys:
             original = station.inner._answer
-            station.inner._answer = lambda text, at: (  # type: ignore[method-assign]
-                None if text[4:12] == "BW0M0000" else original(text, at)
+            station.inner._answer = (
+                lambda text, at: (  # type: ignore[method-assign]
+                    None if text[4:12] == "BW0M0000" else original(text, at)
+                )
             )
         outcomes = submit_all(line, dev, dict.fromkeys(["M0", "M21", "M42", "M63"], True))
         await asyncio.sleep(5)

@@ -6,6 +6,7 @@ from gateway.config.customs import custom
 from gateway.config.messages import Mistakes, Path
 from gateway.config.model import LineSection
 from gateway.config.plain import DeviceConfig
+from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.frames import FrameDriver
 from gateway.transport.port import SerialSettings, SimulatorAddress, TcpAddress
 from gateway.wiretime import NETWORK_BAUD, Wire, character_bits
@@ -31,6 +32,12 @@ def check_line(
             mistakes.add(
                 (*place, "station"),
                 f"{other} on this line is station {number} already: both would answer at once",
+            )
+        if line.echo and isinstance(device.driver, ComputerLink) and device.driver.send_area_c:
+            mistakes.add(
+                (*place, "send_area_c"),
+                "the line has `echo: true`, and the echo of this acknowledgement looks exactly "
+                "like the PLC's to a write: leave it out, no PLC is known to need it",
             )
         if custom(device.driver).baudrate is None:
             _check_network(line, devices, device, place, mistakes)

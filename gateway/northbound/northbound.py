@@ -16,6 +16,7 @@ from gateway.errors import GatewayError
 from gateway.keys import Keys
 from gateway.northbound import secrets
 from gateway.northbound.audit import Audit
+from gateway.northbound.controls import Commanded, Controls
 from gateway.northbound.directory import Directory
 from gateway.northbound.duty import Duty, StandbySettings
 from gateway.northbound.inbox import Inbox
@@ -65,11 +66,13 @@ class Northbound:
         history: History | None = None,
         record_write: Callable[[WriteOutcome], None] | None = None,
         writers: Path | None = None,
+        commanded: Commanded | None = None,
         standby: StandbySettings | None = None,
         status_every: float = STATUS_EVERY,
     ) -> None:
         """`record_write` gets every outcome that is told, on the event loop; it must not block.
         `writers` is the file of those who may write; without it all that Zenoh lets through.
+        `commanded` takes commands such as stop; without it there are none.
         """
         self.keys = Keys(settings.prefix, name)
         self.opened = asyncio.Event()  # everything is declared, all current values are queued
@@ -79,6 +82,8 @@ class Northbound:
         self._links = Links()
         self._duty = Duty(standby, self.keys, self._config)
         self._plant = plant
+        self._commanded = commanded
+        self._commands: list[str] = []  # keys
         self._history = history
         self._status_every = status_every
         self._publisher = Publisher(self.keys)
@@ -170,7 +175,13 @@ class Northbound:
         replies = Replies(
             self.keys, self._plant, self._directory, session.new_timestamp, self._history
         )
-        self._queries = Queries(self._plant, self._directory, writes, replies, self._status)
+        controls = None
+        if self._commanded is not None:
+            controls = Controls(self.keys, self._commanded, session.new_timestamp, self._writers)
+            self._commands = controls.queryables
+        self._queries = Queries(
+            self._plant, self._directory, writes, replies, self._status, controls
+        )
         queries = Inbox(self._queries.take, self._queries.refuse)
         self._puts = PutWrites(writes, self._directory)
         puts = Inbox(self._puts.take, self._puts.refuse)
@@ -219,6 +230,7 @@ class Northbound:
                 session.declare_queryable(self.keys.sets(device.name), ask, complete=True)
                 for device in mine
             ),
+            *(session.declare_queryable(key, ask, complete=True) for key in self._commands),
             session.declare_subscriber(
                 f"{self.keys.values}/@set",
                 _directly(puts),

@@ -18,10 +18,12 @@ import zenoh
 from gateway import payload
 from gateway.errors import BadValue, GatewayError
 from gateway.keys import Asked, Family, asked, max_age
+from gateway.northbound.controls import Controls
 from gateway.northbound.directory import Directory
 from gateway.northbound.plant import Plant
 from gateway.northbound.replies import Replies
 from gateway.northbound.writes import ANSWER_WITHIN, Writes, asker
+from gateway.orders import Obeyed
 from gateway.payload import Failure, Problem
 from gateway.tags import Sample, Written
 
@@ -56,6 +58,7 @@ class Queries:
         writes: Writes,
         replies: Replies,
         documents: Documents,
+        controls: Controls | None = None,
     ) -> None:
         self.counters = Asks()
         self._plant = plant
@@ -63,6 +66,7 @@ class Queries:
         self._writes = writes
         self._replies = replies
         self._documents = documents
+        self._controls = controls
         self._open = threading.Semaphore(OPEN_LIMIT)
         self._open_wide = threading.Semaphore(WIDE_LIMIT)
         self._refusals = threading.Semaphore(REFUSALS_LIMIT)
@@ -84,6 +88,8 @@ class Queries:
         match wanted.family:
             case Family.SET:
                 self._task(self._set(query))
+            case Family.COMMAND if self._controls is not None:
+                self._task(self._command(query, self._controls))
             case Family.STATUS:
                 self._task(self._status(query))
             case Family.VALUE if query.parameters.get("_time") is not None:
@@ -123,6 +129,16 @@ class Queries:
             )
         finally:
             self._soon(query, partial(self._replies.outcome, result))
+
+    async def _command(self, query: zenoh.Query, controls: Controls) -> None:
+        key, data = str(query.key_expr), query.payload
+        result: Obeyed | Failure = Failure(Problem.UNCLEAR, "the gateway is ending")
+        try:
+            result = await controls.obey(
+                key, None if data is None else data.to_bytes(), asker(query)
+            )
+        finally:
+            self._soon(query, partial(controls.reply, result))
 
     async def _status(self, query: zenoh.Query) -> None:
         documents: dict[str, bytes] = {}

@@ -119,7 +119,8 @@ async def test_every_bar_code_is_an_event_also_one_read_twice(
     codes = ["4006381333931", "4006381333931", "A-17", "4006381333931"]
     with ByteDevice() as reader:
         config = configured(tmp_path, "barcode-reader", reader.port, endpoint)
-        with started(config):
+        with started(config) as program:
+            program.says("line open")  # what was said before would be lost
             async with ZenohPeer("client", connect=[endpoint]) as client:
                 heard = await client.subscribe("plant/reader/barcode")
                 reader.say(b"".join(b"\x02" + code.encode() + b"\x03" for code in codes))
@@ -197,7 +198,8 @@ async def test_the_k120s_weighing_example_is_answered(tmp_path: Path, endpoint: 
 
     with ByteDevice(hear) as machine:
         config = configured(tmp_path, "weighing-machine", machine.port, endpoint)
-        with started(config):
+        with started(config) as program:
+            program.says("line open")  # what was said before would be lost
             async with ZenohPeer("client", connect=[endpoint]) as client:
                 heard = await client.subscribe("plant/weighing/weight")
                 for _ in range(3):

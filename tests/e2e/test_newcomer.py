@@ -37,7 +37,7 @@ def test_the_example_runs_and_what_it_says_to_type_works(tmp_path: Path) -> None
         assert "acknowledged" in done.out
         everything = _typed([*read[: read.index("read") + 1], str(path)])
         assert everything.code == 0
-        assert everything.out.count(" good ") == 16
+        assert everything.out.count(" good ") == 22
         assert program.end(signal.SIGINT) == 0
 
 

@@ -1,0 +1,158 @@
+"""Commands that come over Zenoh: checked, handed down, answered, and every one told in the log.
+
+<prefix>/<device>/@run, @stop, @loopback, @model        by device, in full
+<prefix>/@gateway/<name>/lines/<line>/global            to all stations of a line: on, off
+"""
+
+import asyncio
+import time
+from collections.abc import Callable, Mapping
+from typing import Protocol
+
+import orjson
+import structlog
+import zenoh
+
+from gateway import payload
+from gateway.control import TO_ALL, NotControlled
+from gateway.errors import BadValue, GatewayError
+from gateway.keys import Keys
+from gateway.northbound import forms
+from gateway.northbound.limiter import Limiter
+from gateway.northbound.writers import Asker, NotAllowed, Writers
+from gateway.northbound.writes import ANSWER_WITHIN
+from gateway.orders import Obeyed
+from gateway.payload import Failure, Problem
+
+log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
+
+_LONGEST_ARGUMENT = 1000  # bytes; a loopback takes 254 characters at most
+_BURST, _EVERY = 100, 1.0  # refusals told one by one at once; seconds for each that follows
+_SENT = frozenset({Problem.UNCLEAR, Problem.REFUSED})
+
+
+class Commanded(Protocol):
+    """The gateway below, as far as it tells devices what to do."""
+
+    def commands(self) -> Mapping[str, frozenset[str]]:
+        """By device: what its protocol knows, allowed or not."""
+
+    def speaker(self, line: str) -> str:
+        """The device in whose name all stations of a line are told. Raises `BadValue`."""
+
+    async def control(self, device: str, command: str, argument: str) -> Obeyed:
+        """Returns what the device said. Raises `GatewayError`; `BadValue` before anything."""
+
+
+class Controls:
+    """Bounded by the queries that may be open and by the orders that may wait for a line."""
+
+    def __init__(
+        self,
+        keys: Keys,
+        below: Commanded,
+        stamp: Callable[[], zenoh.Timestamp],
+        writers: Writers | None = None,
+    ) -> None:
+        """`writers`: those who may command are those who may write."""
+        self._keys = keys
+        self._below = below
+        self._stamp = stamp
+        self._writers = writers
+        self._refusals = Limiter(_BURST, _EVERY)
+
+    @property
+    def queryables(self) -> list[str]:
+        """The keys to be declared; those of lines lie under the gateway's own."""
+        return [
+            self._keys.command(device, command)
+            for device, commands in self._below.commands().items()
+            for command in sorted(commands)
+        ]
+
+    async def obey(self, key: str, data: bytes | None, asker: Asker) -> Obeyed | Failure:
+        """`key` as it came, wildcards and all; `data` is the argument as text."""
+        by, argument = asker.session, ""
+        started = time.monotonic()
+        result: Obeyed | Failure = Failure(Problem.UNCLEAR, "the gateway is ending")
+        try:
+            if self._writers is not None:
+                by = self._writers.owner(asker.token)
+            argument = _argument(data)
+            device, command = self._meant(key)
+            async with asyncio.timeout(ANSWER_WITHIN):
+                result = await self._below.control(device, command, argument)
+        except TimeoutError:
+            reason = f"not answered within {ANSWER_WITHIN:g} s: it may yet be done"
+            result = Failure(Problem.UNCLEAR, reason)
+        except NotAllowed as error:
+            result = Failure(Problem.NOT_ALLOWED, str(error))
+        except NotControlled as error:
+            result = Failure(Problem.NOT_WRITABLE, str(error))
+        except GatewayError as error:
+            result = payload.failure(error)
+        finally:
+            self._tell(key, argument, result, time.monotonic() - started, by)
+        return result
+
+    def reply(self, result: Obeyed | Failure, query: zenoh.Query) -> None:
+        """On an answering thread."""
+        match result:
+            case Obeyed(answer, at, took):
+                told = {"answer": answer, "time": payload.rfc3339(at), "took": round(took, 6)}
+                forms.reply_json(query, str(query.key_expr), orjson.dumps(told), self._stamp())
+            case Failure():
+                data = payload.outcome(result)
+                query.reply_err(data, encoding=zenoh.Encoding.APPLICATION_JSON)
+
+    def _meant(self, key: str) -> tuple[str, str]:
+        """Device and command. Raises `BadValue`."""
+        if "*" in key:
+            raise BadValue(f"{payload.short(key)} has a wildcard: a command names one, in full")
+        for line in _line_of(key, self._keys.own):
+            return self._below.speaker(line), TO_ALL
+        stem, _, last = key.rpartition("/")
+        return self._keys.tag(stem) or stem, last.removeprefix("@")
+
+    def _tell(
+        self, key: str, argument: str, result: Obeyed | Failure, took: float, by: str | None
+    ) -> None:
+        shown: dict[str, object] = {
+            "key": payload.short(key),
+            "argument": payload.short(argument),
+            "took": round(took, 4),
+            "by": by,
+        }
+        match result:
+            case Obeyed(answer):
+                log.info("command obeyed", answer=answer, **shown)
+            case Failure(problem, reason, code):
+                if problem in _SENT or self._refusals.allows(time.monotonic()):
+                    log.warning(
+                        "command perhaps obeyed"
+                        if problem is Problem.UNCLEAR
+                        else "command not obeyed",
+                        error=problem.value,
+                        code=code,
+                        reason=payload.short(reason),
+                        **shown,
+                    )
+
+
+def _argument(data: bytes | None) -> str:
+    """Raises `BadValue`."""
+    if data is not None and len(data) > _LONGEST_ARGUMENT:
+        raise BadValue(f"the argument has {len(data)} bytes, more than {_LONGEST_ARGUMENT}")
+    try:
+        return (data or b"").decode()
+    except UnicodeDecodeError:
+        raise BadValue("the argument is no UTF-8 text") from None
+
+
+def _line_of(key: str, own: str) -> list[str]:
+    """The line that a key `<own>/lines/<line>/global` names, or none."""
+    chunks = key.removeprefix(f"{own}/").split("/")
+    match chunks:
+        case ["lines", line, "global"]:
+            return [line]
+    return []

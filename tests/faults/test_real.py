@@ -1,0 +1,268 @@
+"""Real processes killed, real connections cut, a disk full: what stays true, what returns."""
+
+import asyncio
+import os
+import signal
+import sys
+import time
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gateway.northbound import Mode
+from tests.e2e.processes import (
+    Program,
+    free_port,
+    started,
+    station,
+    until,
+    vigor_line,
+    write_config,
+)
+from tests.zenoh_peer import ZenohPeer, free_endpoint
+
+WITHIN = 2.0  # seconds from SIGTERM to the end
+RESTARTS = int(os.environ.get("RESTARTS", "20"))
+TAGS = {
+    "speed": {"address": "D10", "publish": "always"},
+    "recipe": {"address": "D500", "write": True},
+}
+
+
+class Cuttable:
+    """A TCP proxy between gateway and PLC: cuts in the middle of a reply, or falls silent."""
+
+    def __init__(self, far: int) -> None:
+        self._far = far
+        self.number = free_port()
+        self.cut_after: int | None = None  # bytes of the next reply
+        self.hanging = False
+        self.connections = 0
+        self._open: list[asyncio.StreamWriter] = []
+
+    async def serve(self) -> asyncio.Server:
+        return await asyncio.start_server(self._accept, "127.0.0.1", self.number)
+
+    async def _accept(self, near: asyncio.StreamReader, back: asyncio.StreamWriter) -> None:
+        self.connections += 1
+        far, there = await asyncio.open_connection("127.0.0.1", self._far)
+        self._open += [back, there]
+        await asyncio.gather(
+            self._pass(near, there, replies=False),
+            self._pass(far, back, replies=True),
+            return_exceptions=True,
+        )
+        for end in (there, back):
+            end.close()
+
+    async def _pass(
+        self, source: asyncio.StreamReader, target: asyncio.StreamWriter, *, replies: bool
+    ) -> None:
+        while data := await source.read(4096):
+            if self.hanging:
+                continue
+            if replies and self.cut_after is not None:
+                target.write(data[: self.cut_after])
+                await target.drain()
+                self.cut_after = None
+                self.close()
+                return
+            target.write(data)
+            await target.drain()
+
+    def close(self) -> None:
+        """End every connection, as a device server does that is switched off and on."""
+        for end in self._open:
+            end.close()
+        self._open.clear()
+
+
+@asynccontextmanager
+async def _proxied(far: int) -> AsyncIterator[Cuttable]:
+    proxy = Cuttable(far)
+    server = await proxy.serve()
+    try:
+        yield proxy
+    finally:
+        proxy.close()
+        server.close()
+        await asyncio.sleep(0.05)  # its connections notice
+
+
+def _good(key: str) -> Callable[[Any], bool]:
+    return lambda heard: heard.key == key and heard.json["quality"] == "good"
+
+
+def _bad(key: str) -> Callable[[Any], bool]:
+    return lambda heard: heard.key == key and heard.json["quality"] == "bad"
+
+
+async def test_tcp_cut_in_the_middle_of_a_reply_and_half_open(tmp_path: Path) -> None:
+    endpoint, far = free_endpoint(), free_port()
+    with station("tcp", str(far)) as plc:
+        plc.tell("count 1 D 10")
+        async with _proxied(far) as proxy:
+            line = vigor_line(f"tcp://127.0.0.1:{proxy.number}", TAGS)
+            config = write_config(tmp_path / "config.yaml", endpoint, {"hall": line})
+            with await asyncio.to_thread(started, config) as service:
+                async with ZenohPeer("client", connect=[endpoint]) as client:
+                    heard = await client.subscribe("plant/mixer/*")
+                    await heard.next(_good("plant/mixer/speed"))
+                    for length in (1, 5, 9):
+                        heard.forget()
+                        proxy.cut_after = length
+                        told = await heard.next(_bad("plant/mixer/speed"))
+                        assert told.json["value"] is None
+                        await heard.next(_good("plant/mixer/speed"))
+                    # Half open: it is connected, and nothing passes.
+                    heard.forget()
+                    proxy.hanging = True
+                    assert (await heard.next(_bad("plant/mixer/speed"))).json[
+                        "reason"
+                    ] == "no-reply"
+                    [answer] = await client.get("plant/mixer/recipe/@set", b"7")
+                    assert answer.json["error"] in ("no-reply", "unclear")
+                    heard.forget()
+                    proxy.hanging = False
+                    proxy.close()
+                    await heard.next(_good("plant/mixer/speed"))
+                    assert plc.tell("get 1 D 500") == "0"
+                assert proxy.connections >= 5
+                assert not service.has_said("Traceback")
+
+
+async def test_the_station_killed_and_started_again(tmp_path: Path) -> None:
+    endpoint, number = free_endpoint(), free_port()
+    line = vigor_line(f"tcp://127.0.0.1:{number}", TAGS)
+    config = write_config(tmp_path / "config.yaml", endpoint, {"hall": line})
+    with station("tcp", str(number)) as plc, await asyncio.to_thread(started, config) as service:
+        async with ZenohPeer("client", connect=[endpoint]) as client:
+            heard = await client.subscribe("plant/mixer/*")
+            await heard.next(_good("plant/mixer/speed"))
+            heard.forget()
+            plc.end(signal.SIGKILL)
+            assert (await heard.next(_bad("plant/mixer/speed"))).json["reason"] == "line-down"
+            with await asyncio.to_thread(station, "tcp", str(number)) as again:
+                again.tell("set 1 D 10 77")
+                await heard.next(lambda h: _good("plant/mixer/speed")(h) and h.json["value"] == 77)
+        assert not service.has_said("Traceback")
+
+
+async def test_the_router_killed_and_started_again(tmp_path: Path) -> None:
+    """The lines go on; with the router the values are back, and writes arrive."""
+    endpoint, number = free_endpoint(), free_port()
+    zenoh = {"mode": "client", "listen": [], "connect": [endpoint]}
+    line = vigor_line(f"tcp://127.0.0.1:{number}", TAGS)
+    config = write_config(tmp_path / "config.yaml", "", {"hall": line}, zenoh=zenoh)
+    with station("tcp", str(number)) as plc:
+        plc.tell("count 1 D 10")
+        async with ZenohPeer(Mode.ROUTER, listen=[endpoint]) as router:
+            service = await asyncio.to_thread(started, config)
+            try:
+                await router.kill()
+            except BaseException:
+                service.__exit__()
+                raise
+        with service:
+            await asyncio.to_thread(service.says, "Zenoh link down")
+            async with (
+                ZenohPeer(Mode.ROUTER, listen=[endpoint]),
+                ZenohPeer("client", connect=[endpoint]) as client,
+            ):
+                heard = await client.subscribe("plant/mixer/*")
+                await heard.next(_good("plant/mixer/speed"), 30.0)
+                [done] = await client.get("plant/mixer/recipe/@set", b"9")
+                assert done.ok
+                assert plc.tell("get 1 D 500") == "9"
+            assert not service.has_said("Traceback")
+            assert not service.has_said("line down")
+
+
+async def test_a_disk_that_is_full_stops_the_history_and_nothing_else(tmp_path: Path) -> None:
+    """No file of this process may grow beyond 200 kB, as on a full disk."""
+    endpoint = free_endpoint()
+    tags = {f"v{n}": {"address": f"D{n}", "publish": "always"} for n in range(20)}
+    config = write_config(
+        tmp_path / "config.yaml",
+        endpoint,
+        {"hall": vigor_line("simulator", tags)},
+        defaults={"every": "50ms", "history": True},
+        history={"path": "history.db"},
+    )
+    run = f"ulimit -f 200; exec {sys.executable} -m gateway run {config}"
+    with Program("bash", "-c", run) as service:
+        await asyncio.to_thread(service.says, "on Zenoh")
+        async with ZenohPeer("client", connect=[endpoint]) as client:
+            heard = await client.subscribe("plant/mixer/v0")
+
+            async def trouble() -> str:
+                [status] = await client.get("plant/@gateway/demo/history")
+                return str(status.json.get("trouble") or "")
+
+            async with asyncio.timeout(60):
+                while not await trouble():
+                    await asyncio.sleep(0.2)
+            heard.forget()
+            await heard.next(_good("plant/mixer/v0"))
+        asked = time.monotonic()
+        assert await asyncio.to_thread(service.end) == 0
+        assert time.monotonic() - asked < WITHIN
+        assert not service.has_said("Traceback")
+
+
+def test_restarts_leave_nothing_behind(tmp_path: Path) -> None:
+    """Ended kindly and killed by turns: no process, no file, no lock, no name on the port."""
+    tty = str(tmp_path / "tty")
+    with station("pty", tty) as plc:
+        plc.tell("count 1 D 10")
+        config = write_config(
+            tmp_path / "config.yaml", free_endpoint(), {"hall": vigor_line(tty, TAGS)}
+        )
+        before: set[Path] | None = None
+        for number in range(RESTARTS):
+            with started(config) as service:
+                service.says("device answers")
+                assert not service.has_said("line down")
+                pid = service.pid
+                by = signal.SIGTERM if number % 2 else signal.SIGKILL
+                assert service.end(by) == (0 if number % 2 else -signal.SIGKILL)
+            assert not Path(f"/proc/{pid}").exists()
+            assert not _children(pid)
+            now = set(tmp_path.rglob("*"))
+            assert before is None or now == before
+            before = now
+        until(lambda: not _holders(tty), "nobody holds the port")
+
+
+def _children(pid: int) -> list[int]:
+    found = []
+    for status in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = status.read_text().rpartition(")")[2].split()
+        except (FileNotFoundError, ProcessLookupError):
+            continue
+        if int(fields[1]) == pid:
+            found.append(int(status.parent.name))
+    return found
+
+
+def _holders(tty: str) -> list[str]:
+    """Gateways that have the port open."""
+    real, found = os.path.realpath(tty), []
+    for command in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            if b"gateway\0run" not in command.read_bytes():
+                continue
+            opened = [os.path.realpath(fd) for fd in (command.parent / "fd").iterdir()]
+        except (FileNotFoundError, ProcessLookupError, PermissionError):
+            continue
+        if real in opened:
+            found.append(command.parent.name)
+    return found
+
+
+if __name__ == "__main__":
+    sys.exit(pytest.main([__file__, "-q", "-k", "restarts"]))
