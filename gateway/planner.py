@@ -36,33 +36,31 @@ class Block:
     tags: tuple[Tag, ...]
     cost: Cost
     listed: tuple[Span, ...] = ()
-    parts: tuple[tuple[Decode, slice], ...] = field(init=False, repr=False)
+    parts: tuple[tuple[Tag, Decode, slice], ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "parts", tuple(self._parts()))
 
-    def _parts(self) -> Iterator[tuple[Decode, slice]]:
-        """For each tag its decoder and where its units stand among those that are read."""
+    def _parts(self) -> Iterator[tuple[Tag, Decode, slice]]:
+        """Each tag with its decoder and where its units stand among those that are read."""
         begins, place = {}, 0
         for span in self.listed:
             begins[span] = place
             place += span.size
         for tag in self.tags:
             begin = begins.get(tag.span, tag.span.start - self.span.start)
-            yield tag.decode, slice(begin, begin + tag.span.size)
+            yield tag, tag.decode, slice(begin, begin + tag.span.size)
 
     def decode(self, units: Sequence[int], time: int) -> list[Sample]:
         """The samples of all tags; `time` is when the reply arrived (ns since 1970)."""
         if self.tags[0].shape is not None:
-            places = zip(self.tags, self.parts, strict=True)
-            return [of_field(tag, units[part.start], time) for tag, (_, part) in places]
+            return [of_field(tag, units[part.start], time) for tag, _, part in self.parts]
         good, new = Quality.GOOD, tuple.__new__  # half of what the constructor takes: it is much
-        values = [decode(units[part]) for decode, part in self.parts]
         return [
             bad(tag, Reason.NOT_A_NUMBER, time)
-            if value is None
+            if (value := decode(units[part])) is None
             else new(Sample, (tag, value, good, time, None, ""))
-            for tag, value in zip(self.tags, values, strict=True)
+            for tag, decode, part in self.parts
         ]
 
 

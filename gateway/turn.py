@@ -89,8 +89,10 @@ class Turn:
         self.clock.quiet_since += len(data) * self.wire.character
 
     async def ask(self, frame: Any, reply: int, answers: Callable[[Any], T | None]) -> T:
+        loop = asyncio.get_running_loop()
         if not self._open:
-            await self._quiet()
+            if self.clock.quiet_since + self.silence > loop.time():
+                await self._quiet()
             if self.heard:
                 # It answers nothing: not a byte of it may be read as an answer.
                 self._codec = self.new_codec()
@@ -99,7 +101,6 @@ class Turn:
                 self._gap.cancel()
             self._rest = b""
         data = self._codec.encode(frame)
-        loop = asyncio.get_running_loop()
         self._send(data)
         started = self.clock.quiet_since
         question = _Question(answers, loop.create_future())

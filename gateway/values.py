@@ -136,7 +136,7 @@ def from_words(layout: Layout) -> FromWords:
         return lambda words: _from_bcd(_ordered(words, layout))
     unpack = struct.Struct(_STRUCT[kind]).unpack
     if kind is Kind.FLOAT32:
-        return lambda words: _shortest(unpack(_octets(_ordered(words, layout)))[0])
+        return lambda words: shortest(unpack(_octets(_ordered(words, layout)))[0])
     if kind is Kind.FLOAT64:
         return lambda words: _finite(unpack(_octets(_ordered(words, layout)))[0])
     plain = layout.byte_order is Order.HIGH_FIRST
@@ -161,9 +161,9 @@ def to_words(layout: Layout) -> ToWords:
         return lambda value: [int(_boolean(value))]
     if kind in _BCD:
         digits = 4 * layout.type.words
-        return lambda value: _ordered(_to_bcd(_whole(value), digits), layout)
+        return lambda value: _ordered(_to_bcd(whole(value), digits), layout)
     pack = struct.Struct(_STRUCT[kind]).pack
-    convert: Callable[[Value], int | float] = _real if kind in _FLOATS else _whole
+    convert: Callable[[Value], int | float] = real if kind in _FLOATS else whole
 
     def encode(value: Value) -> list[int]:
         number = convert(value)
@@ -195,10 +195,12 @@ def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _shortest(value: float) -> float | None:
+def shortest(value: float) -> float | None:
     """The decimal a person would write for a 32-bit float: 0.1, not 0.10000000149011612."""
     if not math.isfinite(value):
         return None
+    if value.is_integer():
+        return value
     packed = _SINGLE.pack(value)
     for digits in (6, 7, 8):
         short = float(f"{value:.{digits}g}")
@@ -234,7 +236,8 @@ def _boolean(value: Value) -> bool:
     return bool(value)
 
 
-def _whole(value: Value) -> int:
+def whole(value: Value) -> int:
+    """The value as an integer. Raises `BadValue` for what is none."""
     if isinstance(value, (bool, str)):
         raise BadValue(f"{value!r} is no number")
     if isinstance(value, float) and not value.is_integer():
@@ -242,7 +245,8 @@ def _whole(value: Value) -> int:
     return int(value)
 
 
-def _real(value: Value) -> float:
+def real(value: Value) -> float:
+    """The value as a finite float. Raises `BadValue` for what is none."""
     if isinstance(value, (bool, str)):
         raise BadValue(f"{value!r} is no number")
     try:

@@ -30,7 +30,10 @@ from tests.e2e.processes import (
 )
 from tests.zenoh_peer import free_endpoint
 
-COMMANDS = ["run", "check", "read", "write", "watch", "simulate", "health", "schema", "version"]
+COMMANDS = [
+    *("run", "check", "read", "write", "control", "watch", "simulate"),
+    *("health", "schema", "version"),
+]
 TAGS = {
     "speed": {"address": "D10", "unit": "rpm"},
     "trim": {"address": "D500", "write": {"min": -5, "max": 40, "verify": True}},
@@ -124,6 +127,7 @@ def test_wrong_usage_ends_with_2(command: Command, arguments: list[str], says: s
         ("check", []),
         ("read", []),
         ("write", ["mixer/trim", "1"]),
+        ("control", ["mixer", "stop"]),
         ("watch", []),
         ("simulate", []),
         ("health", []),

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from gateway.errors import BadValue, ConfigError, Evidence, Garbled
-from gateway.values import Value
+from gateway.values import Value, real, shortest, whole
 
 FieldType = Literal[
     "uint8",
@@ -207,8 +207,10 @@ class Field:
             if not ordered.hex().isdecimal():
                 raise _garbled("a BCD digit above 9", raw)
             return int(ordered.hex())
-        number: int | float = struct.unpack(_STRUCT[self.type], ordered)[0]
-        if not math.isfinite(number):
+        number: int | float | None = struct.unpack(_STRUCT[self.type], ordered)[0]
+        if self.type == "float32" and number is not None:
+            number = shortest(number)
+        if number is None or not math.isfinite(number):
             raise _garbled("not a number", raw)
         return number if self.bit is None else bool(int(number) >> self.bit & 1)
 
@@ -218,7 +220,7 @@ class Field:
             raise BadValue("one bit of a number cannot be written")
         if self.type == "text":
             return self._put_text(value)
-        number = _real(value) if self.kind == "number" else _whole(value)
+        number = real(value) if self.kind == "number" else whole(value)
         return self._put_written(number) if self.size is None else self._put_raw(number)
 
     def _put_text(self, value: Value) -> bytes:
@@ -267,24 +269,6 @@ def check_writable(field: Field) -> None:
         raise ConfigError("one bit of a number cannot be written")
     if field.type == "decimal" and field.format is None:
         raise ConfigError("decimal needs a format, such as 06.2f")
-
-
-def _real(value: Value) -> float:
-    if isinstance(value, (bool, str)):
-        raise BadValue(f"{value!r} is no number")
-    try:
-        number = float(value)
-    except OverflowError:
-        number = math.inf
-    if not math.isfinite(number):
-        raise BadValue(f"{value} is no finite number")
-    return number
-
-
-def _whole(value: Value) -> int:
-    if isinstance(value, (bool, str)) or (isinstance(value, float) and not value.is_integer()):
-        raise BadValue(f"{value!r} is no whole number")
-    return int(value)
 
 
 def _garbled(why: str, data: bytes) -> Garbled:
