@@ -34,6 +34,7 @@ def device_of(config: DeviceConfig, line: LineConfig) -> Device:
         timing=config.timing,
         tags=config.tags,
         late_guard=config.late_guard,
+        verify_reads=config.verify_reads,
         turnaround=config.turnaround_configured,
         control=config.control,
     )

@@ -68,6 +68,7 @@ class Device:
     tags: tuple[Tag, ...]
     late_guard: float
     turnaround: float | None = None  # set in the file, or measured; None: the protocol's usual
+    verify_reads: int = 1  # so many readings in a row must agree
     control: bool = False  # it may be told to run, stop ...
     blocks: tuple[Block, ...] = ()
     standing: Standing = Standing.STARTING
@@ -113,7 +114,8 @@ class Device:
     @property
     def load(self) -> float:
         """The share of the line's time that its polls take."""
-        return sum(self.seconds(block.cost) / block.every for block in self.blocks)
+        once = sum(self.seconds(block.cost) / block.every for block in self.blocks)
+        return once * self.verify_reads
 
     def plan(self) -> None:
         """Decide anew what to ask, around what the device has refused."""

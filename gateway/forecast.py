@@ -54,7 +54,9 @@ class LineForecast:
 def forecast(name: str, devices: Sequence[Device], wire: Wire) -> LineForecast:
     """Reckon a line from its plan."""
     asked = [
-        (device, block, device.seconds(block.cost)) for device in devices for block in device.blocks
+        (device, block, device.verify_reads * device.seconds(block.cost))
+        for device in devices
+        for block in device.blocks
     ]
     load = sum(seconds / block.every for _, block, seconds in asked)
     longest = max((seconds for _, _, seconds in asked), default=0.0)

@@ -63,9 +63,7 @@ def written(folder: Path, endpoint: str = "tcp/127.0.0.1:7447", **devices: Any) 
         ("oven", "global", "saw is not to be told"),
     ],
 )
-def test_what_the_file_does_not_allow(
-    tmp_path: Path, device: str, command: str, why: str
-) -> None:
+def test_what_the_file_does_not_allow(tmp_path: Path, device: str, command: str, why: str) -> None:
     config = load(written(tmp_path))
     check_command(config, "oven", "stop")
     with pytest.raises(BadValue, match=why):

@@ -29,6 +29,7 @@ import socket
 import sys
 import threading
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
@@ -178,7 +179,8 @@ class ZenohPeer:
 
     async def kill(self) -> None:
         assert self._process is not None
-        self._process.kill()
+        with suppress(ProcessLookupError):  # it has ended by itself
+            self._process.kill()
         await self._process.wait()
 
     async def subscribe(self, key: str, *, advanced: bool = False) -> Subscription:

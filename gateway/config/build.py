@@ -139,6 +139,7 @@ class Builder:
             timing=timing,
             turnaround_configured=settings.turnaround,
             late_guard=_either(settings.late_guard, timing.reply_timeout),
+            verify_reads=settings.verify_reads,
             blocks=settings.blocks,
             control=settings.control,
             enabled=settings.enabled,

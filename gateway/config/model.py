@@ -245,6 +245,8 @@ class DeviceSection(Section):
     """Quiet kept on the wire before it is spoken to."""
     retries: Annotated[int, Field(ge=0, le=10)] | None = None
     """How often a read that went wrong is asked again; writes never are."""
+    verify_reads: Annotated[int, Field(ge=1, le=3)] = 1
+    """How many readings in a row must agree before a value is believed."""
     late_guard: Duration | None = None
     """How long a late reply is waited for before anyone speaks again."""
     blocks: bool = False

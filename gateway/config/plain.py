@@ -60,6 +60,7 @@ class DeviceConfig:
     timing: Timing  # the protocol's, with what the file says of this device
     turnaround_configured: float | None  # None: measured
     late_guard: float  # how long a late reply is waited for before anyone speaks again
+    verify_reads: int  # so many readings in a row must agree
     blocks: bool  # also one put per scan with all changed tags
     control: bool  # may be told to run, stop ...
     enabled: bool

@@ -13,7 +13,7 @@ from typing import Generic, TypeVar
 T = TypeVar("T")
 
 LIMIT = 1024  # arrivals that wait for the loop
-_AT_ONCE = 128  # taken in one turn of the loop, so that everything else has its turn
+_AT_ONCE = 16  # taken in one turn of the loop, so that everything else has its turn
 
 
 class Inbox(Generic[T]):

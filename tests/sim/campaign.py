@@ -13,6 +13,7 @@ from collections import Counter
 from functools import partial
 from pathlib import Path
 
+from tests.sim.draw import PACES
 from tests.sim.world import Story, run
 
 
@@ -29,7 +30,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=seeds, default=seeds("0-19"), metavar="0-19")
     parser.add_argument("--hours", type=float, default=1.0)
-    parser.add_argument("--pace", choices=("busy", "lean", "storm"), default="busy")
+    parser.add_argument("--pace", choices=sorted(PACES), default="busy")
     parser.add_argument("--workers", type=int, default=multiprocessing.cpu_count())
     parser.add_argument("--result", type=Path)
     parser.add_argument("--first", action="store_true", help="end at the first broken seed")

@@ -11,6 +11,9 @@ PROTOCOLS = ("vigor", "computer-link", "modbus-rtu", "modbus-ascii")
 # How often tags are read: `busy` fills the wires, `lean` leaves time for many hours.
 PACES = {
     "busy": ("200ms", "500ms", "1s", "1s", "2s", "2s", "5s", "10s"),
+    "noisy": ("500ms", "1s"),  # storms of one kind only, below
+    "late": ("500ms", "1s"),
+    "tardy": ("500ms", "1s"),
     "storm": ("500ms", "1s", "2s"),  # ten times as much goes wrong
     "lean": ("20s", "30s", "60s", "60s"),
 }
@@ -62,8 +65,8 @@ def draw(seed: int, seconds: float, pace: str = "busy") -> Drawn:
         lines[name] = _line(name, chance, missing, PACES[pace])
         chunks[name] = chance.choice((0, 0, 16, 16, 1) if pace == "busy" else (0, 0, 0, 16))
         zeros[name] = chance.random() < 0.5
-        haste = 0.1 if pace == "storm" else 1.0
-        episodes += _line_episodes(name, lines[name], chance, seconds, haste)
+        haste = 1.0 if pace in ("busy", "lean") else 0.1
+        episodes += _line_episodes(name, lines[name], chance, seconds, haste, pace)
     jumps = []
     at = chance.expovariate(1 / 1800)
     while at < seconds:
@@ -179,12 +182,25 @@ _STATION_KINDS = (
 _LINE_KINDS = ("noise", "noise", "noise-after", "vanish", "vanish", "hang", "flicker")
 
 
+_ONLY: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "noisy": ((), ("noise-after",)),
+    "late": (("late",), ()),
+    "tardy": (("very-late",), ()),
+}
+
+
 def _line_episodes(
-    name: str, line: dict[str, Any], chance: random.Random, seconds: float, haste: float
+    name: str,
+    line: dict[str, Any],
+    chance: random.Random,
+    seconds: float,
+    haste: float,
+    pace: str,
 ) -> list[Episode]:
-    found = _series(name, "", _LINE_KINDS, chance, seconds, 1500.0 * haste)
+    stations, wires = _ONLY.get(pace, (_STATION_KINDS, _LINE_KINDS))
+    found = _series(name, "", wires, chance, seconds, 1500.0 * haste)
     for device in line["devices"]:
-        found += _series(name, device, _STATION_KINDS, chance, seconds, 700.0 * haste)
+        found += _series(name, device, stations, chance, seconds, 700.0 * haste)
     return found
 
 
@@ -199,7 +215,7 @@ def _series(
     """One after the other, never two at once."""
     found = []
     at = chance.expovariate(1 / pause)
-    while at < seconds - CALM:
+    while kinds and at < seconds - CALM:
         kind = chance.choice(kinds)
         last = _LASTS.get(kind, lambda c: c.choice((2.0, 20.0, 60.0, 300.0)) * c.uniform(0.5, 1))
         end = min(at + last(chance), seconds - CALM)

@@ -1,0 +1,232 @@
+"""Wrong values that pass every check, by bit error rate: counted, beside what theory allows.
+
+    python -m tests.sim.residual --seconds 20
+
+A block of eight words is read again and again through bit errors, both ways, by the driver and
+against the simulated station, without a line: what is measured is frames and check sums alone.
+Theory: every pattern of the fewest errors that can pass is tried on the reply once, and counted;
+the share of wrong values is that number times the chance of one such pattern.
+"""
+
+import argparse
+import asyncio
+import itertools
+import json
+import random
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Coroutine, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from gateway.errors import DeviceError, Garbled, NoReply, Refused
+from gateway.protocols.computer_link import ComputerLink
+from gateway.protocols.driver import AnyDriver, Span
+from gateway.protocols.modbus import ModbusAscii, ModbusRtu
+from gateway.protocols.vigor import Vigor
+from gateway.simulation import station_for
+from tests.sim.wire import Format, Noise, spoil
+
+RATES = (1e-5, 1e-4, 1e-3)
+WORDS = [0x1234, 0xFFFF, 0x0000, 0xA5A5, 0x0BAD, 100, 42, 0x8001]
+
+
+@dataclass(frozen=True)
+class Case:
+    name: str
+    driver: AnyDriver
+    span: Span
+    shape: Format
+
+
+CASES = (
+    Case("vigor 7E1", Vigor(station=1), Span("D", 100, 8), Format(7, parity=True)),
+    Case("vigor 8N1", Vigor(station=1), Span("D", 100, 8), Format(8)),
+    Case("computer-link 7E1", ComputerLink(station=1), Span("D", 100, 8), Format(7, parity=True)),
+    Case("computer-link 8N1", ComputerLink(station=1), Span("D", 100, 8), Format(8)),
+    Case("modbus-ascii 7E1", ModbusAscii(station=1), Span("holding", 100, 8), Format(7, True)),
+    Case("modbus-ascii 8N1", ModbusAscii(station=1), Span("holding", 100, 8), Format(8)),
+    Case("modbus-rtu 8E1", ModbusRtu(station=1), Span("holding", 100, 8), Format(8, True)),
+    Case("modbus-rtu 8N1", ModbusRtu(station=1), Span("holding", 100, 8), Format(8)),
+)
+
+
+class Direct:
+    """A `Talk` without time: what is said is heard at once, through the noise."""
+
+    def __init__(
+        self, case: Case, ask: Callable[[bytes], bytes], hurt: Callable[[bytes], bytes]
+    ) -> None:
+        self._case, self._station, self._hurt = case, ask, hurt
+
+    async def tell(self, frame: Any) -> None:
+        self._station(self._case.driver.codec().encode(frame))
+
+    async def ask(self, frame: Any, reply: int, answers: Callable[[Any], Any]) -> Any:
+        codec = self._case.driver.codec()
+        heard = self._hurt(self._station(self._hurt(codec.encode(frame))))
+        for found in codec.feed(heard):
+            answer = answers(found)
+            if answer is not None:
+                return answer
+        raise NoReply("nothing")
+
+
+def finish(work: Coroutine[Any, Any, Sequence[int]]) -> Sequence[int]:
+    """Run a coroutine that never waits."""
+    try:
+        work.send(None)
+    except StopIteration as end:
+        units: Sequence[int] = end.value
+        return units
+    raise AssertionError("it waits")
+
+
+class Bench:
+    """One driver, one station, and the number of readings of each kind."""
+
+    def __init__(self, case: Case, chance: random.Random) -> None:
+        self.case, self.chance = case, chance
+        self.noise = Noise()
+        self.now = 0.0
+        self.station = station_for(case.driver, ())
+        self.station.memory.write(case.span.area, case.span.start, WORDS)
+
+    def ask(self, data: bytes) -> bytes:
+        self.now += 10.0  # whatever it heard before is forgotten
+        return b"".join(self.station.hear(data, self.now))
+
+    def hurt(self, data: bytes) -> bytes:
+        if not self.noise.before:
+            return data
+        return spoil(data, self.noise, self.case.shape, self.chance)
+
+    def read(self) -> list[int] | None:
+        """The words, or None where anything was noticed."""
+        try:
+            return list(finish(self.case.driver.read(Direct(self.case, self.ask, self.hurt), self.case.span)))
+        except (Refused, Garbled, NoReply, DeviceError):
+            self.station.hear(b"\x00" * 300, self.now + 10.0)
+            return None
+
+
+def measured(case: Case, rate: float, seconds: float, times: int) -> dict[str, int]:
+    """Counted over so many seconds; a value counts when `times` readings in a row agree."""
+    bench = Bench(case, random.Random(f"{case.name} {rate} {times}"))
+    bench.noise = Noise(before=rate)
+    seen: Counter[str] = Counter()
+    until = time.monotonic() + seconds
+    while time.monotonic() < until:
+        for _ in range(200):
+            first = bench.read()
+            if first is None:
+                seen["noticed"] += 1
+                continue
+            if any(bench.read() != first for _ in range(times - 1)):
+                seen["noticed"] += 1
+            else:
+                seen["right" if first == WORDS else "wrong"] += 1
+    return dict(seen)
+
+
+def theory(case: Case) -> tuple[int, int, int]:
+    """(fewest errors that can pass, patterns of so many that give a wrong value, bits).
+
+    Both ways: in the reply and in the request. Where parity is checked, two bits of each of two
+    characters; otherwise two bits of two characters in one place. For a CRC-16 no pattern of
+    three or fewer passes in so short a frame; of four about one in 2**15 does.
+    """
+    bench = Bench(case, random.Random(0))
+    sent: list[bytes] = []
+    finish(case.driver.read(Direct(case, lambda d: sent.append(d) or bench.ask(d), bytes), case.span))  # type: ignore[func-returns-value]
+    request = sent[0]
+    reply = bench.ask(request)
+    bits = case.shape.data_bits + case.shape.parity
+    total = (len(reply) + len(request)) * bits
+    if case.driver.protocol == "modbus-rtu":
+        patterns = sum(
+            _choose(len(frame) * bits, 4) / 2**15 for frame in (request, reply)
+        )
+        return 4, int(patterns), total
+    return (4 if case.shape.parity else 2), _passing(case, bench, request, reply), total
+
+
+def _choose(n: int, k: int) -> float:
+    chosen = 1.0
+    for i in range(k):
+        chosen *= (n - i) / (i + 1)
+    return chosen
+
+
+def _passing(case: Case, bench: Bench, request: bytes, reply: bytes) -> int:
+    """How many patterns on two characters pass: one bit of each, or with parity two of each."""
+    width = case.shape.data_bits + case.shape.parity
+    hits = [
+        sum(1 << bit for bit in bits)
+        for bits in itertools.combinations(range(width), 2 if case.shape.parity else 1)
+    ]
+    data = (1 << case.shape.data_bits) - 1
+    found = 0
+    for of_request, frame in ((True, request), (False, reply)):
+        for (i, a), (j, b) in itertools.combinations(enumerate(frame), 2):
+            # The sum of two characters changes by nothing, or it does not pass.
+            for hit in hits:
+                for other in hits:
+                    if not _same_sum(case, a, b, hit & data, other & data, i, j, frame):
+                        continue
+                    spoilt = bytearray(frame)
+                    spoilt[i] ^= hit & data
+                    spoilt[j] ^= other & data
+                    found += _believed(case, bench, request, bytes(spoilt), of_request)
+    return found
+
+
+def _same_sum(
+    case: Case, a: int, b: int, hit: int, other: int, i: int, j: int, frame: bytes
+) -> bool:
+    """A quick look, so that few patterns have to be tried in full."""
+    if case.driver.protocol == "modbus-ascii" or j >= len(frame) - 4:
+        return True
+    return ((a ^ hit) + (b ^ other) - a - b) % 256 == 0
+
+
+def _believed(case: Case, bench: Bench, request: bytes, spoilt: bytes, of_request: bool) -> bool:
+    """Whether a wrong value comes of it."""
+    turn = iter((spoilt, None) if of_request else (None, spoilt))
+
+    def hurt(data: bytes) -> bytes:
+        other = next(turn)
+        return data if other is None else other
+
+    try:
+        words = list(finish(case.driver.read(Direct(case, bench.ask, hurt), case.span)))
+    except (DeviceError, StopIteration):
+        return False
+    return words != WORDS
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seconds", type=float, default=10.0, help="for each rate of each case")
+    parser.add_argument("--rates", type=float, nargs="*", default=list(RATES))
+    chosen = parser.parse_args()
+    for case in CASES:
+        fewest, patterns, bits = theory(case)
+        for rate in chosen.rates:
+            line: dict[str, Any] = {"case": case.name, "rate": rate}
+            share = patterns * rate**fewest * (1 - rate) ** (bits - fewest)
+            for times in (1, 2):
+                seen = measured(case, rate, chosen.seconds, times)
+                believed = seen.get("right", 0) + seen.get("wrong", 0)
+                line[f"readings x{times}"] = sum(seen.values())
+                line[f"wrong x{times}"] = seen.get("wrong", 0)
+                line[f"share x{times}"] = seen.get("wrong", 0) / max(1, believed)
+            line |= {"theory x1": share, "patterns": patterns, "errors": fewest}
+            print(json.dumps(line), flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    asyncio.set_event_loop(None)
+    sys.exit(main())
