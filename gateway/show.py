@@ -18,6 +18,7 @@ from gateway.payload import rfc3339
 from gateway.planner import spell
 from gateway.tags import Quality, Sample, Tag, WriteRule
 from gateway.values import Kind
+from gateway.wiretime import NETWORK_BAUD, Wire
 
 
 def shown(sample: Sample) -> Shown:
@@ -104,12 +105,16 @@ def plan(lines: Sequence[LineForecast], *, every_block: bool) -> RenderableType:
 def _line(line: LineForecast) -> Text:
     text = (
         f"line {line.name}: {len(line.blocks)} requests, {line.requests:.2f} a second, "
-        f"{line.characters:.0f} characters a second at {line.wire.baudrate} baud\n"
+        f"{line.characters:.0f} characters a second {_speed(line.wire)}\n"
         f"  load {line.load:.1%} of the wire; one round of everything takes {seconds(line.cycle)}\n"
         f"  worst write latency {seconds(line.worst_write)}, "
         f"{seconds(line.worst_write_silent)} while a station has just gone silent"
     )
     return Text(text)
+
+
+def _speed(wire: Wire) -> str:
+    return "over the network" if wire.baudrate == NETWORK_BAUD else f"at {wire.baudrate} baud"
 
 
 def _blocks(line: LineForecast) -> Table:

@@ -84,7 +84,7 @@ def test_area_c_on_an_echoing_line_is_an_error(tmp_path: Path) -> None:
     path = written(tmp_path, oven=link(5, send_area_c=True))
     load(path)
     path.write_text(path.read_text().replace('"baudrate"', '"echo": true, "baudrate"'))
-    with pytest.raises(ConfigError, match="send_area_c.*echo"):
+    with pytest.raises(ConfigError, match=r"send_area_c.*echo"):
         load(path)
     path.write_text(path.read_text().replace('"send_area_c": true', '"send_area_c": false'))
     load(path)

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import pytest
 
 from tests.conftest import needs
-from tests.e2e.processes import Program, cable, plc_gateway, started, write_config
+from tests.e2e.processes import Program, cable, plc_gateway, started, until, write_config
 from tests.zenoh_peer import ZenohPeer, free_endpoint
 
 TAGS = {
@@ -138,13 +138,13 @@ async def test_control(oven: Oven) -> None:
             assert done.json["answer"] == "acknowledged"
         [sent] = await client.get("plant/@gateway/demo/lines/hall/global", b"on")
         assert "none answers" in sent.json["answer"]
-        assert oven.plc.tell("get M8126") == "1"
+        until(lambda: oven.plc.tell("get M8126") == "1", "the flag is heard")
     oven.gateway.says("command obeyed", "@stop")
     done = plc_gateway("control", oven.config, "oven", "loopback", "HI")
     assert (done.code, done.out) == (0, "HI\n")
     done = plc_gateway("control", oven.config, "oven", "global", "off")
     assert done.code == 0
-    assert oven.plc.tell("get M8126") == "0"
+    until(lambda: oven.plc.tell("get M8126") == "0", "the flag is heard")
     oven.plc.tell("mute")
     assert plc_gateway("control", oven.config, "oven", "model").code == 1
 

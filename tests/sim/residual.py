@@ -105,7 +105,11 @@ class Bench:
     def read(self) -> list[int] | None:
         """The words, or None where anything was noticed."""
         try:
-            return list(finish(self.case.driver.read(Direct(self.case, self.ask, self.hurt), self.case.span)))
+            return list(
+                finish(
+                    self.case.driver.read(Direct(self.case, self.ask, self.hurt), self.case.span)
+                )
+            )
         except (Refused, Garbled, NoReply, DeviceError):
             self.station.hear(b"\x00" * 300, self.now + 10.0)
             return None
@@ -139,15 +143,15 @@ def theory(case: Case) -> tuple[int, int, int]:
     """
     bench = Bench(case, random.Random(0))
     sent: list[bytes] = []
-    finish(case.driver.read(Direct(case, lambda d: sent.append(d) or bench.ask(d), bytes), case.span))  # type: ignore[func-returns-value]
+    finish(
+        case.driver.read(Direct(case, lambda d: sent.append(d) or bench.ask(d), bytes), case.span)
+    )  # type: ignore[func-returns-value]
     request = sent[0]
     reply = bench.ask(request)
     bits = case.shape.data_bits + case.shape.parity
     total = (len(reply) + len(request)) * bits
     if case.driver.protocol == "modbus-rtu":
-        patterns = sum(
-            _choose(len(frame) * bits, 4) / 2**15 for frame in (request, reply)
-        )
+        patterns = sum(_choose(len(frame) * bits, 4) / 2**15 for frame in (request, reply))
         return 4, int(patterns), total
     return (4 if case.shape.parity else 2), _passing(case, bench, request, reply), total
 

@@ -31,8 +31,8 @@ class Watch(Protocol):
     def overlapped(self, station: Speaker | None) -> None:
         """The gateway and this station speak at once."""
 
-    def damaged(self, data: bytes) -> None:
-        """Not what was sent has just arrived, at either end, by noise or collision."""
+    def damaged(self, way: str) -> None:
+        """Not what was sent arrives at the stations (>) or at the gateway (<)."""
 
     def passed(self, way: str, data: bytes) -> None:
         """Arrived."""
@@ -152,7 +152,7 @@ class SimWire:
         return hit
 
     def _reach_stations(self, request: _Sending) -> None:
-        data = self._through(request)
+        data = self._through(request, request.data, ">")
         if not data or self.hanging:
             return
         self.watch.passed(">", data)
@@ -184,21 +184,20 @@ class SimWire:
     def _deliver(self, sending: _Sending, piece: bytes) -> None:
         if self._ear is None or self.hanging:
             return
-        data = self._through(sending, piece)
+        data = self._through(sending, piece, "<")
         if data:
             self.watch.passed("<", data)
             self._ear.received(data)
 
-    def _through(self, sending: _Sending, piece: bytes | None = None) -> bytes:
+    def _through(self, sending: _Sending, data: bytes, way: str) -> bytes:
         """What arrives of it."""
-        data = sending.data if piece is None else piece
         heard = data
         if sending.spoilt:
             heard = bytes(self.chance.randrange(1 << self.shape.data_bits) for _ in data)
         if self.noise.before or self.noise.after:
             heard = spoil(heard, self.noise, self.shape, self.chance)
         if heard != data:
-            self.watch.damaged(heard)
+            self.watch.damaged(way)
         return heard
 
     def _at(self, due: float, then: Callable[[], None]) -> None:

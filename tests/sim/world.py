@@ -69,6 +69,7 @@ class Bus:
     sent_at: float = 0.0  # when the gateway spoke last
     asked: Device | None = None
     hurt_at: float = -1.0  # when something damaged arrived last
+    hurt: dict[str, float] = field(default_factory=lambda: {"<": -1.0, ">": -1.0})
     heard: bytes = b""  # since the gateway spoke last
     request: bytes = b""  # as it reached the stations
     writes: Counter[int] = field(default_factory=Counter)  # write frames by station number
@@ -105,8 +106,8 @@ class Bus:
             return  # nobody waits for late answers to a probe: that is the rule
         world.broke(f"{self.line.name}: spoke while {device.name} did")
 
-    def damaged(self, data: bytes) -> None:
-        self.hurt_at = self.world.now
+    def damaged(self, way: str) -> None:
+        self.hurt_at = self.hurt[way] = self.world.now
         self.world.story.counts["damaged"] += 1
 
     def passed(self, way: str, data: bytes) -> None:
@@ -130,12 +131,15 @@ class Bus:
 
     def blind(self, since: float) -> bool:
         """Something was damaged since then, and its own check sum agrees."""
-        if self.hurt_at < since:
-            return False
         checks = [CHECKS[self.protocol]]
         if self.protocol == "vigor":
             checks.append(CHECKS["computer-link"])
-        return any(check(part) for check in checks for part in (self.heard, self.request))
+        damaged = [
+            heard
+            for way, heard in (("<", self.heard), (">", self.request))
+            if self.hurt[way] >= since
+        ]
+        return any(check(part) for check in checks for part in damaged)
 
 
 @dataclass(eq=False)
