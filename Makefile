@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: run test check format schema sim fuzz bench clean
+.PHONY: run test check format schema sim fuzz soak mutants faults bench clean
 
 run: .venv/installed
 	$(BIN)/plc-gateway run config.example.yaml
@@ -39,3 +39,25 @@ clean:
 .venv/ready: .venv/installed
 	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[dev]'
 	touch $@
+
+# Long proofs (docs/proof.md); a short slice of each runs with the tests.
+SEEDS ?= 0-19
+HOURS ?= 1
+PACE ?= busy
+EXAMPLES ?= 20000
+MINUTES ?= 30
+
+sim: .venv/ready
+	$(BIN)/python -m tests.sim.campaign --seeds $(SEEDS) --hours $(HOURS) --pace $(PACE)
+
+fuzz: .venv/ready
+	EXAMPLES=$(EXAMPLES) $(BIN)/python -m pytest -q tests/fuzz
+
+soak: .venv/ready
+	$(BIN)/python -m tests.faults.soak --minutes $(MINUTES)
+
+mutants: .venv/ready
+	$(BIN)/python -m tests.sim.mutants
+
+faults: .venv/ready
+	RESTARTS=200 $(BIN)/python -m pytest -q tests/faults

@@ -74,7 +74,7 @@ class Line:
     def submit(self, device: Device, tag: Tag, units: Sequence[int], done: Done) -> None:
         """Write as soon as the current exchange ends. `done` gets the outcome, exactly once."""
         write = Write(device, tag, units, _now(), _now() + PATIENCE, done)
-        for older in self._schedule.superseded(write):
+        for older in self._schedule.orders.superseded(write):
             older.done(Busy("a newer value took its place; not sent"))
         self._accept(write)
 
@@ -87,7 +87,7 @@ class Line:
             order.done(LineDown(self.record.trouble or f"line {self.name} is not open"))
         elif not self._schedule.reachable(order.device, _now()):
             order.done(_offline(order.device))
-        elif not self._schedule.submit(order):
+        elif not self._schedule.orders.submit(order):
             order.done(Busy(f"line {self.name}: too many orders are waiting; not sent"))
         else:
             self._wake.set()
@@ -162,7 +162,7 @@ class Line:
 
     async def _close(self) -> None:
         self.is_open = False
-        for write in self._schedule.withdraw():
+        for write in self._schedule.orders.withdraw():
             write.done(LineDown(f"line {self.name} went down; not sent"))
         port, self._port = self._port, None
         if port is not None:
@@ -171,7 +171,7 @@ class Line:
     async def _serve(self) -> None:
         while self._down is None:
             now = _now()
-            for write in self._schedule.expired(now):
+            for write in self._schedule.orders.expired(now):
                 write.done(Busy(f"waited {now - write.submitted:.1f} s for the line; not sent"))
             match self._listening.next(now) or self._schedule.next(now):
                 case Answer() as answer:
@@ -180,7 +180,7 @@ class Line:
                 case Poll() as poll:
                     await self._poll(poll)
                 case Write() as write:
-                    others = self._schedule.companions(write, together)
+                    others = self._schedule.orders.companions(write, together)
                     await self._writer.write(write, others)
                 case Command() as command:
                     await self._writer.command(command)
@@ -284,7 +284,7 @@ class Line:
         late = await turn.settle(guard, max(GAP, 4 * self.wire.character))
         self._then.unclear(device, before, _now() - turn.started, late)
         if device.standing is Standing.SILENT:
-            for write in self._schedule.withdraw(device):
+            for write in self._schedule.orders.withdraw(device):
                 write.done(_offline(device))
 
     def hold(self, device: Device) -> None:

@@ -1,5 +1,6 @@
 """What people want of a device: writes and commands, on their way down the line."""
 
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -58,3 +59,69 @@ class Command:
 
 
 Order = Write | Command
+
+
+WAITING_ORDERS = 1000
+
+
+class OrderQueue:
+    """The orders of one line that wait. What a device is told stays in the order it was asked."""
+
+    def __init__(self) -> None:
+        self._orders: deque[Order] = deque()
+
+    def __len__(self) -> int:
+        return len(self._orders)
+
+    @property
+    def first(self) -> Order:
+        return self._orders[0]
+
+    def take(self) -> Order:
+        return self._orders.popleft()
+
+    def submit(self, order: Order) -> bool:
+        """False when too many orders wait already."""
+        if len(self._orders) >= WAITING_ORDERS:
+            return False
+        self._orders.append(order)
+        return True
+
+    def superseded(self, write: Write) -> list[Order]:
+        """The waiting writes that need not be sent, as `write` follows: its tag says `latest`."""
+        if not write.latest:
+            return []
+        return self._out(lambda other: isinstance(other, Write) and other.tag is write.tag)
+
+    def companions(self, write: Write, fit: Callable[[Sequence[Write]], bool]) -> list[Write]:
+        """The next orders of its device as far as all can go out with it; they are taken out."""
+        found: list[Write] = []
+        for order in self._orders:
+            if order.device is not write.device:
+                continue
+            if not isinstance(order, Write) or not fit([write, *found, order]):
+                break
+            found.append(order)
+        if found:
+            self._out(lambda order: order in found)
+        return found
+
+    def each_alone(self, writes: Sequence[Write]) -> None:
+        """They were refused together, so nothing of them was done: they are next, one by one."""
+        for write in reversed(writes):
+            write.alone = True
+            self._orders.appendleft(write)
+
+    def withdraw(self, device: Device | None = None) -> list[Order]:
+        """The waiting orders (to one device) that will not be sent any more."""
+        return self._out(lambda order: device is None or order.device is device)
+
+    def expired(self, now: float) -> list[Order]:
+        """The waiting orders nobody waits for any longer; they are forgotten here."""
+        return self._out(lambda order: order.expires <= now) if self._orders else []
+
+    def _out(self, which: Callable[[Order], bool]) -> list[Order]:
+        taken = [order for order in self._orders if which(order)]
+        if taken:
+            self._orders = deque(order for order in self._orders if not which(order))
+        return taken

@@ -4,16 +4,15 @@ import heapq
 import itertools
 import random
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 from gateway.device import Device, Standing
 from gateway.jobs import NOWHERE, PAUSE_FIRST, PAUSE_LONGEST, URGENT, Idle, Job, Poll, Probe
-from gateway.orders import Order, Write
+from gateway.orders import OrderQueue
 from gateway.planner import Block
 
 GOLDEN = 0.6180339887498949  # its multiples spread evenly, however many there are
 SILENT_SHARE = 0.05  # of the wire's time, for all silent stations together
-WAITING_ORDERS = 1000
 
 
 class Schedule:
@@ -35,15 +34,14 @@ class Schedule:
         self.devices = devices
         self._random = random.Random(seed)  # noqa: S311  (jitter, not a secret)
         self._order = itertools.count()
-        self._phases = (
-            n * GOLDEN % 1 / 2 for n in itertools.count()
-        )  # of a period, to begin early
+        # By how much of its period each poll begins early.
+        self._phases = (n * GOLDEN % 1 / 2 for n in itertools.count())
         self._waiting: list[tuple[float, int, Poll]] = []  # by due time
         self._ready: list[tuple[float, int, Poll]] = []  # due, by deadline
         self._roomy = 64  # places in `_waiting` before the void ones are looked for
         self._urgent: deque[Poll] = deque()
         self._polls: dict[Device, list[Poll]] = {}
-        self._orders: deque[Order] = deque()
+        self.orders = OrderQueue()
         self._wrote = False
         self._hurried = False
         self._failed_lane = now  # when, with polls of others due, the next may fail
@@ -82,41 +80,6 @@ class Schedule:
         self._polls[poll.device] = kept + polls
         self._push(polls)
 
-    def submit(self, order: Order) -> bool:
-        """False when too many orders wait already."""
-        if len(self._orders) >= WAITING_ORDERS:
-            return False
-        self._orders.append(order)
-        return True
-
-    def superseded(self, write: Write) -> list[Order]:
-        """The waiting writes that need not be sent, as `write` follows: its tag says `latest`."""
-        if not write.latest:
-            return []
-        return self._take(lambda other: isinstance(other, Write) and other.tag is write.tag)
-
-    def companions(self, write: Write, fit: Callable[[Sequence[Write]], bool]) -> list[Write]:
-        """The next orders of its device as far as all can go out with it; they are taken out.
-
-        What a device is told stays in the order it was asked for.
-        """
-        found: list[Write] = []
-        for order in self._orders:
-            if order.device is not write.device:
-                continue
-            if not isinstance(order, Write) or not fit([write, *found, order]):
-                break
-            found.append(order)
-        if found:
-            self._take(lambda order: order in found)
-        return found
-
-    def each_alone(self, writes: Sequence[Write]) -> None:
-        """They were refused together, so nothing of them was done: they are next, one by one."""
-        for write in reversed(writes):
-            write.alone = True
-            self._orders.appendleft(write)
-
     def reachable(self, device: Device, now: float) -> bool:
         """False for a silent device whose next probe is not allowed yet."""
         return device.standing is not Standing.SILENT or self._silent_lane <= now
@@ -137,7 +100,7 @@ class Schedule:
     def next(self, now: float) -> Job:
         self._ripen(now)
         due = bool(self._ready or self._urgent)
-        if self._orders and not (self._wrote and due):
+        if self.orders and not (self._wrote and due):
             return self._next_order()
         self._wrote = False
         until = self._waiting[0][0] if self._waiting else float("inf")
@@ -148,12 +111,11 @@ class Schedule:
         return self._next_poll(now) if due else Idle(until)
 
     def _next_order(self) -> Job:
-        order = self._orders[0]
+        order = self.orders.first
         if order.device.doubtful:
             return Probe(order.device)
-        self._orders.popleft()
         self._wrote = True
-        return order
+        return self.orders.take()
 
     def _next_poll(self, now: float) -> Job:
         hurry = bool(self._urgent) and not (self._hurried and self._ready)
@@ -239,14 +201,6 @@ class Schedule:
             poll.due = when
         self._push([poll])
 
-    def withdraw(self, device: Device | None = None) -> list[Order]:
-        """The waiting orders (to one device) that will not be sent any more."""
-        return self._take(lambda order: device is None or order.device is device)
-
-    def expired(self, now: float) -> list[Order]:
-        """The waiting orders nobody waits for any longer; they are forgotten here."""
-        return self._take(lambda order: order.expires <= now) if self._orders else []
-
     def failed(self, now: float, took: float) -> None:
         """A conversation with a device not silent yet ended unclear after `took` seconds."""
         self._failed_lane = now + took
@@ -273,12 +227,6 @@ class Schedule:
         """The line has been opened: every device is to be heard anew."""
         self._failed_lane = self._silent_lane = now
         self._wrote = self._hurried = False
-
-    def _take(self, which: Callable[[Order], bool]) -> list[Order]:
-        taken = [order for order in self._orders if which(order)]
-        if taken:
-            self._orders = deque(order for order in self._orders if not which(order))
-        return taken
 
     def _push(self, polls: Iterable[Poll]) -> None:
         """Polls of a device that is not served wait for `woke`."""

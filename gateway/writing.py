@@ -189,7 +189,7 @@ class Writer:
                 await driver.write_scattered(turn, parts)
             except Refused as error:
                 self._denied(device, error)
-                self.then.schedule.each_alone(group)
+                self.then.schedule.orders.each_alone(group)
                 return []
             except Unclear as error:
                 outcomes.update((one, error) for one in group)

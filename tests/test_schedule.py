@@ -9,8 +9,8 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 from gateway.device import Device, Standing
 from gateway.errors import NoReply
 from gateway.jobs import PAUSE_FIRST, PAUSE_LONGEST, Idle, Poll, Probe
-from gateway.orders import Write
-from gateway.schedule import SILENT_SHARE, WAITING_ORDERS, Schedule
+from gateway.orders import WAITING_ORDERS, Write
+from gateway.schedule import SILENT_SHARE, Schedule
 from gateway.tags import WriteRule
 from tests.sim.plant import device, make_tag
 
@@ -43,7 +43,7 @@ def test_writes_go_first() -> None:
     dev = up(0)
     schedule = Schedule([dev], 0.0)
     mine = write(dev)
-    schedule.submit(mine)
+    schedule.orders.submit(mine)
     assert schedule.next(0.0) is mine
     assert isinstance(schedule.next(0.0), Poll)
 
@@ -53,7 +53,7 @@ def test_but_not_twice_in_a_row_while_a_poll_is_due() -> None:
     schedule = Schedule([dev], 0.0)
     writes = [write(dev) for _ in range(4)]
     for one in writes:
-        schedule.submit(one)
+        schedule.orders.submit(one)
     jobs: list[Any] = []
     for _ in range(6):
         jobs.append(schedule.next(0.0))
@@ -67,8 +67,8 @@ def test_a_write_does_not_wait_for_polls_that_are_not_to_be_asked_any_more() -> 
     """The second write goes at once when the poll that was due has been replaced meanwhile."""
     dev = up(0)
     schedule = Schedule([dev], 0.0)
-    schedule.submit(write(dev))
-    schedule.submit(second := write(dev))
+    schedule.orders.submit(write(dev))
+    schedule.orders.submit(second := write(dev))
     assert isinstance(schedule.next(0.0), Write)
     schedule.plan(dev, 0.0)
     schedule.polls(dev)[0].live = False
@@ -137,7 +137,7 @@ def test_a_device_in_doubt_is_probed_before_anything_else() -> None:
     dev = up(0)
     schedule = Schedule([dev], 0.0)
     doubt(dev)
-    for what in (lambda: None, lambda: schedule.submit(write(dev))):
+    for what in (lambda: None, lambda: schedule.orders.submit(write(dev))):
         what()
         job = schedule.next(0.0)
         assert isinstance(job, Probe)
@@ -318,19 +318,19 @@ def test_writes_are_withdrawn_by_device_and_expire() -> None:
     schedule = Schedule([one, two], 0.0)
     writes = [write(one), write(two), write(one, expires=1.0), write(two)]
     for each in writes:
-        assert schedule.submit(each)
-    assert schedule.expired(0.9) == []
-    assert schedule.expired(1.0) == [writes[2]]
-    assert schedule.withdraw(two) == [writes[1], writes[3]]
-    assert schedule.withdraw() == [writes[0]]
-    assert schedule.withdraw() == []
+        assert schedule.orders.submit(each)
+    assert schedule.orders.expired(0.9) == []
+    assert schedule.orders.expired(1.0) == [writes[2]]
+    assert schedule.orders.withdraw(two) == [writes[1], writes[3]]
+    assert schedule.orders.withdraw() == [writes[0]]
+    assert schedule.orders.withdraw() == []
 
 
 def test_too_many_waiting_writes_are_not_taken() -> None:
     dev = up(0)
     schedule = Schedule([dev], 0.0)
-    assert all(schedule.submit(write(dev)) for _ in range(WAITING_ORDERS))
-    assert not schedule.submit(write(dev))
+    assert all(schedule.orders.submit(write(dev)) for _ in range(WAITING_ORDERS))
+    assert not schedule.orders.submit(write(dev))
 
 
 class AnyOrder(RuleBasedStateMachine):
@@ -421,13 +421,13 @@ class AnyOrder(RuleBasedStateMachine):
 
     @rule(which=st.integers(0, 2))
     def submit(self, which: int) -> None:
-        self.schedule.submit(write(self.devices[which], expires=1e9))
+        self.schedule.orders.submit(write(self.devices[which], expires=1e9))
         self.submitted += 1
 
     @precondition(lambda self: self.submitted)
     @rule(which=st.integers(0, 2))
     def withdraw(self, which: int) -> None:
-        self.submitted -= len(self.schedule.withdraw(self.devices[which]))
+        self.submitted -= len(self.schedule.orders.withdraw(self.devices[which]))
 
     @rule(which=st.integers(0, 2))
     def plan(self, which: int) -> None:
@@ -468,7 +468,7 @@ class AnyOrder(RuleBasedStateMachine):
 
     @invariant()
     def no_write_is_lost(self) -> None:
-        assert len(self.schedule._orders) == self.submitted - self.written
+        assert len(self.schedule.orders) == self.submitted - self.written
 
 
 AnyOrder.TestCase.settings = settings(max_examples=60, stateful_step_count=40, deadline=None)

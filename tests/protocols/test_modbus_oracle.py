@@ -17,7 +17,7 @@ from pymodbus.pdu.register_message import (
     WriteSingleRegisterResponse,
 )
 
-from gateway.errors import Refused
+from gateway.errors import Refused, Unclear
 from gateway.protocols.driver import Span
 from tests.protocols.modbus_peer import KINDS, Hearing, oracle_decodes, oracle_encodes
 
@@ -91,6 +91,8 @@ async def test_the_oracles_exceptions_are_refusals(
     driver, span = kind(station=station), Span("holding", 7, 2)
     refused = ExceptionResponse(16 if writing else 3, code, device_id=station, transaction=1)
     talk = Hearing(driver, [oracle_encodes(kind, refused)])
-    with pytest.raises(Refused) as no:
+    accepted = writing and code == 5  # and may be done later: not refused
+    with pytest.raises(Unclear if accepted else Refused) as no:
         await (driver.write(talk, span, [1, 2]) if writing else driver.read(talk, span))
-    assert no.value.code == f"{code:02d}"
+    if isinstance(no.value, Refused):
+        assert no.value.code == f"{code:02d}"

@@ -149,7 +149,7 @@ def theory(case: Case) -> tuple[int, int, int]:
     request = sent[0]
     reply = bench.ask(request)
     bits = case.shape.data_bits + case.shape.parity
-    total = (len(reply) + len(request)) * bits
+    total = (len(reply) + len(request)) * case.shape.bits
     if case.driver.protocol == "modbus-rtu":
         patterns = sum(_choose(len(frame) * bits, 4) / 2**15 for frame in (request, reply))
         return 4, int(patterns), total
@@ -222,10 +222,9 @@ def main() -> int:
             share = patterns * rate**fewest * (1 - rate) ** (bits - fewest)
             for times in (1, 2):
                 seen = measured(case, rate, chosen.seconds, times)
-                believed = seen.get("right", 0) + seen.get("wrong", 0)
                 line[f"readings x{times}"] = sum(seen.values())
                 line[f"wrong x{times}"] = seen.get("wrong", 0)
-                line[f"share x{times}"] = seen.get("wrong", 0) / max(1, believed)
+                line[f"share x{times}"] = seen.get("wrong", 0) / max(1, sum(seen.values()))
             line |= {"theory x1": share, "patterns": patterns, "errors": fewest}
             print(json.dumps(line), flush=True)
     return 0

@@ -131,15 +131,13 @@ class Bus:
 
     def blind(self, since: float) -> bool:
         """Something was damaged since then, and its own check sum agrees."""
-        checks = [CHECKS[self.protocol]]
-        if self.protocol == "vigor":
-            checks.append(CHECKS["computer-link"])
+        protocol = self.asked.driver.protocol if self.asked else self.protocol
         damaged = [
             heard
             for way, heard in (("<", self.heard), (">", self.request))
             if self.hurt[way] >= since
         ]
-        return any(check(part) for check in checks for part in damaged)
+        return any(CHECKS[protocol](part) for part in damaged)
 
 
 @dataclass(eq=False)
@@ -512,8 +510,8 @@ class World:
                 kept = len(schedule._waiting) + len(schedule._ready) + len(schedule._urgent)
                 if kept > 4 * polls + 50:
                     self.broke(f"{line.name}: {kept} places in the queues for {polls} polls")
-                if len(schedule._orders) > len(line.devices):
-                    self.broke(f"{line.name}: {len(schedule._orders)} writes wait")
+                if len(schedule.orders) > len(line.devices):
+                    self.broke(f"{line.name}: {len(schedule.orders)} writes wait")
             waiting = sum(map(len, self.gateway._waiting.values()))
             if waiting > 2 * len(self.devices):
                 self.broke(f"{waiting} who asked for fresh values are still remembered")

@@ -19,7 +19,7 @@ from pymodbus.pdu.register_message import (
     WriteSingleRegisterRequest,
 )
 
-from gateway.errors import NoReply, Refusal, Refused
+from gateway.errors import NoReply, Refusal, Refused, Unclear
 from gateway.protocols.modbus.frame import EXCEPTION
 
 _READS: dict[int, type[ModbusPDU]] = {
@@ -105,17 +105,24 @@ def words_of(dwords: Sequence[int], *, low_first: bool) -> list[int]:
     return [word for low, high in pairs for word in ((low, high) if low_first else (high, low))]
 
 
+_ACCEPTED = 5
+_WRITES = (5, 6, 15, 16)
+
+
 def raise_refusal(pdu: bytes, function: int) -> None:
     """Raise what `pdu` says if it is an exception to a question of that function.
 
     `Refused` with the exception code in hex; `NoReply` for 0B, by which a gateway tells that
-    the device behind it kept silent: nobody knows then whether a write was done.
+    the device behind it kept silent: nobody knows then whether a write was done. `Unclear` for
+    05 to a write: it was accepted, and may be done later.
     """
     if len(pdu) != 2 or pdu[0] != function | EXCEPTION:
         return
     code = pdu[1]
     if code == _NO_RESPONSE_BEHIND:
         raise NoReply("a gateway on the way got no answer from the device (exception 0B)")
+    if code == _ACCEPTED and function in _WRITES:
+        raise Unclear("accepted, but it takes longer (exception 05): it may be done yet")
     words, refusal = _EXCEPTIONS.get(code, ("unknown exception", Refusal.OTHER))
     raise Refused(
         f"exception {code:02X} to function {function:02d}: {words}",

@@ -1,0 +1,158 @@
+"""Anything may be heard, written in the file or sent as a payload: nothing but our own errors.
+
+A short slice runs in the suite; `make fuzz EXAMPLES=200000` goes on for long.
+"""
+
+import os
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from gateway.config import ConfigErrors, load
+from gateway.errors import BadValue, GatewayError
+from gateway.payload import wanted
+from gateway.protocols.computer_link import ComputerLink
+from gateway.protocols.driver import AnyDriver, Span
+from gateway.protocols.modbus import ModbusAscii, ModbusRtu, ModbusTcp
+from gateway.protocols.vigor import Vigor
+from gateway.simulation import station_for
+
+EXAMPLES = int(os.environ.get("EXAMPLES", "150"))
+often = settings(
+    max_examples=EXAMPLES, deadline=None, suppress_health_check=list(HealthCheck), database=None
+)
+DRIVERS: dict[str, tuple[AnyDriver, Span]] = {
+    "vigor": (Vigor(station=1), Span("D", 100, 4)),
+    "link-1": (ComputerLink(station=1), Span("D", 100, 4)),
+    "link-4": (ComputerLink(station=1, frame_format=4), Span("D", 100, 4)),
+    "link-sumless": (ComputerLink(station=1, sum_check=False), Span("D", 100, 4)),
+    "rtu": (ModbusRtu(station=1), Span("holding", 100, 4)),
+    "ascii": (ModbusAscii(station=1), Span("holding", 100, 4)),
+    "tcp": (ModbusTcp(station=1), Span("holding", 100, 4)),
+}
+# What protocols are made of, so that more of it gets further than the first byte.
+BYTES = st.lists(
+    st.one_of(
+        st.sampled_from([b"\x02", b"\x03", b"\x05", b"\x06", b"\x15", b"\r\n", b":", b"01", b"00"]),
+        st.sampled_from([b"\x01\x03\x08", b"\x06015100", b"\x0201FF", b"\x0601FF", b":0103"]),
+        st.binary(max_size=12),
+    ),
+    max_size=12,
+).map(b"".join)
+
+
+class Once:
+    """A `Talk` on which one question is answered with given bytes, in given pieces."""
+
+    def __init__(self, driver: AnyDriver, heard: bytes, piece: int) -> None:
+        self._codec, self._heard, self._piece = driver.codec(), heard, piece
+        self.sent = b""
+
+    async def tell(self, frame: Any) -> None:
+        self.sent = self._codec.encode(frame)
+
+    async def ask(self, frame: Any, reply: int, answers: Callable[[Any], Any]) -> Any:
+        self.sent = self._codec.encode(frame)
+        for first in range(0, len(self._heard), self._piece):
+            for found in self._codec.feed(self._heard[first : first + self._piece]):
+                answer = answers(found)
+                if answer is not None:
+                    return answer
+        raise GatewayError("no answer")
+
+
+def _end(work: Any) -> Any:
+    try:
+        work.send(None)
+    except StopIteration as end:
+        return end.value
+    raise AssertionError("it waits")
+
+
+@pytest.mark.parametrize("name", DRIVERS)
+@often
+@given(heard=BYTES, piece=st.integers(1, 40))
+def test_whatever_is_heard_is_words_or_an_error_of_ours(
+    name: str, heard: bytes, piece: int
+) -> None:
+    driver, span = DRIVERS[name]
+    try:
+        units = _end(driver.read(Once(driver, heard, piece), span))
+    except GatewayError:
+        return
+    assert len(units) == span.size
+    assert all(0 <= unit <= 0xFFFF for unit in units)
+
+
+@pytest.mark.parametrize("name", DRIVERS)
+@often
+@given(data=st.data())
+def test_a_damaged_answer_is_right_or_refused_but_for_the_sum_s_blind_spot(
+    name: str, data: st.DataObject
+) -> None:
+    """One byte of a good answer is another one: no check sum misses that."""
+    driver, span = DRIVERS[name]
+    if name in ("link-sumless", "tcp"):
+        return  # nothing protects these
+    station = station_for(driver, ())
+    words = data.draw(st.lists(st.integers(0, 0xFFFF), min_size=4, max_size=4))
+    station.memory.write(span.area, span.start, words)
+    question = Once(driver, b"", 1)
+    with pytest.raises(GatewayError):
+        _end(driver.read(question, span))
+    answer = bytearray(b"".join(station.hear(question.sent, 1.0)))
+    place = data.draw(st.integers(0, len(answer) - 1))
+    answer[place] ^= data.draw(st.integers(1, 255))
+    with suppress(GatewayError):
+        assert list(_end(driver.read(Once(driver, bytes(answer), 40), span))) == words
+
+
+@pytest.mark.parametrize("name", DRIVERS)
+@often
+@given(heard=BYTES)
+def test_a_simulated_station_survives_whatever_it_hears(name: str, heard: bytes) -> None:
+    driver, _ = DRIVERS[name]
+    station = station_for(driver, ())
+    for now, byte in enumerate(heard):
+        station.hear(bytes([byte]), float(now) / 1000)
+    station.hear(heard, 100.0)
+
+
+@often
+@given(st.one_of(st.binary(max_size=60), st.text(max_size=40).map(str.encode)))
+def test_a_payload_is_a_value_or_refused(payload: bytes) -> None:
+    with suppress(BadValue):
+        assert isinstance(wanted(payload), (bool, int, float, str))
+
+
+WORDS = (
+    "gateway zenoh defaults lines devices tags port simulator protocol vigor modbus-rtu station "
+    "address D100 M12 holding:5 every 1s write true name prefix format 7E1 baudrate 9600 "
+    "verify_reads <<: *a &a [ ] { } - 1 0 -5 1e999 null ~ '' : # ! | >"
+)
+WORD = st.sampled_from(WORDS.split(" "))
+LINES = st.lists(
+    st.tuples(st.integers(0, 4), st.lists(st.one_of(WORD, st.text(max_size=6)), max_size=4)),
+    max_size=14,
+)
+
+
+@often
+@given(lines=LINES)
+def test_any_file_is_a_configuration_or_a_list_of_mistakes(
+    tmp_path_factory: pytest.TempPathFactory, lines: list[tuple[int, list[str]]]
+) -> None:
+    path = _folder(tmp_path_factory) / "config.yaml"
+    text = "\n".join("  " * depth + ": ".join(words) for depth, words in lines)
+    path.write_bytes(text.encode("utf-8", "surrogatepass"))
+    with suppress(ConfigErrors):
+        assert load(path).lines is not None
+
+
+def _folder(factory: pytest.TempPathFactory) -> Path:
+    return factory.getbasetemp()
