@@ -23,7 +23,10 @@ FIFO = 16  # characters a UART hands over at once
 
 @dataclass(slots=True)
 class Passed:
-    """Seconds and characters, from the first request to the end of the last reply."""
+    """Seconds and characters, from the second request to the end of the last reply.
+
+    The first exchange is the short question by which the line finds out who is there.
+    """
 
     exchanges: int = 0
     characters: int = 0
@@ -37,20 +40,24 @@ def serve(stations: Sequence[Station], character: float, turnaround: float) -> N
     tty.setraw(slave)
     print(os.ttyname(slave), flush=True)
     passed = Passed()
-    started = 0.0
+    started, heard = 0.0, 0
     while True:
         ready = select.select([master, sys.stdin], [], [])[0]
         if sys.stdin in ready:
             break
         arrived = time.monotonic()
         request = os.read(master, 4096)
-        started = started or arrived
+        heard += 1
+        if heard == 2:
+            started = arrived
         spoken = arrived + len(request) * character
         replies = [reply for s in stations for reply in s.hear(request, time.monotonic())]
         if not replies:
             continue
         begin = spoken + turnaround
         ended = _send(master, b"".join(replies), begin, character)
+        if heard == 1:
+            continue
         passed.exchanges += 1
         passed.characters += len(request) + sum(map(len, replies))
         passed.turnarounds += turnaround

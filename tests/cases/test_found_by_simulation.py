@@ -62,7 +62,7 @@ async def test_seed_4_lean_a_clock_set_back_makes_no_old_value_fresh(tmp_path: P
 
 
 @on_virtual_time
-async def test_seed_11_lean_nobody_who_asked_in_vain_is_remembered(tmp_path: Path) -> None:
+async def test_nobody_who_asked_in_vain_is_remembered(tmp_path: Path) -> None:
     """While a device is silent no sample of it comes, however often it is asked for."""
     config = load(_file(tmp_path, speed={"address": "D100", "every": "1h"}))
     gateway = Gateway(config)
