@@ -8,7 +8,7 @@ oldest run frees whole pages at the beginning. Every method is one transaction.
 
 import sqlite3
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from datetime import UTC, datetime
 from itertools import chain
 from pathlib import Path
@@ -65,15 +65,14 @@ class HistoryFile:
         # What is in the log and not yet in the file proper counts as well.
         self.log_limit = max(256 * 1024, min(4 * 1024 * 1024, max_size // 16))
         self._database = _opened(path)
-        try:
+        with ExitStack() as undo:
+            undo.callback(self._database.close)
             pages = max(16, self.log_limit // (2 * 4096))
             self._database.execute(f"PRAGMA wal_autocheckpoint = {pages}")
             self._database.execute(f"PRAGMA journal_size_limit = {self.log_limit}")
             self.inode = path.stat().st_ino
             self._tags = dict(self._database.execute("SELECT key, id FROM tag"))
-        except BaseException:
-            self._database.close()
-            raise
+            undo.pop_all()
 
     def close(self) -> None:
         self._database.close()
@@ -203,10 +202,9 @@ class HistoryFile:
         try:
             yield
             self._database.execute("COMMIT")
-        except BaseException:
+        finally:
             if self._database.in_transaction:
                 self._database.execute("ROLLBACK")
-            raise
 
 
 def is_damage(error: sqlite3.Error) -> bool:
@@ -219,11 +217,10 @@ def _opened(path: Path) -> sqlite3.Connection:
     database = sqlite3.connect(
         path, timeout=BUSY_WITHIN, isolation_level=None, check_same_thread=False
     )
-    try:
+    with ExitStack() as undo:
+        undo.callback(database.close)
         _prepare(database, path)
-    except BaseException:
-        database.close()
-        raise
+        undo.pop_all()
     return database
 
 

@@ -4,7 +4,7 @@ import sqlite3
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from heapq import heappop, heappush
 from pathlib import Path
 from typing import NamedTuple
@@ -107,11 +107,10 @@ class Reader:
             database = sqlite3.connect(
                 f"{self._path.absolute().as_uri()}?mode=ro", uri=True, check_same_thread=False
             )
-        try:
+        with ExitStack() as undo:
+            undo.callback(database.close)
             yield database
-        except BaseException:
-            database.close()
-            raise
+            undo.pop_all()
         with self._lock:
             if age == self._age:
                 self._idle.append(database)
