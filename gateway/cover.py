@@ -12,8 +12,7 @@ open requests afresh will never be cheaper; nor will one that is no cheaper and 
 left in its open requests.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 # Seconds of one exchange over items first..last, None where one request cannot hold them.
@@ -30,20 +29,17 @@ class Request(NamedTuple):
     every: float
 
 
-@dataclass(slots=True, eq=False)
-class _State:
-    """One way to have covered the items so far."""
+class _Closed(NamedTuple):
+    """Requests that have ended, newest first."""
 
-    starts: tuple[int, ...]  # by interval, fastest first: where the open request began
-    paid: float  # wire time per second of the requests that are closed
-    total: float  # as if the open ones were closed here
-    done: "_Closed | None"  # the closed requests, newest first
-
-
-@dataclass(slots=True, eq=False)
-class _Closed:
     request: Request
     before: "_Closed | None"
+
+
+_Starts = tuple[int, ...]  # by interval, fastest first: where the open request began, or CLOSED
+# One way to have covered the items so far: its wire time per second, as if the open requests
+# were closed here; the open requests; the closed ones.
+_State = tuple[float, _Starts, _Closed | None]
 
 
 def cover(
@@ -61,129 +57,144 @@ def cover(
     packed from their first one do not); it makes long rows much faster.
     """
     rates = sorted(set(intervals))
-    states = [_State((CLOSED,) * len(rates), 0.0, 0.0, None)]
+    rank = {every: rate for rate, every in enumerate(rates)}
+    states: list[_State] = [(0.0, (CLOSED,) * len(rates), None)]
     for item, interval in enumerate(intervals):
         alone = seconds(item, item)
         if alone is None:
             raise ValueError(item)
-        step = _Step(item, rates.index(interval), rates, _Known(seconds), item in splits)
-        found: dict[tuple[int, ...], _State] = {}
+        fresh = [alone / every for every in rates]
+        growth = _growth(item, states, seconds, split=item in splits, even=even)
+        step = _Step(item, rank[interval], rates, fresh, growth)
+        found: dict[_Starts, _State] = {}
         for state in states:
             for after in step.after(state):
-                known = found.get(after.starts)
-                if known is None or after.total < known.total - _TINY:
-                    found[after.starts] = after
-        states = _contenders(list(found.values()), rates, alone)
-        if even and len(states) > 1:
-            states = _undominated(states, [alone / every for every in rates])
-    best = min(states, key=lambda state: state.total)
-    return _requests(best, len(intervals) - 1, rates)
+                known = found.get(after[1])
+                if known is None or after[0] < known[0] - _TINY:
+                    found[after[1]] = after
+        states = (_undominated if even else _contenders)(list(found.values()), fresh)
+    _, starts, done = min(states, key=_total)
+    return _requests(starts, done, len(intervals) - 1, rates)
 
 
-class _Known(dict[tuple[int, int], float | None]):
-    """What an exchange costs, asked for once in each step."""
+def _growth(
+    item: int, states: Sequence[_State], seconds: SecondsOf, *, split: bool, even: bool
+) -> dict[int, float | None]:
+    """What `item` adds to each open request, by where that began; None where it does not fit."""
+    begun = sorted({start for _, starts, _ in states for start in starts if start != CLOSED})
+    if split:
+        return dict.fromkeys(begun)
+    growth: dict[int, float | None] = {}
+    for place, start in enumerate(begun):
+        whole = seconds(start, item)
+        if whole is None:
+            growth[start] = None
+            continue
+        more = whole - (seconds(start, item - 1) or 0.0)
+        if even:  # those that began later are shorter still
+            growth.update(dict.fromkeys(begun[place:], more))
+            break
+        growth[start] = more
+    return growth
 
-    def __init__(self, seconds: SecondsOf) -> None:
-        super().__init__()
-        self._seconds = seconds
 
-    def __missing__(self, run: tuple[int, int]) -> float | None:
-        found = self[run] = self._seconds(*run)
-        return found
-
-
-@dataclass(frozen=True, slots=True)
-class _Step:
+class _Step(NamedTuple):
     """What may be done at one item."""
 
     item: int
     rate: int  # which of the intervals the item wants
     rates: Sequence[float]
-    seconds: _Known
-    split: bool
+    fresh: Sequence[float]  # by interval: what a new request for the item alone costs
+    growth: dict[int, float | None]
 
-    def after(self, state: _State) -> list[_State]:
-        """Every state that `state` can become: each open request goes on or ends, others begin."""
-        ways = [_State((), state.paid, state.paid, state.done)]
-        # Of the open requests only the fastest served the item before, so it alone may end there:
-        # the others would have ended sooner. In the same way a request begins where it serves.
-        fastest = next((r for r, start in enumerate(state.starts) if start != CLOSED), None)
-        for rate, start in enumerate(state.starts):
-            ends = rate == fastest
-            ways = [more for way in ways for more in self._choices(way, rate, start, ends=ends)]
-        return [way for way in ways if self._served(way)]
+    def after(self, state: _State) -> Iterator[_State]:
+        """Every state that `state` can become: each open request goes on or ends, others begin.
 
-    def _choices(self, way: _State, rate: int, start: int, *, ends: bool) -> list[_State]:
-        every = self.rates[rate]
-        found = []
-        closed = way
-        if start != CLOSED:
-            longer = None if self.split else self.seconds[start, self.item]
-            if longer is not None:
-                found.append(_extended(way, start, longer / every))
-                if not ends:
-                    return found
-            spent = (self.seconds[start, self.item - 1] or 0.0) / every
-            done = _Closed(Request(start, self.item - 1, every), way.done)
-            closed = _State(way.starts, way.paid + spent, way.total + spent, done)
-        if rate <= self.rate and not self._served(way):
-            alone = self.seconds[self.item, self.item]
-            if alone is not None:
-                found.append(_extended(closed, self.item, alone / every))
-        found.append(_State((*closed.starts, CLOSED), closed.paid, closed.total, closed.done))
-        return found
+        Of the open requests only the fastest served the item before, so it alone may end without
+        need: the others would have ended sooner.
+        """
+        total, starts, done = state
+        fastest: int | None = None
+        spared: float | None = None
+        for rate, start in enumerate(starts):
+            if start == CLOSED:
+                continue
+            more = self.growth[start]
+            if more is None:
+                starts, done = self._end(starts, done, rate)
+            else:
+                more /= self.rates[rate]
+                total += more
+            if fastest is None:
+                fastest, spared = rate, more
+        yield from self._serve(total, starts, done)
+        if fastest is not None and spared is not None:
+            yield from self._serve(total - spared, *self._end(starts, done, fastest))
 
-    def _served(self, way: _State) -> bool:
-        return any(start != CLOSED for start in way.starts[: self.rate + 1])
+    def _end(
+        self, starts: _Starts, done: _Closed | None, rate: int
+    ) -> tuple[_Starts, _Closed | None]:
+        request = Request(starts[rate], self.item - 1, self.rates[rate])
+        return (*starts[:rate], CLOSED, *starts[rate + 1 :]), _Closed(request, done)
+
+    def _serve(self, total: float, starts: _Starts, done: _Closed | None) -> Iterator[_State]:
+        """A request begins only where nothing else serves."""
+        if max(starts[: self.rate + 1]) != CLOSED:
+            yield total, starts, done
+            return
+        for rate in range(self.rate + 1):
+            began = (*starts[:rate], self.item, *starts[rate + 1 :])
+            yield total + self.fresh[rate], began, done
 
 
-def _extended(way: _State, start: int, spent: float) -> _State:
-    return _State((*way.starts, start), way.paid, way.total + spent, way.done)
+def _total(state: _State) -> float:
+    return state[0]
 
 
-def _contenders(states: list[_State], rates: Sequence[float], alone: float) -> list[_State]:
+def _contenders(states: list[_State], fresh: Sequence[float]) -> list[_State]:
     """Those that could still win. From the cheapest one can go on as any other would by
     beginning its open requests afresh, for at most one exchange of a single item each."""
-    best = min(state.total for state in states)
+    best = min(map(_total, states))
 
     def could_win(state: _State) -> bool:
-        fresh = sum(
-            alone / every
-            for start, every in zip(state.starts, rates, strict=True)
-            if start != CLOSED
-        )
-        return state.total < best + fresh - _TINY or state.total <= best + _TINY
+        prices = zip(state[1], fresh, strict=True)
+        most = best + sum(price for start, price in prices if start != CLOSED)
+        return state[0] < most - _TINY or state[0] <= best + _TINY
 
     return [state for state in states if could_win(state)]
 
 
 def _undominated(states: list[_State], fresh: Sequence[float]) -> list[_State]:
-    """Without those that another can match by beginning afresh only where it has less room."""
+    """Without those that another can match by beginning afresh only where it has less room.
+
+    Written out flat: most of the time that a plan takes is spent here.
+    """
     kept: list[_State] = []
-    for state in sorted(states, key=lambda state: (state.total, [-s for s in state.starts])):
-        limit = state.total + _TINY
-        if not any(other.total + _to_match(other, state, fresh) <= limit for other in kept):
+    for state in sorted(states, key=_total):
+        limit, wanted = state[0] + _TINY, state[1]
+        for total, starts, _ in kept:
+            left = limit - total
+            for start, want, price in zip(starts, wanted, fresh):  # noqa: B905  # strict is slow
+                if want > start:  # CLOSED is below every start
+                    left -= price
+                    if left < 0:
+                        break
+            else:
+                break  # matched
+        else:
             kept.append(state)
     return kept
 
 
-def _to_match(state: _State, other: _State, fresh: Sequence[float]) -> float:
-    """What it costs at most to have as much room as `other` in all its open requests."""
-    spent = 0.0
-    for start, wanted, price in zip(state.starts, other.starts, fresh, strict=True):
-        if wanted > start:  # CLOSED is below every start
-            spent += price
-    return spent
-
-
-def _requests(state: _State, last: int, rates: Sequence[float]) -> list[Request]:
+def _requests(
+    starts: _Starts, done: _Closed | None, last: int, rates: Sequence[float]
+) -> list[Request]:
     found = [
         Request(start, last, every)
-        for start, every in zip(state.starts, rates, strict=True)
+        for start, every in zip(starts, rates, strict=True)
         if start != CLOSED
     ]
-    closed = state.done
-    while closed is not None:
-        found.append(closed.request)
-        closed = closed.before
+    while done is not None:
+        found.append(done.request)
+        done = done.before
     return sorted(found)

@@ -1,0 +1,89 @@
+"""How long a plan takes: `python -m benchmarks.planning`.
+
+Registers of one Modbus device at 19200 baud in rows of several shapes, wanted at one interval or
+at several that were drawn at random for each register, which is the hardest case there is. The
+processor's time for ten thousand of them, and how many times that is of the time for a thousand.
+"""
+
+import random
+import time
+from functools import partial
+
+from gateway.planner import plan
+from gateway.protocols.driver import Address, Span, Unit
+from gateway.protocols.modbus import ModbusRtu
+from gateway.tags import Tag
+from gateway.values import Layout, parse_type
+from gateway.wiretime import Wire
+
+DRIVER = ModbusRtu(station=1)
+SECONDS = partial(Wire(19200, 11).exchange, timing=DRIVER.timing, turnaround=0.010)
+LAYOUT = Layout(parse_type("uint16"))
+INTERVALS = {1: [1.0], 2: [1.0, 10.0], 3: [0.5, 1.0, 5.0], 5: [0.2, 0.5, 1.0, 5.0, 60.0]}
+
+
+def registers(shape: str, count: int) -> list[int]:
+    rng = random.Random(shape)
+    match shape:
+        case "one row":
+            return list(range(count))
+        case "every third":
+            return list(range(0, 3 * count, 3))
+        case "100 in a row, 50 at every second, 50 at every tenth":
+            few = [*range(100), *range(200, 300, 2), *range(400, 900, 10)]
+            return [1300 * n + one for n in range(-(-count // len(few))) for one in few][:count]
+        case "gaps at random":
+            found, at = [], 0
+            for _ in range(count):
+                at += 1 + rng.choice([0, 0, 0, 1, 5, 20])
+                found.append(at)
+            return found
+    raise ValueError(shape)
+
+
+SHAPES = (
+    "one row",
+    "every third",
+    "100 in a row, 50 at every second, 50 at every tenth",
+    "gaps at random",
+)
+
+
+def tags(shape: str, count: int, intervals: list[float]) -> list[Tag]:
+    rng = random.Random(f"{shape} {intervals}")
+    return [
+        Tag(
+            device="plc",
+            name=f"t{n}",
+            text=f"holding:{n}",
+            address=Address("holding", n),
+            span=Span("holding", n, 1),
+            unit_kind=Unit.WORD,
+            layout=LAYOUT,
+            every=rng.choice(intervals),
+        )
+        for n in registers(shape, count)
+    ]
+
+
+def took(shape: str, count: int, intervals: list[float]) -> float:
+    """Seconds of the processor."""
+    wanted = tags(shape, count, intervals)
+    begun = time.process_time()
+    plan(wanted, DRIVER, SECONDS)
+    return time.process_time() - begun
+
+
+def main() -> None:
+    took("one row", 1000, [1.0])  # warm
+    print("| row | intervals | s for 10,000 | x of 1,000 |")
+    print("|---|---|---|---|")
+    for shape in SHAPES:
+        for number, intervals in INTERVALS.items():
+            small = min(took(shape, 1000, intervals) for _ in range(3))
+            large = min(took(shape, 10_000, intervals) for _ in range(2))
+            print(f"| {shape} | {number} | {large:.2f} | {large / small:.1f} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
