@@ -2,11 +2,18 @@
 the most of it."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 from gateway.config.messages import Mistakes
 from gateway.config.model import TagDefaults, WriteSection
-from gateway.config.tag_rules import TagSource, check_bounds, inherit, write_rule
-from gateway.errors import ConfigError
+from gateway.config.tag_rules import (
+    TagSource,
+    address_of,
+    assemble,
+    check_bounds,
+    inherit,
+    write_rule,
+)
 from gateway.protocols.driver import Address, Span, Unit
 from gateway.protocols.frames import Field, FrameDriver
 from gateway.tags import Publish, Tag, WriteRule
@@ -26,10 +33,8 @@ _OF_WORDS = ("type", "word_order", "byte_order")
 def field_tag(source: TagSource, driver: FrameDriver, mistakes: Mistakes) -> Tag | None:
     """The tag, or None after its mistakes were noted."""
     before = len(mistakes)
-    try:
-        address = driver.address(source.own.address)
-    except ConfigError as error:
-        mistakes.add((*source.path, "address"), str(error))
+    address = address_of(source, driver, mistakes)
+    if address is None:
         return None
     settings = inherit(source.inherited, source.own)
     kind = _kind(driver.settings.field_of(source.own.address))
@@ -38,29 +43,11 @@ def field_tag(source: TagSource, driver: FrameDriver, mistakes: Mistakes) -> Tag
         mistakes.add((*source.path, place), problem)
     if len(mistakes) > before:
         return None
-    number, event = kind.is_number, source.own.event
-    tag = Tag(
-        device=source.device,
-        name=source.name,
-        text=source.own.address,
-        address=address,
-        span=Span(address.area, address.number, 1),
-        unit_kind=Unit.WORD,
-        layout=Layout(kind),
-        every=settings.every,
-        scale=settings.scale if number else 1.0,
-        offset=settings.offset if number else 0.0,
-        unit=settings.unit,
-        description=settings.description,
-        deadband=settings.deadband if number else None,
-        publish=Publish.ALWAYS if event else settings.publish,
-        heartbeat=None if event else settings.heartbeat,
-        history=settings.history,
-        payload=settings.payload,
-        write=write,
-        shape=driver.shape(address),
-        event=event,
-    )
+    span = Span(address.area, address.number, 1)
+    tag = assemble(source, settings, address, span, Unit.WORD, Layout(kind), write)
+    tag = replace(tag, shape=driver.shape(address), event=source.own.event)
+    if tag.event:
+        tag = replace(tag, publish=Publish.ALWAYS, heartbeat=None)
     check_bounds(source, tag, mistakes)
     return tag
 

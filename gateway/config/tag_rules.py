@@ -43,10 +43,8 @@ def inherit(outer: TagDefaults, inner: TagDefaults) -> TagDefaults:
 def build_tag(source: TagSource, driver: AnyDriver, mistakes: Mistakes) -> Tag | None:
     """The tag, or None after its mistakes were noted."""
     before = len(mistakes)
-    try:
-        address = driver.address(source.own.address)
-    except ConfigError as error:
-        mistakes.add((*source.path, "address"), str(error))
+    address = address_of(source, driver, mistakes)
+    if address is None:
         return None
     area = driver.areas.get(address.area)
     if area is None:  # a broadcast has no areas that can only be read
@@ -64,15 +62,40 @@ def build_tag(source: TagSource, driver: AnyDriver, mistakes: Mistakes) -> Tag |
         mistakes.add((*source.path, place), problem)
     if len(mistakes) > before:
         return None
-    number = kind.is_number
-    tag = Tag(
+    layout = _layout(settings, driver, area, kind)
+    tag = assemble(source, settings, address, span, area.unit, layout, write)
+    check_bounds(source, tag, mistakes)
+    return tag
+
+
+def address_of(source: TagSource, driver: AnyDriver, mistakes: Mistakes) -> Address | None:
+    """What the tag's address means to its device, or None after the mistake was noted."""
+    try:
+        return driver.address(source.own.address)
+    except ConfigError as error:
+        mistakes.add((*source.path, "address"), str(error))
+        return None
+
+
+def assemble(
+    source: TagSource,
+    settings: TagDefaults,
+    address: Address,
+    span: Span,
+    unit_kind: Unit,
+    layout: Layout,
+    write: WriteRule | None,
+) -> Tag:
+    """The tag, without what only numbers have where it is none."""
+    number = layout.type.is_number
+    return Tag(
         device=source.device,
         name=source.name,
         text=source.own.address,
         address=address,
         span=span,
-        unit_kind=area.unit,
-        layout=_layout(settings, driver, area, kind),
+        unit_kind=unit_kind,
+        layout=layout,
         every=settings.every,
         scale=settings.scale if number else 1.0,
         offset=settings.offset if number else 0.0,
@@ -85,8 +108,6 @@ def build_tag(source: TagSource, driver: AnyDriver, mistakes: Mistakes) -> Tag |
         payload=settings.payload,
         write=write,
     )
-    check_bounds(source, tag, mistakes)
-    return tag
 
 
 def _type(
