@@ -116,7 +116,7 @@ def check(
     for line in lines:
         if line.overloaded:
             err.print(f"warning: {line.advice()}")
-    print(f"{config}: good, {len(_tags(loaded))} tags on {len(lines)} lines")
+    print(f"{config}: good, {show.size(loaded)}")
 
 
 @cli.command()

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 from gateway.device import Device
 from gateway.planner import Block, plan
+from gateway.protocols.frames.driver import LISTENED
 from gateway.tags import Tag
 from gateway.wiretime import Wire
 
@@ -34,6 +35,7 @@ class LineForecast:
     worst_write: float  # from asking to the acknowledgement
     worst_write_silent: float  # the same while a station has just gone silent
     shortest: float  # the shortest interval at which all tags could be polled alike
+    unasked: tuple[tuple[Device, int], ...]  # devices with tags that come unasked: how many
 
     @property
     def overloaded(self) -> bool:
@@ -71,6 +73,9 @@ def forecast(name: str, devices: Sequence[Device], wire: Wire) -> LineForecast:
         BlockForecast(device, block, seconds, _worst_age(block.every, seconds, wait, load))
         for device, block, seconds in asked
     )
+    unasked = [
+        (device, sum(tag.span.area == LISTENED for tag in device.tags)) for device in devices
+    ]
     return LineForecast(
         name=name,
         wire=wire,
@@ -82,6 +87,7 @@ def forecast(name: str, devices: Sequence[Device], wire: Wire) -> LineForecast:
         worst_write=longest + write,
         worst_write_silent=longest + write + silence,
         shortest=sum(_round(device) for device in devices) if load > 1 else cycle,
+        unasked=tuple((device, tags) for device, tags in unasked if tags),
     )
 
 

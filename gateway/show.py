@@ -103,14 +103,29 @@ def plan(lines: Sequence[LineForecast], *, every_block: bool) -> RenderableType:
 
 
 def _line(line: LineForecast) -> Text:
-    text = (
-        f"line {line.name}: {len(line.blocks)} requests, {line.requests:.2f} a second, "
-        f"{line.characters:.0f} characters a second {_speed(line.wire)}\n"
-        f"  load {line.load:.1%} of the wire; one round of everything takes {seconds(line.cycle)}\n"
-        f"  worst write latency {seconds(line.worst_write)}, "
+    writes = (
+        f"\n  worst write latency {seconds(line.worst_write)}, "
         f"{seconds(line.worst_write_silent)} while a station has just gone silent"
     )
-    return Text(text)
+    if not line.blocks:
+        text = f"line {line.name}: nothing is asked {_speed(line.wire)}"
+        return Text(text + writes if line.worst_write else text)
+    return Text(
+        f"line {line.name}: {_counted(len(line.blocks), 'request')}, {line.requests:.2f} a second, "
+        f"{line.characters:.0f} characters a second {_speed(line.wire)}\n"
+        f"  load {line.load:.1%} of the wire; one round of everything takes {seconds(line.cycle)}"
+        + writes
+    )
+
+
+def size(config: Config) -> str:
+    """`22 tags on 3 lines`."""
+    tags = sum(len(device.tags) for device in config.devices)
+    return f"{_counted(tags, 'tag')} on {_counted(len(config.lines), 'line')}"
+
+
+def _counted(number: int, what: str) -> str:
+    return f"{number} {what}" if number == 1 else f"{number} {what}s"
 
 
 def _speed(wire: Wire) -> str:
@@ -132,6 +147,8 @@ def _blocks(line: LineForecast) -> Table:
             seconds(row.seconds),
             seconds(row.worst_age),
         )
+    for device, tags in line.unasked:
+        table.add_row(f"  {device.name}", "comes unasked", str(tags))
     return table
 
 
@@ -144,9 +161,8 @@ def next_steps(config: Config, path: Path, command: str) -> str:
     """What a newcomer types in a second terminal; `command` is how this one was started."""
     file = shlex.quote(str(path))
     tags = [tag for device in config.devices for tag in device.tags]
-    counted = f"{len(tags)} tags on {len(config.lines)} lines"
     lines = [
-        f"Gateway {config.name}: {counted}. In a second terminal:",
+        f"Gateway {config.name}: {size(config)}. In a second terminal:",
         f"  {command} watch {file}",
     ]
     if tags:

@@ -30,6 +30,8 @@ from tests.e2e.processes import (
 )
 from tests.zenoh_peer import free_endpoint
 
+EXAMPLES = Path(__file__).parents[1] / "examples"
+
 COMMANDS = [
     *("run", "check", "read", "write", "control", "watch", "simulate"),
     *("health", "schema", "version"),
@@ -178,9 +180,15 @@ def test_check_prints_the_plan(command: Command, config: Path) -> None:
     assert "worst write latency" in done.out
     rows = [line.split() for line in done.out.splitlines() if line.startswith("  mixer")]
     assert "Y20" in [row[1] for row in rows]
-    assert f"{config}: good, 6 tags on 1 lines" in done.out
+    assert f"{config}: good, 6 tags on 1 line" in done.out
     assert "writing mixer/valve (D7.3) reads the word" in done.err
     assert "warning" not in done.err
+
+
+def test_check_tells_what_comes_unasked(command: Command) -> None:
+    out = command("check", EXAMPLES / "barcode-reader.yaml").out
+    assert "line conveyor: nothing is asked at 9600 baud\n  device" in out
+    assert "  reader  comes unasked  1" in out
 
 
 def test_check_warns_of_a_line_that_is_asked_too_much(command: Command, tmp_path: Path) -> None:
@@ -206,7 +214,7 @@ def test_check_leaves_brackets_alone(command: Command, tmp_path: Path) -> None:
     folder.mkdir(parents=True)
     lines = {"hall": vigor_line("simulator", {"speed": {"address": "D10"}})}
     path = write_config(folder / "config.yaml", free_endpoint(), lines)
-    assert f"{path}: good, 1 tags on 1 lines\n" in command("check", path).out
+    assert f"{path}: good, 1 tag on 1 line\n" in command("check", path).out
 
 
 # -- read, write, watch: mistakes of the user --------------------------------------------------
