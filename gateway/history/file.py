@@ -62,6 +62,7 @@ class HistoryFile:
 
     def __init__(self, path: Path, max_size: int) -> None:
         self.path = path
+        self._log = Path(f"{path}-wal")  # made once: every new path costs the interpreter a string
         # What is in the log and not yet in the file proper counts as well.
         self.log_limit = max(256 * 1024, min(4 * 1024 * 1024, max_size // 16))
         self._database = _opened(path)
@@ -177,7 +178,7 @@ class HistoryFile:
 
     def log_size(self) -> int:
         try:
-            return Path(f"{self.path}-wal").stat().st_size
+            return self._log.stat().st_size
         except FileNotFoundError:
             return 0
 

@@ -104,7 +104,7 @@ class HalfDuplex:
         start = max(self._loop.time(), self._master_until)
         sending = self._put(data, start)
         self._master_until = sending.end
-        self._at(sending.end, lambda: self._reach_stations(sending))
+        self._at(sending.end, lambda: self._reach_stations(sending), self._loop.time())
 
     def close(self) -> None:
         """Nobody hears anything any more."""
@@ -134,19 +134,20 @@ class HalfDuplex:
     def _reply(self, data: bytes, start: float) -> None:
         sending = self._put(data, start)
         chunk = FIFO if self._character else len(data)
+        now = self._loop.time()  # one for all pieces: what is due overtakes what is not yet
         for first in range(0, len(data), chunk):
-            self._deliver_later(sending, first, min(first + chunk, len(data)))
+            self._deliver_later(sending, first, min(first + chunk, len(data)), now)
 
-    def _deliver_later(self, sending: _Sending, first: int, last: int) -> None:
+    def _deliver_later(self, sending: _Sending, first: int, last: int, now: float) -> None:
         due = sending.start + last * self._character
-        self._at(due, lambda: self._deliver(sending.heard(first, last)))
+        self._at(due, lambda: self._deliver(sending.heard(first, last)), now)
 
-    def _at(self, due: float, then: Callable[[], None]) -> None:
+    def _at(self, due: float, then: Callable[[], None], now: float) -> None:
         def unless_cut() -> None:
             if not self.cut:
                 then()
 
-        if due <= self._loop.time():
+        if due <= now:
             self._loop.call_soon(unless_cut)  # timers of one moment do not keep their order
         else:
             self._loop.call_at(due, unless_cut)

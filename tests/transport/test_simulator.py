@@ -1,6 +1,7 @@
 """The simulated wire: characters take their time, chunks come as from a UART, talk collides."""
 
 import asyncio
+import itertools
 
 import pytest
 from hypothesis import given, settings
@@ -50,6 +51,23 @@ def test_a_reply_comes_in_fifo_chunks_each_at_its_time() -> None:
         (pytest.approx(begin + 2 * FIFO * C), reply[FIFO : 2 * FIFO]),
         (pytest.approx(begin + 40 * C), reply[2 * FIFO :]),
     ]
+
+
+@pytest.mark.parametrize("stalled", range(40))
+def test_the_pieces_of_a_reply_keep_their_order_when_the_machine_stalls(stalled: int) -> None:
+    """Found by the soak: a process that stood still while it planned the pieces swapped two."""
+    reply = bytes(range(100))
+
+    async def play() -> bytes:
+        loop, ear = asyncio.get_running_loop(), Heard()
+        port = await open_simulator([Says(reply)], WIRE, ear)
+        clock, looks = loop.time, itertools.count()
+        loop.time = lambda: clock() + (0.1 if next(looks) > stalled else 0.0)  # type: ignore[method-assign]
+        port.write(REQUEST)
+        await asyncio.sleep(1)
+        return ear.data
+
+    assert counted(play) == reply
 
 
 def test_two_frames_of_a_station_follow_each_other() -> None:
