@@ -155,10 +155,13 @@ def started(config: Path) -> Program:
     return _ready(gateway("run", config), "on Zenoh")
 
 
-def station(*where: str, stations: tuple[int, ...] = (1,)) -> Program:
-    """Simulated Vigor PLCs that obey commands (tests/e2e/station.py), ready to be spoken to."""
-    numbers = ",".join(map(str, stations))
-    return _ready(Program(sys.executable, "-m", "tests.e2e.station", numbers, *where), "ready")
+def station(*where: str, stations: tuple[int, ...] = (1,), by: tuple[str, ...] = ()) -> Program:
+    """Simulated Vigor PLCs that obey commands (tests/e2e/station.py), ready to be spoken to.
+
+    `by`: the command that runs them, such as `ip netns exec plc`.
+    """
+    program = (*by, sys.executable, "-m", "tests.e2e.station")
+    return _ready(Program(*program, ",".join(map(str, stations)), *where), "ready")
 
 
 def cable(socat: str, link: Path, far_end: str) -> Program:

@@ -1,7 +1,7 @@
 """Simulated Vigor PLCs in a process of their own that do what they are told.
 
-`python -m tests.e2e.station 1,2 pty LINK` or `… tcp PORT`. It says `ready`, then obeys lines on
-its standard input and answers each with `ok …`:
+`python -m tests.e2e.station 1,2 pty LINK` or `… tcp [HOST:]PORT`. It says `ready`, then obeys
+lines on its standard input and answers each with `ok …`:
 
     mute 1            obeys, but its answers are lost          speak 1     answers again
     hole 1 D 700      this model lacks the device              fill 1 D 700
@@ -34,7 +34,8 @@ class Plant:
         if self._kind == "pty":
             self._served = await serve_on_pty(stations, WIRE, self._where)
         else:
-            self._served = await serve_on_tcp(stations, WIRE, "127.0.0.1", int(self._where))
+            host, _, port = self._where.rpartition(":")
+            self._served = await serve_on_tcp(stations, WIRE, host or "127.0.0.1", int(port))
 
     async def close(self) -> None:
         if self._served is not None:

@@ -104,7 +104,7 @@ async def test_two_gateways_of_a_group_share_one_wire(tmp_path: Path) -> None:
                     # Whoever comes back later stands by, until the other is ended in order.
                     a = programs.enter_context(gateway(tmp_path, "a", router_at, port))
                     await stand_so(client, "waiting active")
-                    await asyncio.sleep(HOLD + CLAIM + 1)
+                    await asyncio.sleep(CLAIM + 1)
                     await stand_so(client, "waiting active")
                     assert await asyncio.to_thread(b.end) == 0
                     await line.until(1, within=3)

@@ -1,0 +1,42 @@
+"""Wrong values that pass every check, once and twice: a slice of what `twice.py` counts."""
+
+import pytest
+
+from gateway.protocols.driver import Span
+from gateway.protocols.modbus import ModbusRtu
+from gateway.protocols.vigor import Vigor
+from tests.sim.residual import Case
+from tests.sim.twice import BARE, CASES, counted, in_a_row, theory
+from tests.sim.wire import Format
+
+SUM = CASES[0]  # Vigor without parity
+STRONG = (
+    Case("vigor 7E1", Vigor(station=1), Span("D", 100, 1), Format(7, parity=True)),
+    Case("modbus-rtu 8N1", ModbusRtu(station=1), Span("holding", 100, 1), Format(8)),
+)
+
+
+@pytest.mark.parametrize("case", STRONG, ids=lambda case: case.name)
+def test_parity_with_a_sum_and_a_crc_notice_every_one_and_two_errors(case: Case) -> None:
+    assert theory(case).ways == {}
+
+
+@pytest.mark.parametrize(
+    ("case", "fewest", "rate", "readings"), [(SUM, 2, 1e-3, 12_000), (BARE, 1, 3e-3, 1200)]
+)
+def test_reading_twice_leaves_the_square_or_less(
+    case: Case, fewest: int, rate: float, readings: int
+) -> None:
+    """Counted, and as theory says. The chance is seeded: it comes out alike every time."""
+    known = theory(case)
+    assert known.fewest == fewest
+    once, twice = known.shares(rate)
+    assert twice < once**2
+    found = counted(case, rate, fewest, readings)
+    assert found.once.low < once < found.once.high
+    assert found.twice.low < twice < found.twice.high
+    assert found.twice.value < found.once.value**2
+    assert found.twice.hits > 0
+    if case is BARE:  # frequent enough to be met by simply reading
+        plain = in_a_row(case, rate, 6000)
+        assert 0 < plain.low < twice < plain.high
