@@ -11,9 +11,14 @@ import pytest
 
 from gateway.app import Gateway
 from gateway.config import load
-from gateway.errors import Busy
+from gateway.errors import Busy, GatewayError
+from gateway.jobs import Poll
+from gateway.protocols.computer_link import ComputerLink
+from gateway.schedule import Schedule
 from gateway.tags import Quality, Reason
-from tests.sim.plant import device, plant, running, words
+from tests.sim.bench import Bench, Unruly
+from tests.sim.links import link_device, link_station
+from tests.sim.plant import Plant, device, plant, running, words
 from tests.sim.virtual import on_virtual_time
 
 SECOND = 1_000_000_000
@@ -112,3 +117,58 @@ async def test_seed_118_lean_one_refusal_costs_an_address_that_was_there_no_five
         station.inner.holes.add(("D", 100))
         await asyncio.sleep(3)
         assert hall.reason(mixer.tags[0]) is Reason.REFUSED
+
+
+@pytest.mark.parametrize("echo", [False, True], ids=["plain", "echo"])
+@on_virtual_time
+async def test_seeds_0_and_2_lean_stations_are_left_time_to_take_in_what_goes_to_all(
+    echo: bool,
+) -> None:
+    """Not as much as one PLC takes to answer, once that is known; and an echo is no end of it."""
+    mixer = link_device(ComputerLink(station=1), "D100", every=0.02, control=True)
+    hall = Plant([mixer], [Unruly(link_station(mixer.driver))], Bench(echo=echo))  # type: ignore[arg-type]
+    said: list[str | GatewayError] = []
+    async with running(hall):
+        await asyncio.sleep(5)
+        assert (mixer.reckoned or 1.0) < 0.02  # measured
+        hall.line.command(mixer, "global", "on", said.append)
+        await asyncio.sleep(1)
+    place = next(i for i, (_, data) in enumerate(hall.bench.sent) if data[5:7] == b"GW")
+    (begin, data), (after, _) = hall.bench.sent[place : place + 2]
+    assert said == ["sent to all stations, none answers"]
+    assert 0.1 <= after - (begin + len(data) * hall.wire.character) < 0.15
+
+
+@on_virtual_time
+async def test_seed_20_lean_an_address_that_is_back_is_asked_for_as_often_as_before() -> None:
+    """Read well for the first time, it waited as long as one that is refused: five minutes."""
+    mixer = device([*words(100, 1, every=5.0), *words(900, 1, every=5.0)])
+    hall = plant([mixer])
+    away = mixer.tags[1]
+    async with running(hall):
+        await asyncio.sleep(5)
+        hall.stations[0].inner.holes.add(("D", 900))
+        await asyncio.sleep(20)
+        assert hall.reason(away) is Reason.REFUSED
+        hall.stations[0].inner.holes.clear()
+        await asyncio.sleep(400)
+        good = [at for at, told in hall.told if told.tag is away and told.value is not None]
+        assert asyncio.get_running_loop().time() - good[-1] < 6.0
+        assert len([at for at in good if at > good[-1] - 52]) > 10
+
+
+def test_seed_13_storm_polls_that_come_and_go_behind_a_late_one_leave_no_places() -> None:
+    """A device that is written to all the time has had its share; its polls wait, others do not."""
+    greedy, modest = device(words(100, 1, every=0.1)), device(words(200, 2, every=0.1), station=2)
+    schedule, now = Schedule([greedy, modest], 0.0), 0.0
+    for each in (greedy, modest):
+        each.answered()
+        schedule.woke(each, now)
+    for _ in range(2000):
+        now += 0.5
+        greedy.used(now, 5.0)
+        job = schedule.next(now)
+        assert isinstance(job, Poll)
+        assert job.device is modest
+        schedule.polled(job, now)
+    assert len(schedule._ready) < 200

@@ -14,7 +14,10 @@ from functools import partial
 from pathlib import Path
 
 from tests.sim.draw import PACES
-from tests.sim.world import Story, run
+from tests.sim.story import Story
+from tests.sim.world import run
+
+MOST = ("most timers", "most open")  # of what is counted, the largest is told
 
 
 def seeds(text: str) -> list[int]:
@@ -44,9 +47,10 @@ def main() -> int:
         task = partial(run, hours=chosen.hours, pace=chosen.pace)
         for story in pool.imap_unordered(task, chosen.seeds):
             done += 1
-            most = max(counts["most timers"], story.counts["most timers"])
+            most = {name: max(counts[name], story.counts[name]) for name in MOST}
             counts += story.counts
-            counts["most timers"] = most
+            for name, number in most.items():
+                counts[name] = number
             if story.broken:
                 broken.append(story)
                 print("\n  ".join([story.replay(), *story.broken]), flush=True)

@@ -2,10 +2,12 @@
 
 import json
 import random
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from tests.sim.episodes import Episode, disappearances, line_episodes
+from tests.sim.more import add_to, net_line, raw_line, rule
 
 PROTOCOLS = ("vigor", "computer-link", "modbus-rtu", "modbus-ascii")
 # How often tags are read: `busy` fills the wires, `lean` leaves time for many hours.
@@ -17,24 +19,6 @@ PACES = {
     "storm": ("500ms", "1s", "2s"),  # ten times as much goes wrong
     "lean": ("20s", "30s", "60s", "60s"),
 }
-CALM = 1000.0  # seconds at the end in which nothing goes wrong
-
-
-@dataclass(frozen=True)
-class Episode:
-    """One thing that goes wrong, for a while."""
-
-    start: float
-    end: float
-    line: str
-    device: str  # empty: the line
-    kind: str
-    strength: float
-
-    @property
-    def silent(self) -> bool:
-        """Nothing of the device is heard meanwhile."""
-        return self.kind in ("deaf", "mute", "vanish", "hang")
 
 
 @dataclass(frozen=True)
@@ -59,14 +43,28 @@ def draw(seed: int, seconds: float, pace: str = "busy") -> Drawn:
     lines: dict[str, Any] = {}
     missing: dict[str, frozenset[int]] = {}
     chunks, zeros = {}, {}
+    haste = 1.0 if pace in ("busy", "lean") else 0.1
     episodes: list[Episode] = []
     for number in range(chance.choice((1, 1, 1, 2, 2, 3))):
         name = f"line{number}"
         lines[name] = _line(name, chance, missing, PACES[pace])
         chunks[name] = chance.choice((0, 0, 16, 16, 1) if pace == "busy" else (0, 0, 0, 16))
         zeros[name] = chance.random() < 0.5
-        haste = 1.0 if pace in ("busy", "lean") else 0.1
-        episodes += _line_episodes(name, lines[name], chance, seconds, haste, pace)
+        episodes += line_episodes(name, lines[name], chance, seconds, haste, pace)
+    more = random.Random(f"more {seed}")
+    for name, line in lines.items():
+        add_to(name, line, more)
+    for name, make in (("net", net_line), ("raw", raw_line)):
+        if more.random() < 0.4:
+            lines[name] = make(name, more, PACES[pace])
+            chunks[name] = more.choice((0, 1, 1, 16))
+            zeros[name] = more.random() < 0.5
+            episodes += line_episodes(name, lines[name], more, seconds, haste, pace)
+    if pace in ("busy", "lean", "storm"):
+        for name, line in lines.items():
+            for device, settings in line["devices"].items():
+                if settings["protocol"] != "frames" and settings["station"] != 0:
+                    episodes += disappearances(name, device, settings, more, seconds)
     jumps = []
     at = chance.expovariate(1 / 1800)
     while at < seconds:
@@ -146,10 +144,10 @@ def _device(
     tags["scaled"] = {"address": f"{word}{first + 310}", "type": "uint16", "scale": 0.1}
     tags["flag"] = {"address": f"{bit}{chance.randrange(0, 200)}"}
     tags["bit"] = {"address": f"{word}{first + 320}.10"}
-    tags["w0"] = {"address": f"{word}{first + 330}", "type": "uint16", "write": _rule(chance)}
-    tags["w1"] = {"address": f"{word}{first + 332}", "type": "uint32", "write": _rule(chance)}
-    tags["w2"] = {"address": f"{bit}{300 + chance.randrange(100)}", "write": _rule(chance)}
-    tags["w3"] = {"address": f"{word}{first + 340}.3", "write": _rule(chance)}
+    tags["w0"] = {"address": f"{word}{first + 330}", "type": "uint16", "write": rule(chance)}
+    tags["w1"] = {"address": f"{word}{first + 332}", "type": "uint32", "write": rule(chance)}
+    tags["w2"] = {"address": f"{bit}{300 + chance.randrange(100)}", "write": rule(chance)}
+    tags["w3"] = {"address": f"{word}{first + 340}.3", "write": rule(chance)}
     if chance.random() < 0.3:
         tags["slow"] = {"address": f"{word}{first + 311}", "type": "uint16", "every": "30s"}
     if chance.random() < 0.25:
@@ -158,81 +156,3 @@ def _device(
         missing[name] = frozenset((hole,))
     device["tags"] = tags
     return device
-
-
-def _rule(chance: random.Random) -> dict[str, Any]:
-    return {"verify": chance.random() < 0.4, "repeat": chance.random() < 0.3}
-
-
-# What goes wrong
-
-_STATION_KINDS = (
-    "deaf",
-    "deaf",
-    "mute",
-    "lose",
-    "cut",
-    "slow",
-    "late",
-    "very-late",
-    "foreign",
-    "junk",
-    "reboot",
-)
-_LINE_KINDS = ("noise", "noise", "noise-after", "vanish", "vanish", "hang", "flicker")
-
-
-_ONLY: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
-    "noisy": ((), ("noise-after",)),
-    "late": (("late",), ()),
-    "tardy": (("very-late",), ()),
-}
-
-
-def _line_episodes(
-    name: str,
-    line: dict[str, Any],
-    chance: random.Random,
-    seconds: float,
-    haste: float,
-    pace: str,
-) -> list[Episode]:
-    stations, wires = _ONLY.get(pace, (_STATION_KINDS, _LINE_KINDS))
-    found = _series(name, "", wires, chance, seconds, 1500.0 * haste)
-    for device in line["devices"]:
-        found += _series(name, device, stations, chance, seconds, 700.0 * haste)
-    return found
-
-
-def _series(
-    line: str,
-    device: str,
-    kinds: tuple[str, ...],
-    chance: random.Random,
-    seconds: float,
-    pause: float,
-) -> list[Episode]:
-    """One after the other, never two at once."""
-    found = []
-    at = chance.expovariate(1 / pause)
-    while kinds and at < seconds - CALM:
-        kind = chance.choice(kinds)
-        last = _LASTS.get(kind, lambda c: c.choice((2.0, 20.0, 60.0, 300.0)) * c.uniform(0.5, 1))
-        end = min(at + last(chance), seconds - CALM)
-        found.append(Episode(at, end, line, device, kind, _STRENGTHS.get(kind, _half)(chance)))
-        at = end + chance.expovariate(1 / pause)
-    return found
-
-
-def _half(chance: random.Random) -> float:
-    return chance.choice((0.05, 0.3, 0.7))
-
-
-_LASTS: dict[str, Callable[[random.Random], float]] = {
-    "reboot": lambda chance: chance.uniform(0.5, 8.0),
-    "flicker": lambda chance: chance.uniform(0.01, 1.0),
-}
-_STRENGTHS: dict[str, Callable[[random.Random], float]] = {
-    "noise": lambda chance: chance.choice((1e-4, 1e-3, 1e-2)),
-    "noise-after": lambda chance: chance.choice((1e-5, 1e-4, 1e-3)),
-}

@@ -62,9 +62,18 @@ def _crc_ends_well(data: bytes) -> bool:
     return False
 
 
+def frames(data: bytes) -> bool:
+    """SOH, ..., ETX, two digits: the sum goes from behind SOH to ETX."""
+    return any(
+        _summed(match[1], match[2])
+        for match in re.finditer(rb"(?s)(?=\x01([^\x01]*?\x03)(..))", data)
+    )
+
+
 CHECKS: dict[str, Callable[[bytes], bool]] = {
     "vigor": vigor,
     "computer-link": link,
     "modbus-ascii": lrc,
     "modbus-rtu": crc,
+    "frames": frames,
 }

@@ -4,15 +4,18 @@ Every word that moves says what time it is, in milliseconds, by an offset of its
 that is too old, or from another address or another station, is not what it should be.
 """
 
+import asyncio
 import random
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 from gateway.protocols.driver import AnyDriver, Unit
+from gateway.protocols.frames import FrameDriver
 from gateway.simulation import station_for
 from gateway.stations.station import Memory, Station
 from gateway.tags import Tag
 from gateway.values import Value
+from tests.sim.gadgets import Gadget, wrapping_of
 
 BLINK = 4096  # ms that a moving bit stays as it is
 SLACK = 2  # ms: moments are rounded to milliseconds on both sides
@@ -28,15 +31,21 @@ def milliseconds(now: float) -> int:
 
 
 def moving(
-    station: int, area: str, number: int, unit: Unit, part: int = 0
+    station: int, area: str, number: int, unit: Unit, part: int = 0, coarse: int = 0
 ) -> Callable[[float], int]:
     """What the unit at `number + part` shows of the clock that begins at `number`."""
     own = offset(station, area, number)
     if unit is Unit.BIT:
         return lambda now: (milliseconds(now) + own) // BLINK & 1
     if unit is Unit.DWORD:
-        return lambda now: (milliseconds(now) + own) & 0xFFFF_FFFF
-    return lambda now: (milliseconds(now) + own) >> 16 * part & 0xFFFF
+        return lambda now: _hashed((milliseconds(now) + own) >> coarse, own, coarse) & 0xFFFF_FFFF
+    shift = 16 * part
+    return lambda now: _hashed((milliseconds(now) + own) >> coarse, own, coarse) >> shift & 0xFFFF
+
+
+def _hashed(step: int, own: int, coarse: int) -> int:
+    """What the clock shows at this step: the step itself, or, where steps are long, any number."""
+    return (step * 2_654_435_761 + own) % 2**32 if coarse else step
 
 
 @dataclass(eq=False)
@@ -58,17 +67,28 @@ class Troubled:
     last: bytes = b""
     others: list["Troubled"] = field(default_factory=list)
     written: dict[tuple[str, int], list[tuple[float, int]]] = field(default_factory=dict)
+    coarse: int = 0  # so many bits of its clocks are left out: values that change rarely
+    numbered: bool = False  # answers carry a number: a foreign one is its own, of a while ago
+    ordered: bool = True  # answers keep the order of the questions
+    missing: set[tuple[str, int]] = field(default_factory=set)  # addresses it refuses
+    absent: dict[tuple[str, int], list[list[float]]] = field(default_factory=dict)  # since, until
 
     def __post_init__(self) -> None:
         self._busy_until = 0.0
         self._now = 0.0
+        self.broke_off = False  # the last answer
+        self.computed: set[tuple[str, int]] = set()  # by its own program: not to be written
         self._remember_writes(self.inner.memory)
+        for where in self.missing:
+            self.absent[where] = [[0.0, float("inf")]]
 
     def _remember_writes(self, memory: Memory) -> None:
         plain = memory.write
 
         def write(area: str, start: int, values: list[int]) -> None:
             values = list(values)
+            if any((area, start + i) in self.computed for i in range(len(values))):
+                return  # its program has the last word
             for i, value in enumerate(values):
                 self.written.setdefault((area, start + i), []).append((self._now, value))
             plain(area, start, values)
@@ -83,19 +103,27 @@ class Troubled:
         if not said:
             return None
         chance = self.chance
-        real, self.last = said, said
+        before, real, self.last, self.broke_off = self.last, said, said, False
         if self.mute or (self.lose and chance.random() < self.lose):
             return None
         if self.foreign and chance.random() < self.foreign:
-            said = next((other.last for other in self.others if other.last), b"") or said
+            others = b"" if self.numbered else next((o.last for o in self.others if o.last), b"")
+            said = others or (before if self.numbered else b"") or said
         if self.cut and chance.random() < self.cut:
             said = said[: chance.randrange(1, len(said))]
+            self.broke_off = True
         if self.junk and chance.random() < self.junk:
             said = chance.randbytes(chance.randrange(1, 6)) + said
         delay = self.turnaround + (self.late(chance) if self.late and said is real else 0.0)
-        delay = max(delay, self._busy_until - now)  # answers keep their order, as a PLC's do
+        if self.ordered:
+            delay = max(delay, self._busy_until - now)  # as a PLC's do
         self._busy_until = now + delay + len(said) * self.character + 0.002
         return said, delay
+
+    @property
+    def speaks(self) -> bool:
+        """It is about to answer, or does."""
+        return _now() < self._busy_until
 
     def well(self) -> None:
         self.deaf = self.mute = False
@@ -108,9 +136,45 @@ class Troubled:
         area, start, size = tag.span
         return self.inner.memory.read(area, start, size, self._now)
 
+    def vanish(self, tag: Tag) -> None:
+        """Its program has no such address any more."""
+        for where in _places(tag):
+            self.missing.add(where)
+            self.absent.setdefault(where, []).append([_now(), float("inf")])
+        set_holes(self.inner, self.missing)
+
+    def come_back(self, tag: Tag) -> None:
+        for where in _places(tag):
+            self.missing.discard(where)
+            self.absent[where][-1][1] = _now()
+        set_holes(self.inner, self.missing)
+
+    def lacks(self, tag: Tag) -> bool:
+        return not self.missing.isdisjoint(_places(tag))
+
+    def lacked(self, tag: Tag, since: float, until: float) -> bool:
+        """At no moment between the two was it there."""
+        return any(
+            begin <= since and until <= end
+            for where in _places(tag)
+            for begin, end in self.absent.get(where, ())
+        )
+
+    def changed(self, tag: Tag, since: float) -> bool:
+        """It came or went since then."""
+        return any(
+            since <= moment
+            for where in _places(tag)
+            for span in self.absent.get(where, ())
+            for moment in span
+            if moment < float("inf")
+        )
+
     def was(self, tag: Tag, value: Value, since: float, until: float) -> bool:
         """Whether the tag had this value at some moment between the two."""
         area, start, _ = tag.span
+        if self.lacked(tag, since, until):
+            return False
         if tag.write is not None:
             return self._was_written(tag, value, since, until)
         first, last = milliseconds(since) - SLACK, milliseconds(until) + SLACK
@@ -118,15 +182,25 @@ class Troubled:
         if tag.unit_kind is Unit.BIT:
             seen = {(ms + own) // BLINK & 1 for ms in (first, last)}
             return len(seen) == 2 or last - first >= BLINK or bool(value) == bool(seen.pop())
+        if self.coarse:
+            return any(tag.decode(units) == value for units in self._steps(tag, own, first, last))
         if tag.address.bit is not None:
-            shift = tag.address.bit
-            turns = {(ms + own) >> shift for ms in (first, last)}
+            turns = {(ms + own) >> tag.address.bit for ms in (first, last)}
             return len(turns) == 2 or bool(value) == bool(turns.pop() & 1)
         if not isinstance(value, (int, float)):
             return False
         bits = 32 if tag.unit_kind is Unit.DWORD or tag.span.size == 2 else 16
         raw = round((value - tag.offset) / tag.scale)
         return (raw - own - first) % (1 << bits) <= last - first
+
+    def _steps(self, tag: Tag, own: int, first: int, last: int) -> Iterator[list[int]]:
+        """What its clock showed from `first` to `last`, in milliseconds."""
+        for step in range((first + own) >> self.coarse, ((last + own) >> self.coarse) + 1):
+            number = _hashed(step, own, self.coarse)
+            if tag.unit_kind is Unit.DWORD:
+                yield [number]
+            else:
+                yield [number >> 16 * part & 0xFFFF for part in range(tag.span.size)]
 
     def _was_written(self, tag: Tag, value: Value, since: float, until: float) -> bool:
         area, start, size = tag.span
@@ -145,23 +219,43 @@ class Troubled:
         return False
 
 
-def station_of(driver: AnyDriver, tags: tuple[Tag, ...], missing: set[tuple[str, int]]) -> Station:
-    """A station in which every tag moves, but those that can be written."""
-    station = station_for(driver, ())
+def station_of(driver: AnyDriver, device: str) -> Station:
+    """The one that the driver talks to, nothing in it yet."""
+    if isinstance(driver, FrameDriver):
+        return Gadget(device[-1], wrapping_of(driver.settings.framing))
+    return station_for(driver, ())
+
+
+def set_going(station: Troubled, tags: tuple[Tag, ...]) -> None:
+    """Every tag moves, but those that can be written."""
+    memory = station.inner.memory
     for tag in tags:
         area, start, size = tag.span
-        if not station.memory.holds(area, start, size):
+        if not memory.holds(area, start, size):
             raise AssertionError(f"{tag.text} is not in the simulated station")
-        if tag.write is None:
-            for part in range(size):
-                motion = moving(driver.station, area, start, tag.unit_kind, part)
-                station.memory.animate(area, start + part, motion)
-    set_holes(station, missing)
-    return station
+        if tag.write is not None:
+            memory.write(area, start, [0] * size)
+            continue
+        for part in range(size):
+            kind = tag.unit_kind
+            motion = moving(station.number, area, start, kind, part, station.coarse)
+            memory.animate(area, start + part, motion)
+            station.computed.add((area, start + part))
+    set_holes(station.inner, station.missing)
+
+
+def _places(tag: Tag) -> list[tuple[str, int]]:
+    return [(tag.span.area, tag.span.start + i) for i in range(tag.span.size)]
+
+
+def _now() -> float:
+    return asyncio.get_running_loop().time()
 
 
 def set_holes(station: Station, missing: set[tuple[str, int]]) -> None:
     """Addresses (area, number) that the station refuses from now on."""
+    if isinstance(station, Gadget):
+        return
     if hasattr(station, "_store"):
         holes = tuple((area, number, number) for area, number in sorted(missing))
         station._store._holes = holes

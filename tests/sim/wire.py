@@ -7,7 +7,7 @@ moments of the loop's clock, and all chance comes from one `random.Random`.
 import asyncio
 import math
 import random
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -163,6 +163,11 @@ class SimWire:
             if said is not None and said[0]:
                 self._say(said[0], request.end + said[1], station)
 
+    def speak(self, data: bytes, station: Speaker) -> None:
+        """The station says this now, whether anybody asked or not."""
+        if not self.hanging:
+            self._say(data, _now(), station)
+
     def _say(self, data: bytes, start: float, station: Speaker) -> None:
         sending = _Sending(start, start + len(data) * self.wire.character, data, station)
         if start <= _now():
@@ -216,16 +221,23 @@ class SimWire:
 
 def spoil(data: bytes, noise: Noise, shape: Format, chance: random.Random) -> bytes:
     """Bit errors of both kinds; start, parity and stop bits are hit as well."""
-    out: list[int] = list(data)
     if noise.before:
-        masks: dict[int, int] = {}
-        for bit in flips(len(data) * shape.bits, noise.before, chance):
-            masks[bit // shape.bits] = masks.get(bit // shape.bits, 0) | 1 << bit % shape.bits
-        for place, mask in sorted(masks.items(), reverse=True):
-            _break(out, place, mask, shape)
+        data = strike(data, flips(len(data) * shape.bits, noise.before, chance), shape)
+    out: list[int] = list(data)
     if noise.after:
         for bit in flips(len(out) * shape.data_bits, noise.after, chance):
             out[bit // shape.data_bits] ^= 1 << bit % shape.data_bits
+    return bytes(out)
+
+
+def strike(data: bytes, bits: Iterable[int], shape: Format) -> bytes:
+    """What the receiver makes of it when these bits turn, counted from the first start bit."""
+    masks: dict[int, int] = {}
+    for bit in bits:
+        masks[bit // shape.bits] = masks.get(bit // shape.bits, 0) | 1 << bit % shape.bits
+    out: list[int] = list(data)
+    for place, mask in sorted(masks.items(), reverse=True):
+        _break(out, place, mask, shape)
     return bytes(out)
 
 

@@ -1,0 +1,246 @@
+"""One line as the judge sees it: what passed on its wire, and what excuses whom."""
+
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+from gateway.config import LineConfig
+from gateway.device import Device, Standing
+from gateway.line import Line
+from gateway.protocols.computer_link import ComputerLink
+from gateway.protocols.frames import FrameDriver
+from gateway.tags import Tag
+from tests.sim.episodes import Episode
+from tests.sim.gadgets import Gadget
+from tests.sim.net import SimNet
+from tests.sim.oracle import CHECKS
+from tests.sim.requests import (
+    ALL,
+    Asked,
+    answer_in,
+    asked,
+    is_command,
+    is_registration,
+    is_write,
+    protocol_of,
+    station_in,
+)
+from tests.sim.stations import Troubled
+from tests.sim.story import Story
+from tests.sim.wire import SimWire, Speaker
+
+UNTIMELY = ("very-late", "foreign", "junk", "noise", "noise-after", "vanish", "hang", "flicker")
+SPOKE_LATELY = 1.0 + 0.7  # seconds: an answer to unasked words comes within one
+AFTER_ALL = 0.09  # seconds that stations need to take in what goes to all of them
+
+
+@dataclass(eq=False)
+class Bus:
+    """The watch of a wire. Times by the loop's clock."""
+
+    config: LineConfig
+    stations: dict[str, Troubled]
+    protocol: str  # of most of its devices
+    episodes: Sequence[Episode]  # of this line
+    story: Story
+    note: Callable[..., None]
+    broke: Callable[[str], None]
+    now: Callable[[], float]
+    began: float
+    wire: SimWire | SimNet = field(init=False)
+    line: Line = field(init=False)  # built after its port
+    sent_at: float = 0.0  # when the gateway spoke last
+    asked: Device | None = None
+    hurt_at: float = -1.0  # when something damaged arrived last
+    hurt: dict[str, float] = field(default_factory=lambda: {"<": -1.0, ">": -1.0})
+    heard: bytes = b""  # since the gateway spoke last
+    request: bytes = b""  # as it reached the stations
+    writes: Counter[int] = field(default_factory=Counter)  # write frames by station number
+    commands: Counter[int] = field(default_factory=Counter)
+    misled: set[Device] = field(default_factory=set)  # whose list was damaged, and agreed to
+    questions: deque[tuple[float, Asked]] = field(default_factory=lambda: deque(maxlen=64))
+    open: dict[tuple[int, int], float] = field(default_factory=dict)  # Modbus TCP: since when
+    speaking: tuple[float, float] = (0.0, 0.0)  # an unasked frame that we could hear
+    _to_all_until: float = -1.0
+    _registering: Device | None = None
+
+    # The watch of the wire
+
+    def sent(self, data: bytes, start: float, end: float) -> None:
+        if self._registering is not None:
+            self._registered(self._registering)
+        self.sent_at, self.heard, self.request = start, b"", b""
+        protocol = protocol_of(self.protocol, data)
+        number = station_in(protocol, data)
+        self.note("sent", self.line.name, data)
+        self.story.counts["frames"] += 1
+        self.story.counts[f"frames {protocol}"] += 1
+        if start - self._to_all_until < AFTER_ALL:
+            self.broke(f"{self.line.name}: spoke {start - self._to_all_until:.3f} s after all")
+        named = [d for d in self.line.devices if self.number_of(d) == number]
+        if number == ALL.get(protocol):
+            self._to_all_until = end
+            named = named or [d for d in self.line.devices if d.control]
+        if not named:
+            self.broke(f"{self.line.name}: spoke to station {number}, which is not served")
+            return
+        self.asked = named[0]
+        self.writes[number] += is_write(protocol, data)
+        self.commands[number] += is_command(protocol, data)
+        if is_registration(protocol, data):
+            self._registering = self.asked
+        if protocol == "modbus-tcp":
+            self._questioned(asked(data), named[0])
+        elif protocol == "frames":
+            self._check_answer(data, named[0])
+        begin, until = self.speaking
+        heard = begin + 0.001 < start < min(until - 0.001, begin + 1.0)
+        if heard and self.hurt["<"] < begin - 0.1:
+            self.broke(f"{self.line.name}: spoke into a frame that was coming in")
+
+    def number_of(self, device: Device) -> int:
+        """What `station_in` says of what is sent to it."""
+        return (
+            ord(device.name[-1])
+            if isinstance(device.driver, FrameDriver)
+            else (device.driver.station)
+        )
+
+    def overlapped(self, station: Speaker | None) -> None:
+        self.story.counts["overlaps"] += 1
+        if isinstance(station, Troubled) and self.unasked(station):
+            return  # it cannot be made to wait
+        device = next(
+            (d for d in self.line.devices if self.stations.get(d.name) is station), self.asked
+        )
+        if device is None or self.excused(self.now() - self.began - 30.0):
+            return
+        if device.standing in (Standing.SILENT, Standing.STARTING):
+            return  # nobody waits for late answers to a probe: that is the rule
+        self.broke(f"{self.line.name}: spoke while {device.name} did")
+
+    def damaged(self, way: str) -> None:
+        self.hurt_at = self.hurt[way] = self.now()
+        self.story.counts["damaged"] += 1
+
+    def passed(self, way: str, data: bytes) -> None:
+        self.note(way, self.line.name, data)
+        if way == "<":
+            self.heard += data
+            if isinstance(self.wire, SimNet) and len(data) >= 7:
+                self.open.pop((data[6], int.from_bytes(data[:2], "big")), None)
+        else:
+            self.request += data
+
+    # Who speaks unasked
+
+    @property
+    def collides(self) -> bool:
+        """Somebody on it speaks when he likes, though he or others are asked."""
+        drivers = [device.driver for device in self.line.devices]
+        speakers = [d for d in drivers if isinstance(d, FrameDriver) and d.listens]
+        return bool(speakers) and (len(drivers) > 1 or bool(speakers[0].settings.ask))
+
+    @staticmethod
+    def unasked(station: Troubled) -> bool:
+        return isinstance(station.inner, Gadget) and station.inner.letter == "z"
+
+    def _check_answer(self, data: bytes, device: Device) -> None:
+        number = answer_in(data)
+        if number is None:
+            return
+        self.story.counts["answers"] += 1
+        said = self.stations[device.name].inner.said  # type: ignore[attr-defined]
+        since = self.now() - SPOKE_LATELY
+        if not any(at >= since and value == number for at, _, value in said):
+            self._unless_hurt(since, f"{device.name} is answered {number}, which it did not say")
+
+    def _unless_hurt(self, since: float, what: str) -> None:
+        if self.hurt_at >= since:
+            self.story.counts["blind answers"] += 1
+        else:
+            self.broke(what)
+
+    # Modbus TCP
+
+    def _questioned(self, question: Asked, device: Device) -> None:
+        """Never more are open than its window says, and no number is used again soon."""
+        now = self.now()
+        since = max(now - device.timing.reply_timeout, self.line.record.since)
+        key = question.unit, question.number
+        if key in self.open and now - self.open[key] < 30.0:
+            self.broke(f"{device.name}: number {question.number} is used again")
+        self.open = {k: at for k, at in self.open.items() if now - at < 30.0}
+        self.open[key] = now
+        waiting = [k for k, at in self.open.items() if k[0] == key[0] and at > since]
+        self.story.counts["most open"] = max(self.story.counts["most open"], len(waiting))
+        if len(waiting) > device.window:
+            self.broke(f"{device.name}: {len(waiting)} questions are open at once")
+        self.questions.append((now, question))
+
+    def asked_at(self, tag: Tag) -> float:
+        """When the exchange began that fetched the tag's value, which has just come."""
+        if self.protocol != "modbus-tcp":
+            return self.sent_at
+        device = next(d for d in self.line.devices if d.name == tag.device)
+        return max(
+            (
+                at
+                for at, question in self.questions
+                if question.unit == device.driver.station and question.covers(*tag.span)
+            ),
+            default=self.now(),
+        )
+
+    # What excuses it
+
+    def excused(self, since: float) -> bool:
+        """Whether an answer may come at any time: later than any guard, or in another's name.
+
+        `since` in seconds from the start, as the episodes have it.
+        """
+        return any(
+            e.kind in UNTIMELY and e.end > since and e.start <= self.now() - self.began
+            for e in self.episodes
+        )
+
+    def untimely(self, device: str) -> bool:
+        """Whether the device answers, or has of late, when nobody expects it any more."""
+        passed = self.now() - self.began
+        return any(
+            e.device == device and e.kind == "very-late" and e.start <= passed < e.end + 10.0
+            for e in self.episodes
+        )
+
+    def blind(self, since: float) -> bool:
+        """Something was damaged since then, and its own check sum, if it has one, agrees."""
+        device = self.asked
+        damaged = [
+            heard
+            for way, heard in (("<", self.heard), (">", self.request))
+            if self.hurt[way] >= since
+        ]
+        if device is not None and device in self.misled:
+            return True
+        if device is not None and not summed(device):
+            return bool(damaged)
+        protocol = device.driver.protocol if device else self.protocol
+        return any(CHECKS[protocol](part) for part in damaged)
+
+    def _registered(self, device: Device) -> None:
+        """A list of wrong addresses was taken for the right one: it is believed till the next."""
+        self._registering = None
+        if self.hurt_at >= self.sent_at and self.blind(self.sent_at):
+            self.misled.add(device)
+        else:
+            self.misled.discard(device)
+
+
+def summed(device: Device) -> bool:
+    """Whether its frames have a check sum."""
+    match device.driver:
+        case ComputerLink() as link:
+            return link.sum_check
+        case FrameDriver() as driver:
+            return driver.settings.framing.sum_check
+    return True

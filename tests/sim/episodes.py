@@ -1,0 +1,124 @@
+"""What goes wrong on the lines of a seed, and when."""
+
+import random
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+CALM = 1000.0  # seconds at the end in which nothing goes wrong
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One thing that goes wrong, for a while. Times in seconds from the start."""
+
+    start: float
+    end: float
+    line: str
+    device: str  # empty: the line
+    kind: str
+    strength: float
+    tag: str = ""  # empty: all of them
+
+    @property
+    def silent(self) -> bool:
+        """Nothing of the device is heard meanwhile."""
+        return self.kind in ("deaf", "mute", "vanish", "hang")
+
+
+_STATION_KINDS = (
+    "deaf",
+    "deaf",
+    "mute",
+    "lose",
+    "cut",
+    "slow",
+    "late",
+    "very-late",
+    "foreign",
+    "junk",
+    "reboot",
+)
+_LINE_KINDS = ("noise", "noise", "noise-after", "vanish", "vanish", "hang", "flicker")
+# TCP loses and invents nothing, but its devices do what they like.
+_NET_STATION_KINDS = tuple(kind for kind in _STATION_KINDS if kind != "junk")
+_NET_LINE_KINDS = ("vanish", "hang", "flicker")
+
+_ONLY: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "noisy": ((), ("noise-after",)),
+    "late": (("late",), ()),
+    "tardy": (("very-late",), ()),
+}
+
+
+def line_episodes(
+    name: str,
+    line: dict[str, Any],
+    chance: random.Random,
+    seconds: float,
+    haste: float,
+    pace: str,
+) -> list[Episode]:
+    """Of a line and of all that hangs on it; none of a device at which everybody is spoken to."""
+    stations, wires = _STATION_KINDS, _LINE_KINDS
+    if line["port"].startswith("tcp:"):
+        stations, wires = _NET_STATION_KINDS, _NET_LINE_KINDS
+    if pace in _ONLY:
+        may = _ONLY[pace]
+        stations = tuple(kind for kind in may[0] if kind in stations)
+        wires = tuple(kind for kind in may[1] if kind in wires)
+    found = _series(name, "", wires, chance, seconds, 1500.0 * haste)
+    for device in line["devices"]:
+        found += _series(name, device, stations, chance, seconds, 700.0 * haste)
+    return found
+
+
+def disappearances(
+    line: str, name: str, device: dict[str, Any], chance: random.Random, seconds: float
+) -> list[Episode]:
+    """Addresses that a PLC's program takes away, for a while or for good."""
+    found = []
+    at = chance.expovariate(1 / 2400)
+    while at < seconds - CALM:
+        tag = chance.choice([t for t in device["tags"] if t not in ("missing", "told")])
+        end = min(at + chance.choice((5.0, 60.0, 600.0, 1500.0)), seconds - CALM)
+        forever = chance.random() < 0.2
+        found.append(Episode(at, seconds + CALM if forever else end, line, name, "gone", 1.0, tag))
+        if forever:
+            break
+        at = end + chance.expovariate(1 / 2400)
+    return found
+
+
+def _series(
+    line: str,
+    device: str,
+    kinds: tuple[str, ...],
+    chance: random.Random,
+    seconds: float,
+    pause: float,
+) -> list[Episode]:
+    """One after the other, never two at once."""
+    found = []
+    at = chance.expovariate(1 / pause)
+    while kinds and at < seconds - CALM:
+        kind = chance.choice(kinds)
+        last = _LASTS.get(kind, lambda c: c.choice((2.0, 20.0, 60.0, 300.0)) * c.uniform(0.5, 1))
+        end = min(at + last(chance), seconds - CALM)
+        found.append(Episode(at, end, line, device, kind, _STRENGTHS.get(kind, _half)(chance)))
+        at = end + chance.expovariate(1 / pause)
+    return found
+
+
+def _half(chance: random.Random) -> float:
+    return chance.choice((0.05, 0.3, 0.7))
+
+
+_LASTS: dict[str, Callable[[random.Random], float]] = {
+    "reboot": lambda chance: chance.uniform(0.5, 8.0),
+    "flicker": lambda chance: chance.uniform(0.01, 1.0),
+}
+_STRENGTHS: dict[str, Callable[[random.Random], float]] = {
+    "noise": lambda chance: chance.choice((1e-4, 1e-3, 1e-2)),
+    "noise-after": lambda chance: chance.choice((1e-5, 1e-4, 1e-3)),
+}

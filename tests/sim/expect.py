@@ -1,0 +1,239 @@
+"""What must follow: bad in time, good again in time, everybody served, nothing piled up."""
+
+import asyncio
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from gateway.device import Device, Standing
+from gateway.line import Line
+from gateway.protocols.frames import FrameDriver
+from gateway.protocols.frames.driver import LISTENED
+from gateway.refusals import RETRY
+from gateway.tags import Quality, Reason, Tag
+from tests.sim.bus import UNTIMELY, Bus, summed
+from tests.sim.episodes import CALM, Episode
+from tests.sim.judge import Judge
+from tests.sim.net import SimNet
+
+SPOKEN = 0.35  # seconds: the longest frames of a seed, there and back
+LONGEST_PAUSE = 66.0  # between two probes of a silent device
+DISTURBING = ("late", *UNTIMELY)  # late answers to probes are not waited for, and may hit others
+UNTRIED = RETRY + 60.0  # seconds: an address that was refused is not asked for so long
+
+
+@dataclass(eq=False)
+class Expectations:
+    """Times in seconds; episodes count from the start, all else by the loop's clock."""
+
+    judge: Judge
+    lines: Mapping[str, Bus]  # by line
+    seconds: float  # of the whole run
+    most_timers: int
+
+    @property
+    def passed(self) -> float:
+        return self.judge.now - self.judge.began
+
+    def later(self, limit: float, must: str, *what: object) -> None:
+        asyncio.get_running_loop().call_later(limit, getattr(self, must), *what)
+
+    def times(self, line: Line) -> tuple[float, float]:
+        """The longest that one failed conversation takes, and the line's load."""
+        longest = max(d.timing.reply_timeout + d.late_guard for d in line.devices) + SPOKEN
+        return longest, max(1.0, sum(d.load for d in line.devices))
+
+    def every(self, bus: Bus, device: Device, tag: Tag) -> float:
+        """How often it is to be heard of."""
+        if tag.span.area == LISTENED and isinstance(device.driver, FrameDriver):
+            (stale,) = {one.stale_after for one in device.driver.settings.listen.values()} - {None}
+            return stale / 10  # as it was drawn
+        return tag.every
+
+    def concerned(self, episode: Episode) -> list[tuple[Device, Tag]]:
+        """Whom it concerns, as far as they can be known at all."""
+        return [
+            (device, tag)
+            for device in self.lines[episode.line].line.devices
+            if episode.device in ("", device.name)
+            for tag in device.tags
+            if episode.tag in ("", tag.name) and self.judge.readable(tag)
+        ]
+
+    # Bad in time
+
+    def bad(self, episode: Episode) -> None:
+        bus = self.lines[episode.line]
+        gone = episode.kind == "gone"
+        if not (episode.silent or gone) or self._mixed(episode) or not bus.line.devices:
+            return
+        longest, load = self.times(bus.line)
+        for device, tag in self.concerned(episode):
+            every = self.every(bus, device, tag)
+            limit = 2 * load * every + 2 * (len(bus.line.devices) + 2) * longest + 1.0
+            if tag.span.area == LISTENED:
+                limit = 10 * every + 2 * longest + 1.0
+            if gone:  # asked twice, then searched for by halving
+                limit += 3 * load * every + 8 * longest
+                if self._unwell(episode.line, device.name, episode.start - LONGEST_PAUSE, limit):
+                    continue
+            if episode.start + limit < episode.end:
+                self.later(limit, "_must_be_bad", tag, episode)
+
+    def _mixed(self, episode: Episode) -> bool:
+        """Whether the line itself has other trouble at that time."""
+        return any(
+            other is not episode
+            and not other.device
+            and other.start < episode.end
+            and other.end + 100 > episode.start
+            for other in self.lines[episode.line].episodes
+        )
+
+    def _must_be_bad(self, tag: Tag, episode: Episode) -> None:
+        gone = episode.kind == "gone"
+        self.judge.story.counts["absence checks" if gone else "silence checks"] += 1
+        if self.judge.gateway.mirror[tag].quality is Quality.GOOD:
+            self.judge.broke(
+                f"{tag.key} is still good, {self.passed - episode.start:.1f} s after "
+                f"{episode.device or episode.line} became silent ({episode.kind})"
+            )
+
+    # Good again in time
+
+    def good(self, episode: Episode) -> None:
+        bus = self.lines[episode.line]
+        if not bus.line.devices or episode.end >= self.seconds:
+            return
+        longest, load = self.times(bus.line)
+        for device, tag in self.concerned(episode):
+            every = self.every(bus, device, tag)
+            limit = LONGEST_PAUSE + 20 * longest * len(bus.line.devices) + 2 * load * every + 5.0
+            if tag.span.area == LISTENED:
+                limit += 20 * every  # now and then it says what nobody understands
+            if episode.kind == "gone" or not summed(device):
+                limit += UNTRIED  # damage may have made another question of ours, refused twice
+            until = episode.end + limit
+            troubled = any(
+                other is not episode
+                and (other.device in ("", device.name) or _disturbs(bus, other))
+                and other.tag in ("", tag.name)
+                and other.start < until
+                and other.end > episode.end - LONGEST_PAUSE - UNTRIED * (other.kind == "gone")
+                for other in bus.episodes
+            )
+            if not troubled and until < self.seconds:
+                self.later(limit, "_must_be_good", tag, limit, episode)
+
+    def _must_be_good(self, tag: Tag, limit: float, episode: Episode) -> None:
+        judge, station = self.judge, self.judge.stations[tag.device]
+        judge.story.counts["recovery checks"] += 1
+        sample = judge.gateway.mirror[tag]
+        if (sample.quality is Quality.GOOD) is not station.lacks(tag):
+            return
+        if not station.lacks(tag) and self._passing(tag, sample.reason):
+            return
+        judge.broke(
+            f"{tag.key} is {sample.quality.value} ({sample.reason}: {sample.detail}) "
+            f"{limit:.0f} s after {episode.kind} of {episode.device or episode.line} ended"
+        )
+
+    def _passing(self, tag: Tag, reason: Reason | None) -> bool:
+        """Where somebody speaks when he likes, this or that is lost, and comes again."""
+        bus = self.judge.buses[tag.device]
+        lately = self.judge.now - self.judge.read_at.get(tag, 0.0) < LONGEST_PAUSE
+        said = tag.span.area == LISTENED
+        return (bus.collides or said) and lately
+
+    # All the while
+
+    async def look_around(self) -> None:
+        """Now and then: nothing piles up, and who is well is served."""
+        gateway, judge = self.judge.gateway, self.judge
+        while True:
+            await asyncio.sleep(60.0)
+            for line in gateway.lines:
+                schedule = line._schedule
+                polls = sum(len(schedule.polls(device)) for device in line.devices)
+                kept = len(schedule._waiting) + len(schedule._ready) + len(schedule._urgent)
+                if kept > 4 * polls + 50:
+                    judge.broke(f"{line.name}: {kept} places in the queues for {polls} polls")
+                if len(schedule.orders) > 4 * len(line.devices):
+                    judge.broke(f"{line.name}: {len(schedule.orders)} orders wait")
+                if len(line._listening._answers) > 4:
+                    judge.broke(f"{line.name}: {len(line._listening._answers)} answers wait")
+            waiting = sum(map(len, gateway._waiting.values()))
+            if waiting > 2 * len(judge.served):
+                judge.broke(f"{waiting} who asked for fresh values are still remembered")
+            timers = len(asyncio.get_running_loop()._scheduled)  # type: ignore[attr-defined]
+            if timers > self.most_timers:
+                judge.broke(f"{timers} timers are waiting")
+            judge.story.counts["most timers"] = max(judge.story.counts["most timers"], timers)
+            for bus in self.lines.values():
+                self._look_at_shares(bus)
+
+    def _look_at_shares(self, bus: Bus) -> None:
+        """A device that has been well for two minutes, on a line that was, is served."""
+        if not bus.line.devices:
+            return
+        longest, load = self.times(bus.line)
+        for device in bus.line.devices:
+            for tag in device.tags:
+                station = self.judge.stations.get(device.name)
+                if station is None or station.lacks(tag) or not self.judge.readable(tag):
+                    continue
+                every = self.every(bus, device, tag)
+                patience = 4 * load * every + 6 * longest * len(bus.line.devices)
+                if bus.collides or tag.span.area == LISTENED:
+                    patience += 20 * every + LONGEST_PAUSE
+                since = self.judge.read_at.get(tag, 0.0)
+                if self.judge.now - since <= patience:
+                    continue
+                begin = self.passed - patience - LONGEST_PAUSE - 25 * longest - 60
+                if not summed(device):
+                    begin -= UNTRIED
+                if begin < 0 or self._unwell(bus.line.name, device.name, begin, 0.0):
+                    continue
+                if station.changed(tag, self.judge.now - patience - UNTRIED):
+                    continue
+                self.judge.story.counts["starved"] += 1
+                self.judge.broke(
+                    f"{tag.key} was not read for {self.judge.now - since:.1f} s, "
+                    f"every {every:g} s is asked for, load {load:.2f}"
+                )
+
+    def _unwell(self, line: str, device: str, since: float, ahead: float) -> bool:
+        return any(
+            (e.device in ("", device) or _disturbs(self.lines[line], e))
+            and e.kind != "gone"
+            and e.end > since
+            and e.start < self.passed + ahead
+            for e in self.lines[line].episodes
+        )
+
+    # At the end
+
+    def at_the_end(self) -> None:
+        """Nothing has gone wrong for a while."""
+        if self.seconds < 2 * CALM:
+            return
+        judge = self.judge
+        for bus in self.lines.values():
+            for device in bus.line.devices:
+                well = device.standing is Standing.UP and judge.alive.get(device.name)
+                if not well and not device.broadcast and not bus.collides:
+                    judge.broke(
+                        f"{device.name} is {device.standing.value} at the end: {device.trouble}"
+                    )
+                for tag in device.tags:
+                    sample = judge.gateway.mirror[tag]
+                    if not judge.readable(tag) or self._passing(tag, sample.reason):
+                        continue
+                    lacks = judge.stations[device.name].lacks(tag)
+                    if (sample.quality is Quality.GOOD) is lacks:
+                        judge.broke(f"{tag.key} at the end: {sample}")
+
+
+def _disturbs(bus: Bus, episode: Episode) -> bool:
+    """Whether it concerns others than the device it befalls."""
+    broken = episode.kind == "cut" and isinstance(bus.wire, SimNet)  # so is the connection
+    return broken or episode.kind in DISTURBING

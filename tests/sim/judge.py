@@ -1,0 +1,133 @@
+"""What the gateway says, held against what was in the PLCs."""
+
+import asyncio
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from gateway.app import Gateway
+from gateway.protocols.frames import FrameDriver
+from gateway.protocols.frames.driver import LISTENED
+from gateway.tags import Quality, Reason, Sample, Tag
+from tests.sim.bus import Bus, summed
+from tests.sim.gadgets import Gadget
+from tests.sim.stations import Troubled
+from tests.sim.story import Story
+
+MOST_TROUBLES = 20  # noted in one run
+
+
+@dataclass(eq=False)
+class Judge:
+    """Judges every sample on its way up. Times by the loop's clock."""
+
+    gateway: Gateway
+    buses: dict[str, Bus]  # by device
+    stations: dict[str, Troubled]  # by device
+    story: Story
+    began: float
+    read_at: dict[Tag, float] = field(default_factory=dict)  # when it was good last
+    alive: dict[str, bool] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self._plain = self.gateway.samples
+        self.gateway.samples = self.told  # type: ignore[method-assign]  # the lines call it
+        self.known = {tag for device in self.gateway.config.devices for tag in device.tags}
+        self.served = {device.name for device in self.gateway.spoken_to}
+
+    def broke(self, what: str) -> None:
+        if len(self.story.broken) < MOST_TROUBLES:
+            self.story.broken.append(f"{self.now - self.began:.3f} s: {what}")
+
+    @property
+    def now(self) -> float:
+        return asyncio.get_running_loop().time()
+
+    # What the lines tell
+
+    def told(self, samples: Sequence[Sample]) -> None:
+        for sample in samples:
+            if sample.quality is Quality.GOOD:
+                self._judge(sample)
+            elif sample.reason is Reason.LINE_DOWN and "internal error" in sample.detail:
+                self.broke(f"{sample.tag.key}: {sample.detail}")
+        self._plain(samples)
+
+    def published(self, samples: Sequence[Sample]) -> None:
+        for sample in samples:
+            if sample.tag not in self.known:
+                self.broke(f"{sample.tag.key} is not configured, but published")
+            if sample.quality is not Quality.GOOD:
+                self.story.counts["bad samples"] += 1
+
+    def shown_alive(self, device: str, alive: bool) -> None:
+        self.alive[device] = alive
+        if device not in self.served:
+            self.broke(f"{device} is not served, but shown")
+
+    def _judge(self, sample: Sample) -> None:
+        tag, bus = sample.tag, self.buses[sample.tag.device]
+        self.story.counts["good samples"] += 1
+        self.read_at[tag] = self.now
+        value = sample.value
+        assert value is not None
+        if tag.span.area == LISTENED:
+            self._judge_unasked(sample, bus)
+            return
+        since = bus.asked_at(tag)
+        if self.stations[tag.device].was(tag, value, since, self.now):
+            return
+        if bus.blind(since):
+            self._blind("blind reads", tag)
+        elif tag.shape is not None and bus.untimely(tag.device):
+            self.story.counts["stale reads of frames"] += 1  # nothing says what they answer
+        else:
+            self.broke(
+                f"{tag.key} is told as good {value!r}, which was not in the PLC since "
+                f"{since - self.began:.3f}: heard {bus.heard!r}"
+            )
+
+    def _judge_unasked(self, sample: Sample, bus: Bus) -> None:
+        """It was said just now, or while the device itself was asked."""
+        station = self.stations[sample.tag.device].inner
+        assert isinstance(station, Gadget)
+        device = next(d for d in bus.line.devices if d.name == sample.tag.device)
+        since = self.now - 0.6 - device.timing.reply_timeout - device.late_guard
+        if any(end >= since and value == sample.value for _, end, value in station.said):
+            return
+        if bus.hurt["<"] >= since - 0.5:
+            self._blind("blind reads", sample.tag)
+        else:
+            self.broke(f"{sample.tag.key} is told as good {sample.value!r}, which was not said")
+
+    def _blind(self, what: str, tag: Tag) -> None:
+        bus = self.buses[tag.device]
+        device = next(d for d in bus.line.devices if d.name == tag.device)
+        self.story.counts[what if summed(device) else f"{what} without a sum"] += 1
+
+    # What devices say by themselves
+
+    def said(self, name: str, station: Gadget) -> None:
+        """A weight has just begun to be said: on a line of its own, in good times, it is told."""
+        bus = self.buses[name]
+        start, end, value = station.said[-1]
+        passed = start - self.began
+        well = bus.line.is_open and bus.line.record.since < start - 2.0
+        troubled = any(e.start < passed + 2.0 and e.end > passed - 5.0 for e in bus.episodes)
+        if well and not troubled and not bus.collides:
+            limit = end - start + station.wrapping.gap + 0.1
+            asyncio.get_running_loop().call_later(limit, self._must_be_told, name, start, value)
+
+    def _must_be_told(self, name: str, start: float, value: int) -> None:
+        self.story.counts["words that must be told"] += 1
+        (tag,) = (tag for tag in self.known if tag.device == name and tag.span.area == LISTENED)
+        sample = self.gateway.mirror[tag]
+        if (sample.value != value or self.read_at.get(tag, 0.0) < start) and (
+            self.buses[name].hurt_at < start
+        ):
+            self.broke(f"{name} said {value} at {start - self.began:.3f}, and it was not told")
+
+    def readable(self, tag: Tag) -> bool:
+        """Whether it can ever be good: asked for, or said."""
+        _, device = self.gateway._places[tag.device]
+        asked = device.driver.areas[tag.span.area].readable
+        return asked or (isinstance(device.driver, FrameDriver) and tag.span.area == LISTENED)

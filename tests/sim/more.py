@@ -1,0 +1,200 @@
+"""More of a plant than its PLCs: devices without a protocol, Modbus TCP, everybody at once.
+
+Drawn by a `random.Random` of its own, so that a seed's PLCs stay what they are.
+"""
+
+import random
+from typing import Any
+
+SEPARATE = "<SOH>"  # no other protocol of ours begins with it
+
+
+def add_to(name: str, line: dict[str, Any], chance: random.Random) -> None:
+    """Settings that only some plants have, on a line that is drawn already."""
+    devices = line["devices"]
+    protocols = {device["protocol"] for device in devices.values()}
+    unsummed, told = chance.random() < 0.4, chance.random() < 0.6
+    for device in devices.values():
+        if device["protocol"] == "computer-link":
+            if unsummed:
+                device["sum_check"] = device["monitor"] = False
+            device["control"] = told
+        if chance.random() < 0.12:
+            device["verify_reads"] = 2
+            device["retries"] = 3
+    if protocols & {"modbus-rtu", "modbus-ascii"} and chance.random() < 0.3:
+        devices[f"{name}-all"] = {
+            "protocol": min(protocols),
+            "station": 0,
+            "tags": {
+                "word": {"address": "holding:9000", "type": "uint16", "write": True},
+                "long": {"address": "holding:9002", "type": "uint32", "write": True},
+                "bit": {"address": "coil:9000", "write": True},
+            },
+        }
+
+
+def net_line(name: str, chance: random.Random, intervals: tuple[str, ...]) -> dict[str, Any]:
+    """One Modbus TCP connection, with several units behind it or one that takes many questions."""
+    window = chance.choice((1, 1, 2, 4, 16))
+    every = chance.choice(intervals)
+    devices = {}
+    for i in range(chance.choice((1, 1, 2, 3))):
+        timeout = chance.choice((100, 300, 500))
+        first = chance.randrange(0, 400)
+        tags: dict[str, Any] = {}
+        for k in range(chance.randrange(4, 14)):
+            address = first + 200 * (k % 8) + k
+            tags[f"v{k}"] = {"address": f"holding:{address}", "type": "uint16"}
+        tags |= {
+            "long": {"address": f"holding:{first + 2000}", "type": "uint32"},
+            "scaled": {"address": f"holding:{first + 2010}", "type": "uint16", "scale": 0.1},
+            "flag": {"address": f"coil:{first}"},
+            "bit": {"address": f"holding:{first + 2020}.10"},
+            "w0": {"address": f"holding:{first + 2030}", "type": "uint16", "write": rule(chance)},
+            "w1": {"address": f"holding:{first + 2032}", "type": "uint32", "write": rule(chance)},
+            "w2": {"address": f"coil:{first + 300}", "write": rule(chance)},
+            "w3": {"address": f"holding:{first + 2040}.3", "write": rule(chance)},
+        }
+        devices[f"{name}-{i}"] = {
+            "protocol": "modbus-tcp",
+            "station": i + 1,
+            "window": window,
+            "max_read_words": chance.choice((16, 125)),
+            "reply_timeout": f"{timeout}ms",
+            "late_guard": f"{timeout}ms",
+            "retries": chance.choice((0, 1, 2)),
+            "diagnostics": chance.random() < 0.3,
+            "defaults": {"every": every},
+            "tags": tags,
+        }
+    return {"port": "tcp://plant.test:502", "devices": devices}
+
+
+# How frames are bounded: by a header and a terminator, with a sum or without, by the end of a
+# text line, by silence.
+_FRAMINGS: tuple[dict[str, Any], ...] = (
+    {"header": SEPARATE, "terminator": "<ETX>", "sum_check": True, "max_length": 32},
+    {"header": SEPARATE, "terminator": "<ETX>", "max_length": 32},
+    {"ending": "CR LF", "max_length": 32},
+    {"max_length": 32, "gap": "50ms"},
+)
+
+
+def raw_line(name: str, chance: random.Random, intervals: tuple[str, ...]) -> dict[str, Any]:
+    """Devices without a protocol: one that speaks by itself, some that are asked, maybe a PLC."""
+    devices: dict[str, Any] = {}
+    every = chance.choice(intervals)
+    speaks = chance.random() < 0.7
+    asked = chance.choice((0, 1, 1, 2)) if speaks else chance.choice((1, 2, 3))
+    framing = chance.choice(_FRAMINGS[:3] if asked + speaks > 1 else _FRAMINGS)
+    if speaks:
+        devices[f"{name}-z"] = _speaker("z", framing, every, chance, alone=not asked)
+    for letter in "abc"[:asked]:
+        devices[f"{name}-{letter}"] = _asked(letter, framing, every, chance)
+    if asked and chance.random() < 0.3:
+        devices[f"{name}-0"] = _neighbour(every, chance)
+    return {
+        "port": f"/dev/tty-{name}",
+        "baudrate": chance.choice((9600, 19200)),
+        "format": chance.choice(("8N1", "8E1", "7E1")),
+        "echo": chance.random() < 0.15,
+        "devices": devices,
+    }
+
+
+def _device(framing: dict[str, Any], chance: random.Random) -> dict[str, Any]:
+    timeout = chance.choice((150, 300, 500))
+    return {
+        "protocol": "frames",
+        "framing": dict(framing),
+        "reply_timeout": f"{timeout}ms",
+        "late_guard": f"{timeout}ms",
+        "retries": chance.choice((1, 2)),
+    }
+
+
+def _asked(
+    letter: str, framing: dict[str, Any], every: str, chance: random.Random
+) -> dict[str, Any]:
+    number, refused = {"type": "integer"}, f"{letter}ER(?P<code>[0-9]{{2}})"
+    written = {"type": "integer", "format": "05d"}
+    return _device(framing, chance) | {
+        "defaults": {"every": every},
+        "ask": {
+            "both": {
+                "send": f"{letter}Q0?",
+                "match": f"{letter}Q0=(?P<x>[0-9]{{5}}),(?P<y>[0-9]{{5}})",
+                "fields": {"x": number, "y": number},
+                "refused": refused,
+            },
+            "held": {
+                "send": f"{letter}Q1?",
+                "match": f"{letter}Q1=(?P<set>[0-9]{{5}}),(?P<v>[0-9]{{5}})",
+                "fields": {"set": number, "v": number},
+            },
+        },
+        "write": {
+            "set": {
+                "send": f"{letter}S={{value}}",
+                "value": written,
+                "match": f"{letter}OK",
+                "refused": refused,
+            },
+            "told": {"send": f"{letter}T={{value}}", "value": written},
+        },
+        "tags": {
+            "x": {"address": "x"},
+            "y": {"address": "y"},
+            "v": {"address": "v"},
+            "set": {"address": "set", "write": rule(chance)},
+            "told": {"address": "told", "write": True},
+        },
+    }
+
+
+def _speaker(
+    letter: str, framing: dict[str, Any], every: str, chance: random.Random, alone: bool
+) -> dict[str, Any]:
+    """Says its weight again and again; now and then something else, known or unknown.
+
+    Some such devices are asked and told something too.
+    """
+    asked = chance.random() < 0.3
+    period = chance.choice((0.4, 1.0, 5.0) if alone and not asked else (3.0, 8.0))
+    weighing: dict[str, Any] = {
+        "match": f"{letter}W=(?P<w>[0-9]{{5}})",
+        "fields": {"w": {"type": "integer"}},
+        "stale_after": f"{10 * period:g}s",
+    }
+    if chance.random() < 0.4:
+        weighing["answer"] = f"{letter}!{{w}}"
+    listen = {"weighing": weighing, "nothing": {"match": f"{letter}N"}}
+    tags = {"w": {"address": "w", "event": chance.random() < 0.5}}
+    if not asked:
+        return _device(framing, chance) | {"listen": listen, "tags": tags}
+    device = _asked(letter, framing, every, chance)
+    return device | {"listen": listen, "tags": device["tags"] | tags}
+
+
+def _neighbour(every: str, chance: random.Random) -> dict[str, Any]:
+    first = chance.randrange(400)
+    return {
+        "protocol": "vigor",
+        "station": 9,
+        "reply_timeout": "300ms",
+        "late_guard": "300ms",
+        "defaults": {"every": every},
+        "tags": {
+            "v0": {"address": f"D{first}", "type": "uint16"},
+            "scaled": {"address": f"D{first + 30}", "type": "uint16", "scale": 0.1},
+            "flag": {"address": f"M{first % 200}"},
+            "w0": {"address": f"D{first + 60}", "type": "uint16", "write": rule(chance)},
+            "w2": {"address": f"M{300 + first % 100}", "write": rule(chance)},
+        },
+    }
+
+
+def rule(chance: random.Random) -> dict[str, Any]:
+    """What may follow a write that ended unclear."""
+    return {"verify": chance.random() < 0.4, "repeat": chance.random() < 0.3}

@@ -1,0 +1,129 @@
+"""A TCP connection to Modbus TCP units: nothing is lost or damaged, but it may stall or break.
+
+Both ways at once, in order. What was on its way when the connection stalled arrives afterwards.
+"""
+
+import asyncio
+import random
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+from gateway.errors import LineDown
+from gateway.transport import Ear
+from tests.sim.stations import Troubled
+from tests.sim.wire import Noise, Watch
+
+HOP = 0.0004  # seconds from one end to the other
+
+
+@dataclass(eq=False)
+class SimNet:
+    """The opener of a connection, and the units behind it, by number."""
+
+    units: Mapping[int, Troubled]
+    chance: random.Random
+    watch: Watch
+    split: bool = False  # answers arrive in two pieces
+    noise: Noise = field(default_factory=Noise)  # there is none
+    gone: str = ""
+    opened: int = 0
+    closed: int = 0
+
+    def __post_init__(self) -> None:
+        self._ear: Ear | None = None
+        self._generation = 0
+        self._hanging = False
+        self._stuck: list[Callable[[], None]] = []
+
+    # The port
+
+    async def open(self, ear: Ear) -> "SimNet":
+        if self.gone or self._hanging:
+            raise LineDown(self.gone or "no answer within 5 s")
+        self._ear = ear
+        self._generation += 1
+        self.opened += 1
+        return self
+
+    def write(self, data: bytes) -> None:
+        if self._ear is None:
+            raise LineDown(self.gone or "closed")
+        now = _now()
+        self.watch.sent(data, now, now)
+        self._pass(HOP, lambda: self._arrive(data))
+
+    async def close(self) -> None:
+        self.closed += 1
+        self._end()
+
+    def vanish(self, why: str) -> None:
+        self.gone = why
+        self._reset(why)
+
+    def come_back(self) -> None:
+        self.gone = ""
+
+    @property
+    def hanging(self) -> bool:
+        return self._hanging
+
+    @hanging.setter
+    def hanging(self, hanging: bool) -> None:
+        self._hanging = hanging
+        if not hanging:
+            stuck, self._stuck = self._stuck, []
+            for deliver in stuck:
+                deliver()
+
+    # The network
+
+    def _end(self) -> None:
+        self._ear = None
+        self._generation += 1
+        self._stuck.clear()
+
+    def _reset(self, why: str) -> None:
+        ear = self._ear
+        self._end()
+        if ear is not None:
+            ear.lost(LineDown(why))
+
+    def _arrive(self, data: bytes) -> None:
+        self.watch.passed(">", data)
+        unit = self.units.get(data[6])
+        said = None if unit is None else unit.hear(data, _now())
+        if unit is None or said is None:
+            return
+        reply, delay = said
+        if unit.broke_off:
+            self._pass(delay, lambda: self._break_off(reply))
+        else:
+            self._pass(delay + HOP, lambda: self._deliver(reply))
+
+    def _break_off(self, reply: bytes) -> None:
+        self._deliver(reply)
+        self._reset("connection reset by peer")
+
+    def _deliver(self, data: bytes) -> None:
+        cut = self.chance.randrange(len(data)) if self.split else 0
+        self.watch.passed("<", data)
+        for piece in (data[:cut], data[cut:]):
+            if piece and self._ear is not None:
+                self._ear.received(piece)
+
+    def _pass(self, after: float, then: Callable[[], None]) -> None:
+        generation = self._generation
+
+        def unless_closed() -> None:
+            if generation != self._generation:
+                return
+            if self._hanging:
+                self._stuck.append(unless_closed)
+            else:
+                then()
+
+        asyncio.get_running_loop().call_later(after, unless_closed)
+
+
+def _now() -> float:
+    return asyncio.get_running_loop().time()

@@ -1,0 +1,282 @@
+"""Who writes, asks for fresh values, and gives commands; and whether they are told the truth."""
+
+import asyncio
+import random
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from typing import Any
+
+from gateway.device import Device
+from gateway.errors import BadValue, Busy, GatewayError, LineDown, Offline, Refused
+from gateway.protocols.computer_link import ComputerLink
+from gateway.protocols.computer_link.refusals import model_name
+from gateway.tags import Quality, Tag, Written
+from gateway.values import Kind, Value
+from tests.sim.bus import Bus, summed
+from tests.sim.judge import Judge
+from tests.sim.stations import Troubled
+
+SOON = 1.0  # seconds: what nobody acknowledges has arrived by then, or never will
+NOT_SENT = (Busy, Offline, LineDown)
+_QUIET = ("deaf", "reboot", "vanish", "flicker", "hang")
+
+
+@dataclass(eq=False)
+class Person:
+    """Has to do with one device. `haste`: how much more rarely than usual."""
+
+    device: Device
+    judge: Judge
+    bus: Bus
+    chance: random.Random
+    haste: float
+
+    @property
+    def number(self) -> int:
+        return self.bus.number_of(self.device)
+
+    def blind(self, what: str) -> None:
+        count = what if summed(self.device) else f"{what} without a sum"
+        self.judge.story.counts[count] += 1
+
+    def deaf(self, device: str, since: float) -> bool:
+        """Whether the device need not have heard what was sent after `since`."""
+        begin = since - self.judge.began - 1.0
+        now = self.judge.now - self.judge.began
+        return any(
+            e.device in ("", device) and e.kind in _QUIET and e.start <= now and e.end >= begin
+            for e in self.bus.episodes
+        )
+
+    async def _pause(self, mean: float) -> None:
+        await asyncio.sleep(self.chance.expovariate(1 / (mean * self.haste)))
+
+    # Writes
+
+    async def write_now_and_then(self) -> None:
+        tags = [tag for tag in self.device.tags if tag.write is not None]
+        number = self.chance.randrange(1000)
+        pause = self.chance.choice((2.0, 10.0, 30.0, 120.0))
+        while tags:
+            await self._pause(pause)
+            several = self.chance.choice((1, 1, 1, 1, 3))
+            chosen = self.chance.sample(tags, min(several, len(tags)))
+            writes = []
+            for tag in chosen:
+                number += 1
+                if tag.layout.type.kind is Kind.BOOL:
+                    value: Value = self.chance.random() < 0.5
+                else:
+                    bits = 32 if tag.span.size == 2 else 16
+                    value = (number * 40_503) % (1 << bits)
+                writes.append((tag, value))
+            await self._write(writes)
+
+    async def _write(self, writes: list[tuple[Tag, Value]]) -> None:
+        """Several at once may go out in one frame, and one by one if that is refused."""
+        frames, since = self.bus.writes[self.number], self.judge.now
+        most = sum(2 if tag.write and tag.write.repeat else 1 for tag, _ in writes)
+        most += len(writes) > 1
+        if self.device.broadcast:
+            await asyncio.gather(*(self._tell_all(tag, value) for tag, value in writes))
+        else:
+            await asyncio.gather(*(self._write_one(t, v, len(writes) > 1) for t, v in writes))
+        sent = self.bus.writes[self.number] - frames
+        if sent > most:
+            self.judge.broke(f"{self.device.name}: {len(writes)} writes were sent {sent} times")
+        if self.bus.hurt_at < since:
+            self.judge.story.counts["writes in groups"] += len(writes) > 1
+
+    async def _write_one(self, tag: Tag, value: Value, beside_others: bool) -> None:
+        judge, bus, station = self.judge, self.bus, self.judge.stations[tag.device]
+        frames, since = bus.writes[self.number], judge.now
+        known = _times(station, tag)
+        held = tag.decode(station.holds(tag))
+        outcome = await self._outcome(tag, value)
+        sent = bus.writes[self.number] - frames
+        bus.note("outcome", tag.key, value, type(outcome).__name__, sent)
+        judge.story.counts[f"write {type(outcome).__name__}"] += 1
+        holds = tag.decode(station.holds(tag)) == value
+        obeyed = _times(station, tag) - known
+        most = 2 if tag.write is not None and tag.write.repeat else 1
+        match outcome:
+            case Written(acknowledged=False):
+                await self._must_arrive(tag, value, station, since)
+                return
+            case Written():
+                true = holds and (obeyed > 0 or held == value)
+            case Refused() | BadValue():
+                true = obeyed == 0
+            case Busy() | Offline() | LineDown():
+                true = obeyed == 0 and (sent == 0 or beside_others)
+            case _:
+                true = True
+        true = true and obeyed <= most
+        if true:
+            return
+        if bus.hurt_at >= since:
+            self.blind("blind writes")
+        elif tag.shape is not None and bus.untimely(tag.device):
+            judge.story.counts["stale acknowledgements of frames"] += 1
+        else:
+            judge.broke(
+                f"{tag.key}: write of {value!r} ended {outcome!r}, sent {sent} times, "
+                f"obeyed {obeyed} times, holds {holds}"
+            )
+
+    async def _outcome(self, tag: Tag, value: Value) -> Written | GatewayError:
+        try:
+            return await self.judge.gateway.write(tag, value)
+        except GatewayError as error:
+            return error
+
+    async def _must_arrive(self, tag: Tag, value: Value, station: Troubled, since: float) -> None:
+        """Nobody has said that it was done; where all is well, it is."""
+        await asyncio.sleep(SOON)
+        if self.deaf(tag.device, since) or self.bus.hurt_at >= since:
+            return
+        self.judge.story.counts["told writes checked"] += 1
+        if tag.decode(station.holds(tag)) != value:
+            self.judge.broke(f"{tag.key}: {value!r} was told, and is not there")
+
+    async def _tell_all(self, tag: Tag, value: Value) -> None:
+        judge, bus = self.judge, self.bus
+        frames, since = bus.writes[self.number], judge.now
+        outcome = await self._outcome(tag, value)
+        sent = bus.writes[self.number] - frames
+        bus.note("told all", tag.key, value, type(outcome).__name__, sent)
+        judge.story.counts[f"broadcast {type(outcome).__name__}"] += 1
+        if isinstance(outcome, Written) and outcome.acknowledged:
+            judge.broke(f"{tag.key}: nobody acknowledges, but it is said to be done")
+        if not isinstance(outcome, Written):
+            return
+        await asyncio.sleep(SOON)
+        for name, station in bus.stations.items():
+            if self.deaf(name, since) or bus.hurt_at >= since:
+                continue
+            judge.story.counts["told writes checked"] += 1
+            history = station.written.get((tag.span.area, tag.span.start), [])
+            if not any(at >= since for at, _ in history):
+                judge.broke(f"{tag.key}: told to all, but {name} did not get it")
+
+    # Fresh values
+
+    async def ask_now_and_then(self) -> None:
+        pause = self.chance.choice((5.0, 30.0, 300.0))
+        tags = [tag for tag in self.device.tags if self.judge.readable(tag)]
+        while tags:
+            await self._pause(pause)
+            await self._ask(self.chance.choice(tags), self.chance.choice((0.0, 0.5, 5.0, 60.0)))
+
+    async def _ask(self, tag: Tag, most: float) -> None:
+        judge, asked = self.judge, self.judge.now
+        try:
+            sample = await judge.gateway.fresh(tag, most)
+        except Busy:
+            judge.story.counts["fresh Busy"] += 1
+            return
+        self.bus.note("fresh", tag.key, sample.value)
+        if sample.quality is not Quality.GOOD or sample.value is None:
+            return
+        judge.story.counts["fresh"] += 1
+        if judge.read_at[tag] >= asked:
+            return  # it was read since, and judged then
+        since = asked - most - 1.5
+        was = judge.stations[tag.device].was(tag, sample.value, since, judge.now)
+        excused = self.bus.hurt_at >= since or self.bus.untimely(tag.device)
+        if not was and not excused and self.device not in self.bus.misled:
+            judge.broke(f"{tag.key}: {sample.value!r} is not fresh within {most} s")
+
+    # Commands
+
+    async def command_now_and_then(self) -> None:
+        pause = self.chance.choice((30.0, 120.0))
+        while True:
+            await self._pause(pause)
+            name, argument = self.chance.choice(
+                (
+                    *(("run", ""), ("stop", ""), ("run", ""), ("model", "")),
+                    *(("loopback", ""), ("loopback", "HALLO 1"), ("loopback", "no\x01")),
+                    *(("global", "on"), ("global", "off"), ("global", "maybe")),
+                )
+            )
+            await self._command(name, argument)
+
+    async def _command(self, name: str, argument: str) -> None:
+        judge, bus, station = self.judge, self.bus, self.judge.stations[self.device.name]
+        number = 255 if name == "global" else self.number
+        frames, since = bus.commands[number], judge.now
+        ran, known = station.inner.running, _switched(station)  # type: ignore[attr-defined]
+        outcome = await _said(lambda: judge.gateway.control(self.device.name, name, argument))
+        sent = bus.commands[number] - frames
+        bus.note("command", self.device.name, name, str(outcome), sent)
+        judge.story.counts[f"command {name}"] += 1
+        obeyed = _switched(station) - known
+        runs = station.inner.running  # type: ignore[attr-defined]
+        match name, outcome:
+            case _, BadValue():
+                true = sent == 0 and argument in ("no\x01", "maybe")
+            case _, Busy() | Offline() | LineDown():
+                true = sent == 0
+            case "run" | "stop", str():
+                true = sent == 1 and obeyed == 1 and runs is (name == "run")
+            case "run" | "stop", Refused():
+                true = obeyed == 0 and (ran is (name == "run") or ran is runs)
+            case "loopback", str():
+                true = outcome == (argument or "ABCDE")
+            case "model", str():
+                true = outcome == model_name("9E")
+            case "global", str():
+                await self._must_be_known(argument, since)
+                return
+            case _:
+                true = sent <= 1 and obeyed <= 1
+        if true:
+            return
+        if bus.hurt_at >= since:
+            self.blind("blind commands")
+        else:
+            judge.broke(
+                f"{self.device.name}: {name} {argument!r} ended {outcome!r}, sent {sent} times, "
+                f"obeyed {obeyed} times, runs {runs}"
+            )
+
+    async def _must_be_known(self, argument: str, since: float) -> None:
+        """To every PLC of the line that listens."""
+        await asyncio.sleep(SOON)
+        for name, station in self.bus.stations.items():
+            device = next((d for d in self.bus.line.devices if d.name == name), None)
+            if device is None or not _alike(device, self.device):
+                continue  # another format: it does not understand
+            if self.deaf(name, since) or self.bus.hurt_at >= since:
+                continue
+            self.judge.story.counts["told commands checked"] += 1
+            flag = station.written.get(("M8", 8126), [])
+            if (int(argument == "on")) not in [value for at, value in flag if at >= since]:
+                self.judge.broke(f"{name}: global {argument} did not arrive")
+
+
+async def _said(ask: Callable[[], Awaitable[Any]]) -> Any:
+    """What was answered, or the error."""
+    try:
+        return (await ask()).answer
+    except GatewayError as error:
+        return error
+
+
+def _alike(one: Device, other: Device) -> bool:
+    """Whether both are spoken to in the same way."""
+    match one.driver, other.driver:
+        case ComputerLink() as a, ComputerLink() as b:
+            return (a.frame_format, a.sum_check) == (b.frame_format, b.sum_check)
+    return False
+
+
+def _times(station: Troubled, tag: Tag) -> int:
+    """At how many moments the tag was written to: some PLCs write it byte by byte."""
+    return len({at for at, _ in station.written.get((tag.span.area, tag.span.start), ())})
+
+
+def _switched(station: Troubled) -> int:
+    """How often the PLC was told to run or stop, and did."""
+    return len(station.written.get(("M8", 8035), ()))

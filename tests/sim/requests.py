@@ -1,0 +1,83 @@
+"""What the gateway says, read a second time: to whom, whether it writes, what it asks for."""
+
+from typing import NamedTuple
+
+ALL = {"modbus-rtu": 0, "modbus-ascii": 0, "computer-link": 255}  # numbers that all obey
+_AREAS = {1: "coil", 2: "discrete", 3: "holding", 4: "input"}
+_LETTERS = b"abcdefghijklmnopqrstuvwxyz"
+
+
+class Asked(NamedTuple):
+    """A Modbus TCP question, or another frame with its number."""
+
+    unit: int
+    number: int
+    area: str
+    start: int
+    size: int
+
+    def covers(self, area: str, start: int, size: int) -> bool:
+        return self.area == area and (
+            self.start <= start and start + size <= self.start + self.size
+        )
+
+
+def protocol_of(usual: str, data: bytes) -> str:
+    """Of a frame on a line most of whose devices speak `usual`."""
+    if usual == "modbus-tcp":
+        return usual
+    if usual == "frames":
+        return usual if data[:1] == b"\x01" or data[0] in _LETTERS else "vigor"
+    if usual == "vigor" and data[:1] == b"\x05" and data[3:5] == b"FF":
+        return "computer-link"
+    return usual
+
+
+def station_in(protocol: str, data: bytes) -> int:
+    """The station number; of a device without a protocol, its letter."""
+    match protocol:
+        case "modbus-rtu":
+            return data[0]
+        case "modbus-tcp":
+            return data[6]
+        case "frames":
+            return data.lstrip(b"\x01")[0]
+    return int(data[1:3], 16)
+
+
+def is_write(protocol: str, data: bytes) -> bool:
+    match protocol:
+        case "vigor":
+            return data[3:5] in (b"61", b"70", b"71")
+        case "computer-link":
+            return data[5:7] in (b"BW", b"WW", b"BT", b"WT")
+        case "modbus-rtu":
+            return data[1] in (5, 6, 15, 16)
+        case "modbus-tcp":
+            return data[7] in (5, 6, 15, 16)
+        case "frames":
+            return data.lstrip(b"\x01")[1:3] in (b"S=", b"T=")
+    return data[3:5] in (b"05", b"06", b"0F", b"10")
+
+
+def is_command(protocol: str, data: bytes) -> bool:
+    return protocol == "computer-link" and data[5:7] in (b"RR", b"RS", b"GW")
+
+
+def is_registration(protocol: str, data: bytes) -> bool:
+    """Of a list of addresses, which the PLC remembers."""
+    return protocol == "computer-link" and data[5:7] in (b"BM", b"WM")
+
+
+def answer_in(data: bytes) -> int | None:
+    """The number that an answer to unasked words repeats."""
+    body = data.lstrip(b"\x01")
+    return int(body[2:7]) if body[1:2] == b"!" else None
+
+
+def asked(data: bytes) -> Asked:
+    """Of a Modbus TCP frame."""
+    number = int.from_bytes(data[:2], "big")
+    area = _AREAS.get(data[7], "")
+    start, size = int.from_bytes(data[8:10], "big"), int.from_bytes(data[10:12], "big")
+    return Asked(data[6], number, area, start, size)
