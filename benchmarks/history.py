@@ -6,12 +6,14 @@ goes; beside it the loop's stalls are measured. Then questions are asked of the 
 
 import argparse
 import asyncio
+import gc
 import random
 import resource
 import tempfile
 import time
 from pathlib import Path
 
+from benchmarks.northbound import memory
 from gateway.history import Historian
 from gateway.history.recent import MOST_RUNS
 from gateway.protocols.driver import Address, Span, Unit
@@ -118,13 +120,18 @@ def query(folder: Path, count: int, samples: int) -> None:
     for what, text in asks.items():
         limit = 1 if what == "first" else None
         tried = 1 if what == "all" and count < 10 else 50
+        gc.collect()
+        before = most = memory()
         begun, found = time.perf_counter(), 0
         for n in range(tried):
-            found += sum(1 for _ in historian.samples(some[n % count], text, limit))
+            for number, _ in enumerate(historian.samples(some[n % count], text, limit), 1):
+                found += 1
+                if number % 10_000 == 0:
+                    most = max(most, memory())
         took = time.perf_counter() - begun
         print(
             f"{count:7} {samples:9,} {what:>7} {found // tried:9,} "
-            f"{took / tried * 1e3:9.2f} {found / took:12,.0f}"
+            f"{took / tried * 1e3:9.2f} {found / took:12,.0f} {most - before:6.1f}"
         )
     historian.close()
     path.unlink()
@@ -146,8 +153,9 @@ def main() -> None:
         for count in given.tags:
             for rate in (10_000.0, 50_000.0, 0.0):
                 insert(Path(folder), count, rate, given.seconds)
-        print("asking one tag; ms for each question")
-        print(f"{'tags':>7} {'in file':>9} {'range':>7} {'found':>9} {'ms':>9} {'samples/s':>12}")
+        print("asking one tag; ms for each question, MB by which the process grew meanwhile")
+        print(f"{'tags':>7} {'in file':>9} {'range':>7} {'found':>9} {'ms':>9} {'samples/s':>12} "
+              f"{'MB':>6}")  # fmt: skip
         for count in (1, 100, 5_000):
             query(Path(folder), count, given.samples)
 

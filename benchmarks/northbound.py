@@ -9,8 +9,9 @@ The subscriber is a process of its own on the same machine. Measured in one run:
 * the same number of samples through `Mirror.update` and `Northbound.publish`: decided, made
   into JSON and put, all of them arrived, and how late the event loop was meanwhile;
 * the time from a made configuration to being on Zenoh, and memory;
-* with `--flood`: questions, writes and junk on every key from another process for so many
-  seconds: how late the event loop was, and what memory grew by.
+* with `--flood`: for so many seconds questions as fast as three processes can ask them, then as
+  long questions, writes and junk on every key from two: how late the event loop was, what memory
+  grew by, and how the questions ended.
 """
 
 import argparse
@@ -21,10 +22,13 @@ import resource
 import subprocess
 import sys
 import time
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections import Counter as CounterOf
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import structlog
 import zenoh
@@ -33,7 +37,7 @@ from gateway.mirror import Mirror
 from gateway.northbound import Mode, Northbound, ZenohSettings
 from gateway.northbound.session import configure
 from gateway.protocols.driver import Address, Span, Unit
-from gateway.service import SWITCH
+from gateway.service import COLLECT, SWITCH
 from gateway.tags import Sample, Tag, WriteRule, Written, good
 from gateway.values import Layout, Value, parse_type
 from tests.zenoh_peer import free_endpoint
@@ -138,7 +142,7 @@ def count(endpoint: str) -> None:
         subscriber = session.declare_subscriber("plant/**", heard)
         print("ready", flush=True)
         for _ in sys.stdin:
-            print(arrived, flush=True)
+            print(arrived, time.process_time(), flush=True)
         subscriber.undeclare()
 
 
@@ -174,6 +178,31 @@ def flood(endpoint: str, seconds: float) -> None:
     print(sent, flush=True)
 
 
+def ask(endpoint: str, seconds: float) -> None:
+    """Questions and nothing else, as fast as they go; tells how each of them ended."""
+    ended: CounterOf[str] = CounterOf()
+    keys = (("plant/d1/t0", None), ("plant/d1/t0/@set", b"7"), ("plant/d1/t0/@meta", None))
+
+    def end(heard: list[zenoh.Reply]) -> None:
+        first = heard[0] if heard else None
+        ended["silent" if first is None else "answered" if first.ok else "an error"] += 1
+
+    with zenoh.open(configure(ZenohSettings(mode=Mode.CLIENT, connect=(endpoint,)))) as session:
+        asked, until = 0, time.monotonic() + seconds
+        while time.monotonic() < until:
+            for key, payload in keys:
+                heard: list[zenoh.Reply] = []
+                on_reply = zenoh.handlers.Callback(
+                    heard.append, partial(end, heard), indirect=False
+                )
+                session.get(key, on_reply, payload=payload, timeout=10.0)
+                asked += 1
+        patience = time.monotonic() + 15.0
+        while ended.total() < asked and time.monotonic() < patience:
+            time.sleep(0.05)
+    print(json.dumps({"asked": asked, "ended": dict(ended)}), flush=True)
+
+
 @contextmanager
 def other(*arguments: object) -> Iterator["subprocess.Popen[str]"]:
     command = [sys.executable, "-m", "benchmarks.northbound", *map(str, arguments)]
@@ -188,6 +217,14 @@ def other(*arguments: object) -> Iterator["subprocess.Popen[str]"]:
         process.wait(20)
 
 
+class Arrived(NamedTuple):
+    samples: int
+    seconds: float  # of processor time, all threads
+
+    def __sub__(self, other: "Arrived") -> "Arrived":  # type: ignore[override]
+        return Arrived(self.samples - other.samples, self.seconds - other.seconds)
+
+
 class Counter:
     """The subscriber's count."""
 
@@ -196,16 +233,17 @@ class Counter:
         assert process.stdout is not None
         assert process.stdout.readline() == "ready\n"
 
-    def now(self) -> int:
+    def now(self) -> Arrived:
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         self._process.stdin.write("\n")
-        return int(self._process.stdout.readline())
+        samples, seconds = self._process.stdout.readline().split()
+        return Arrived(int(samples), float(seconds))
 
-    def until_quiet(self) -> int:
+    def until_quiet(self) -> Arrived:
         before = -1
-        while (found := self.now()) != before:
-            before = found
+        while (found := self.now()).samples != before:
+            before = found.samples
             time.sleep(0.3)
         return found
 
@@ -213,9 +251,29 @@ class Counter:
 # -- measured ----------------------------------------------------------------------------------
 
 
-def bare(tags: int, devices: int, seconds: float, *, declared: bool) -> float:
-    """Samples a second of a loop of puts, as many as arrive. `declared`: beside the tokens and
-    queryables of a gateway, against which Zenoh matches each put."""
+@dataclass(frozen=True)
+class Rate:
+    put: int
+    took: float  # seconds
+    ours: float  # seconds of processor time
+    arrived: Arrived
+
+    @property
+    def each(self) -> float:
+        """Samples that arrived, a second."""
+        return self.arrived.samples / self.took
+
+    def __str__(self) -> str:
+        samples, theirs = self.arrived
+        return (f"{self.put / self.took:,.0f}/s put, {samples / self.put:.1%} of them arrived; "
+                f"processor time of a sample {self.ours / self.put * 1e6:.1f} us here, "
+                f"{theirs / max(samples, 1) * 1e6:.1f} us at the subscriber")  # fmt: skip
+
+
+def bare(tags: int, devices: int, seconds: float, *, like_ours: bool) -> Rate:
+    """A loop of puts, as many as arrive: `session.put(key, payload)` and nothing else; or
+    `like_ours`, beside the tokens and queryables of a gateway, against which Zenoh matches each
+    put, and with encoding, time stamp and `DROP`."""
     endpoint = free_endpoint()
     keys = [f"plant/d{d}/t{n}" for d in range(devices) for n in range(tags // devices)]
     data = b'{"value":123456,"quality":"good","time":"2026-11-20T12:00:00.123456Z"}'
@@ -224,31 +282,35 @@ def bare(tags: int, devices: int, seconds: float, *, declared: bool) -> float:
         zenoh.open(configure(ZenohSettings(listen=(endpoint,)))) as session,
         other("count", endpoint) as process,
     ):
-        kept = []
-        if declared:
+        put, stamp, kept = session.put, session.new_timestamp, []
+        if like_ours:
             ignore = zenoh.handlers.Callback(lambda _: None, indirect=False)
             for device in range(devices):
                 kept.append(session.declare_queryable(f"plant/d{device}/**/@set", ignore))
                 kept.append(session.liveliness().declare_token(f"plant/d{device}"))
         counter = Counter(process)
         time.sleep(0.3)
-        began, put = time.perf_counter(), 0
+        first, used = counter.now(), time.process_time()
+        began, count = time.perf_counter(), 0
         while time.perf_counter() - began < seconds:
-            for key in keys:
-                stamp = session.new_timestamp()
-                session.put(
-                    key, data, encoding=json_encoding, congestion_control=drop, timestamp=stamp
-                )
-            put += len(keys)
-        took = time.perf_counter() - began
-        arrived = counter.until_quiet()
+            if like_ours:
+                for key in keys:
+                    put(key, data, encoding=json_encoding, congestion_control=drop,
+                        timestamp=stamp())  # fmt: skip
+            else:
+                for key in keys:
+                    put(key, data)
+            count += len(keys)
+        took, used = time.perf_counter() - began, time.process_time() - used
+        rate = Rate(count, took, used, counter.until_quiet() - first)
     beside = f"beside {len(kept)} declarations" if kept else "and nothing else"
-    print(f"bare loop of put {beside}: {put / took:,.0f}/s, {arrived / put:.1%} of them arrived")
-    return arrived / took
+    print(f"bare loop of put {beside}: {rate}")
+    return rate
 
 
-async def gateway(tags: int, devices: int, seconds: float, for_flood: float) -> float:
-    sys.setswitchinterval(SWITCH)  # as the service does
+async def gateway(tags: int, devices: int, seconds: float, for_flood: float) -> Rate:
+    sys.setswitchinterval(SWITCH)  # both as the service does
+    gc.set_threshold(*COLLECT)
     endpoint = free_endpoint()
     before = memory()
     made = plant(tags, devices)
@@ -261,45 +323,46 @@ async def gateway(tags: int, devices: int, seconds: float, for_flood: float) -> 
           f"{time.perf_counter() - began:.2f} s")  # fmt: skip
     print(f"memory: {before:.0f} MB empty, {with_tags - before:.0f} MB more with the tags, "
           f"{memory() - with_tags:.0f} MB more on Zenoh")  # fmt: skip
-    rate = 0.0
     try:
         with other("count", endpoint) as process:
             counter = await asyncio.to_thread(Counter, process)
             await asyncio.sleep(1.0)
             rate = await published(made, northbound, counter, seconds)
-        print(f"memory then: {memory():.0f} MB")
         if for_flood:
-            await flooded(made, northbound, endpoint, for_flood)
+            await flooded(made, northbound, ("ask", "ask", "ask"), endpoint, for_flood)
+            await flooded(made, northbound, ("flood", "ask"), endpoint, for_flood)
     finally:
         serves.cancel()
         await asyncio.wait([serves])
     return rate
 
 
-async def published(made: Plant, northbound: Northbound, counter: Counter, seconds: float) -> float:
+async def published(made: Plant, northbound: Northbound, counter: Counter, seconds: float) -> Rate:
     for _ in range(2):
-        await publish_all(made, northbound)
-        await asyncio.to_thread(counter.until_quiet)
-    first = await asyncio.to_thread(counter.now)
+        before = northbound.counters()["published"]
+        await put(northbound, before + await publish_all(made, northbound))
+    first = await asyncio.to_thread(counter.until_quiet)
     gc.collect()
     gc.freeze()  # as the service does once it runs
     lag = Lag()
     probe = asyncio.create_task(lag.run())
-    before = northbound.counters()
-    began = time.perf_counter()
-    sent = 0
+    began, used, sent = time.perf_counter(), time.process_time(), 0
+    before = northbound.counters()["published"]
     while time.perf_counter() - began < seconds:
         sent += await publish_all(made, northbound)
-        while northbound.counters()["published"] - before["published"] < sent - SCAN:
-            await asyncio.sleep(0.002)  # the lines would go on; here nothing is to be replaced
-    while northbound.counters()["published"] - before["published"] < sent:
-        await asyncio.sleep(0.002)
-    took = time.perf_counter() - began
+        await put(northbound, before + sent - SCAN)  # as lines go on; and nothing is replaced
+    await put(northbound, before + sent)
+    took, used = time.perf_counter() - began, time.process_time() - used
     probe.cancel()
-    arrived = await asyncio.to_thread(counter.until_quiet) - first
-    print(f"gateway: {sent / took:,.0f}/s from mirror to put, {arrived / sent:.1%} arrived; "
-          f"{lag.shown()}")  # fmt: skip
-    return arrived / took
+    rate = Rate(sent, took, used, await asyncio.to_thread(counter.until_quiet) - first)
+    print(f"gateway, from mirror to put: {rate}; {lag.shown()}; memory {memory():.0f} MB")
+    return rate
+
+
+async def put(northbound: Northbound, count: int) -> None:
+    """Until so many were put."""
+    while northbound.counters()["published"] < count:
+        await asyncio.sleep(0.002)
 
 
 async def publish_all(made: Plant, northbound: Northbound) -> int:
@@ -314,19 +377,27 @@ async def publish_all(made: Plant, northbound: Northbound) -> int:
     return sent
 
 
-async def flooded(made: Plant, northbound: Northbound, endpoint: str, seconds: float) -> None:
+async def flooded(
+    made: Plant, northbound: Northbound, kinds: Sequence[str], endpoint: str, seconds: float
+) -> None:
+    """By a process for each kind: `ask`, or `flood` with everything."""
     lag = Lag()
     probe = asyncio.create_task(lag.run())
-    before, most = memory(), memory()
-    with other("flood", endpoint, seconds) as process:
-        while process.poll() is None:
+    before, most, earlier = memory(), memory(), northbound.counters()
+    with ExitStack() as stack:
+        strangers = [stack.enter_context(other(kind, endpoint, seconds)) for kind in kinds]
+        while any(stranger.poll() is None for stranger in strangers):
             samples = [good(tag, 1, time.time_ns()) for tag in made.tags[:SCAN]]
             northbound.publish(made.mirror.update(samples))
             most = max(most, memory())
             await asyncio.sleep(0.1)
+        told = [stranger.stdout.read().strip() for stranger in strangers if stranger.stdout]
     probe.cancel()
-    print(f"flood of {seconds:g} s: {lag.shown()}; memory {before:.0f} MB, at most {most:.0f} MB")
-    print("counted:", json.dumps(northbound.counters()))
+    print(f"{seconds:g} s of {' + '.join(kinds)}: {lag.shown()}; "
+          f"memory {before:.0f} MB, at most {most:.0f} MB")  # fmt: skip
+    print("they told:", *told)
+    now = northbound.counters()
+    print("counted:", {name: now[name] - earlier.get(name, 0) for name in now})
 
 
 def main(arguments: Iterable[str] | None = None) -> None:
@@ -337,11 +408,13 @@ def main(arguments: Iterable[str] | None = None) -> None:
     parser.add_argument("--flood", type=float, default=0.0)
     options = parser.parse_args(arguments)  # type: ignore[arg-type]  # any iterable will do
     structlog.configure(processors=[_quiet])
-    best = bare(options.tags, options.devices, options.seconds, declared=False)
-    like = bare(options.tags, options.devices, options.seconds, declared=True)
-    rate = asyncio.run(gateway(options.tags, options.devices, options.seconds, options.flood))
-    print(f"arrived: {rate:,.0f}/s; {rate / best:.2f} of the bare loop with nothing else, "
-          f"{rate / like:.2f} of the bare loop with the same declarations")  # fmt: skip
+    load = options.tags, options.devices, options.seconds
+    best = bare(*load, like_ours=False)
+    rate = asyncio.run(gateway(*load, options.flood))
+    again = bare(*load, like_ours=False)
+    like = bare(*load, like_ours=True)
+    print(f"arrived: {rate.each:,.0f}/s; {rate.each / max(best.each, again.each):.2f} of the bare "
+          f"loop with nothing else, {rate.each / like.each:.2f} of the one like ours")  # fmt: skip
 
 
 def _quiet(*_: object) -> str:
@@ -354,5 +427,7 @@ if __name__ == "__main__":
             count(where)
         case ["flood", where, how_long]:
             flood(where, float(how_long))
+        case ["ask", where, how_long]:
+            ask(where, float(how_long))
         case _:
             main()

@@ -18,6 +18,7 @@ from typing import Never
 import orjson
 
 from gateway.errors import BadValue, Busy, GatewayError, LineDown, Offline, Refused
+from gateway.orders import Obeyed
 from gateway.tags import Quality, Reason, Sample, Tag, Written
 from gateway.values import Value
 
@@ -52,18 +53,20 @@ class Failure:
 
 @dataclass(frozen=True, slots=True)
 class WriteOutcome:
-    """One write and what became of it, for log, audit and the `writes` key.
+    """One write or command and what became of it, for log, history and the `writes` key.
 
-    `key` is the key that was written to, `value` what was asked for (None if it could not be
-    understood), `time` when it ended (ns since 1970), `by` the asker, where Zenoh tells.
+    `key` is that of the value that was written, or the command's own; `value` what was asked for
+    (None if it could not be understood), or the command's argument; `time` when it ended (ns
+    since 1970), `by` the asker, where Zenoh tells.
     """
 
     key: str
     value: Value | None
-    result: Written | Failure
+    result: Written | Obeyed | Failure
     time: int
     took: float
     by: str | None = None
+    command: bool = False
 
 
 def failure(error: GatewayError) -> Failure:
@@ -131,6 +134,7 @@ def meta(tag: Tag) -> bytes:
         "heartbeat": tag.heartbeat,
         "history": tag.history,
         "payload": tag.payload.value,
+        "event": tag.event,
         "write": None
         if rule is None
         else {"min": rule.min, "max": rule.max, "verify": rule.verify},
@@ -144,7 +148,8 @@ def outcome(result: Written | Failure) -> bytes:
 
 
 def write_outcome(done: WriteOutcome) -> bytes:
-    """The line of the audit trail; `outcome` is `written` or the word for what went wrong."""
+    """The line of the audit trail; `outcome` is `written`, `obeyed` or the word for what went
+    wrong."""
     line: dict[str, object] = {
         "key": short(done.key),
         "value": shown(done.value),
@@ -155,6 +160,8 @@ def write_outcome(done: WriteOutcome) -> bytes:
     match done.result:
         case Written(verified=verified):
             line |= {"outcome": "written", "verified": verified}
+        case Obeyed(answer):
+            line |= {"outcome": "obeyed", "answer": short(answer)}
         case Failure(problem, reason, code):
             line |= {"outcome": problem.value, "code": code, "reason": short(reason)}
     return orjson.dumps(line)

@@ -1,15 +1,20 @@
 """History over Zenoh: asked by `_time`, and caught up by a consumer whose router was away."""
 
 import asyncio
+import json
 import sys
 import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
+from typing import Any
 
+from gateway import payload
 from gateway.history import Historian
 from gateway.northbound import Mode, Northbound, ZenohSettings
-from gateway.tags import Reason, bad, good
+from gateway.orders import Obeyed
+from gateway.payload import Failure, Problem, WriteOutcome
+from gateway.tags import Reason, Written, bad, good
 from tests.history_writer import WEEK, until
 from tests.test_northbound import PlainDevice, PlainPlant, tag
 from tests.zenoh_peer import ZenohPeer, free_endpoint
@@ -19,6 +24,7 @@ SPEED = tag("mixer", "speed", history=True)
 DOOR = tag("mixer", "door", history=True)
 OTHER = tag("mixer", "other")
 SECOND = 10**9
+MIDNIGHT = time.strftime("%Y-%m-%dT00:00:00Z", time.gmtime())
 PAST = 1_795_262_400 * SECOND  # 2026-11-21T12:00:00Z
 
 
@@ -93,6 +99,38 @@ async def test_history_is_answered_by_zenohs_time_ranges(tmp_path: Path) -> None
             assert reply.json["error"] == "bad-query", wrong
 
 
+async def test_what_became_of_writes_and_commands_is_asked_back_by_time(tmp_path: Path) -> None:
+    endpoint = free_endpoint()
+    writes = "plant/@gateway/demo/writes"
+    done = [
+        WriteOutcome("plant/mixer/speed", 7, Written(7, PAST, 0.1), PAST, 0.1, "alice"),
+        WriteOutcome(
+            "plant/mixer/@stop", None, Obeyed("ok", PAST, 0.2), PAST + 1, 0.2, command=True
+        ),
+        WriteOutcome("plant/mixer/speed", 8, Failure(Problem.UNCLEAR, "?"), PAST + SECOND, 8.0),
+    ]
+    async with (
+        recording(tmp_path / "h.db") as historian,
+        serving(plant(), historian, endpoint, listen=True),
+        ZenohPeer("client", connect=[endpoint]) as client,
+    ):
+        for outcome in done:
+            historian.record_write(outcome)
+        async with asyncio.timeout(10):
+            while historian.document()["writes_stored"] != len(done):
+                await asyncio.sleep(0.01)
+
+        async def asked(selector: str) -> list[Any]:
+            return [reply.json for reply in await client.get(f"{writes}?_time={selector}")]
+
+        told = await asked("[..]")
+        assert told == [json.loads(payload.write_outcome(outcome)) for outcome in done]
+        assert [line["outcome"] for line in told] == ["written", "obeyed", "unclear"]
+        assert await asked("[..];limit=1") == told[:1]
+        assert await asked("[2026-11-21T12:00:01Z..]") == told[2:]
+        assert [line["error"] for line in await asked("yesterday")] == ["bad-query"]
+
+
 class Poll:
     """A plant that goes on whatever the network does: 1, 2, 3 ... every 5 ms, all recorded."""
 
@@ -107,8 +145,14 @@ class Poll:
             self.told += 1
             sample = self.plant.now("mixer/speed", self.told)
             self._historian.record([sample])
-            if self.northbound is not None:
-                self.northbound.publish([sample])
+            if (northbound := self.northbound) is not None:
+                before = northbound.counters()["published"]
+                northbound.publish([sample])
+                # No faster than they go out: on a busy machine a newer one would take its place.
+                while (
+                    self.northbound is northbound and northbound.counters()["published"] <= before
+                ):
+                    await asyncio.sleep(0.005)
             await asyncio.sleep(0.005)
 
     @asynccontextmanager
@@ -145,27 +189,40 @@ class Consumer:
 
 
 @asynccontextmanager
-async def polling_and_consuming(path: Path, endpoint: str) -> AsyncIterator[tuple[Poll, Consumer]]:
+async def consuming(endpoint: str, since: str) -> AsyncIterator[Consumer]:
+    """In the end it is killed."""
+    process = await asyncio.create_subprocess_exec(
+        sys.executable,
+        str(EXAMPLE),
+        *("--connect", endpoint, "--since", since),
+        stdout=asyncio.subprocess.PIPE,
+    )
+    consumer = Consumer(process)
+    try:
+        yield consumer
+    finally:
+        await consumer.end()
+
+
+@asynccontextmanager
+async def polling(path: Path) -> AsyncIterator[Poll]:
     async with recording(path) as historian:
         poll = Poll(historian)
-        polling = asyncio.create_task(poll.run())
-        midnight = time.strftime("%Y-%m-%dT00:00:00Z", time.gmtime())
-        process = await asyncio.create_subprocess_exec(
-            sys.executable,
-            str(EXAMPLE),
-            *("--connect", endpoint, "--since", midnight),
-            stdout=asyncio.subprocess.PIPE,
-        )
-        consumer = Consumer(process)
+        goes_on = asyncio.create_task(poll.run())
         try:
-            yield poll, consumer
+            yield poll
         finally:
-            polling.cancel()
-            await consumer.end()
+            goes_on.cancel()
 
 
-def nothing_lost_and_nothing_twice(consumer: Consumer) -> None:
-    speeds = [line.split() for line in consumer.lines if "plant/mixer/speed" in line]
+@asynccontextmanager
+async def polling_and_consuming(path: Path, endpoint: str) -> AsyncIterator[tuple[Poll, Consumer]]:
+    async with polling(path) as poll, consuming(endpoint, MIDNIGHT) as consumer:
+        yield poll, consumer
+
+
+def nothing_lost_and_nothing_twice(lines: list[str]) -> None:
+    speeds = [line.split() for line in lines if "plant/mixer/speed" in line]
     assert [int(words[2]) for words in speeds] == list(range(1, len(speeds) + 1))
     assert not any("late" in words for words in speeds)
 
@@ -183,7 +240,7 @@ async def test_a_consumer_loses_nothing_when_its_router_is_killed(tmp_path: Path
                     await asyncio.sleep(0.01)
             async with ZenohPeer(Mode.ROUTER, listen=[endpoint]):
                 await consumer.knows(poll.told + 50)
-        nothing_lost_and_nothing_twice(consumer)
+        nothing_lost_and_nothing_twice(consumer.lines)
 
 
 async def test_a_consumer_loses_nothing_when_the_gateway_is_away(tmp_path: Path) -> None:
@@ -195,4 +252,26 @@ async def test_a_consumer_loses_nothing_when_the_gateway_is_away(tmp_path: Path)
         for _ in range(2):
             async with poll.on_air(endpoint):
                 await consumer.knows(poll.told + 50)
-        nothing_lost_and_nothing_twice(consumer)
+        nothing_lost_and_nothing_twice(consumer.lines)
+
+
+async def test_a_consumer_that_is_killed_goes_on_from_the_last_it_knew(tmp_path: Path) -> None:
+    endpoint = free_endpoint()
+    known: list[str] = []
+    async with (
+        ZenohPeer(Mode.ROUTER, listen=[endpoint]),
+        polling(tmp_path / "h.db") as poll,
+        poll.on_air(endpoint),
+    ):
+        for _ in range(4):
+            since = known[-1].split()[0] if known else MIDNIGHT
+            async with consuming(endpoint, since) as consumer:
+                await consumer.knows(poll.told + 50)
+            # Killed while it listened; what was asked for again is what it knew already.
+            whole = [line for line in consumer.lines if line.split()[0] > since or not known]
+            known += [line for line in whole if "plant/mixer/speed" in line]
+        assert poll.northbound is not None
+        async with ZenohPeer("client", connect=[endpoint]) as client:
+            assert len(await client.get("plant/**")) == 3  # and it answers as before
+            assert await client.tokens("plant/@gateway/*") == ["plant/@gateway/demo"]
+    nothing_lost_and_nothing_twice(known)

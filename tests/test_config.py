@@ -4,7 +4,7 @@ import gc
 import json
 import tempfile
 import textwrap
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gateway.config import Config, ConfigErrors, load, schema, written
+from gateway.config.model import (
+    HistorySection,
+    Section,
+    TagDefaults,
+    WebSection,
+    ZenohSection,
+)
 from gateway.config.yaml_file import read_yaml
 from gateway.errors import ConfigError
 from gateway.protocols import ComputerLink, ModbusRtu, ModbusTcp, Vigor
@@ -971,6 +978,43 @@ def test_the_example_is_what_the_schema_describes(tmp_path: Path) -> None:
     contract = tmp_path / "contract.yaml"
     contract.write_text(CONTRACT)
     assert violations(plain(contract), schema()) == []
+
+
+def _settings_with_default(shape: Any, at: str = "") -> Iterator[tuple[str, dict[str, Any]]]:
+    if isinstance(shape, dict):
+        for name, setting in shape.get("properties", {}).items():
+            if "default" in setting:
+                yield f"{at}/{name}", setting
+        for name, inner in shape.items():
+            yield from _settings_with_default(inner, f"{at}/{name}")
+
+
+def test_every_default_in_the_schema_is_one_that_the_file_could_say() -> None:
+    root = schema()
+    found = dict(_settings_with_default(root))
+    assert len(found) > 50
+    for where, setting in found.items():
+        assert violations(setting["default"], setting | {"$defs": root["$defs"]}) == [], where
+
+
+@pytest.mark.parametrize(
+    ("section", "settings"),
+    [
+        (HistorySection, ("path", "keep", "max_size")),
+        (WebSection, ("listen",)),
+        (ZenohSection, ("prefix", "mode", "listen", "connect")),
+        (TagDefaults, ("every", "scale", "publish", "payload")),
+    ],
+)
+def test_a_default_in_the_schema_means_what_holds_when_nothing_is_said(
+    section: type[Section], settings: tuple[str, ...]
+) -> None:
+    name_there = "Defaults" if section is TagDefaults else section.__name__
+    shape = schema()["$defs"][name_there]["properties"]
+    said = section.model_validate({name: shape[name]["default"] for name in settings})
+    unsaid = section.model_validate({})
+    for name in settings:
+        assert getattr(said, name) == getattr(unsaid, name), name
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """Commands to PLCs over Zenoh and by hand: obeyed where the file allows it, else refused unsent."""
 
 import asyncio
+import json
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -9,15 +10,17 @@ from typing import Any
 import pytest
 from structlog.testing import capture_logs
 
+from gateway import payload
 from gateway.app import Gateway
 from gateway.config import load
 from gateway.control import NotControlled, check_command, speaker
 from gateway.errors import BadValue, ConfigError, LineDown
 from gateway.keys import Family, Keys, asked
+from gateway.northbound.audit import Audit
 from gateway.northbound.controls import Controls
 from gateway.northbound.writers import Asker
 from gateway.orders import Obeyed
-from gateway.payload import Failure, Problem
+from gateway.payload import Failure, Problem, WriteOutcome
 from tests.e2e.processes import plc_gateway, started, write_config
 from tests.zenoh_peer import ZenohPeer, free_endpoint
 
@@ -138,20 +141,29 @@ class Below:
 
 
 def obey(below: Below, key: str, data: bytes | None = None) -> tuple[Any, list[Any]]:
-    controls = Controls(KEYS, below, lambda: None)  # type: ignore[arg-type,return-value]
+    """The result, and what the log, the `writes` key and history were told."""
+    published: list[bytes] = []
+    recorded: list[WriteOutcome] = []
     with capture_logs() as logs:
+        audit = Audit(published.append, recorded.append)
+        controls = Controls(KEYS, below, lambda: None, audit)  # type: ignore[arg-type,return-value]
         result = asyncio.run(controls.obey(key, data, Asker("client")))
-    return result, logs
+    assert [payload.write_outcome(outcome) for outcome in recorded] == published
+    return result, logs + [json.loads(line) for line in published]
 
 
-def test_a_command_is_handed_down_and_told_in_the_log() -> None:
+def test_a_command_is_handed_down_and_told_as_a_write_is() -> None:
     below = Below(Obeyed("acknowledged", 1, 0.1))
-    result, [line] = obey(below, "plant/oven/@stop")
+    result, [line, told] = obey(below, "plant/oven/@stop")
     assert result == below.outcome
+    assert (told["key"], told["value"], told["by"]) == ("plant/oven/@stop", None, "client")
+    assert (told["outcome"], told["answer"]) == ("obeyed", "acknowledged")
+    assert {"time", "took"} <= told.keys()
     assert below.told == [("oven", "stop", "")]
     assert line["event"] == "command obeyed"
     assert (line["key"], line["by"], line["log_level"]) == ("plant/oven/@stop", "client", "info")
-    obey(below, "plant/@gateway/demo/lines/hall/global", b"on")
+    _, [_, told] = obey(below, "plant/@gateway/demo/lines/hall/global", b"on")
+    assert told["value"] == "on"
     assert below.told[-1] == ("oven", "global", "on")
 
 
@@ -169,11 +181,12 @@ def test_what_is_no_command_is_refused_and_told(
     key: str, data: bytes | None, problem: Problem
 ) -> None:
     below = Below(Obeyed("acknowledged", 1, 0.1))
-    result, [line] = obey(below, key, data)
+    result, [line, told] = obey(below, key, data)
     assert isinstance(result, Failure)
     assert result.problem is problem
     assert below.told == []
     assert (line["event"], line["log_level"]) == ("command not obeyed", "warning")
+    assert (told["key"], told["outcome"]) == (key, problem.value)
 
 
 @pytest.mark.parametrize(
@@ -185,10 +198,10 @@ def test_what_is_no_command_is_refused_and_told(
     ],
 )
 def test_every_ending_has_its_word(error: Exception, problem: Problem) -> None:
-    result, [line] = obey(Below(error), "plant/oven/@stop")
+    result, [line, told] = obey(Below(error), "plant/oven/@stop")
     assert isinstance(result, Failure)
     assert result.problem is problem
-    assert line["error"] == problem.value
+    assert line["error"] == told["outcome"] == problem.value
     assert ("perhaps" in line["event"]) == (problem is Problem.UNCLEAR)
 
 
@@ -242,8 +255,11 @@ async def test_over_zenoh(served: tuple[str, Path]) -> None:
         assert (running.json["error"], running.json["code"]) == ("refused", "18")
         assert await client.get("plant/vigor/@stop") == []
         assert [reply.key for reply in await client.get("plant/**")]  # asks, and commands nothing
+        audit = await client.subscribe("plant/@gateway/*/writes")
         [stopped] = await client.get("plant/oven/@stop")
         assert stopped.json["answer"] == "acknowledged"
+        told = (await audit.next(lambda _: True)).json
+        assert (told["key"], told["outcome"]) == ("plant/oven/@stop", "obeyed")
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 import time
+import tracemalloc
 from collections.abc import Iterable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -27,6 +28,7 @@ from gateway.history.recent import MOST_RUNS
 from gateway.history.rows import from_row, to_row
 from gateway.history.timerange import EARLIEST, LATEST
 from gateway.history.writer import MOST_WRITES_WAITING
+from gateway.orders import Obeyed
 from gateway.payload import Failure, Problem, WriteOutcome
 from gateway.tags import Quality, Reason, Sample, Tag, Written, bad, good
 from gateway.values import Value
@@ -274,6 +276,22 @@ def test_questions_see_each_sample_once_while_runs_move_to_disk(tmp_path: Path) 
         assert historian.document()["lost"] == 0
 
 
+def test_an_answer_of_very_many_samples_does_not_sit_in_memory(tmp_path: Path) -> None:
+    count = 200_000  # 50 MB of them; what is held is one run of 32,768 at a time
+    with history(tmp_path / "h.db") as historian:
+        for first in range(0, count, 1000):
+            historian.record(good(SPEED, n, NOON + n) for n in range(first, first + 1000))
+    with history(tmp_path / "h.db") as historian:
+        found = historian.samples(SPEED, EVERYTHING, None)
+        tracemalloc.start()
+        try:
+            assert sum(1 for _ in found) == count
+            _, most = tracemalloc.get_traced_memory()
+        finally:
+            tracemalloc.stop()
+    assert most < 15_000_000
+
+
 def test_a_slow_reader_gets_all_and_holds_up_neither_log_nor_writer(tmp_path: Path) -> None:
     path = tmp_path / "h.db"
     with history(path, max_size=20_000_000) as historian:
@@ -383,11 +401,12 @@ def test_every_write_is_kept_with_its_outcome(tmp_path: Path) -> None:
         WriteOutcome("plant/mixer/speed", 12.5, done, NOON + 2, 0.031, by="abc"),
         WriteOutcome("plant/mixer/run", True, Failure(Problem.REFUSED, "no", "28"), NOON + 1, 0.1),
         WriteOutcome("plant/mixer/x", None, Failure(Problem.UNCLEAR, "\ud800"), NOON + 2, 8.0),
+        WriteOutcome("plant/mixer/@stop", None, Obeyed("ok", 1, 0.1), NOON + 3, 0.1, command=True),
     ]
     with history(tmp_path / "h.db") as historian:
         for outcome in outcomes:
             historian.record_write(outcome)
-        until(historian, writes_stored=3)
+        until(historian, writes_stored=4)
     with history(tmp_path / "h.db") as historian:
         lines = [json.loads(line) for line in historian.writes(EVERYTHING)]
         late = list(historian.writes("[2026-11-21T12:00:00.000000002Z..]", 1))
@@ -395,9 +414,11 @@ def test_every_write_is_kept_with_its_outcome(tmp_path: Path) -> None:
         "plant/mixer/run",
         "plant/mixer/speed",
         "plant/mixer/x",
+        "plant/mixer/@stop",
     ]
     assert lines[0]["outcome"] == "refused"
     assert lines[0]["code"] == "28"
+    assert (lines[3]["outcome"], lines[3]["answer"]) == ("obeyed", "ok")
     assert lines[1]["value"] == 12.5
     assert lines[1]["verified"] is True
     assert lines[1]["by"] == "abc"

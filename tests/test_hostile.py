@@ -1,12 +1,16 @@
 """Whatever a stranger sends on whichever key: bounded memory, and the event loop undisturbed.
 
-`python -m benchmarks.northbound --flood 600` does the same for longer, with 50,000 tags.
+`python -m benchmarks.northbound --flood 600` does the same for longer, with 50,000 tags, and prints
+how many questions a second came.
 """
 
 import asyncio
+import json
 import subprocess
 import sys
 import time
+from collections import Counter
+from contextlib import ExitStack
 from pathlib import Path
 
 from benchmarks.northbound import Lag, memory
@@ -14,6 +18,8 @@ from gateway.northbound import ZenohSettings
 from tests.test_northbound import PlainDevice, PlainPlant, serving, tag
 from tests.zenoh_peer import ZenohPeer, free_endpoint
 
+# One with everything on every key, and two with questions alone: 10,000 a second and more.
+KINDS = ("flood", "ask", "ask")
 ROOT = Path(__file__).parent.parent
 
 
@@ -21,6 +27,11 @@ def plant() -> PlainPlant:
     return PlainPlant(
         *(PlainDevice(f"d{d}", tuple(tag(f"d{d}", f"t{n}") for n in range(50))) for d in range(4))
     )
+
+
+def stranger(kind: str, endpoint: str) -> "subprocess.Popen[str]":
+    command = [sys.executable, "-m", "benchmarks.northbound", kind, endpoint, "3"]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT)
 
 
 async def test_a_flood_of_everything_costs_little_memory_and_no_poll() -> None:
@@ -34,19 +45,26 @@ async def test_a_flood_of_everything_costs_little_memory_and_no_poll() -> None:
         before = most = memory()
         lag = Lag()
         probe = asyncio.create_task(lag.run())
-        command = [sys.executable, "-m", "benchmarks.northbound", "flood", endpoint, "3"]
-        with subprocess.Popen(command, stdout=subprocess.PIPE, cwd=ROOT) as flood:
-            while flood.poll() is None:
+        with ExitStack() as stack:
+            strangers = [stack.enter_context(stranger(kind, endpoint)) for kind in KINDS]
+            while any(one.poll() is None for one in strangers):
                 northbound.publish([served.now("d0/t0", int(time.time()) % 30_000)])
                 most = max(most, memory())
                 await asyncio.sleep(0.05)
-            assert flood.stdout is not None
-            sent = int(flood.stdout.read())
+            told = [one.stdout.read() for one in strangers if one.stdout is not None]
         probe.cancel()
         counters = northbound.counters()
         # It did hear a good part of it, and refused what there was no room for.
-        assert sent > 1000
+        assert int(told[0]) > 1000
         assert counters["queries"] > 500
+        # Each question ended, with an answer, with an error, or (no room for that) without a word.
+        ended: Counter[str] = Counter()
+        for told_by_one in map(json.loads, told[1:]):
+            assert sum(told_by_one["ended"].values()) == told_by_one["asked"]
+            ended += Counter(told_by_one["ended"])
+        assert ended["answered"] > 500
+        assert ended["an error"] > 500
+        assert ended["silent"] <= counters["unanswered"]
         assert most - before < 150.0, f"{before:.0f} MB grew to {most:.0f} MB"
         # A line's task would have been late by as much; a stall of seconds is what must not be.
         late = sorted(lag.late)

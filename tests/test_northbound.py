@@ -251,6 +251,30 @@ async def test_events_beyond_the_limit_are_dropped_and_counted() -> None:
     assert [value for *_, value in session.puts] == [0, *range(EVENTS_LIMIT)]
 
 
+async def test_a_bad_value_is_repeated_with_its_heartbeat_and_keeps_its_time() -> None:
+    plant = PlainPlant(
+        PlainDevice("mixer", (tag("mixer", "speed", heartbeat=0.5), tag("mixer", "level")))
+    )
+    async with together(plant) as (northbound, client):
+        speed, level = (plant.tag(f"mixer/{name}") for name in ("speed", "level"))
+        assert speed is not None
+        assert level is not None
+        heard = await client.subscribe("plant/mixer/*")
+        down = [bad(of, Reason.NO_REPLY, time.time_ns()) for of in (speed, level)]
+        plant.samples |= {sample.tag.key: sample for sample in down}
+        northbound.publish(down)
+        await heard.next(lambda sample: sample.key.endswith("level"))
+        told = await heard.next(lambda sample: sample.key.endswith("speed"))
+        heard.forget()
+        for _ in range(2):
+            again = await heard.next(lambda _: True)
+            assert again.key == "plant/mixer/speed"  # the other has no heartbeat
+            assert again.json == told.json
+            heard.forget()
+        northbound.publish([plant.now("mixer/speed", 7)])
+        assert (await heard.next(lambda _: True)).json["value"] == 7
+
+
 async def test_events_all_arrive_in_order() -> None:
     plant = mixer()
     async with together(plant) as (northbound, client):

@@ -23,10 +23,12 @@ from gateway.northbound.audit import BURST, Audit
 from gateway.northbound.limiter import Limiter
 from gateway.northbound.session import configure
 from gateway.northbound.writers import NotAllowed, Writers
+from gateway.orders import Obeyed
 from gateway.payload import Failure, Problem, WriteOutcome
 from gateway.tags import Written
 from tests.conftest import needs
 from tests.e2e.processes import Program
+from tests.test_controls import Below
 from tests.test_northbound import PlainPlant, mixer, until
 from tests.zenoh_peer import ZenohPeer, free_endpoint
 
@@ -80,6 +82,9 @@ async def running(northbound: Northbound) -> AsyncIterator[None]:
         await asyncio.wait([serves], timeout=5)
 
 
+COMMANDED = Below(Obeyed("acknowledged", 1, 0.1))
+
+
 @asynccontextmanager
 async def behind_a_router(plant: PlainPlant, folder: Path) -> AsyncIterator[tuple[Any, str]]:
     endpoint = free_endpoint()
@@ -90,7 +95,7 @@ async def behind_a_router(plant: PlainPlant, folder: Path) -> AsyncIterator[tupl
     password = secret(folder / "password.txt", PASSWORDS["gateway"] + "\n")
     settings = ZenohSettings(connect=(endpoint,), user="gateway", password_file=password)
     async with ZenohPeer("router", listen=[endpoint], config=config):
-        northbound = Northbound(settings, "demo", plant)
+        northbound = Northbound(settings, "demo", plant, commanded=COMMANDED)
         async with running(northbound):
             await until(lambda: northbound.counters()["links"] == 1)
             yield northbound, endpoint
@@ -102,7 +107,7 @@ async def by_itself(plant: PlainPlant, folder: Path) -> AsyncIterator[tuple[Any,
     file = folder / "access.json5"
     file.write_text(GATEWAY_RULES)
     settings = ZenohSettings(listen=(endpoint,), config_file=file, users_file=users(folder))
-    northbound = Northbound(settings, "demo", plant)
+    northbound = Northbound(settings, "demo", plant, commanded=COMMANDED)
     async with running(northbound):
         yield northbound, endpoint
 
@@ -167,6 +172,19 @@ async def test_a_viewer_reads_and_an_operator_writes_and_nobody_else_does(
             as_user("operator", endpoint, "wrong"),
         ):
             assert await refused(stranger)
+
+
+@pytest.mark.parametrize("guarded", [behind_a_router, by_itself])
+async def test_neither_a_viewer_nor_an_operator_commands_a_plc_or_all_of_a_line(
+    guarded: Callable[..., Any], tmp_path: Path
+) -> None:
+    async with guarded(mixer(), tmp_path) as (_, endpoint):
+        for name in ("viewer", "operator"):
+            async with as_user(name, endpoint) as person:
+                assert len(await person.get("plant/@gateway/demo/status")) == 1
+                for key in ("plant/oven/@stop", "plant/@gateway/demo/lines/hall/global"):
+                    assert await person.get(key, b"on", target="ALL") == []
+    assert COMMANDED.told == []
 
 
 async def refused(peer: ZenohPeer) -> bool:

@@ -18,6 +18,8 @@ from gateway.config.nested import is_duration
 from gateway.config.settings import DURATION_SCHEMA
 from gateway.config.validate import DRIVERS
 
+_DURATIONS = {"d": 86400.0, "h": 3600.0, "min": 60.0, "s": 1.0, "ms": 0.001}
+_SIZES = {"TB": 1e12, "GB": 1e9, "MB": 1e6, "kB": 1e3}
 _PARTS: dict[str, type[Section]] = {"Line": LineSection, "Tag": TagSection, "Defaults": TagDefaults}
 
 
@@ -46,6 +48,9 @@ def schema() -> dict[str, Any]:
     line = shared["Line"]["properties"]
     line["devices"] |= {"additionalProperties": _ref("Device"), "minProperties": 1}
     line["defaults"] = _defaults("line")
+    for part in (root, *shared.values()):
+        for setting in part.get("properties", {}).values():
+            _write_default(setting)
     return {"$schema": "https://json-schema.org/draft/2020-12/schema"} | root
 
 
@@ -73,6 +78,31 @@ def _mend(kind: type[Any], properties: dict[str, Any]) -> None:
     for name, hint in get_type_hints(kind).items():
         if name in properties and is_duration(hint):
             properties[name] = dict(DURATION_SCHEMA)
+
+
+def _write_default(setting: dict[str, Any]) -> None:
+    """As the file would say it: `7d`, not 604800 seconds. One that it cannot say is left out."""
+    match setting.get("default", ...), setting.get("pattern"):
+        case float(seconds), pattern if pattern == DURATION_SCHEMA["pattern"]:
+            setting["default"] = _in_unit(seconds, _DURATIONS)
+        case int(octets), str():
+            setting["default"] = _in_unit(octets, _SIZES)
+        case (str(host), int(port)), _:
+            setting["default"] = f"{host}:{port}"
+        case None, _ if not _may_be_null(setting):
+            del setting["default"]
+
+
+def _may_be_null(setting: dict[str, Any]) -> bool:
+    shapes = setting.get("anyOf", [setting])
+    return any(shape.get("type") == "null" for shape in shapes) or "$ref" in setting
+
+
+def _in_unit(amount: float, units: dict[str, float]) -> str:
+    """In the largest unit of which it is a whole number, or the smallest."""
+    whole = [unit for unit, size in units.items() if amount and amount % size == 0]
+    unit = whole[0] if whole else list(units)[-1]
+    return f"{amount / units[unit]:g}{unit}"
 
 
 def _dataclasses_in(kind: type[Any]) -> Iterator[type[Any]]:

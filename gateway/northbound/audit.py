@@ -1,8 +1,8 @@
-"""Every write and what became of it: in the log, on the `writes` key, and in history.
+"""Every write and command and what became of it: in the log, on the `writes` key, in history.
 
 What has reached a device, or may have, is always told: the wire itself bounds how often that
-happens. Writes that were refused before anything was sent come as fast as anybody likes, so
-beyond a burst they are counted, and told by their number.
+happens. What was refused before anything was sent comes as fast as anybody likes, so beyond
+a burst it is counted, and told by its number.
 """
 
 import time
@@ -12,6 +12,7 @@ import structlog
 
 from gateway import payload
 from gateway.northbound.limiter import Limiter
+from gateway.orders import Obeyed
 from gateway.payload import Failure, Problem, WriteOutcome
 from gateway.tags import Written
 
@@ -19,6 +20,12 @@ log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 
 BURST = 300  # refusals told one by one at once
 EVERY = 1.0  # seconds for each that follows: 20 MB of log a day at most
+_ENDINGS = {
+    (False, False): "not written",
+    (False, True): "perhaps written",
+    (True, False): "command not obeyed",
+    (True, True): "command perhaps obeyed",
+}
 _ON_THE_WIRE = frozenset({Problem.UNCLEAR, Problem.REFUSED})
 
 
@@ -41,7 +48,7 @@ class Audit:
 
     def __call__(self, outcome: WriteOutcome) -> None:
         result = outcome.result
-        on_the_wire = isinstance(result, Written) or result.problem in _ON_THE_WIRE
+        on_the_wire = not isinstance(result, Failure) or result.problem in _ON_THE_WIRE
         if not on_the_wire and not self._refusals.allows(time.monotonic()):
             return
         _log(outcome)
@@ -52,7 +59,9 @@ class Audit:
     def tell_rest(self) -> None:
         """To be called now and again."""
         if count := self._refusals.untold():
-            log.warning("more writes were refused than are told one by one", count=count)
+            log.warning(
+                "more writes and commands were refused than are told one by one", count=count
+            )
 
 
 def _log(outcome: WriteOutcome) -> None:
@@ -66,9 +75,11 @@ def _log(outcome: WriteOutcome) -> None:
     match outcome.result:
         case Written(verified=verified):
             log.info("written", verified=verified, **shown)
+        case Obeyed(answer):
+            log.info("command obeyed", answer=answer, **shown)
         case Failure(problem, reason, code):
             log.warning(
-                "perhaps written" if problem is Problem.UNCLEAR else "not written",
+                _ENDINGS[outcome.command, problem is Problem.UNCLEAR],
                 error=problem.value,
                 code=code,
                 reason=payload.short(reason),

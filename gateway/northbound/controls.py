@@ -1,4 +1,4 @@
-"""Commands that come over Zenoh: checked, handed down, answered, and every one told in the log.
+"""Commands that come over Zenoh: checked, handed down, answered, and every outcome told.
 
 <prefix>/<device>/@run, @stop, @loopback, @model        by device, in full
 <prefix>/@gateway/<name>/lines/<line>/global            to all stations of a line: on, off
@@ -10,7 +10,6 @@ from collections.abc import Callable, Mapping
 from typing import Protocol
 
 import orjson
-import structlog
 import zenoh
 
 from gateway import payload
@@ -18,17 +17,12 @@ from gateway.control import TO_ALL, NotControlled
 from gateway.errors import BadValue, GatewayError
 from gateway.keys import Keys
 from gateway.northbound import forms
-from gateway.northbound.limiter import Limiter
 from gateway.northbound.writers import Asker, NotAllowed, Writers
 from gateway.northbound.writes import ANSWER_WITHIN
 from gateway.orders import Obeyed
-from gateway.payload import Failure, Problem
-
-log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
+from gateway.payload import Failure, Problem, WriteOutcome
 
 _LONGEST_ARGUMENT = 1000  # bytes; a loopback takes 254 characters at most
-_BURST, _EVERY = 100, 1.0  # refusals told one by one at once; seconds for each that follows
-_SENT = frozenset({Problem.UNCLEAR, Problem.REFUSED})
 
 
 class Commanded(Protocol):
@@ -52,14 +46,15 @@ class Controls:
         keys: Keys,
         below: Commanded,
         stamp: Callable[[], zenoh.Timestamp],
+        told: Callable[[WriteOutcome], None],
         writers: Writers | None = None,
     ) -> None:
-        """`writers`: those who may command are those who may write."""
+        """`told` gets every outcome; `writers`: who may command are those who may write."""
         self._keys = keys
         self._below = below
         self._stamp = stamp
+        self._told = told
         self._writers = writers
-        self._refusals = Limiter(_BURST, _EVERY)
 
     @property
     def queryables(self) -> list[str]:
@@ -92,7 +87,9 @@ class Controls:
         except GatewayError as error:
             result = payload.failure(error)
         finally:
-            self._tell(key, argument, result, time.monotonic() - started, by)
+            took = time.monotonic() - started
+            value = argument or None
+            self._told(WriteOutcome(key, value, result, time.time_ns(), took, by, command=True))
         return result
 
     def reply(self, result: Obeyed | Failure, query: zenoh.Query) -> None:
@@ -113,30 +110,6 @@ class Controls:
             return self._below.speaker(line), TO_ALL
         stem, _, last = key.rpartition("/")
         return self._keys.tag(stem) or stem, last.removeprefix("@")
-
-    def _tell(
-        self, key: str, argument: str, result: Obeyed | Failure, took: float, by: str | None
-    ) -> None:
-        shown: dict[str, object] = {
-            "key": payload.short(key),
-            "argument": payload.short(argument),
-            "took": round(took, 4),
-            "by": by,
-        }
-        match result:
-            case Obeyed(answer):
-                log.info("command obeyed", answer=answer, **shown)
-            case Failure(problem, reason, code):
-                if problem in _SENT or self._refusals.allows(time.monotonic()):
-                    log.warning(
-                        "command perhaps obeyed"
-                        if problem is Problem.UNCLEAR
-                        else "command not obeyed",
-                        error=problem.value,
-                        code=code,
-                        reason=payload.short(reason),
-                        **shown,
-                    )
 
 
 def _argument(data: bytes | None) -> str:

@@ -11,9 +11,11 @@ from gateway import payload
 from gateway.tags import Form, Sample
 
 _DROP = zenoh.CongestionControl.DROP
+_JSON = zenoh.Encoding.APPLICATION_JSON
+_TEXT = zenoh.Encoding.TEXT_PLAIN
 
 
-def put(session: zenoh.Session, key: str, sample: Sample, stamp: zenoh.Timestamp) -> None:
+def put(session: zenoh.Session, key: str, sample: Sample, stamp: zenoh.Timestamp | None) -> None:
     """Raises `ZError`."""
     if sample.tag.payload is Form.JSON:
         put_json(session, key, payload.value(sample), stamp)
@@ -25,19 +27,19 @@ def put(session: zenoh.Session, key: str, sample: Sample, stamp: zenoh.Timestamp
     session.put(
         key,
         bare,
-        encoding=zenoh.Encoding.TEXT_PLAIN,
+        encoding=_TEXT,
         congestion_control=_DROP,
         timestamp=stamp,
         attachment=about,
     )
 
 
-def put_json(session: zenoh.Session, key: str, data: bytes, stamp: zenoh.Timestamp) -> None:
+def put_json(session: zenoh.Session, key: str, data: bytes, stamp: zenoh.Timestamp | None) -> None:
     """Raises `ZError`."""
     session.put(
         key,
         data,
-        encoding=zenoh.Encoding.APPLICATION_JSON,
+        encoding=_JSON,
         congestion_control=_DROP,
         timestamp=stamp,
     )
@@ -52,9 +54,9 @@ def reply(query: zenoh.Query, key: str, sample: Sample, stamp: zenoh.Timestamp) 
     if bare is None:
         query.reply_del(key, timestamp=stamp, attachment=about)
         return
-    query.reply(key, bare, encoding=zenoh.Encoding.TEXT_PLAIN, timestamp=stamp, attachment=about)
+    query.reply(key, bare, encoding=_TEXT, timestamp=stamp, attachment=about)
 
 
 def reply_json(query: zenoh.Query, key: str, data: bytes, stamp: zenoh.Timestamp) -> None:
     """Raises `ZError`."""
-    query.reply(key, data, encoding=zenoh.Encoding.APPLICATION_JSON, timestamp=stamp)
+    query.reply(key, data, encoding=_JSON, timestamp=stamp)

@@ -172,12 +172,11 @@ class Northbound:
         self._with_blocks = frozenset(device.name for device in devices if device.blocks)
         self._publisher.start(session)
         writes = Writes(self.keys, self._plant, self._directory, self._audit, self._writers)
-        replies = Replies(
-            self.keys, self._plant, self._directory, session.new_timestamp, self._history
-        )
+        stamp = session.new_timestamp
+        replies = Replies(self.keys, self._plant, self._directory, stamp, self._history)
         controls = None
         if self._commanded is not None:
-            controls = Controls(self.keys, self._commanded, session.new_timestamp, self._writers)
+            controls = Controls(self.keys, self._commanded, stamp, self._audit, self._writers)
             self._commands = controls.queryables
         self._queries = Queries(
             self._plant, self._directory, writes, replies, self._status, controls

@@ -54,3 +54,6 @@ class History(Protocol):
         """In the order of time, the first `limit`; called from an answering thread. Raises
         `BadValue` for a range that cannot be understood, and `Busy`, also in the middle, when
         the past cannot be read now."""
+
+    def writes(self, time_range: str, limit: int | None) -> Iterator[str]:
+        """What was told of writes and commands, as on the `writes` key. Raises likewise."""

@@ -90,6 +90,8 @@ class Queries:
                 self._task(self._set(query))
             case Family.COMMAND if self._controls is not None:
                 self._task(self._command(query, self._controls))
+            case Family.STATUS if query.parameters.get("_time") is not None:
+                self._widely(query, self._replies.writes)
             case Family.STATUS:
                 self._task(self._status(query))
             case Family.VALUE if query.parameters.get("_time") is not None:

@@ -1,4 +1,5 @@
-"""All current values, again after each return to the network, which keeps nothing."""
+"""What is told again: all values after a return to the network, which keeps nothing, and bad
+ones with their heartbeat. Good ones are repeated as they are read."""
 
 import asyncio
 from contextlib import suppress
@@ -7,12 +8,14 @@ from gateway.northbound.directory import Directory
 from gateway.northbound.links import Links
 from gateway.northbound.plant import Plant
 from gateway.northbound.publisher import Publisher
+from gateway.tags import Quality, Sample, Tag
 
 # After a link returned: first its declarations arrive, and only then does a put reach anyone.
 _SETTLE = 0.3
 # A router that was restarted gets its other clients back later than us: once more for them.
 _LATECOMERS = 5.0
 _AT_ONCE = 500  # samples in one turn of the loop
+_LOOK_EVERY = 1.0  # seconds: a heartbeat may be so late
 
 
 class Repeater:
@@ -35,6 +38,11 @@ class Repeater:
 
     async def run(self) -> None:
         """Until cancelled."""
+        async with asyncio.TaskGroup() as tasks:
+            tasks.create_task(self._after_returns())
+            tasks.create_task(self._beat())
+
+    async def _after_returns(self) -> None:
         returned = self._links.returned
         while True:
             await returned.wait()
@@ -46,3 +54,23 @@ class Repeater:
                     await returned.wait()
                     continue
             await self.publish_all()
+
+    async def _beat(self) -> None:
+        tags = [tag for tag in self._directory.all() if tag.heartbeat and not tag.event]
+        told: dict[Tag, float] = {}  # when each bad value was, by the loop's clock
+        while tags:
+            await asyncio.sleep(_LOOK_EVERY)
+            for start in range(0, len(tags), _AT_ONCE):
+                self._publisher.values(self._due(tags[start : start + _AT_ONCE], told))
+                await asyncio.sleep(0)
+
+    def _due(self, tags: list[Tag], told: dict[Tag, float]) -> list[Sample]:
+        now, due = asyncio.get_running_loop().time(), []
+        for tag in tags:
+            sample = self._plant.sample(tag)
+            if sample.quality is Quality.GOOD:
+                told.pop(tag, None)
+            elif now - told.setdefault(tag, now) >= (tag.heartbeat or 0.0):
+                told[tag] = now
+                due.append(sample)
+        return due

@@ -13,6 +13,7 @@ from gateway.northbound.plant import History, Plant
 from gateway.payload import Failure, Problem
 from gateway.tags import Sample, Tag, Written
 
+_NOT_ALL = "the gateway is ending: this is not all"
 _NO_HISTORY = Failure(Problem.NO_HISTORY, "no history is kept here: ask without _time")
 
 
@@ -84,8 +85,26 @@ class Replies:
                 key = self._keys.value(tag.key)
                 for sample in self._history.samples(tag, asked, limit):
                     if self._ended:
-                        raise Busy("the gateway is ending: this is not all")
+                        raise Busy(_NOT_ALL)
                     forms.reply(query, key, sample, self._stamp())
+        except BadValue as error:
+            self.outcome(Failure(Problem.BAD_QUERY, str(error)), query)
+        except GatewayError as error:
+            self.outcome(payload.failure(error), query)
+
+    def writes(self, query: zenoh.Query) -> None:
+        """Of the past; every reply is on the key on which it was published."""
+        if not query.key_expr.intersects(self._keys.writes):
+            return
+        if self._history is None:
+            self.outcome(_NO_HISTORY, query)
+            return
+        try:
+            limit = _limit(query.parameters.get("limit"))
+            for told in self._history.writes(query.parameters.get("_time") or "", limit):
+                if self._ended:
+                    raise Busy(_NOT_ALL)
+                self._reply(query, self._keys.writes, told.encode(), self._stamp())
         except BadValue as error:
             self.outcome(Failure(Problem.BAD_QUERY, str(error)), query)
         except GatewayError as error:

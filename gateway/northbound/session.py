@@ -82,7 +82,7 @@ _GATEWAY: dict[str, object] = {
     "transport/link/tx/queue/congestion_control/block/wait_before_close": 1_000_000,
 }
 # A router carries the messages of others; any other gateway is sent writes, which are short.
-_LONGEST_MESSAGE = {"transport/link/rx/max_message_size": 1024 * 1024}
+_LONGEST_MESSAGE = {"transport/link/rx/max_message_size": 256 * 1024}
 
 
 def configure(settings: ZenohSettings) -> zenoh.Config:

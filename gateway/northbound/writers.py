@@ -7,7 +7,6 @@ anybody keep the gateway busy with wrong tokens.
 
 import hashlib
 import hmac
-import os
 import re
 import time
 from pathlib import Path
@@ -85,7 +84,7 @@ class Writers:
 
     def _stat(self) -> tuple[int, ...] | None:
         try:
-            found = os.stat(self._path)  # noqa: PTH116  (a call on every write)
+            found = self._path.stat()
         except OSError:
             return None
         return (found.st_mtime_ns, found.st_size, found.st_ino, found.st_mode)
