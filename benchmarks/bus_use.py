@@ -21,21 +21,21 @@ from typing import NamedTuple
 
 import structlog
 
+from benchmarks.words import words
 from gateway.device import Device
 from gateway.errors import GatewayError
 from gateway.forecast import forecast
 from gateway.line import Line
 from gateway.protocols.computer_link import ComputerLink
-from gateway.protocols.driver import Address, AnyDriver, Span, Unit
+from gateway.protocols.driver import AnyDriver
 from gateway.protocols.modbus import ModbusRtu
 from gateway.protocols.vigor import Vigor
 from gateway.stations.computer_link import ComputerLinkStation
 from gateway.stations.modbus import ModbusStation
 from gateway.stations.station import Station
 from gateway.stations.vigor import VigorStation
-from gateway.tags import Sample, Tag, WriteRule, Written
+from gateway.tags import Sample, Tag, Written
 from gateway.transport import SerialPath, SerialSettings, open_port
-from gateway.values import Layout, parse_type
 from gateway.wiretime import Wire, character_bits
 
 TURNAROUND = 0.005
@@ -89,23 +89,9 @@ class Result:
 
 def tags(area: str) -> tuple[Tag, ...]:
     """Four full blocks of 64 words, asked for ten times faster than any line carries them."""
-    found = []
-    for number in range(BLOCKS * WORDS):
-        address = number + (number // WORDS) * 200  # too far apart to share a request
-        found.append(
-            Tag(
-                device="plc",
-                name=f"t{number}",
-                text=f"{area}{address}",
-                address=Address(area, address),
-                span=Span(area, address, 1),
-                unit_kind=Unit.WORD,
-                layout=Layout(parse_type("int16")),
-                every=0.01,
-                write=WriteRule() if number == 0 else None,
-            )
-        )
-    return tuple(found)
+    # Too far apart to share a request.
+    numbers = [number + (number // WORDS) * 200 for number in range(BLOCKS * WORDS)]
+    return words(area, numbers, 0.01, writable=numbers[:1])
 
 
 async def writing(line: Line, device: Device, tag: Tag, took: list[float]) -> None:

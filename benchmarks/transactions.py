@@ -1,7 +1,8 @@
 """CPU per read of 64 words: `python -m benchmarks.transactions`.
 
 Our whole line (schedule, turn, driver, decoding, mirror) beside pymodbus's asyncio client and a
-libmodbus loop in C, against the same slave (libmodbus, in another process) in one run. Vigor has
+libmodbus loop in C, against the same slave (libmodbus, in another process) in one run. Its
+registers stay as they are; for the rows `changing` all of them change between two reads. Vigor has
 no foreign slave, so a simulated station in another process answers. Figures are processor
 time of this process, or of the C loop, per exchange; ratios within the run are what counts.
 """
@@ -25,16 +26,16 @@ from typing import Any
 import structlog
 from pymodbus.client import AsyncModbusSerialClient, AsyncModbusTcpClient
 
+from benchmarks.words import words
 from gateway.device import Device
 from gateway.line import Line
 from gateway.mirror import Mirror
-from gateway.protocols.driver import Address, AnyDriver, Span, Unit
+from gateway.protocols.driver import AnyDriver
 from gateway.protocols.modbus import ModbusRtu, ModbusTcp
 from gateway.protocols.vigor import Vigor
 from gateway.tags import Sample, Tag
 from gateway.transport import Ear, Port, SerialPath, SerialSettings, TcpAddress, open_port
 from gateway.transport.loop import new_event_loop
-from gateway.values import Layout, parse_type
 from gateway.wiretime import NETWORK_BAUD, Wire
 
 INTEROP = Path(__file__).parent.parent / "tests" / "interop"
@@ -81,19 +82,7 @@ class Counting:
 
 def tags(area: str, each: int) -> tuple[Tag, ...]:
     """64 words as 64 tags, or as 2 tags at both ends (`each` = 1 or 63)."""
-    return tuple(
-        Tag(
-            device="plc",
-            name=f"t{n}",
-            text=f"{area}{n}",
-            address=Address(area, n),
-            span=Span(area, n, 1),
-            unit_kind=Unit.WORD,
-            layout=Layout(parse_type("uint16")),
-            every=1e-6,
-        )
-        for n in range(FIRST, FIRST + WORDS, each)
-    )
+    return words(area, range(FIRST, FIRST + WORDS, each), 1e-6, kind="uint16")
 
 
 async def ours(
@@ -123,7 +112,7 @@ async def pymodbus(
     begun = time.process_time()
     for _ in range(count):
         reply = await client.read_holding_registers(FIRST, count=WORDS, device_id=1)
-        assert reply.registers[0] == FIRST
+        assert len(reply.registers) == WORDS
     spent = time.process_time() - begun
     client.close()
     return spent / count
@@ -166,8 +155,8 @@ def free_port() -> int:
 
 
 @contextlib.contextmanager
-def pty_pair(folder: Path) -> Iterator[tuple[str, str]]:
-    ends = [str(folder / "a"), str(folder / "b")]
+def pty_pair(folder: Path, name: str) -> Iterator[tuple[str, str]]:
+    ends = [str(folder / f"{name}{end}") for end in (1, 2)]
     child = subprocess.Popen(["socat", *(f"pty,raw,echo=0,link={end}" for end in ends)])
     try:
         while not all(Path(end).exists() for end in ends):
@@ -184,7 +173,7 @@ def run(coroutine: Coroutine[Any, Any, float]) -> float:
 
 
 def run_fast(coroutine: Coroutine[Any, Any, float]) -> float:
-    """On uvloop, as the service does where it is installed."""
+    """On uvloop, as the service does."""
     with asyncio.Runner(loop_factory=new_event_loop) as runner:
         return runner.run(coroutine)
 
@@ -215,15 +204,29 @@ def beside(
     opener: Callable[[Ear], Awaitable[Port]],
     client: Callable[[], AsyncModbusTcpClient | AsyncModbusSerialClient] | None = None,
     in_c: Callable[[int], float] | None = None,
+    changing: Callable[[Ear], Awaitable[Port]] | None = None,
 ) -> Runs:
-    """Ours, and who else can ask that slave; once more on uvloop where it is installed."""
+    """Ours, and who else can ask that slave; once more on uvloop where it is installed.
+
+    `changing` opens a port to a slave of which no register is as it was at the last reading.
+    """
     loops = {"": run}
     if find_spec("uvloop") is not None:
         loops[", uvloop"] = run_fast
     runs: Runs = {}
     for suffix, on in loops.items():
-        runs["ours, 2 tags" + suffix] = lambda n, on=on: on(ours(driver, area, 63, opener, n))
-        runs["ours, 64 tags" + suffix] = lambda n, on=on: on(ours(driver, area, 1, opener, n))
+
+        def read(
+            step: int,
+            opener: Callable[[Ear], Awaitable[Port]],
+            on: Callable[[Coroutine[Any, Any, float]], float] = on,
+        ) -> Callable[[int], float]:
+            return lambda count: on(ours(driver, area, step, opener, count))
+
+        for tags, step in ((2, 63), (64, 1)):
+            runs[f"ours, {tags} tags{suffix}"] = read(step, opener)
+            if changing is not None:
+                runs[f"ours, {tags} changing tags{suffix}"] = read(step, changing)
         if client is not None:
             runs["pymodbus client" + suffix] = lambda n, on=on: on(pymodbus(client, n))
     if in_c is not None:
@@ -235,14 +238,15 @@ def modbus_tcp(folder: Path, count: int, rounds: int) -> dict[str, float] | None
     slave, master = compiled(folder, "modbus_slave"), compiled(folder, "modbus_master")
     if slave is None or master is None:
         return None
-    port = free_port()
-    with process(slave, "tcp", str(port)):
+    port, other = free_port(), free_port()
+    with process(slave, "tcp", str(port)), process(slave, "tcp", str(other), "changing"):
         runs = beside(
             ModbusTcp(station=1),
             "holding",
             tcp_opener(port),
             lambda: AsyncModbusTcpClient("127.0.0.1", port=port),
             lambda n: libmodbus(master, "tcp", str(port), n),
+            tcp_opener(other),
         )
         return repeated(runs, count, rounds)
 
@@ -251,13 +255,19 @@ def modbus_rtu(folder: Path, count: int, rounds: int) -> dict[str, float] | None
     slave, master = compiled(folder, "modbus_slave"), compiled(folder, "modbus_master")
     if slave is None or master is None or shutil.which("socat") is None:
         return None
-    with pty_pair(folder) as (near, far), process(slave, "rtu", far, "1"):
+    with (
+        pty_pair(folder, "a") as (near, far),
+        pty_pair(folder, "c") as (other, end),
+        process(slave, "rtu", far, "1"),
+        process(slave, "rtu", end, "1", "changing"),
+    ):
         runs = beside(
             ModbusRtu(station=1),
             "holding",
             serial_opener(near),
             lambda: AsyncModbusSerialClient(near, baudrate=115200),
             lambda n: libmodbus(master, "rtu", near, n),
+            serial_opener(other),
         )
         return repeated(runs, count, rounds)
 

@@ -8,12 +8,13 @@ from typing import Any, Protocol
 import structlog
 
 from gateway.device import Device, Standing
-from gateway.errors import Evidence, Garbled, GatewayError, Refusal, Refused, Unclear
+from gateway.errors import Differs, Evidence, Garbled, GatewayError, Refusal, Refused, Unclear
 from gateway.jobs import Poll
 from gateway.planner import spell
 from gateway.protocols.driver import Span
 from gateway.schedule import Schedule
 from gateway.tags import Reason, Sample, Tag, bad
+from gateway.unchanged import Unchanged
 
 log = structlog.get_logger("gateway.line")
 BUSY_PAUSE = 0.2  # seconds left to a device that said it was busy, doubled each time
@@ -37,13 +38,12 @@ class Consequences:
     wall: Callable[[], int]  # ns since 1970
     _stale_timer: asyncio.TimerHandle | None = None
 
-    def read(self, poll: Poll, units: Sequence[int]) -> None:
+    def read(self, poll: Poll, units: Sequence[int], now: float) -> None:
         """A block was read well."""
         device, block = poll.device, poll.block
-        now = _now()
         poll.read(now)
-        self.upstairs.samples(block.decode(units, self.wall()))
-        if block.tags[0].shape is not None:
+        self.upstairs.samples(self._samples(poll, units))
+        if block.of_fields:
             self._note_garbled(device, units)
         self.schedule.polled(poll, now)
         refusals = device.refusals
@@ -53,8 +53,22 @@ class Consequences:
                 self._replan(device)
             self._settle(device)
         elif device.learn():
-            log.info("planned anew", device=device.name, turnaround=device.turnaround)
+            log.info("planned anew", device=device.name, turnaround=device.reckoned)
             self.schedule.plan(device, now)
+
+    def _samples(self, poll: Poll, units: Sequence[int]) -> Sequence[Sample]:
+        """What was read. The same units mean the same values: they are not decoded again."""
+        time, told = self.wall(), poll.told
+        if told is None or units != poll.units or poll.block.eager:
+            poll.units = units
+            poll.told = told = poll.block.decode(units, time)
+        elif not isinstance(told, Unchanged):
+            poll.told = told = Unchanged(told, time)
+        elif told.over:
+            poll.told = told = poll.block.decode(units, time)
+        else:
+            told.time = time
+        return told
 
     def _note_garbled(self, device: Device, fields: Sequence[Any]) -> None:
         """A good frame may hold a field that cannot be read."""
@@ -124,6 +138,15 @@ class Consequences:
         poll.last_good = None
         self.bad(poll.block.tags, device.reason, str(error))
         self.schedule.polled(poll, _now(), answered=False)
+
+    def differs(self, poll: Poll, error: Differs) -> None:
+        """The device is well, but what it says is not believed: again in its turn, or bad."""
+        if poll.tries < poll.device.timing.retries:
+            self.schedule.again(poll)
+            return
+        poll.last_good = None
+        self.bad(poll.block.tags, Reason.GARBLED, str(error))
+        self.schedule.polled(poll, _now())
 
     def refused(self, poll: Poll, error: Refused) -> None:
         """A poll was refused: asked again, halved to find the culprit, or its tags are bad."""

@@ -56,6 +56,15 @@ class LineRecord:
     unasked: int = 0  # bytes that nobody had asked for
     trouble: str = ""  # why the port is not open
 
+    def came_up(self, now: float) -> None:
+        self.opened += 1
+        self.since = now
+        self.trouble = ""
+
+    def went_down(self, trouble: str, served: float) -> None:
+        self.trouble = trouble
+        self.open_before += served
+
 
 @dataclass(slots=True, eq=False)
 class Device:
@@ -67,7 +76,7 @@ class Device:
     timing: Timing
     tags: tuple[Tag, ...]
     late_guard: float
-    turnaround: float | None = None  # set in the file, or measured; None: the protocol's usual
+    turnaround: float | None = None  # set in the file
     verify_reads: int = 1  # so many readings in a row must agree
     control: bool = False  # it may be told to run, stop ...
     blocks: tuple[Block, ...] = ()
@@ -84,14 +93,14 @@ class Device:
     record: Record = field(default_factory=Record)
     _use: tuple[float, float] = (0.0, 0.0)  # seconds of the wire, and when that was reckoned
     refusals: Refusals = field(init=False)
-    turnaround_fixed: bool = field(init=False)  # set in the file
+    reckoned: float | None = field(init=False)  # the turnaround planned with; None: the usual
     _learn_at: int = LEARN_EVERY
     broadcast: bool = field(init=False)  # written or listened to, but never asked anything
     window: int = field(init=False)  # questions that may be open at once
 
     def __post_init__(self) -> None:
         self.refusals = Refusals(self.driver.cost)
-        self.turnaround_fixed = self.turnaround is not None
+        self.reckoned = self.turnaround
         self.broadcast = not any(self.driver.areas[tag.span.area].readable for tag in self.tags)
         self.doubtful = not self.broadcast
         self.window = self.driver.window if isinstance(self.driver, Windowed) else 1
@@ -109,7 +118,7 @@ class Device:
 
     def seconds(self, cost: Cost) -> float:
         """One exchange on this line with this station."""
-        return self.wire.exchange(cost, self.timing, self.turnaround)
+        return self.wire.exchange(cost, self.timing, self.reckoned)
 
     @property
     def load(self) -> float:
@@ -125,12 +134,17 @@ class Device:
         self.blocks = blocks
 
     def learn(self) -> bool:
-        """Plan anew where the turnaround measured makes that worth while; True if it was done."""
+        """Plan anew where the turnaround measured makes that worth while; True if it was done.
+
+        In either case the measured one is reckoned with from now on.
+        """
         measured = self.record.turnaround
-        if self.turnaround_fixed or measured is None or self.record.exchanges < self._learn_at:
+        if self.turnaround is not None or measured is None:
+            return False
+        if self.record.exchanges < self._learn_at:
             return False
         self._learn_at = self.record.exchanges + LEARN_EVERY
-        self.turnaround = measured
+        self.reckoned = measured
         now, blocks = self.load, self.blocks
         self.plan()
         if self.load < (1 - WORTH_WHILE) * now:
@@ -191,6 +205,13 @@ class Device:
         """Seconds it had the wire in about the last ten."""
         use, when = self._use
         return use * math.exp2((when - now) / HALF_LIFE)
+
+    def conversed(self, exchanges: int, characters: float, turnarounds: float) -> None:
+        """So many questions were answered; seconds of the wire, and of the station's own time."""
+        self.record.wire_time += characters + turnarounds
+        if exchanges:
+            self.record.exchanges += exchanges
+            self.measured(turnarounds / exchanges)
 
     def measured(self, turnaround: float) -> None:
         """A station's own time in one exchange, smoothed over about ten."""

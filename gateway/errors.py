@@ -100,3 +100,7 @@ class Garbled(Unclear):
         super().__init__(message)
         self.data = data[:64]
         self.evidence = evidence
+
+
+class Differs(Garbled):
+    """Two good answers that ought to be the same are not."""

@@ -1,10 +1,12 @@
 """What a line can have to do next."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from gateway.device import Device
 from gateway.orders import Order
 from gateway.planner import Block
+from gateway.tags import Sample
 
 PAUSE_FIRST = 1.0
 PAUSE_LONGEST = 60.0
@@ -29,6 +31,8 @@ class Poll:
     mean_gap: float = 0.0  # seconds between two good reads, smoothed over about ten
     worst_gap: float = 0.0
     ticket: int = NOWHERE  # its one valid place in the queues
+    units: Sequence[int] | None = None  # as they were read last, and
+    told: Sequence[Sample] | None = None  # what was told of them
 
     def read(self, now: float) -> None:
         """Its values have just come."""

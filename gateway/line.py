@@ -7,20 +7,22 @@ from contextlib import contextmanager, suppress
 
 import structlog
 
+from gateway.clock import Clock
 from gateway.consequences import Consequences, Upstairs
 from gateway.device import Device, LineRecord, Standing
-from gateway.errors import Busy, LineDown, Offline, Refused, Unclear
+from gateway.echo import Adapter
+from gateway.errors import Busy, LineDown, Offline, Unclear
 from gateway.jobs import Idle, Poll, Probe
 from gateway.listening import Answer, Listening
 from gateway.orders import Command, Done, Order, Told, Write
 from gateway.overheard import Overheard
+from gateway.polling import Poller
 from gateway.protocols.driver import Span
-from gateway.reading import read_block
 from gateway.recorder import Recorder
 from gateway.schedule import Schedule
 from gateway.tags import Tag
 from gateway.transport import Ear, Port
-from gateway.turn import Clock, Turn
+from gateway.turn import Turn
 from gateway.wiretime import Wire
 from gateway.writing import Writer, together
 
@@ -57,10 +59,13 @@ class Line:
         self._open_port = open_port
         self._wall = wall
         self._echo = echo
+        self._adapter = Adapter()
+        self._echoed = False  # and that has been told
         self._random = random.Random(seed)  # noqa: S311  (jitter, not a secret)
         self._clock = Clock(spin=0.001 if wire.baudrate > FAST else 0.0)
         self._schedule = Schedule(devices, 0.0, seed)
         self._then = Consequences(name, self._schedule, upstairs, wall)
+        self._poller = Poller(self, self._then)
         self._writer = Writer(self, self._then, wall)
         self._listening = Listening(devices, self._then)
         self._overheard = Overheard(name, devices)
@@ -73,19 +78,21 @@ class Line:
 
     def submit(self, device: Device, tag: Tag, units: Sequence[int], done: Done) -> None:
         """Write as soon as the current exchange ends. `done` gets the outcome, exactly once."""
-        write = Write(device, tag, units, _now(), _now() + PATIENCE, done)
+        now = self._clock.now()
+        write = Write(device, tag, units, now, now + PATIENCE, done)
         for older in self._schedule.orders.superseded(write):
             older.done(Busy("a newer value took its place; not sent"))
         self._accept(write)
 
     def command(self, device: Device, name: str, argument: str, done: Told) -> None:
         """Have the device run, stop, ...: one of its driver's controls. `done` as in `submit`."""
-        self._accept(Command(device, name, argument, _now(), _now() + PATIENCE, done))
+        now = self._clock.now()
+        self._accept(Command(device, name, argument, now, now + PATIENCE, done))
 
     def _accept(self, order: Order) -> None:
         if not self.is_open:
             order.done(LineDown(self.record.trouble or f"line {self.name} is not open"))
-        elif not self._schedule.reachable(order.device, _now()):
+        elif not self._schedule.reachable(order.device, self._clock.now()):
             order.done(_offline(order.device))
         elif not self._schedule.orders.submit(order):
             order.done(Busy(f"line {self.name}: too many orders are waiting; not sent"))
@@ -108,10 +115,12 @@ class Line:
         if self._turn is not None and self._turn.sent:
             self._turn.received(data)
         else:  # before the first question there is nothing to answer
-            self._clock.quiet_since = _now()
+            now = self._clock.now()
+            # No less quiet than is kept after a broadcast, whose echo this may be.
+            self._clock.quiet_since = max(self._clock.quiet_since, now)
             self.record.unasked += len(data)
             self._overheard.idle(data)
-            self._listening.received(data, _now())
+            self._listening.received(data, now)
             self._wake.set()
 
     def lost(self, error: Exception) -> None:
@@ -124,13 +133,13 @@ class Line:
 
     async def run(self) -> None:
         """Serve the line until cancelled; what goes wrong on it stays on it."""
+        self._clock.now = asyncio.get_running_loop().time
         pause = REOPEN_FIRST
         while True:
             try:
                 trouble = await self._open_and_serve()
-                served = _now() - self.record.since if self.is_open else 0.0
-                self.record.trouble = trouble
-                self.record.open_before += served
+                served = self._clock.now() - self.record.since if self.is_open else 0.0
+                self.record.went_down(trouble, served)
                 self._then.line_down(trouble)  # told before closing, which may take a while
             finally:
                 await self._close()
@@ -145,15 +154,15 @@ class Line:
         try:
             self._port = await self._open_port(self)
             self.is_open = True
-            self.record.opened += 1
-            self.record.since = _now()
-            self.record.trouble = ""
+            self.record.came_up(self._clock.now())
+            self._adapter.echoes = None
             log.info("line open", line=self.name)
             self._then.line_up()
-            self._listening.opened(_now())
+            self._listening.opened(self._clock.now())
             await self._serve()
         except LineDown as error:
-            log.warning("line down", line=self.name, why=str(error))
+            tell = log.debug if str(error) == self.record.trouble else log.warning
+            tell("line down", line=self.name, why=str(error))  # once, not at every new try
             return str(error)
         except Exception as error:  # the bulkhead: lines must not sink together
             log.exception("line failed", line=self.name)
@@ -170,22 +179,22 @@ class Line:
 
     async def _serve(self) -> None:
         while self._down is None:
-            now = _now()
+            now = self._clock.now()
             for write in self._schedule.orders.expired(now):
                 write.done(Busy(f"waited {now - write.submitted:.1f} s for the line; not sent"))
             match self._listening.next(now) or self._schedule.next(now):
+                case Poll() as poll:
+                    await self._poller.poll(poll, now)
                 case Answer() as answer:
                     with self.turn_with(answer.device) as turn:
                         await answer.give(turn)
-                case Poll() as poll:
-                    await self._poll(poll)
                 case Write() as write:
                     others = self._schedule.orders.companions(write, together)
                     await self._writer.write(write, others)
                 case Command() as command:
                     await self._writer.command(command)
                 case Probe(device):
-                    await self._probe(device)
+                    await self._poller.probe(device)
                 case Idle(until):
                     await self._idle(until)
         raise self._down
@@ -201,6 +210,15 @@ class Line:
 
     @contextmanager
     def turn_with(self, device: Device) -> Iterator[Turn]:
+        begun = self._clock.now()
+        turn = self.begin(device)
+        try:
+            yield turn
+        finally:
+            self.end(device, turn, begun)
+
+    def begin(self, device: Device) -> Turn:
+        """A conversation; `end` must follow."""
         if self._port is None or self._down is not None:
             raise self._down or LineDown(f"line {self.name} is not open")
         turn = self._turn = Turn(
@@ -213,88 +231,41 @@ class Line:
             self.recorder,
             device.driver.station,
             self._echo,
+            self._adapter,
         )
-        begun = _now()
-        try:
-            yield turn
-        finally:
-            self._turn = None
-            characters = (turn.sent + turn.heard) * self.wire.character
-            self.record.busy += characters
-            self.record.turnarounds += turn.turnaround
-            device.record.exchanges += turn.exchanges
+        return turn
+
+    def end(self, device: Device, turn: Turn, begun: float) -> None:
+        """It is over: what it took is counted."""
+        self._turn = None
+        ended = self._clock.now()
+        characters = (turn.sent + turn.heard) * self.wire.character
+        self.record.busy += characters
+        self.record.turnarounds += turn.turnaround
+        device.conversed(turn.exchanges, characters, turn.turnaround)
+        device.used(ended, ended - begun)
+        if turn.passed:
             device.record.unasked += turn.passed
             self._overheard.frames(device, turn.overheard)
-            device.record.wire_time += characters + turn.turnaround
-            ended = _now()
-            self._listening.ended(device, turn, ended)
-            device.used(ended, ended - begun)
-            if turn.exchanges:
-                device.measured(turn.turnaround / turn.exchanges)
-
-    async def _poll(self, poll: Poll) -> None:
-        device, polls = poll.device, [poll]
-        if device.window > 1:
-            polls += self._schedule.beside(poll, device.window - 1, _now())
-        with self.turn_with(device) as turn:
-            if len(polls) == 1:
-                failed = await self._read(turn, poll)
-            else:
-                ends = await asyncio.gather(*(self._read(turn, one) for one in polls))
-                failed = [failure for end in ends for failure in end]
-            if failed:
-                first, error = failed[0]
-                if isinstance(error, LineDown):
-                    device.doubt = first.block.span
-                    raise error
-                await self.unclear(device, turn, error, first.block.span)
-            for one, error in failed:
-                self._then.unread(one, error)
-
-    async def _read(self, turn: Turn, poll: Poll) -> list[tuple[Poll, Unclear | LineDown]]:
-        """Empty when it was answered."""
-        device = poll.device
-        try:
-            units = await read_block(turn, device, poll.block)
-        except Refused as error:
-            self._then.answered(device)
-            self._then.refused(poll, error)
-        except (Unclear, LineDown) as error:
-            return [(poll, error)]
-        else:
-            self._then.answered(device)
-            self._then.read(poll, units)
-        return []
-
-    async def _probe(self, device: Device) -> None:
-        with self.turn_with(device) as turn:
-            device.salt += 1
-            try:
-                with suppress(Refused):  # that is an answer too
-                    await device.driver.resync(turn, device.doubt, device.salt)
-            except Unclear as error:
-                await self.unclear(device, turn, error, None)
-            else:
-                self._then.answered(device)
+        self._listening.ended(device, turn, ended)
+        if self._adapter.echoes and not self._echoed:
+            self._echoed = True
+            log.warning("the adapter echoes: set echo: true", line=self.name)
 
     async def unclear(self, device: Device, turn: Turn, error: Unclear, asked: Span | None) -> None:
         """Note what was heard and keep quiet until nothing of it can disturb what comes next."""
         before = self._then.doubt(device, error, asked)
         guard = 0.0 if before is Standing.SILENT else device.late_guard
         late = await turn.settle(guard, max(GAP, 4 * self.wire.character))
-        self._then.unclear(device, before, _now() - turn.started, late)
+        self._then.unclear(device, before, self._clock.now() - turn.started, late)
         if device.standing is Standing.SILENT:
             for write in self._schedule.orders.withdraw(device):
                 write.done(_offline(device))
 
     def hold(self, device: Device) -> None:
-        """After a broadcast: the stations need time to take it in."""
+        """After a broadcast: the stations need time to take it in, whatever one takes to answer."""
         self._clock.quiet_since += device.turnaround or BROADCAST_PAUSE
 
 
 def _offline(device: Device) -> Offline:
     return Offline(f"{device.name} does not answer; nothing was sent")
-
-
-def _now() -> float:
-    return asyncio.get_running_loop().time()

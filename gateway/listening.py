@@ -112,6 +112,8 @@ class Listening:
 
     def next(self, now: float) -> Answer | Idle | None:
         """What goes before all other jobs: an answer, or not to speak into a frame."""
+        if not self._speakers:
+            return None
         for speaker in self._speakers:
             if (due := speaker.listener.due) is not None and due <= now:
                 self._take(speaker, speaker.listener.tick(now), now)

@@ -3,6 +3,7 @@
 from collections.abc import Iterable
 
 from gateway.tags import Publish, Quality, Reason, Sample, Tag, bad
+from gateway.unchanged import Unchanged
 
 
 class Mirror:
@@ -17,35 +18,57 @@ class Mirror:
         """`now`: nanoseconds since 1970."""
         self._current = {tag: bad(tag, Reason.STARTING, now) for tag in tags}
         self._published: dict[Tag, Sample] = {}
+        self._unchanged: dict[Tag, Unchanged] = {}  # read again and again since, as they are
 
     def __getitem__(self, tag: Tag) -> Sample:
-        return self._current[tag]
+        sample, unchanged = self._current[tag], self._unchanged.get(tag)
+        return sample if unchanged is None else unchanged.now(sample)
 
     def samples(self) -> Iterable[Sample]:
-        return self._current.values()
+        return map(self.__getitem__, self._current)
 
     def update(self, samples: Iterable[Sample]) -> list[Sample]:
         """Take the samples in; those worth publishing come back, in their order."""
+        if type(samples) is Unchanged and self._goes_on(samples):
+            return []
         current, published, good = self._current, self._published, Quality.GOOD
+        unchanged = self._unchanged
         news = []
         for sample in samples:
             tag, value, quality, _, _, _ = sample
             if quality is not good and _same_trouble(current[tag], sample):
                 continue  # it became bad then, not now
             current[tag] = sample
+            if tag in unchanged:
+                unchanged.pop(tag).over = True
             told = published.get(tag)
-            if (
-                told is not None
-                and told.value == value
-                and quality is told.quality is good
-                and tag.heartbeat is None
-                and tag.publish is not Publish.ALWAYS
-            ):
-                continue  # as the last one: most samples end here
+            if told is not None and quality is told.quality is good:
+                if told.value == value:
+                    if tag.heartbeat is None and tag.publish is not Publish.ALWAYS:
+                        continue  # as the last one: most samples end here
+                elif tag.deadband is None:
+                    published[tag] = sample
+                    news.append(sample)
+                    continue
             if _worth_telling(told, sample):
                 published[tag] = sample
                 news.append(sample)
         return news
+
+    def _goes_on(self, unchanged: Unchanged) -> bool:
+        """Whether these are what is known, so that nothing but their time is new."""
+        if unchanged.over:
+            return False
+        if self._unchanged.get(unchanged.samples[0].tag) is not unchanged:
+            if not all(self._is_known(sample) for sample in unchanged.samples):
+                unchanged.over = True
+                return False
+            self._unchanged |= {sample.tag: unchanged for sample in unchanged.samples}
+        return True
+
+    def _is_known(self, sample: Sample) -> bool:
+        known = self._current[sample.tag]
+        return known is sample or (known.quality is Quality.BAD and _same_trouble(known, sample))
 
 
 def _same_trouble(known: Sample, sample: Sample) -> bool:

@@ -15,7 +15,7 @@ from itertools import pairwise
 from gateway.cover import Request, cover
 from gateway.errors import ConfigError
 from gateway.protocols.driver import AnyDriver, Cost, Span, Unit
-from gateway.tags import Quality, Reason, Sample, Tag, bad, of_field
+from gateway.tags import Publish, Quality, Reason, Sample, Tag, bad, of_field
 from gateway.values import Value
 
 Seconds = Callable[[Cost], float]
@@ -37,9 +37,14 @@ class Block:
     cost: Cost
     listed: tuple[Span, ...] = ()
     parts: tuple[tuple[Tag, Decode, slice], ...] = field(init=False, repr=False)
+    of_fields: bool = field(init=False, repr=False)  # of a frame: values, not words
+    eager: bool = field(init=False, repr=False)  # to be told of though nothing changed
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "parts", tuple(self._parts()))
+        object.__setattr__(self, "of_fields", self.tags[0].shape is not None)
+        eager = any(tag.heartbeat or tag.publish is Publish.ALWAYS for tag in self.tags)
+        object.__setattr__(self, "eager", eager or self.of_fields)
 
     def _parts(self) -> Iterator[tuple[Tag, Decode, slice]]:
         """Each tag with its decoder and where its units stand among those that are read."""
@@ -53,7 +58,7 @@ class Block:
 
     def decode(self, units: Sequence[int], time: int) -> list[Sample]:
         """The samples of all tags; `time` is when the reply arrived (ns since 1970)."""
-        if self.tags[0].shape is not None:
+        if self.of_fields:
             return [of_field(tag, units[part.start], time) for tag, _, part in self.parts]
         good, new = Quality.GOOD, tuple.__new__  # half of what the constructor takes: it is much
         return [

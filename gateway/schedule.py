@@ -39,6 +39,7 @@ class Schedule:
         self._waiting: list[tuple[float, int, Poll]] = []  # by due time
         self._ready: list[tuple[float, int, Poll]] = []  # due, by deadline
         self._roomy = 64  # places in `_waiting` before the void ones are looked for
+        self._crowded = 64  # the same in `_ready`
         self._urgent: deque[Poll] = deque()
         self._polls: dict[Device, list[Poll]] = {}
         self.orders = OrderQueue()
@@ -63,6 +64,8 @@ class Schedule:
                 polls.append(Poll(device, block, now))
             else:
                 polls.append(Poll(device, block, known.due, setbacks=known.setbacks))
+                # It may have been an address refused, which is asked for rarely.
+                polls[-1].due = min(known.due, now + polls[-1].every)
             ages = (at for tag in block.tags if (at := read.get(tag)) is not None)
             polls[-1].last_good = min(ages, default=None)
         for poll in before:
@@ -104,7 +107,8 @@ class Schedule:
             return self._next_order()
         self._wrote = False
         until = self._waiting[0][0] if self._waiting else float("inf")
-        for device, allowed in self._strangers(now):
+        strangers = [device for device in self.devices if not device.served]
+        for device, allowed in self._allowed(strangers) if strangers else ():
             if allowed <= now or (device.standing is Standing.STARTING and not due):
                 return Probe(device)
             until = min(until, allowed)
@@ -162,14 +166,14 @@ class Schedule:
             default=None,
         )
 
-    def _strangers(self, now: float) -> Iterator[tuple[Device, float]]:
+    def _allowed(self, strangers: Sequence[Device]) -> Iterator[tuple[Device, float]]:
         """The next device to be probed of those not heard yet and of the silent: from when on."""
         silent: Device | None = None
-        for device in self.devices:
+        for device in strangers:
             if device.standing is Standing.STARTING and not device.broadcast:
                 yield device, self._failed_lane
                 break
-        for device in self.devices:
+        for device in strangers:
             if device.standing is Standing.SILENT and (
                 silent is None or device.next_probe < silent.next_probe
             ):
@@ -249,6 +253,11 @@ class Schedule:
                 heapq.heappush(ready, (poll.deadline, ticket, poll))
         while ready and not self._valid(ready[0][2], ready[0][1]):
             heapq.heappop(ready)
+        if len(ready) > self._crowded:
+            # Behind one that waits long, others come and go and leave their old places.
+            ready[:] = [place for place in ready if self._valid(place[2], place[1])]
+            heapq.heapify(ready)
+            self._crowded = 2 * len(ready) + 64
         while urgent and not (urgent[0].live and urgent[0].device.served):
             urgent.popleft()
 

@@ -5,6 +5,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
+from gateway.clock import NEVER, Clock
+from gateway.echo import Adapter
 from gateway.errors import DeviceError, Evidence, Garbled, LineDown, NoReply
 from gateway.protocols.driver import Codec, EndedByGap
 from gateway.recorder import Recorder
@@ -16,21 +18,12 @@ MOST_OVERHEARD = 32  # frames of one conversation
 KEPT = 64  # bytes of a failed conversation kept for the log
 
 
-@dataclass(slots=True)
-class Clock:
-    """When the wire was last busy; shared by all turns of a line.
-
-    Event loops round sleeps up by about a millisecond. On a fast line the last `spin` seconds
-    of a silence are therefore waited for by looking at the clock.
-    """
-
-    quiet_since: float = 0.0
-    spin: float = 0.0
-
-
 @dataclass(slots=True, eq=False)
 class _Question:
+    request: bytes
     answers: Callable[[Any], Any]
+    until: float  # by the loop's clock
+    reply: int  # characters of the longest answer
     future: "asyncio.Future[Any]"
     heard: int = 0  # characters that came for it
 
@@ -52,6 +45,7 @@ class Turn:
     recorder: Recorder
     station: int
     echo: bool = False
+    adapter: Adapter = field(default_factory=Adapter)
     started: float = 0.0  # when the first question was sent
     sent: int = 0  # characters, for the statistics
     heard: int = 0
@@ -77,6 +71,11 @@ class Turn:
         self._codec = self.new_codec()
 
     @property
+    def may_echo(self) -> bool:
+        """As in `Talk`. With `echo: true` our own words are dropped before anybody sees them."""
+        return not self.echo and self.adapter.echoes is not False
+
+    @property
     def unreturned(self) -> bytes:
         """What an echo has still to bring back."""
         return self._echo
@@ -89,9 +88,9 @@ class Turn:
         self.clock.quiet_since += len(data) * self.wire.character
 
     async def ask(self, frame: Any, reply: int, answers: Callable[[Any], T | None]) -> T:
-        loop = asyncio.get_running_loop()
+        clock = self.clock
         if not self._open:
-            if self.clock.quiet_since + self.silence > loop.time():
+            if clock.quiet_since + self.silence > clock.now():
                 await self._quiet()
             if self.heard:
                 # It answers nothing: not a byte of it may be read as an answer.
@@ -102,26 +101,30 @@ class Turn:
             self._rest = b""
         data = self._codec.encode(frame)
         self._send(data)
-        started = self.clock.quiet_since
-        question = _Question(answers, loop.create_future())
+        started, character = clock.quiet_since, self.wire.character
+        spoken = (len(data) * (2 if self.echo else 1) + reply) * character
+        until = started + spoken + self.reply_timeout
+        future: asyncio.Future[T] = asyncio.get_running_loop().create_future()
+        question = _Question(data, answers, until, reply, future)
         self._open.append(question)
-        spoken = (len(data) * (2 if self.echo else 1) + reply) * self.wire.character
-        timer = loop.call_later(spoken + self.reply_timeout, self._expire, question, data)
+        clock.alarm.by(until, self._look)
         try:
-            answer: T = await question.future
+            answer = await future
         finally:
-            timer.cancel()
             self._open.remove(question)
-        busy = (len(data) + question.heard) * self.wire.character
-        alone = max(started, self._answered)  # where several are open, each has its own part
-        self._answered = self.clock.quiet_since
+        busy = (len(data) + question.heard) * character
+        # Where several are open, each has its own part.
+        alone = max(started, self._answered)
+        self._answered = clock.quiet_since
         self.exchanges += 1
-        self.turnaround += max(0.0, self._answered - alone - busy)
+        own = self._answered - alone - busy
+        if own > 0.0:
+            self.turnaround += own
         return answer
 
     def received(self, data: bytes) -> None:
         """Bytes from the wire while this turn is open."""
-        self.clock.quiet_since = asyncio.get_running_loop().time()
+        self.clock.quiet_since = self.clock.now()
         self.heard += len(data)
         if self._echo and not (data := self._strip_echo(data)):
             return
@@ -132,15 +135,15 @@ class Turn:
         if self._gap is not None:
             self._gap.cancel()
         codec = self._codec
-        self._take(lambda: codec.feed(data))
+        self._take(codec.feed, data)
         gap = getattr(codec, "gap_timeout", None)  # before isinstance, which is slow
         if gap and isinstance(codec, EndedByGap) and self._broken is None:
             loop = asyncio.get_running_loop()
             self._gap = loop.call_later(gap, self._take, codec.expire)
 
-    def _take(self, frames: Callable[[], list[Any]]) -> None:
+    def _take(self, frames: Callable[..., list[Any]], *data: bytes) -> None:
         try:
-            for frame in frames():
+            for frame in frames(*data):
                 self._offer(frame)
         except Garbled as error:
             self._broken = error
@@ -192,6 +195,8 @@ class Turn:
                 _fail(question, error)
                 return
             if answer is not None:
+                if not self.echo:
+                    self.adapter.heard(question.request, self._rest, question.reply)
                 question.heard, self._rest = len(self._rest), b""
                 question.future.set_result(answer)
                 return
@@ -212,7 +217,7 @@ class Turn:
         if self.echo:
             self._echo, self._unechoed = data, b""
         self.recorder.sent(data)
-        self.clock.quiet_since = asyncio.get_running_loop().time()
+        self.clock.quiet_since = self.clock.now()
         self.started = self.started or self.clock.quiet_since
         self.sent += len(data)
         self.port.write(data)
@@ -237,10 +242,18 @@ class Turn:
         self._echo = self._unechoed = b""
         return rest
 
-    def _expire(self, question: _Question, request: bytes) -> None:
-        if not question.future.done():
-            self._expired = question.answers
-            question.future.set_exception(self._verdict(request))
+    def _look(self) -> float:
+        """End the questions whose time is over. Returns when to look again."""
+        now, again = self.clock.now(), NEVER
+        for question in self._open:
+            if question.future.done():
+                continue
+            if question.until > now:
+                again = min(again, question.until)
+            else:
+                self._expired = question.answers
+                question.future.set_exception(self._verdict(question.request))
+        return again
 
     def _verdict(self, request: bytes) -> DeviceError:
         heard = self._rest or self._unechoed

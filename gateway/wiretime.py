@@ -1,6 +1,6 @@
 """How long characters and exchanges take on a line: what planner and time-outs reckon with."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from gateway.protocols.driver import Cost, Timing
 
@@ -14,10 +14,10 @@ class Wire:
 
     baudrate: int = 9600
     character_bits: int = 10  # start bit, data bits, parity, stop bits
+    character: float = field(init=False, compare=False)  # how long one takes
 
-    @property
-    def character(self) -> float:
-        return self.character_bits / self.baudrate
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "character", self.character_bits / self.baudrate)
 
     def silence(self, timing: Timing) -> float:
         """The quiet kept before a request."""

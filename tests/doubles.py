@@ -21,6 +21,8 @@ class Script:
     one piece each. Silence is a `>` with no `<` after it.
     """
 
+    may_echo = False
+
     def __init__(self, driver: AnyDriver, *lines: str) -> None:
         self._codec: Any = driver.codec()
         self._lines = list(lines)

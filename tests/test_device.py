@@ -126,6 +126,19 @@ def test_a_turnaround_set_in_the_file_is_not_learned_over() -> None:
     assert not dev.learn()
 
 
+def test_a_measured_turnaround_is_reckoned_with_though_the_plan_stays() -> None:
+    """And what the file sets (here nothing) stays what it is: a broadcast is held by that alone."""
+    dev = device([make_tag("D0")])
+    blocks = dev.blocks
+    dev.measured(0.060)
+    dev.record.exchanges = 50
+    before = dev.load
+    assert not dev.learn()
+    assert dev.blocks is blocks
+    assert (dev.reckoned, dev.turnaround) == (0.060, None)
+    assert dev.load > before
+
+
 def test_use_of_the_wire_is_forgotten_by_halves() -> None:
     dev = device([make_tag("D0")])
     dev.used(100.0, 4.0)

@@ -6,6 +6,7 @@ import random
 from typing import Any
 
 import pytest
+from structlog.testing import capture_logs
 
 from gateway.device import Device, Standing
 from gateway.errors import Busy, Evidence, GatewayError, LineDown, Offline, Refused, Unclear
@@ -596,6 +597,23 @@ async def test_the_pause_between_tries_grows_to_ten_seconds_and_starts_anew() ->
             line.bench.come_back()
             await asyncio.sleep(REOPEN_LONGEST * 3)
             assert line.line.is_open
+
+
+@on_virtual_time
+async def test_a_port_that_stays_away_is_told_once_and_not_at_every_try() -> None:
+    line = plant([clocks(5)])
+    with capture_logs() as logs:
+        async with running(line):
+            await asyncio.sleep(10)
+            for _ in range(2):
+                line.bench.vanish()
+                await asyncio.sleep(300)
+                line.bench.come_back()
+                await asyncio.sleep(REOPEN_LONGEST * 3)
+    down = [entry["why"] for entry in logs if entry["event"] == "line down"]
+    told = [e["why"] for e in logs if e["event"] == "line down" and e["log_level"] == "warning"]
+    assert len(down) > 40
+    assert told == ["unplugged", "unplugged"]  # once for each time it went
 
 
 @on_virtual_time

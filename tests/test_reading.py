@@ -2,7 +2,8 @@
 
 import asyncio
 
-from gateway.tags import Quality
+from gateway.device import Standing
+from gateway.tags import Quality, Reason
 from tests.sim.plant import device, plant, running, words
 from tests.sim.virtual import on_virtual_time
 
@@ -32,3 +33,20 @@ async def test_a_value_that_is_another_each_time_is_never_believed() -> None:
         assert hall.now[mixer.tags[0]].quality is Quality.BAD
         assert not hall.reads(mixer)
         assert "differ" in hall.now[mixer.tags[0]].detail
+        assert hall.now[mixer.tags[0]].reason is Reason.GARBLED
+
+
+@on_virtual_time
+async def test_a_device_is_not_taken_for_silent_because_one_of_its_values_moves() -> None:
+    mixer = device([*words(100, 1), *words(900, 1)])
+    mixer.verify_reads = 2
+    hall = plant([mixer])
+    hall.stations[0].memory.animate("D", 100, lambda now: int(now * 1000) & 0xFFFF)
+    async with running(hall):
+        await asyncio.sleep(20)
+        moving, still = mixer.tags
+        assert hall.now[moving].quality is Quality.BAD
+        assert mixer.standing is Standing.UP
+        samples = [told for _, told in hall.told if told.tag is still]
+        assert [told.quality for told in samples[1:]] == [Quality.GOOD] * (len(samples) - 1)
+        assert len(samples) >= 19

@@ -125,6 +125,8 @@ async def test_a_modbus_plc_has_the_drivers_word_order(order: Any) -> None:
     class Wire:
         """The station's answers, straight back."""
 
+        may_echo = False
+
         async def ask(self, frame: Any, reply: int, answers: Any) -> Any:
             [data] = station.hear(driver.codec().encode(frame), 0.0)
             [heard] = driver.codec().feed(data)

@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from gateway.clock import Clock
 from gateway.errors import Evidence, Garbled, LineDown, NoReply, Refused
 from gateway.protocols.driver import Span
 from gateway.protocols.modbus import ModbusRtu
@@ -13,7 +14,7 @@ from gateway.protocols.vigor import Vigor
 from gateway.recorder import Recorder
 from gateway.stations.modbus import ModbusStation
 from gateway.stations.vigor import VigorStation
-from gateway.turn import Clock, Turn
+from gateway.turn import Turn
 from gateway.wiretime import Wire
 from tests.sim.virtual import on_virtual_time
 

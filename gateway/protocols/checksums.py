@@ -1,6 +1,7 @@
 """Check sums, under the names the manuals give them."""
 
 from array import array
+from functools import lru_cache
 from struct import unpack_from
 
 
@@ -28,6 +29,7 @@ def _crc_table() -> "array[int]":
 _CRC = _crc_table()
 
 
+@lru_cache(maxsize=256)  # what is asked and answered is often what it was the last time
 def crc16(data: bytes) -> bytes:
     """Modbus RTU: CRC-16, initial value FFFFh, polynomial A001h reflected; low byte first."""
     crc = 0xFFFF

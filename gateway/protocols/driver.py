@@ -87,6 +87,10 @@ class EndedByGap(Protocol[F]):
 class Talk(Protocol[F]):
     """One turn on the line: all that a driver can do to the world."""
 
+    @property
+    def may_echo(self) -> bool:
+        """Whether a frame that equals our own may be its echo: nothing has shown the contrary."""
+
     async def tell(self, frame: F) -> None:
         """Send a frame that is not answered."""
 

@@ -1,4 +1,4 @@
-"""The event loop that ports live on: uvloop's where it is installed, asyncio's own otherwise."""
+"""The event loop that ports live on: uvloop's; on Windows, where there is none, asyncio's own."""
 
 import asyncio
 import importlib
@@ -13,7 +13,7 @@ def new_event_loop() -> asyncio.AbstractEventLoop:
 
 
 def _uvloop() -> Any:
-    """The optional library (`pip install zenoh-plc-gateway[fast]`), or None."""
+    """The library, or None where there is none."""
     try:
         return importlib.import_module("uvloop")
     except ImportError:

@@ -11,6 +11,9 @@ from gateway.transport.trouble import line_down
 # More than this waiting to be sent means that nobody takes it: what waits are old requests, which
 # must not reach a machine after they have been reported as failed.
 MOST_UNSENT = 4096  # bytes
+# asyncio and serialx make room for 256 KiB at every read. Where the system gives that memory anew
+# each time, and takes it back, this costs more than the read itself.
+MOST_READ = 4096  # bytes
 # A driver may hold a port back until it has sent what it has; nobody waits longer for it.
 LONGEST_CLOSE = 1.0  # seconds
 
@@ -66,6 +69,8 @@ class StreamPort(asyncio.Protocol):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = cast(asyncio.Transport, transport)
         self._transport.set_write_buffer_limits(high=MOST_UNSENT)
+        if hasattr(transport, "max_size"):  # not of uvloop, which keeps its own
+            transport.max_size = MOST_READ
 
     def data_received(self, data: bytes) -> None:
         self._ear.received(data)

@@ -49,6 +49,8 @@ BYTES = st.lists(
 class Once:
     """A `Talk` on which one question is answered with given bytes, in given pieces."""
 
+    may_echo = False
+
     def __init__(self, driver: AnyDriver, heard: bytes, piece: int) -> None:
         self._codec, self._heard, self._piece = driver.codec(), heard, piece
         self.sent = b""

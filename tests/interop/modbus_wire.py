@@ -84,6 +84,8 @@ async def tcp_end(port: int) -> AsyncIterator[Bytes]:
 class Turn:
     """One turn: a fresh codec, any number of open questions."""
 
+    may_echo = False
+
     def __init__(self, end: End, driver: AnyDriver) -> None:
         self._end, self._codec = end, driver.codec()
         self._silence = max(driver.timing.silence, driver.timing.silence_chars * 10 / 19200)

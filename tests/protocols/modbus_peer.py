@@ -25,6 +25,8 @@ class Hearing:
     An item may also be what makes the pieces of the question's bytes.
     """
 
+    may_echo = False
+
     def __init__(
         self, driver: Driver, *heard: Sequence[bytes] | Callable[[bytes], Sequence[bytes]]
     ) -> None:

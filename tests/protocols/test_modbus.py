@@ -288,6 +288,8 @@ async def test_modbus_tcp_numbers_go_round() -> None:
     driver, numbers = ModbusTcp(), []
 
     class Numbering:
+        may_echo = False
+
         async def ask(self, frame: Frame, reply: int, answers: object) -> list[int]:
             numbers.append(frame.transaction)
             return [0]
@@ -300,6 +302,8 @@ async def test_modbus_tcp_numbers_go_round() -> None:
 
 class Answering:
     """A talk on which several questions are open; the answers come in the other order."""
+
+    may_echo = False
 
     def __init__(self, driver: ModbusTcp, station: ModbusStation, open_at_once: int) -> None:
         self._codec, self._station, self._wanted = driver.codec(), station, open_at_once

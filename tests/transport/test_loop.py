@@ -8,11 +8,12 @@ from typing import Any, TypeVar
 
 import pytest
 
+from gateway.clock import Clock
 from gateway.protocols.driver import Span
 from gateway.protocols.modbus import ModbusRtu
 from gateway.recorder import Recorder
 from gateway.transport import SerialPath, SerialSettings, loop, open_port
-from gateway.turn import Clock, Turn
+from gateway.turn import Turn
 from gateway.wiretime import Wire
 from tests.conftest import lacking
 from tests.transport.ends import Heard, Master

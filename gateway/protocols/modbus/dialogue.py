@@ -142,8 +142,14 @@ class Dialogue:
         if self.dialect.forgets_address and request[0] == 6:
             good.add(request[:1] + bytes(2) + request[3:])
 
+        echo = None if self.numbered or not talk.may_echo else request
+
         def answers(heard: Frame) -> bool | None:
+            nonlocal echo
             if heard.station != frame.station or heard.transaction != number:
+                return None
+            if heard.pdu == echo:
+                echo = None  # perhaps our own words: the device must say them again
                 return None
             if heard.pdu in good:
                 return True
@@ -169,17 +175,19 @@ class Dialogue:
     async def resync(self, talk: Talk[Frame], doubt: Span | None, salt: int) -> None:
         """Read another byte count than `doubt` has, or ask function 08 to repeat a token.
 
+        Not while what is repeated may be an echo: a dead device would seem alive.
         An exception is a sign of life too. It names no address, though: it may be the late
         answer to `doubt`, and the answer to our question still to come. So another size is asked
         then, for which that one is no answer, unless questions carry a number.
         """
+        loopback = self.diagnostics and (self.numbered or not talk.may_echo)
         try:
-            if self.diagnostics:
+            if loopback:
                 await self._loopback(talk, salt & 0xFFFF)
             else:
                 await self.read(talk, self._harmless(doubt, salt))
         except Refused:
-            if self.numbered or self.diagnostics:
+            if self.numbered or loopback:
                 return
             with suppress(Refused):
                 await self.read(talk, self._harmless(doubt, salt + 1))

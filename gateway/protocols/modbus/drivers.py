@@ -1,8 +1,8 @@
 """The Modbus drivers: RTU, ASCII and TCP, each a list of settings over the same dialogue."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Coroutine, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 from gateway.errors import ConfigError
 from gateway.protocols.driver import Address, Area, Codec, Cost, Span, Talk, Timing
@@ -31,10 +31,10 @@ _FASTEST_SILENCE = 0.00175  # seconds; above 19200 baud 3.5 characters would be 
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ModbusRtu:
-    """Modbus RTU (serial line guide V1.02). Station 0 is everybody: written to, never read."""
+class _Modbus:
+    """The settings that all kinds share, and the dialogue they come to."""
 
-    protocol: Literal["modbus-rtu"] = "modbus-rtu"
+    protocol: str
     station: int
     addressing: Addressing = "plain"
     numbering: Numbering = "zero_based"  # plain only: how registers are written in the file
@@ -53,145 +53,77 @@ class ModbusRtu:
     @property
     def areas(self) -> Mapping[str, Area]:
         return self._dialogue.areas
+
+    def address(self, text: str) -> Address:
+        return self._dialogue.dialect.address(text)
+
+    def spell(self, address: Address) -> str:
+        return self._dialogue.dialect.spell(address)
+
+    def cost(self, span: Span) -> Cost | None:
+        return self._dialogue.cost(span)
+
+    def write_cost(self, span: Span) -> Cost | None:
+        return self._dialogue.write_cost(span)
+
+    def read(self, talk: Talk[Frame], span: Span) -> Coroutine[Any, Any, Sequence[int]]:
+        return self._dialogue.read(talk, span)
+
+    def write(
+        self, talk: Talk[Frame], span: Span, units: Sequence[int]
+    ) -> Coroutine[Any, Any, bool]:
+        return self._dialogue.write(talk, span, units)
+
+    def resync(self, talk: Talk[Frame], doubt: Span | None, salt: int) -> Coroutine[Any, Any, None]:
+        return self._dialogue.resync(talk, doubt, salt)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ModbusRtu(_Modbus):
+    """Modbus RTU (serial line guide V1.02). Station 0 is everybody: written to, never read."""
+
+    protocol: Literal["modbus-rtu"] = "modbus-rtu"
 
     @property
     def timing(self) -> Timing:
         silence = max(_FASTEST_SILENCE, self._dialogue.dialect.rtu_silence)
         return Timing(silence=silence, silence_chars=3.5)
 
-    def address(self, text: str) -> Address:
-        return self._dialogue.dialect.address(text)
-
-    def spell(self, address: Address) -> str:
-        return self._dialogue.dialect.spell(address)
-
-    def cost(self, span: Span) -> Cost | None:
-        return self._dialogue.cost(span)
-
-    def write_cost(self, span: Span) -> Cost | None:
-        return self._dialogue.write_cost(span)
-
     def codec(self) -> Codec[Frame]:
         return RtuCodec()
 
-    async def read(self, talk: Talk[Frame], span: Span) -> Sequence[int]:
-        return await self._dialogue.read(talk, span)
-
-    async def write(self, talk: Talk[Frame], span: Span, units: Sequence[int]) -> bool:
-        return await self._dialogue.write(talk, span, units)
-
-    async def resync(self, talk: Talk[Frame], doubt: Span | None, salt: int) -> None:
-        await self._dialogue.resync(talk, doubt, salt)
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ModbusAscii:
+class ModbusAscii(_Modbus):
     """Modbus ASCII (serial line guide V1.02). Station 0 is everybody: written to, never read."""
 
     protocol: Literal["modbus-ascii"] = "modbus-ascii"
-    station: int
-    addressing: Addressing = "plain"
-    numbering: Numbering = "zero_based"  # plain only: how registers are written in the file
-    write_single: bool = True  # one unit by function 05 or 06; false: by 15 or 16
-    diagnostics: bool = False  # the device has function 08, sub-function 0
-    counter_word_order: WordOrder = "low_first"  # of Vigor's C200 to C255
-    max_read_words: int | None = None
-    max_read_bits: int | None = None
-    max_write_words: int | None = None
-    max_write_bits: int | None = None
-    _dialogue: Dialogue = field(init=False, repr=False, compare=False)
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "_dialogue", _dialogue(self))
-
-    @property
-    def areas(self) -> Mapping[str, Area]:
-        return self._dialogue.areas
 
     @property
     def timing(self) -> Timing:
         return Timing()
 
-    def address(self, text: str) -> Address:
-        return self._dialogue.dialect.address(text)
-
-    def spell(self, address: Address) -> str:
-        return self._dialogue.dialect.spell(address)
-
-    def cost(self, span: Span) -> Cost | None:
-        return self._dialogue.cost(span)
-
-    def write_cost(self, span: Span) -> Cost | None:
-        return self._dialogue.write_cost(span)
-
     def codec(self) -> Codec[Frame]:
         return AsciiCodec()
 
-    async def read(self, talk: Talk[Frame], span: Span) -> Sequence[int]:
-        return await self._dialogue.read(talk, span)
-
-    async def write(self, talk: Talk[Frame], span: Span, units: Sequence[int]) -> bool:
-        return await self._dialogue.write(talk, span, units)
-
-    async def resync(self, talk: Talk[Frame], doubt: Span | None, salt: int) -> None:
-        await self._dialogue.resync(talk, doubt, salt)
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ModbusTcp:
+class ModbusTcp(_Modbus):
     """Modbus TCP (messaging guide V1.0b). `station` is the unit identifier, 0 as good as any."""
 
     protocol: Literal["modbus-tcp"] = "modbus-tcp"
     station: int = 1
-    addressing: Addressing = "plain"
-    numbering: Numbering = "zero_based"  # plain only: how registers are written in the file
-    write_single: bool = True  # one unit by function 05 or 06; false: by 15 or 16
-    diagnostics: bool = False  # the device has function 08, sub-function 0
-    counter_word_order: WordOrder = "low_first"  # of Vigor's C200 to C255
-    max_read_words: int | None = None
-    max_read_bits: int | None = None
-    max_write_words: int | None = None
-    max_write_bits: int | None = None
     window: int = 1  # questions the device lets be open at once
-    _dialogue: Dialogue = field(init=False, repr=False, compare=False)
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "_dialogue", _dialogue(self))
-
-    @property
-    def areas(self) -> Mapping[str, Area]:
-        return self._dialogue.areas
 
     @property
     def timing(self) -> Timing:
         return Timing(turnaround=0.001, silence=0.0)
 
-    def address(self, text: str) -> Address:
-        return self._dialogue.dialect.address(text)
-
-    def spell(self, address: Address) -> str:
-        return self._dialogue.dialect.spell(address)
-
-    def cost(self, span: Span) -> Cost | None:
-        return self._dialogue.cost(span)
-
-    def write_cost(self, span: Span) -> Cost | None:
-        return self._dialogue.write_cost(span)
-
     def codec(self) -> Codec[Frame]:
         return MbapCodec()
 
-    async def read(self, talk: Talk[Frame], span: Span) -> Sequence[int]:
-        return await self._dialogue.read(talk, span)
 
-    async def write(self, talk: Talk[Frame], span: Span, units: Sequence[int]) -> bool:
-        return await self._dialogue.write(talk, span, units)
-
-    async def resync(self, talk: Talk[Frame], doubt: Span | None, salt: int) -> None:
-        await self._dialogue.resync(talk, doubt, salt)
-
-
-def _dialogue(device: ModbusRtu | ModbusAscii | ModbusTcp) -> Dialogue:
+def _dialogue(device: _Modbus) -> Dialogue:
     """What the settings come to. Raises `ConfigError`."""
     dialect = _DIALECTS[device.addressing]
     if device.numbering == "modicon":
@@ -223,7 +155,7 @@ def _dialogue(device: ModbusRtu | ModbusAscii | ModbusTcp) -> Dialogue:
     )
 
 
-def _limits(device: ModbusRtu | ModbusAscii | ModbusTcp, usual: Limits) -> Limits:
+def _limits(device: _Modbus, usual: Limits) -> Limits:
     """The dialect's limits, where the file does not say otherwise."""
     said = (
         device.max_read_words,

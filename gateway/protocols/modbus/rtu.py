@@ -57,6 +57,8 @@ class RtuCodec:
         Raises `Garbled` when what was surely the answer has a wrong CRC. Frames that were whole
         before it are handed out first.
         """
+        if not self._heard and _whole_reply(data):
+            return [Frame(data[0], data[1:-2])]  # as most answers come
         self._heard += data
         frames: list[Frame] = []
         while self._damage is None and (frame := self._take()) is not None:
@@ -73,7 +75,7 @@ class RtuCodec:
             if size == 0:
                 continue
             whole = bytes(heard[start : start + size])
-            if len(whole) == size and crc16(whole[:-2]) == whole[-2:]:
+            if len(whole) == size and _is_sound(whole):
                 del heard[: start + size]
                 return Frame(whole[0], whole[1:-2])
             if whole[:2] != self._sent[:2] or self._may_be_echo(heard[start:]):
@@ -93,7 +95,17 @@ class RtuCodec:
         return sent[1] not in _ECHOED and sent.startswith(heard[: len(sent)])
 
 
-def _reply_size(heard: bytearray, start: int) -> int:
+def _is_sound(whole: bytes) -> bool:
+    """Whether a frame ends with its CRC."""
+    return crc16(whole[:-2]) == whole[-2:]
+
+
+def _whole_reply(data: bytes) -> bool:
+    """Whether it is one answer, from its first byte to its last."""
+    return len(data) >= _SHORTEST and _reply_size(data, 0) == len(data) and _is_sound(data)
+
+
+def _reply_size(heard: bytes | bytearray, start: int) -> int:
     """The length of the answer that begins at `start`; 0 when none can."""
     function, third = heard[start + 1], heard[start + 2]
     if function in _FIXED:
@@ -138,7 +150,7 @@ class RtuEar:
             whole = bytes(heard[start : start + size])
             if len(whole) < size and whole[0] in self._addressed:
                 return None
-            if len(whole) == size and crc16(whole[:-2]) == whole[-2:]:
+            if len(whole) == size and _is_sound(whole):
                 del heard[: start + size]
                 return Frame(whole[0], whole[1:-2])
         return self._unknown()
@@ -149,7 +161,7 @@ class RtuEar:
             len(whole) < 4
             or whole[0] not in self._addressed
             or whole[1] in _KNOWN
-            or crc16(whole[:-2]) != whole[-2:]
+            or not _is_sound(whole)
         ):
             return None
         self._heard.clear()

@@ -1,0 +1,96 @@
+"""Polls and probes as conversations: one block, several at once, a sign of life."""
+
+import asyncio
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, suppress
+from dataclasses import dataclass
+from typing import Protocol
+
+from gateway.consequences import Consequences
+from gateway.device import Device
+from gateway.errors import Differs, LineDown, Refused, Unclear
+from gateway.jobs import Poll
+from gateway.protocols.driver import Span
+from gateway.reading import read_block
+from gateway.turn import Turn
+
+Failure = tuple[Poll, Unclear | LineDown]
+
+
+class Wire(Protocol):
+    """What polling needs of the line."""
+
+    def turn_with(self, device: Device) -> AbstractContextManager[Turn]: ...
+
+    # The same by hand, for polls: there are more of them than of all else together.
+    def begin(self, device: Device) -> Turn: ...
+
+    def end(self, device: Device, turn: Turn, begun: float) -> None: ...
+
+    async def unclear(
+        self, device: Device, turn: Turn, error: Unclear, asked: Span | None
+    ) -> None: ...
+
+
+@dataclass(slots=True)
+class Poller:
+    """Carries out polls and probes."""
+
+    wire: Wire
+    then: Consequences
+
+    async def poll(self, poll: Poll, now: float) -> None:
+        """One block; with it what else is due of a device that takes several questions at once."""
+        device, others = poll.device, list[Poll]()
+        turn = self.wire.begin(device)
+        try:
+            if device.window > 1:
+                others = self.then.schedule.beside(poll, device.window - 1, now)
+            if not others:
+                failed = await self._read(turn, poll)
+            else:
+                reads = (self._read(turn, one) for one in (poll, *others))
+                failed = [failure for end in await asyncio.gather(*reads) for failure in end]
+            if failed:
+                await self._failed(device, turn, failed)
+        finally:
+            self.wire.end(device, turn, now)
+
+    async def probe(self, device: Device) -> None:
+        """Ask something harmless whose answer is no other's."""
+        with self.wire.turn_with(device) as turn:
+            device.salt += 1
+            try:
+                with suppress(Refused):  # that is an answer too
+                    await device.driver.resync(turn, device.doubt, device.salt)
+            except Unclear as error:
+                await self.wire.unclear(device, turn, error, None)
+            else:
+                self.then.answered(device)
+
+    async def _read(self, turn: Turn, poll: Poll) -> Sequence[Failure]:
+        """Empty when it was answered."""
+        device = poll.device
+        try:
+            units = await read_block(turn, device, poll.block)
+        except Refused as error:
+            self.then.answered(device)
+            self.then.refused(poll, error)
+        except Differs as error:
+            self.then.answered(device)
+            self.then.differs(poll, error)
+        except (Unclear, LineDown) as error:
+            return [(poll, error)]
+        else:
+            self.then.answered(device)
+            self.then.read(poll, units, turn.clock.now())
+        return ()
+
+    async def _failed(self, device: Device, turn: Turn, failed: Sequence[Failure]) -> None:
+        first, error = failed[0]
+        if isinstance(error, LineDown):
+            device.doubt = first.block.span
+            raise error
+        await self.wire.unclear(device, turn, error, first.block.span)
+        for one, why in failed:
+            self.then.unread(one, why)
