@@ -13,6 +13,7 @@ from gateway.planner import Block
 
 GOLDEN = 0.6180339887498949  # its multiples spread evenly, however many there are
 SILENT_SHARE = 0.05  # of the wire's time, for all silent stations together
+ROOM = 16  # places in a queue beside twice those that count
 
 
 class Schedule:
@@ -38,8 +39,8 @@ class Schedule:
         self._phases = (n * GOLDEN % 1 / 2 for n in itertools.count())
         self._waiting: list[tuple[float, int, Poll]] = []  # by due time
         self._ready: list[tuple[float, int, Poll]] = []  # due, by deadline
-        self._roomy = 64  # places in `_waiting` before the void ones are looked for
-        self._crowded = 64  # the same in `_ready`
+        self._roomy = ROOM  # places in `_waiting` before the void ones are looked for
+        self._crowded = ROOM  # the same in `_ready`
         self._urgent: deque[Poll] = deque()
         self._polls: dict[Device, list[Poll]] = {}
         self.orders = OrderQueue()
@@ -242,7 +243,7 @@ class Schedule:
             # Polls that were hastened left their old places behind, some until tomorrow.
             self._waiting = [place for place in self._waiting if place[2].ticket == place[1]]
             heapq.heapify(self._waiting)
-            self._roomy = 2 * len(self._waiting) + 64
+            self._roomy = 2 * len(self._waiting) + ROOM
 
     def _ripen(self, now: float) -> None:
         """What has come due; what is not to be asked any more is dropped here."""
@@ -257,7 +258,7 @@ class Schedule:
             # Behind one that waits long, others come and go and leave their old places.
             ready[:] = [place for place in ready if self._valid(place[2], place[1])]
             heapq.heapify(ready)
-            self._crowded = 2 * len(ready) + 64
+            self._crowded = 2 * len(ready) + ROOM
         while urgent and not (urgent[0].live and urgent[0].device.served):
             urgent.popleft()
 
