@@ -240,8 +240,10 @@ class Schedule:
                 poll.ticket = next(self._order)
                 heapq.heappush(self._waiting, (poll.due, poll.ticket, poll))
         if len(self._waiting) > self._roomy:
-            # Polls that were hastened left their old places behind, some until tomorrow.
-            self._waiting = [place for place in self._waiting if place[2].ticket == place[1]]
+            # Polls that were hastened or planned anew left their old places, some until tomorrow.
+            self._waiting = [
+                place for place in self._waiting if place[2].live and place[2].ticket == place[1]
+            ]
             heapq.heapify(self._waiting)
             self._roomy = 2 * len(self._waiting) + ROOM
 

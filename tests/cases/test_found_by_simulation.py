@@ -172,3 +172,18 @@ def test_seed_13_storm_polls_that_come_and_go_behind_a_late_one_leave_no_places(
         assert job.device is modest
         schedule.polled(job, now)
     assert len(schedule._ready) < 200
+
+
+def test_seed_7_lean_polls_that_were_planned_anew_leave_no_places() -> None:
+    """Addresses come and go, so the device is planned anew; what it was to be asked is void."""
+    mixer = device(words(100, 2, every=86_400.0))
+    schedule = Schedule([mixer], 0.0)
+    mixer.answered()
+    schedule.woke(mixer, 0.0)
+    job = schedule.next(0.0)
+    assert isinstance(job, Poll)
+    schedule.polled(job, 0.0)
+    for _ in range(1000):
+        schedule.plan(mixer, 1.0)
+    assert len(schedule.polls(mixer)) == 1
+    assert len(schedule._waiting) < 100
