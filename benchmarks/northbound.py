@@ -8,6 +8,7 @@ The subscriber is a process of its own on the same machine. Measured in one run:
   gateway: the best that Python can do here; and again with the declarations of a gateway;
 * the same number of samples through `Mirror.update` and `Northbound.publish`: decided, made
   into JSON and put, all of them arrived, and how late the event loop was meanwhile;
+* the same of devices that say `blocks: only`: one put for all 500 tags of a device;
 * the time from a made configuration to being on Zenoh, and memory;
 * with `--flood`: for so many seconds questions as fast as three processes can ask them, then as
   long questions, writes and junk on every key from two: how late the event loop was, what memory
@@ -28,7 +29,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import structlog
 import zenoh
@@ -49,7 +50,7 @@ SCAN = 100  # samples of one publication
 class Device:
     name: str
     tags: list[Tag]
-    blocks: bool = False
+    blocks: bool | Literal["only"] = False
 
 
 @dataclass
@@ -83,7 +84,7 @@ class Plant:
         return {"status": {"state": "running"}}
 
 
-def plant(tags: int, devices: int) -> Plant:
+def plant(tags: int, devices: int, blocks: bool | Literal["only"] = False) -> Plant:
     layout = Layout(parse_type("int32"))
     address, span = Address("D", 100), Span("D", 100, 2)
 
@@ -100,7 +101,9 @@ def plant(tags: int, devices: int) -> Plant:
         )
 
     each = tags // devices
-    return Plant([Device(f"d{d}", [tag(d, n) for n in range(each)]) for d in range(devices)])
+    return Plant(
+        [Device(f"d{d}", [tag(d, n) for n in range(each)], blocks) for d in range(devices)]
+    )
 
 
 class Lag:
@@ -131,19 +134,25 @@ def memory() -> float:
 
 
 def count(endpoint: str) -> None:
-    """Counts what arrives under plant/d*; tells the number whenever a line comes in."""
+    """Counts the samples that arrive, alone or in blocks; tells how many at every line."""
     arrived = 0
 
     def heard(_: zenoh.Sample) -> None:
         nonlocal arrived
         arrived += 1
 
+    def block(heard: zenoh.Sample) -> None:
+        nonlocal arrived
+        arrived += heard.payload.to_bytes().count(b'"quality"')
+
     with zenoh.open(configure(ZenohSettings(mode=Mode.CLIENT, connect=(endpoint,)))) as session:
         subscriber = session.declare_subscriber("plant/**", heard)
+        blocks = session.declare_subscriber("plant/*/@block", block)
         print("ready", flush=True)
         for _ in sys.stdin:
             print(arrived, time.process_time(), flush=True)
         subscriber.undeclare()
+        blocks.undeclare()
 
 
 def flood(endpoint: str, seconds: float) -> None:
@@ -337,6 +346,34 @@ async def gateway(tags: int, devices: int, seconds: float, for_flood: float) -> 
     return rate
 
 
+async def gateway_of_blocks(tags: int, devices: int, seconds: float) -> Rate:
+    """Each device has one scan in a round; the next round begins when all were put."""
+    endpoint, made = free_endpoint(), plant(tags, devices, "only")
+    northbound = Northbound(ZenohSettings(listen=(endpoint,)), "demo", made)
+    serves = asyncio.create_task(northbound.run())
+    await northbound.opened.wait()
+    try:
+        with other("count", endpoint) as process:
+            counter = await asyncio.to_thread(Counter, process)
+            await asyncio.sleep(1.0)
+            first = await asyncio.to_thread(counter.until_quiet)
+            lag = Lag()
+            probe = asyncio.create_task(lag.run())
+            began, used, sent = time.perf_counter(), time.process_time(), 0
+            while time.perf_counter() - began < seconds:
+                before = northbound.counters()["published"]
+                sent += await publish_all(made, northbound, tags // devices)
+                await put(northbound, before + devices)
+            took, used = time.perf_counter() - began, time.process_time() - used
+            probe.cancel()
+            rate = Rate(sent, took, used, await asyncio.to_thread(counter.until_quiet) - first)
+            print(f"gateway, blocks: only: {rate}; {lag.shown()}")
+    finally:
+        serves.cancel()
+        await asyncio.wait([serves])
+    return rate
+
+
 async def published(made: Plant, northbound: Northbound, counter: Counter, seconds: float) -> Rate:
     for _ in range(2):
         before = northbound.counters()["published"]
@@ -365,11 +402,13 @@ async def put(northbound: Northbound, count: int) -> None:
         await asyncio.sleep(0.002)
 
 
-async def publish_all(made: Plant, northbound: Northbound) -> int:
+async def publish_all(made: Plant, northbound: Northbound, scan: int = SCAN) -> int:
     """New values of all tags, a scan at a time; how many samples went out."""
     sent, now = 0, time.time_ns()
-    for start in range(0, len(made.tags), SCAN):
-        samples = [good(tag, now % 1_000_003 + start, now) for tag in made.tags[start:][:SCAN]]
+    for start in range(0, len(made.tags), scan):
+        samples = [
+            good(tag, now % 1_000_003 + start, now) for tag in made.tags[start : start + scan]
+        ]
         news = made.mirror.update(samples)
         northbound.publish(news)
         sent += len(news)
@@ -411,10 +450,13 @@ def main(arguments: Iterable[str] | None = None) -> None:
     load = options.tags, options.devices, options.seconds
     best = bare(*load, like_ours=False)
     rate = asyncio.run(gateway(*load, options.flood))
+    blocks = asyncio.run(gateway_of_blocks(*load))
     again = bare(*load, like_ours=False)
     like = bare(*load, like_ours=True)
-    print(f"arrived: {rate.each:,.0f}/s; {rate.each / max(best.each, again.each):.2f} of the bare "
-          f"loop with nothing else, {rate.each / like.each:.2f} of the one like ours")  # fmt: skip
+    most = max(best.each, again.each)
+    print(f"arrived: {rate.each:,.0f}/s; {rate.each / most:.2f} of the bare loop with nothing "
+          f"else, {rate.each / like.each:.2f} of the one like ours; "
+          f"in blocks {blocks.each:,.0f}/s, {blocks.each / most:.2f}")  # fmt: skip
 
 
 def _quiet(*_: object) -> str:

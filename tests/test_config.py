@@ -383,7 +383,7 @@ DEVICES = [
         f"9: {M}.retries: 99 is above 10",
         f"10: {M}.silence: 'short' is no duration: write it as 500ms, 2s, 15min, 1h or 7d",
         f"11: {M}.late_guard: 1m: m is no unit of time: use 1min for minutes",
-        f"12: {M}.blocks: 1 is neither true nor false",
+        f"12: {M}.blocks: 1 is not known: use true, false or only",
         f"13: {M}.replytimeout: no setting of a vigor device: did you mean reply_timeout?",
     ),
     bad(

@@ -249,11 +249,8 @@ async def test_an_event_is_not_published_again_when_the_network_comes_back() -> 
         def sample(self, tag: Tag) -> Tag:
             return tag
 
-        def values(self, samples: Any) -> None:
-            repeated.extend(samples)
-
     everything: Any = Everything()
-    await Repeater(everything, everything, everything, everything).publish_all()
+    await Repeater(repeated.extend, everything, everything, everything).publish_all()
     assert [tag.key for tag in repeated] == ["scale/weight", "scale/state"]
 
 

@@ -13,7 +13,7 @@ from collections.abc import AsyncIterator, Iterable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import pytest
 
@@ -61,7 +61,7 @@ def tag(device: str, name: str, **settings: Any) -> Tag:
 class PlainDevice:
     name: str
     tags: tuple[Tag, ...]
-    blocks: bool = False
+    blocks: bool | Literal["only"] = False
 
 
 class PlainPlant:
@@ -111,7 +111,7 @@ class PlainPlant:
         return self.samples[key]
 
 
-def mixer(*, blocks: bool = False) -> PlainPlant:
+def mixer(*, blocks: bool | Literal["only"] = False) -> PlainPlant:
     return PlainPlant(
         PlainDevice(
             "mixer",
@@ -304,6 +304,24 @@ async def test_a_scan_of_a_device_with_blocks_is_one_put() -> None:
         }
         [reply] = await client.get("plant/*/@block")
         assert set(reply.json) == {"speed", "recipe", "alarms/door"}
+
+
+async def test_a_device_that_says_blocks_only_puts_no_single_values() -> None:
+    plant = mixer(blocks="only")
+    async with together(plant) as (northbound, client):
+        heard = await client.subscribe("plant/**")
+        block = await client.subscribe("plant/mixer/@block")
+        northbound.publish([plant.now("mixer/speed", 1), plant.now("oven/temperature", 3)])
+        scan = await block.next(lambda sample: sample.json["speed"]["value"] == 1)
+        assert set(scan.json) >= {"speed"}
+        await heard.next(of("plant/oven/temperature", 3))
+        assert not [sample.key for sample in heard.samples if "mixer" in sample.key]
+        # Asked for they are, but not by who would then wait for news.
+        [reply] = await client.get("plant/mixer/speed")
+        assert reply.json["value"] == 1
+        late = await client.subscribe("plant/**", advanced=True)
+        await late.next(of("plant/oven/temperature", 3))
+        assert not [sample.key for sample in late.samples if "mixer" in sample.key]
 
 
 async def test_a_raw_value_travels_bare_and_its_quality_beside_it() -> None:

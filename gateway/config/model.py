@@ -249,8 +249,12 @@ class DeviceSection(Section):
     """How many readings in a row must agree before a value is believed."""
     late_guard: Duration | None = None
     """How long a late reply is waited for before anyone speaks again."""
-    blocks: bool = False
-    """Also one put per scan with all changed tags, at <device>/@block."""
+    blocks: Annotated[
+        bool | Literal["only"],
+        PlainValidator(written.blocks),
+        WithJsonSchema({"enum": [True, False, "only"]}),
+    ] = False
+    """One put per scan with all changed tags, at <device>/@block: also, or only that."""
     control: bool = False
     """The device may be told to run, to stop and the like."""
     enabled: bool = True

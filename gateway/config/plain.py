@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from gateway.protocols.driver import AnyDriver, Timing
 from gateway.tags import Tag
@@ -61,7 +62,7 @@ class DeviceConfig:
     turnaround_configured: float | None  # None: measured
     late_guard: float  # how long a late reply is waited for before anyone speaks again
     verify_reads: int  # so many readings in a row must agree
-    blocks: bool  # also one put per scan with all changed tags
+    blocks: bool | Literal["only"]  # one put per scan with all changed tags: also, or only that
     control: bool  # may be told to run, stop ...
     enabled: bool
     tags: tuple[Tag, ...]

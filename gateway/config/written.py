@@ -8,6 +8,7 @@ import math
 import re
 import unicodedata
 from pathlib import Path
+from typing import Literal
 
 from gateway.config.messages import one_of, shown
 from gateway.errors import ConfigError
@@ -188,6 +189,14 @@ def form(text: object) -> Form:
     if text not in list(Form):
         raise ConfigError(f"{shown(text)} is not known: use {one_of(Form)}")
     return Form(str(text))
+
+
+def blocks(value: object) -> bool | Literal["only"]:
+    if value is True or value is False:
+        return value
+    if value == "only":
+        return "only"
+    raise ConfigError(f"{shown(value)} is not known: use true, false or only")
 
 
 def path(text: object) -> Path:

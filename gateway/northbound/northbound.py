@@ -26,6 +26,7 @@ from gateway.northbound.publisher import Publisher
 from gateway.northbound.queries import Queries
 from gateway.northbound.repeater import Repeater
 from gateway.northbound.replies import Replies
+from gateway.northbound.scans import Scans
 from gateway.northbound.session import (
     CLOSE_WITHIN,
     Mode,
@@ -91,7 +92,7 @@ class Northbound:
         self._directory = Directory(self.keys, ())
         self._declared: list[object] = []
         self._queries: Queries | None = None
-        self._with_blocks: frozenset[str] = frozenset()
+        self._scans = Scans(self._publisher)
         self._puts: PutWrites | None = None
         self._documents: tuple[float, dict[str, bytes]] = (float("-inf"), {})
 
@@ -103,19 +104,7 @@ class Northbound:
         One call is one scan. The plant's own samples must be updated before. Those of event tags
         all go out, in order, none replaced by the next.
         """
-        if any(sample.tag.event for sample in samples):
-            self.publish_events(sample for sample in samples if sample.tag.event)
-            self._publisher.values(sample for sample in samples if not sample.tag.event)
-        else:
-            self._publisher.values(samples)
-        if not self._with_blocks:
-            return
-        scans: dict[str, list[Sample]] = {}
-        for sample in samples:
-            if sample.tag.device in self._with_blocks:
-                scans.setdefault(sample.tag.device, []).append(sample)
-        for device, changed in scans.items():
-            self._publisher.block(device, changed)
+        self._scans.publish(samples)
 
     def publish_events(self, samples: Iterable[Sample]) -> None:
         """Sends out every sample in order, none replaced by the next. Never blocks."""
@@ -169,7 +158,7 @@ class Northbound:
     async def _serve(self, session: zenoh.Session) -> None:
         devices = list(self._plant.devices())
         self._directory = Directory(self.keys, devices)
-        self._with_blocks = frozenset(device.name for device in devices if device.blocks)
+        self._scans.of(devices)
         self._publisher.start(session)
         writes = Writes(self.keys, self._plant, self._directory, self._audit, self._writers)
         stamp = session.new_timestamp
@@ -193,7 +182,7 @@ class Northbound:
             tasks.create_task(self._tell_status())
             await self._duty.on.wait()
             self._declared += await off_loop(self._declare_plant, session, queries, puts)
-            repeater = Repeater(self._publisher, self._plant, self._directory, self._links)
+            repeater = Repeater(self._scans.publish, self._plant, self._directory, self._links)
             await repeater.publish_all()
             self._publish_status()
             self.opened.set()
@@ -222,7 +211,7 @@ class Northbound:
         ask = _directly(queries)
         mine = self._directory.devices
         shared = (self.keys.values, self.keys.late, self.keys.metas)
-        blocks = (self.keys.blocks,) if self._with_blocks else ()
+        blocks = (self.keys.blocks,) if self._scans.with_blocks else ()
         return [
             *(session.declare_queryable(key, ask, complete=False) for key in (*shared, *blocks)),
             *(

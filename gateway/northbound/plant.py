@@ -1,7 +1,7 @@
 """What the Zenoh side needs from the rest of the gateway, and nothing more."""
 
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Protocol
+from typing import Literal, Protocol
 
 from gateway.tags import Sample, Tag, Written
 from gateway.values import Value
@@ -17,8 +17,8 @@ class Device(Protocol):
     def tags(self) -> Iterable[Tag]: ...
 
     @property
-    def blocks(self) -> bool:
-        """Whether each scan is also published as one `@block`."""
+    def blocks(self) -> bool | Literal["only"]:
+        """Whether each scan is published as one `@block`: also, or only so."""
 
 
 class Plant(Protocol):

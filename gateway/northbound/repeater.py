@@ -2,12 +2,12 @@
 ones with their heartbeat. Good ones are repeated as they are read."""
 
 import asyncio
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 
 from gateway.northbound.directory import Directory
 from gateway.northbound.links import Links
 from gateway.northbound.plant import Plant
-from gateway.northbound.publisher import Publisher
 from gateway.tags import Quality, Sample, Tag
 
 # After a link returned: first its declarations arrive, and only then does a put reach anyone.
@@ -22,9 +22,13 @@ class Repeater:
     """Publishes everything in small pieces, so that the event loop has its turn."""
 
     def __init__(
-        self, publisher: Publisher, plant: Plant, directory: Directory, links: Links
+        self,
+        publish: Callable[[Sequence[Sample]], None],
+        plant: Plant,
+        directory: Directory,
+        links: Links,
     ) -> None:
-        self._publisher = publisher
+        self._publish = publish
         self._plant = plant
         self._directory = directory
         self._links = links
@@ -33,7 +37,7 @@ class Repeater:
         tags = [tag for tag in self._directory.all() if not tag.event]  # an event is told once
         for start in range(0, len(tags), _AT_ONCE):
             chunk = tags[start : start + _AT_ONCE]
-            self._publisher.values(self._plant.sample(tag) for tag in chunk)
+            self._publish([self._plant.sample(tag) for tag in chunk])
             await asyncio.sleep(0)
 
     async def run(self) -> None:
@@ -61,7 +65,7 @@ class Repeater:
         while tags:
             await asyncio.sleep(_LOOK_EVERY)
             for start in range(0, len(tags), _AT_ONCE):
-                self._publisher.values(self._due(tags[start : start + _AT_ONCE], told))
+                self._publish(self._due(tags[start : start + _AT_ONCE], told))
                 await asyncio.sleep(0)
 
     def _due(self, tags: list[Tag], told: dict[Tag, float]) -> list[Sample]:

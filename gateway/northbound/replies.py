@@ -38,6 +38,7 @@ class Replies:
         self._stamp = stamp
         self._history = history
         self._ended = False
+        self._only_blocks = {d.name for d in directory.devices if d.blocks == "only"}
 
     def end(self) -> None:
         """A long answer stops at the next tag."""
@@ -54,6 +55,8 @@ class Replies:
         for tag in self._directory.find(wanted.of):
             if self._ended:
                 return
+            if wanted.family is Family.LAST and tag.device in self._only_blocks:
+                continue  # whoever asks so waits for news on that key, and none will come
             if wanted.family is Family.META:
                 self._reply(query, self._keys.meta(tag.key), payload.meta(tag), self._stamp())
             else:
