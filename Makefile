@@ -26,6 +26,8 @@ schema: .venv/installed
 bench: .venv/ready
 	$(BIN)/python -m benchmarks.bus_use
 	$(BIN)/python -m benchmarks.transactions
+	$(BIN)/python -m benchmarks.planning
+	$(BIN)/python -m benchmarks.northbound
 
 clean:
 	rm -rf .venv build dist *.egg-info

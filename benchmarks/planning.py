@@ -7,18 +7,17 @@ processor's time for ten thousand of them, and how many times that is of the tim
 
 import random
 import time
+from dataclasses import replace
 from functools import partial
 
+from benchmarks.words import words
 from gateway.planner import plan
-from gateway.protocols.driver import Address, Span, Unit
 from gateway.protocols.modbus import ModbusRtu
 from gateway.tags import Tag
-from gateway.values import Layout, parse_type
 from gateway.wiretime import Wire
 
 DRIVER = ModbusRtu(station=1)
 SECONDS = partial(Wire(19200, 11).exchange, timing=DRIVER.timing, turnaround=0.010)
-LAYOUT = Layout(parse_type("uint16"))
 INTERVALS = {1: [1.0], 2: [1.0, 10.0], 3: [0.5, 1.0, 5.0], 5: [0.2, 0.5, 1.0, 5.0, 60.0]}
 
 
@@ -51,19 +50,8 @@ SHAPES = (
 
 def tags(shape: str, count: int, intervals: list[float]) -> list[Tag]:
     rng = random.Random(f"{shape} {intervals}")
-    return [
-        Tag(
-            device="plc",
-            name=f"t{n}",
-            text=f"holding:{n}",
-            address=Address("holding", n),
-            span=Span("holding", n, 1),
-            unit_kind=Unit.WORD,
-            layout=LAYOUT,
-            every=rng.choice(intervals),
-        )
-        for n in registers(shape, count)
-    ]
+    alike = words("holding", registers(shape, count), intervals[0])
+    return [replace(tag, every=rng.choice(intervals)) for tag in alike]
 
 
 def took(shape: str, count: int, intervals: list[float]) -> float:
