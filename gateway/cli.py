@@ -1,26 +1,24 @@
-"""The command line: run, check, read, write, watch, simulate, schema."""
+"""The command line: run, check, read, write, watch, scan, simulate, schema."""
 
 import asyncio
 import json
-import logging
 import sys
 from contextlib import suppress
-from enum import StrEnum
 from functools import partial
 from pathlib import Path
 from typing import Annotated, NoReturn
 
-import structlog
 import typer
 from rich.console import Console
 
-from gateway import __version__, app, direct, service, show, simulate
+from gateway import __version__, app, direct, scan, service, show, simulate
 from gateway.client import NOTHING, Shown, connected, matches, parse_value, wanted_keys
 from gateway.config import Config, load
 from gateway.config import schema as config_schema
 from gateway.control import check_command, line_of
 from gateway.errors import BadValue, ConfigError, GatewayError
 from gateway.keys import max_age as age_of
+from gateway.logs import LogFormat, LogLevel, set_up
 from gateway.payload import Problem
 from gateway.tags import Tag
 from gateway.transport.loop import new_event_loop
@@ -53,18 +51,6 @@ Direct = Annotated[
 AsJson = Annotated[bool, typer.Option("--json", help="One JSON document per line.")]
 
 
-class LogFormat(StrEnum):
-    TEXT = "text"
-    JSON = "json"
-
-
-class LogLevel(StrEnum):
-    DEBUG = "debug"
-    INFO = "info"
-    WARNING = "warning"
-    ERROR = "error"
-
-
 def main() -> None:
     """The console command. Exit codes: 0 good, 1 it failed, 2 the user's mistake."""
     try:
@@ -88,7 +74,7 @@ def run(
 ) -> None:
     """The service: poll, mirror onto Zenoh, take writes. SIGTERM or Ctrl-C ends it."""
     loaded = load(config)
-    _log(log_format, log_level)
+    set_up(log_format, log_level)
     hint = show.next_steps(loaded, config, show.typed())
     with asyncio.Runner(loop_factory=new_event_loop) as runner:
         runner.run(service.run(loaded, lambda: err.print(hint)))
@@ -135,7 +121,7 @@ def read(
     if max_age is not None:
         age_of(max_age)  # wrong: said at once, without a gateway
     if without_gateway:
-        _log(LogFormat.TEXT, LogLevel.ERROR)
+        set_up(LogFormat.TEXT, LogLevel.ERROR)
         chosen = [tag for tag in _tags(loaded).values() if matches(tag.key, wanted)]
         samples = asyncio.run(direct.read(loaded, chosen))
         found = [show.shown(sample) for sample in samples]
@@ -174,7 +160,7 @@ def write(
     except BadValue as error:
         raise BadValue(f"{tag}: {error}") from None
     if without_gateway:
-        _log(LogFormat.TEXT, LogLevel.ERROR)
+        set_up(LogFormat.TEXT, LogLevel.ERROR)
         answer = direct.told(loaded, known, wanted)
     else:
         with connected(loaded) as client:
@@ -201,7 +187,7 @@ def control_command(
     loaded = load(config)
     check_command(loaded, device, command)
     if without_gateway:
-        _log(LogFormat.TEXT, LogLevel.ERROR)
+        set_up(LogFormat.TEXT, LogLevel.ERROR)
         print(asyncio.run(direct.control(loaded, device, command, argument)).answer)
         return
     with connected(loaded) as client:
@@ -224,6 +210,31 @@ def watch(config: ConfigPath, tags: TagNames = None, as_json: AsJson = False) ->
                 _print([row], known, as_json=as_json)
 
 
+@cli.command(name="scan")
+def scan_command(
+    port: Annotated[str, typer.Option(help="/dev/ttyUSB0, COM3, tcp://host:port, rfc2217://...")],
+    protocol: Annotated[str, typer.Option(help="vigor, computer-link, modbus-rtu ...")],
+    stations: Annotated[str, typer.Option(help="which to ask: 1-31,40")] = "1-31",
+    baud: Annotated[str | None, typer.Option(help="9600,19200; left out: the likely ones")] = None,
+    serial_format: Annotated[
+        str | None, typer.Option("--format", help="7E1,8N1; left out: the likely ones")
+    ] = None,
+    timeout: Annotated[str, typer.Option(help="how long a station may take")] = "200ms",
+) -> None:
+    """Find out which stations answer at a port, and at which speed and in which format.
+
+    Asks for what changes nothing. No gateway may be running at that port.
+    """
+    plan = scan.planned(port, protocol, stations, baud, serial_format, timeout)
+    set_up(LogFormat.TEXT, LogLevel.ERROR)
+    report = asyncio.run(scan.scan(plan, err.print))
+    for line in show.noises(report):
+        err.print(line)
+    if not report.found:
+        _end(f"no station answered at {port}", FAILED)
+    print(show.stations(report, port))
+
+
 @cli.command(name="simulate")
 def simulate_command(
     config: ConfigPath,
@@ -237,7 +248,7 @@ def simulate_command(
 ) -> None:
     """Serve the configured devices as simulated PLCs on ptys or TCP ports."""
     loaded = load(config)
-    _log(LogFormat.TEXT, LogLevel.INFO)
+    set_up(LogFormat.TEXT, LogLevel.INFO)
     asyncio.run(simulate.serve(loaded, tcp, links, partial(print, flush=True)))
 
 
@@ -263,29 +274,6 @@ def version() -> None:
 def _end(message: str, code: int) -> NoReturn:
     err.print(message)
     sys.exit(code)
-
-
-def _log(form: LogFormat, level: LogLevel) -> None:
-    logging.basicConfig(
-        format="%(message)s", stream=sys.stderr, level=getattr(logging, level.upper())
-    )
-    render = (
-        structlog.processors.JSONRenderer()
-        if form is LogFormat.JSON
-        else structlog.dev.ConsoleRenderer(colors=sys.stderr.isatty())
-    )
-    structlog.configure(
-        processors=[
-            structlog.stdlib.filter_by_level,
-            structlog.stdlib.add_log_level,
-            structlog.processors.TimeStamper(fmt="iso", utc=True),
-            structlog.processors.format_exc_info,
-            render,
-        ],
-        logger_factory=structlog.stdlib.LoggerFactory(),
-        wrapper_class=structlog.stdlib.BoundLogger,
-        cache_logger_on_first_use=True,
-    )
 
 
 def _tags(config: Config) -> dict[str, Tag]:

@@ -1,9 +1,10 @@
 """Tables for people: samples, plans, what is typed next."""
 
+import json
 import shlex
 import shutil
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 from rich.console import Console, Group, RenderableType
@@ -16,6 +17,7 @@ from gateway.config import Config
 from gateway.forecast import LineForecast
 from gateway.payload import rfc3339
 from gateway.planner import spell
+from gateway.scan import Report, spoken
 from gateway.tags import Quality, Sample, Tag, WriteRule
 from gateway.values import Kind
 from gateway.wiretime import NETWORK_BAUD, Wire
@@ -116,6 +118,28 @@ def _line(line: LineForecast) -> Text:
         f"  load {line.load:.1%} of the wire; one round of everything takes {seconds(line.cycle)}"
         + writes
     )
+
+
+def stations(report: Report, port: str) -> str:
+    """What was found, as it is written in the file."""
+    serial = report.found[0].serial
+    lines = ["lines:", "  found:", f"    port: {port}"]
+    if serial is not None:
+        lines += [f"    baudrate: {serial.baudrate}", f"    format: {serial.format}"]
+    lines.append("    devices:")
+    for found in report.found:
+        driver = found.driver
+        said = {"protocol": driver.protocol, "station": driver.station, **found.settings}
+        settings = ", ".join(f"{name}: {json.dumps(value)}" for name, value in said.items())
+        refusal = f"  # it said no: {found.refusal}" if found.refusal else ""
+        lines.append(f"      station-{driver.station}: {{{settings}, tags: {{}}}}{refusal}")
+    return "\n".join(lines).replace('"', "")
+
+
+def noises(report: Report) -> Iterator[str]:
+    """Where something was heard that was no answer: one sentence each."""
+    for serial, what in report.noises.items():
+        yield f"at {spoken(serial)} something was heard that is no answer: {what}"
 
 
 def size(config: Config) -> str:

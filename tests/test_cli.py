@@ -25,6 +25,7 @@ from tests.e2e.processes import (
     gateway,
     plc_gateway,
     started,
+    station,
     vigor_line,
     write_config,
 )
@@ -33,7 +34,7 @@ from tests.zenoh_peer import free_endpoint
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
 COMMANDS = [
-    *("run", "check", "read", "write", "control", "watch", "simulate"),
+    *("run", "check", "read", "write", "control", "watch", "scan", "simulate"),
     *("health", "schema", "version"),
 ]
 TAGS = {
@@ -444,6 +445,36 @@ def test_write_direct(config: Path, as_json: bool) -> None:
         assert answer["time"].endswith("Z")
     else:
         assert done.out.startswith("mixer/trim = -5: acknowledged and read back, ")
+
+
+def test_scan_prints_what_to_write_in_the_file(tmp_path: Path) -> None:
+    number = free_port()
+    with station("tcp", str(number), stations=(2, 5)):
+        port = f"tcp://127.0.0.1:{number}"
+        done = plc_gateway("scan", "--port", port, "--protocol", "vigor", "--stations", "1-5")
+        assert done.code == 0
+        assert done.err == "asking 5 stations at the port\n"
+        path = tmp_path / "found.yaml"
+        path.write_text(done.out)
+        checked = plc_gateway("check", path)
+        assert checked.out.endswith("found.yaml: good, 0 tags on 1 line\n"), checked
+        nobody = plc_gateway("scan", "--port", port, "--protocol", "vigor", "--stations", "7")
+        assert (nobody.code, nobody.out) == (1, "")
+        assert nobody.err.endswith(f"no station answered at {port}\n")
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (["--protocol", "vigor"], "--port"),
+        (["--port", "COM3", "--protocol", "frames"], "frames cannot be sought: use one of vigor"),
+        (["--port", "COM3", "--protocol", "vigor", "--baud", "fast"], "'fast' is no number"),
+    ],
+)
+def test_scan_says_what_was_typed_wrong(command: Command, options: list[str], says: str) -> None:
+    done = command("scan", *options)
+    assert done.code == 2
+    assert says in done.err
 
 
 def test_direct_on_a_port_that_is_not_there_says_why(tmp_path: Path) -> None:
