@@ -22,6 +22,11 @@ def needs(program: str) -> str:
     return shutil.which(program, path=places) or lacking(f"{program} is not installed")
 
 
+def forbidden(what: str) -> NoReturn:
+    """Skips a test of what this machine does not let us do, and says so. Nobody can install that."""
+    pytest.skip(what)
+
+
 def lacking(what: str) -> NoReturn:
     """Skips the test and says why; where PLC_GATEWAY_NO_SKIPS=1 is set, the test fails instead."""
     if os.environ.get("PLC_GATEWAY_NO_SKIPS") == "1":

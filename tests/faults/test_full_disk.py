@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from tests.conftest import lacking, needs
+from tests.conftest import forbidden, needs
 from tests.e2e.processes import Program, vigor_line, write_config
 from tests.zenoh_peer import Heard, Subscription, ZenohPeer, free_endpoint
 
@@ -59,7 +59,7 @@ def disk(tmp_path: Path) -> tuple[str, Path]:
     mount = f"mount -t tmpfs -o size={SIZE}m small {place}"
     with Program("bash", "-c", f"exec unshare {who} --mount bash -c '{mount}'") as probe:
         if probe.ended():
-            lacking(f"no file system may be mounted here: {probe.lines}")
+            forbidden(f"no file system may be mounted here: {probe.lines}")
     return f"exec unshare {who} --mount bash -c '{mount} && exec {{}}'", place
 
 

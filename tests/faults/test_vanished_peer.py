@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from tests.conftest import lacking, needs
+from tests.conftest import forbidden, needs
 from tests.e2e.processes import PATIENCE, Program, station, vigor_line, write_config
 from tests.zenoh_peer import ZenohPeer, free_endpoint
 
@@ -72,7 +72,7 @@ def cable() -> Iterator[Cable]:
     try:
         cable = Cable(ip)
     except subprocess.CalledProcessError as error:
-        lacking(f"no network namespace may be made here: {error.stderr.decode().strip()}")
+        forbidden(f"no network namespace may be made here: {error.stderr.decode().strip()}")
     yield cable
     cable.remove()
 
