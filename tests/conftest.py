@@ -23,7 +23,7 @@ def needs(program: str) -> str:
 
 
 def forbidden(what: str) -> NoReturn:
-    """Skips a test of what this machine does not let us do, and says so. Nobody can install that."""
+    """Skips a test of what this machine does not let us do, which nobody can install."""
     pytest.skip(what)
 
 
