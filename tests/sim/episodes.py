@@ -78,9 +78,15 @@ def disappearances(
 ) -> list[Episode]:
     """Addresses that a PLC's program takes away, for a while or for good."""
     found = []
+    never = device["tags"].get("missing", {"address": None})["address"]
+    known = [
+        name
+        for name, tag in device["tags"].items()
+        if name != "told" and tag["address"].partition(".")[0] != never
+    ]
     at = chance.expovariate(1 / 2400)
     while at < seconds - CALM:
-        tag = chance.choice([t for t in device["tags"] if t not in ("missing", "told")])
+        tag = chance.choice(known)
         end = min(at + chance.choice((5.0, 60.0, 600.0, 1500.0)), seconds - CALM)
         forever = chance.random() < 0.2
         found.append(Episode(at, seconds + CALM if forever else end, line, name, "gone", 1.0, tag))
