@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import structlog
 
 from gateway.device import Device, Standing
-from gateway.errors import Differs, Evidence, Garbled, GatewayError, Refusal, Refused, Unclear
+from gateway.errors import Evidence, Garbled, GatewayError, Refusal, Refused, Unclear, Unsteady
 from gateway.jobs import Poll
 from gateway.planner import spell
 from gateway.protocols.driver import Span
@@ -139,7 +139,7 @@ class Consequences:
         self.bad(poll.block.tags, device.reason, str(error))
         self.schedule.polled(poll, _now(), answered=False)
 
-    def differs(self, poll: Poll, error: Differs) -> None:
+    def unsteady(self, poll: Poll, error: Unsteady) -> None:
         """The device is well, but what it says is not believed: again in its turn, or bad."""
         if poll.tries < poll.device.timing.retries:
             self.schedule.again(poll)

@@ -102,5 +102,5 @@ class Garbled(Unclear):
         self.evidence = evidence
 
 
-class Differs(Garbled):
+class Unsteady(Garbled):
     """Two good answers that ought to be the same are not."""

@@ -8,7 +8,7 @@ from typing import Protocol
 
 from gateway.consequences import Consequences
 from gateway.device import Device
-from gateway.errors import Differs, LineDown, Refused, Unclear
+from gateway.errors import LineDown, Refused, Unclear, Unsteady
 from gateway.jobs import Poll
 from gateway.protocols.driver import Span
 from gateway.reading import read_block
@@ -76,9 +76,9 @@ class Poller:
         except Refused as error:
             self.then.answered(device)
             self.then.refused(poll, error)
-        except Differs as error:
+        except Unsteady as error:
             self.then.answered(device)
-            self.then.differs(poll, error)
+            self.then.unsteady(poll, error)
         except (Unclear, LineDown) as error:
             return [(poll, error)]
         else:

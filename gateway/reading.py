@@ -4,7 +4,7 @@ from collections.abc import Awaitable, Sequence
 from typing import Any
 
 from gateway.device import Device
-from gateway.errors import DeviceError, Differs, Evidence
+from gateway.errors import DeviceError, Evidence, Unsteady
 from gateway.planner import Block
 from gateway.protocols.driver import Monitor, Talk
 
@@ -14,7 +14,7 @@ _DIFFER = "two readings in a row differ; verify_reads is for values that change 
 def read_block(talk: Talk[Any], device: Device, block: Block) -> Awaitable[Sequence[int]]:
     """The units of the block, read as often as `verify_reads` says.
 
-    Raises `Differs` where two readings do: a check sum does not see everything.
+    Raises `Unsteady` where two readings do: a check sum does not see everything.
     """
     if block.listed or device.verify_reads > 1:
         return _read_with_care(talk, device, block)
@@ -25,7 +25,7 @@ async def _read_with_care(talk: Talk[Any], device: Device, block: Block) -> Sequ
     units = await _read_once(talk, device, block)
     for _ in range(1, device.verify_reads):
         if list(await _read_once(talk, device, block)) != list(units):
-            raise Differs(_DIFFER, evidence=Evidence.CHECKSUM)
+            raise Unsteady(_DIFFER, evidence=Evidence.CHECKSUM)
     return units
 
 

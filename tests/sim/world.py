@@ -204,7 +204,8 @@ class World:
                 self.judge.said(name, gadget)
             wire.speak(data, station)
             first = wire.chunk * character
-            if gadget.wrapping.header and 0 < wire.chunk < len(data) and not station.junk:
+            whole = not (wire.hanging or station.junk)
+            if gadget.wrapping.header and 0 < wire.chunk < len(data) and whole:
                 self._loop.call_later(
                     first + 1e-6, self._begun, bus, self._loop.time() + len(data) * character
                 )
