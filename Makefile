@@ -8,7 +8,7 @@ run: .venv/installed
 	$(BIN)/plc-gateway run config.example.yaml
 
 test: .venv/ready
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 check: .venv/ready
 	$(BIN)/ruff format --check .
