@@ -38,9 +38,9 @@ class Mirror:
             tag, value, quality, _, _, _ = sample
             if quality is not good and _same_trouble(current[tag], sample):
                 continue  # it became bad then, not now
-            current[tag] = sample
             if tag in unchanged:
                 unchanged.pop(tag).over = True
+            current[tag] = sample  # last: a thread may look, and must not give it the older time
             told = published.get(tag)
             if told is not None and quality is told.quality is good:
                 if told.value == value:
