@@ -1,6 +1,5 @@
 """Tables for people: samples, plans, what is typed next."""
 
-import json
 import shlex
 import shutil
 import sys
@@ -130,10 +129,10 @@ def stations(report: Report, port: str) -> str:
     for found in report.found:
         driver = found.driver
         said = {"protocol": driver.protocol, "station": driver.station, **found.settings}
-        settings = ", ".join(f"{name}: {json.dumps(value)}" for name, value in said.items())
+        settings = ", ".join(f"{name}: {_value(value)}" for name, value in said.items())
         refusal = f"  # it said no: {found.refusal}" if found.refusal else ""
         lines.append(f"      station-{driver.station}: {{{settings}, tags: {{}}}}{refusal}")
-    return "\n".join(lines).replace('"', "")
+    return "\n".join(lines)
 
 
 def noises(report: Report) -> Iterator[str]:

@@ -1,7 +1,7 @@
 """The JSON schema of the file, for editors that complete and check."""
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any, get_args, get_type_hints
 
 from pydantic import TypeAdapter
@@ -17,9 +17,8 @@ from gateway.config.model import (
 from gateway.config.nested import is_duration
 from gateway.config.settings import DURATION_SCHEMA
 from gateway.config.validate import DRIVERS
+from gateway.config.written import BYTES, SECONDS
 
-_DURATIONS = {"d": 86400.0, "h": 3600.0, "min": 60.0, "s": 1.0, "ms": 0.001}
-_SIZES = {"TB": 1e12, "GB": 1e9, "MB": 1e6, "kB": 1e3}
 _PARTS: dict[str, type[Section]] = {"Line": LineSection, "Tag": TagSection, "Defaults": TagDefaults}
 
 
@@ -84,9 +83,9 @@ def _write_default(setting: dict[str, Any]) -> None:
     """As the file would say it: `7d`, not 604800 seconds. One that it cannot say is left out."""
     match setting.get("default", ...), setting.get("pattern"):
         case float(seconds), pattern if pattern == DURATION_SCHEMA["pattern"]:
-            setting["default"] = _in_unit(seconds, _DURATIONS)
+            setting["default"] = _in_unit(seconds, SECONDS)
         case int(octets), str():
-            setting["default"] = _in_unit(octets, _SIZES)
+            setting["default"] = _in_unit(octets, BYTES)
         case (str(host), int(port)), _:
             setting["default"] = f"{host}:{port}"
         case None, _ if not _may_be_null(setting):
@@ -98,10 +97,10 @@ def _may_be_null(setting: dict[str, Any]) -> bool:
     return any(shape.get("type") == "null" for shape in shapes) or "$ref" in setting
 
 
-def _in_unit(amount: float, units: dict[str, float]) -> str:
+def _in_unit(amount: float, units: Mapping[str, float]) -> str:
     """In the largest unit of which it is a whole number, or the smallest."""
     whole = [unit for unit, size in units.items() if amount and amount % size == 0]
-    unit = whole[0] if whole else list(units)[-1]
+    unit = max(whole, key=units.__getitem__, default=min(units, key=units.__getitem__))
     return f"{amount / units[unit]:g}{unit}"
 
 

@@ -17,9 +17,9 @@ from gateway.transport.port import PortAddress, parse_port
 from gateway.values import Order, ValueType, parse_type
 
 _DURATION = re.compile(r"([0-9]+(?:\.[0-9]+)?) ?([A-Za-zµ]+)\Z")
-_SECONDS = {"ms": 0.001, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
+SECONDS = {"ms": 0.001, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
 _SIZE = re.compile(r"([0-9]+(?:\.[0-9]+)?) ?([kKMGT]B)\Z")
-_BYTES = {"kB": 10**3, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
+BYTES = {"kB": 10**3, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
 _PERCENT = re.compile(r"([0-9]+(?:\.[0-9]+)?) ?%\Z")
 _WEB = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[^\[\]/:\s]+):([0-9]{1,5})\Z")
 _ENDPOINT = re.compile(r"[a-z][a-z0-9_-]*/[^\s/]\S*\Z")
@@ -43,11 +43,11 @@ def duration(text: object) -> float:
     match = _DURATION.match(text) if isinstance(text, str) else None
     if match is None:
         raise ConfigError(f"{shown(text)} is no duration: write it as {DURATIONS}")
-    if match[2] not in _SECONDS:
-        hint = f"{match[1]}min for minutes" if match[2] in "mM" else one_of(_SECONDS)
+    if match[2] not in SECONDS:
+        hint = f"{match[1]}min for minutes" if match[2] in "mM" else one_of(SECONDS)
         raise ConfigError(f"{text}: {match[2]} is no unit of time: use {hint}")
     # By tenths of a millisecond, so that 1.1s is the number a person would write.
-    seconds = round(float(match[1]) * _SECONDS[match[2]], 7)
+    seconds = round(float(match[1]) * SECONDS[match[2]], 7)
     if seconds > _LONGEST_TIME:
         raise ConfigError(f"{text} is longer than ten years")
     return seconds
@@ -66,7 +66,7 @@ def size(text: object) -> int:
     match = _SIZE.match(text) if isinstance(text, str) else None
     if match is None:
         raise ConfigError(f"{shown(text)} is no size: write it as 500MB or 1GB")
-    octets = int(float(match[1]) * _BYTES[match[2]])
+    octets = int(float(match[1]) * BYTES[match[2]])
     if octets < 10**6:
         raise ConfigError(f"{text} is too little: use at least 1MB")
     return octets
