@@ -25,7 +25,7 @@ import sys
 import time
 from collections import Counter as CounterOf
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -210,6 +210,14 @@ def ask(endpoint: str, seconds: float) -> None:
         while ended.total() < asked and time.monotonic() < patience:
             time.sleep(0.05)
     print(json.dumps({"asked": asked, "ended": dict(ended)}), flush=True)
+
+
+async def idle(seconds: float) -> None:
+    """Nothing at all; tells how late an event loop is on this machine as it is now."""
+    lag = Lag()
+    with suppress(TimeoutError):
+        await asyncio.wait_for(lag.run(), seconds)
+    print(json.dumps(sorted(lag.late)), flush=True)
 
 
 @contextmanager
@@ -471,5 +479,7 @@ if __name__ == "__main__":
             flood(where, float(how_long))
         case ["ask", where, how_long]:
             ask(where, float(how_long))
+        case ["idle", how_long]:
+            asyncio.run(idle(float(how_long)))
         case _:
             main()

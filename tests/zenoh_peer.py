@@ -218,6 +218,14 @@ class ZenohPeer:
         [replies] = await self.many([(selector, payload)], timeout, **how)
         return replies
 
+    async def get_until(self, selector: str, wanted: Callable[[Any], bool]) -> Any:
+        """The one document there, once it is as wanted: a status may be a fifth of a second old."""
+        async with asyncio.timeout(TIMEOUT):
+            while True:
+                [reply] = await self.get(selector)
+                if wanted(reply.json):
+                    return reply.json
+
     async def many(
         self,
         queries: Sequence[tuple[str, bytes | None]],

@@ -57,6 +57,7 @@ class Plc:
                 self.peer.registered.clear()
             case ["gone", name]:
                 self.gone = name
+                self.peer.registered.clear()  # a read by list would not name it
             case ["say", data]:
                 os.write(self.port, self.peer.stx(data, "FE"))
             case ["heard"]:
