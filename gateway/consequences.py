@@ -2,7 +2,7 @@
 
 import asyncio
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import structlog
@@ -10,6 +10,7 @@ import structlog
 from gateway.device import Device, Standing
 from gateway.errors import Evidence, Garbled, GatewayError, Refusal, Refused, Unclear, Unsteady
 from gateway.jobs import Poll
+from gateway.overdue import Overdue
 from gateway.planner import spell
 from gateway.protocols.driver import Span
 from gateway.schedule import Schedule
@@ -36,7 +37,10 @@ class Consequences:
     schedule: Schedule
     upstairs: Upstairs
     wall: Callable[[], int]  # ns since 1970
-    _stale_timer: asyncio.TimerHandle | None = None
+    overdue: Overdue = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.overdue = Overdue(self.schedule, self.bad)
 
     def read(self, poll: Poll, units: Sequence[int], now: float) -> None:
         """A block was read well."""
@@ -89,13 +93,14 @@ class Consequences:
             log.info("device answers", line=self.line, device=device.name)
             device.refusals.abandon()
             self.schedule.woke(device, _now())
+            self.overdue.watch()
 
     def doubt(self, device: Device, error: Unclear, asked: Span | None) -> Standing:
         """A conversation ended unclear. Returns the device's standing before."""
         before = device.standing
         device.failed(error, asked)
         log.info("no good reply", line=self.line, device=device.name, why=str(error))
-        self._watch_stale()
+        self.overdue.watch()
         return before
 
     def unclear(self, device: Device, before: Standing, took: float, late: float | None) -> None:
@@ -135,7 +140,7 @@ class Consequences:
         if poll.tries < device.timing.retries and not poll.setbacks:
             self.schedule.again(poll)
             return
-        poll.last_good = None
+        poll.forget(_now())
         self.bad(poll.block.tags, device.reason, str(error))
         self.schedule.polled(poll, _now(), answered=False)
 
@@ -144,7 +149,7 @@ class Consequences:
         if poll.tries < poll.device.timing.retries:
             self.schedule.again(poll)
             return
-        poll.last_good = None
+        poll.forget(_now())
         self.bad(poll.block.tags, Reason.GARBLED, str(error))
         self.schedule.polled(poll, _now())
 
@@ -161,7 +166,7 @@ class Consequences:
         if block.listed:
             self._unlisted(poll, error)
             return
-        if error.refusal is Refusal.ADDRESS and poll.last_good is not None and not poll.tries:
+        if error.refusal is Refusal.ADDRESS and poll.seen and not poll.tries:
             self.schedule.again(poll)  # it was there: noise can make a request another one
             return
         if error.refusal is Refusal.ADDRESS:
@@ -172,6 +177,7 @@ class Consequences:
             log.warning(
                 "address refused", device=device.name, block=spell(poll.block), why=str(error)
             )
+        poll.forget(_now())
         self.bad(block.tags, Reason.REFUSED, str(error))
         self.schedule.polled(poll, _now())
         self._settle(device)
@@ -196,7 +202,7 @@ class Consequences:
         self.upstairs.samples([bad(tag, reason, now, detail) for tag in tags])
 
     def line_down(self, why: str) -> None:
-        self._forget_stale_timer()
+        self.overdue.stop()
         for device in self.schedule.devices:
             self.upstairs.alive(device, False)
             self.bad(device.tags, Reason.LINE_DOWN, why)
@@ -216,42 +222,6 @@ class Consequences:
         device.refusals.abandon()
         device.plan()
         self.schedule.plan(device, _now())
-
-    def _watch_stale(self) -> None:
-        """While a device fails, each of its values turns bad once it is two intervals old.
-
-        So do those of devices that it holds up, after the longest that one failure takes: where
-        all are dead, their turn to be found out may be long in coming.
-        """
-        self._forget_stale_timer()
-        devices = self.schedule.devices
-        if not any(device.standing is Standing.FAILING for device in devices):
-            return
-        now, later = _now(), float("inf")
-        load = max(1.0, sum(device.load for device in devices if device.served))
-        held_up = max(device.timing.reply_timeout + device.late_guard for device in devices)
-        for device in devices:
-            if not device.served:
-                continue  # its values are bad already
-            failing = device.standing is Standing.FAILING
-            stretch, grace = (2.0, 0.0) if failing else (2.0 * load, held_up)
-            why = device.diagnosis() if failing else "not asked: another device holds up the line"
-            for poll in self.schedule.polls(device):
-                if poll.last_good is None:
-                    continue
-                ends = poll.last_good + stretch * poll.block.every + grace
-                if ends > now:
-                    later = min(later, ends)
-                else:
-                    poll.last_good = None
-                    self.bad(poll.block.tags, device.reason, why)
-        if later < float("inf"):
-            self._stale_timer = asyncio.get_running_loop().call_at(later, self._watch_stale)
-
-    def _forget_stale_timer(self) -> None:
-        if self._stale_timer is not None:
-            self._stale_timer.cancel()
-            self._stale_timer = None
 
 
 def _now() -> float:

@@ -38,6 +38,7 @@ class Record:
     unasked: int = 0  # frames that answered nothing
     heard: int = 0  # frames that came unasked and were understood
     overruns: int = 0  # polls left out because the one before was late
+    overdue: int = 0  # blocks whose values turned bad because they were not read for too long
     failures: Counter[str] = field(default_factory=Counter)  # by evidence
     refusals: Counter[str] = field(default_factory=Counter)  # by the maker's code
     turnaround: float | None = None  # what the station takes, measured
@@ -197,12 +198,12 @@ class Device:
         trouble = self.trouble
         return isinstance(trouble, Garbled) and trouble.evidence is Evidence.SLOW
 
-    def used(self, now: float, seconds: float) -> None:
-        """A conversation with it took so long on the wire."""
-        self._use = (self.recent_use(now) + seconds, now)
+    def used(self, now: float, begun: float) -> None:
+        """It had the wire since `begun`. Writes do not count: they must not cost it its reads."""
+        self._use = (self.recent_use(now) + now - begun, now)
 
     def recent_use(self, now: float) -> float:
-        """Seconds it had the wire in about the last ten."""
+        """Seconds it was polled and probed in about the last ten."""
         use, when = self._use
         return use * math.exp2((when - now) / HALF_LIFE)
 

@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from gateway.ages import asked, load_of, worst_ages
 from gateway.device import Device
 from gateway.planner import Block, plan
 from gateway.protocols.frames.driver import LISTENED
@@ -55,34 +56,26 @@ class LineForecast:
 
 def forecast(name: str, devices: Sequence[Device], wire: Wire) -> LineForecast:
     """Reckon a line from its plan."""
-    asked = [
-        (device, block, device.verify_reads * device.seconds(block.cost))
-        for device in devices
-        for block in device.blocks
-    ]
-    load = sum(seconds / block.every for _, block, seconds in asked)
-    longest = max((seconds for _, _, seconds in asked), default=0.0)
+    blocks = asked(devices)
+    load = load_of(blocks)
+    longest = max((one.seconds for one in blocks), default=0.0)
     write = max((_longest_write(device) for device in devices), default=0.0)
     silence = max(
         (device.timing.reply_timeout + device.late_guard for device in devices), default=0.0
     )
-    rates = [(block.every, seconds) for _, block, seconds in asked]
-    cycle = sum(seconds for _, seconds in rates)
-    wait = _longest_wait(rates, longest, load)
-    blocks = tuple(
-        BlockForecast(device, block, seconds, _worst_age(block.every, seconds, wait, load))
-        for device, block, seconds in asked
-    )
+    cycle = sum(one.seconds for one in blocks)
     unasked = [
         (device, sum(tag.span.area == LISTENED for tag in device.tags)) for device in devices
     ]
     return LineForecast(
         name=name,
         wire=wire,
-        blocks=blocks,
+        blocks=tuple(
+            BlockForecast(*one, age) for one, age in zip(blocks, worst_ages(blocks), strict=True)
+        ),
         load=load,
-        requests=sum(1 / every for every, _ in rates),
-        characters=sum(sum(block.cost) / block.every for _, block, _ in asked),
+        requests=sum(1 / one.block.every for one in blocks),
+        characters=sum(sum(one.block.cost) / one.block.every for one in blocks),
         cycle=cycle,
         worst_write=longest + write,
         worst_write_silent=longest + write + silence,
@@ -96,30 +89,6 @@ def _round(device: Device) -> float:
     alike = [replace(tag, every=1.0) for tag in device.tags]
     blocks = plan(alike, device.driver, device.seconds, device.refusals.cuts)
     return sum(device.seconds(block.cost) for block in blocks)
-
-
-def _longest_wait(rates: Sequence[tuple[float, float]], longest: float, load: float) -> float:
-    """The longest the line can be busy without a pause: nobody due waits longer than that.
-
-    The usual fixed point: an exchange just begun, then everything that comes due meanwhile.
-    """
-    if load >= 1:
-        return math.inf
-    busy = longest
-    for _ in range(1000):
-        later = longest + sum(math.ceil(busy / every) * seconds for every, seconds in rates)
-        if later <= busy:
-            return busy
-        busy = later
-    return math.inf
-
-
-def _worst_age(every: float, seconds: float, wait: float, load: float) -> float:
-    """Just before the next value arrives. By earliest deadline no poll waits beyond its period
-    while the line carries its load; beyond that all periods stretch alike."""
-    if load > 1:
-        return 2 * every * load + seconds
-    return every + min(every, wait) + seconds
 
 
 def _longest_write(device: Device) -> float:

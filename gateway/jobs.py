@@ -22,7 +22,8 @@ class Poll:
     due: float
     tries: int = 0
     setbacks: int = 0  # rounds in a row that got no answer, though the device answers otherwise
-    last_good: float | None = None
+    last_good: float | None = None  # when it was read last; None: its values are bad
+    seen: bool = False  # it was read at least once
     asked: float = 0.0  # when it was handed out last
     phased: bool = True  # it has found its place in the period
     live: bool = True  # False once the device was planned anew
@@ -42,6 +43,14 @@ class Poll:
             self.mean_gap += (gap - self.mean_gap) / max(1, min(10, self.reads))
         self.reads += 1
         self.last_good = now
+        self.seen = True
+
+    def forget(self, now: float) -> float:
+        """Its values turn bad. Returns how old they were."""
+        age = 0.0 if self.last_good is None else now - self.last_good
+        self.worst_gap = max(self.worst_gap, age)
+        self.last_good = None
+        return age
 
     @property
     def every(self) -> float:

@@ -194,7 +194,7 @@ class Line:
                 case Command() as command:
                     await self._writer.command(command)
                 case Probe(device):
-                    await self._poller.probe(device)
+                    await self._poller.probe(device, now)
                 case Idle(until):
                     await self._idle(until)
         raise self._down
@@ -210,12 +210,11 @@ class Line:
 
     @contextmanager
     def turn_with(self, device: Device) -> Iterator[Turn]:
-        begun = self._clock.now()
         turn = self.begin(device)
         try:
             yield turn
         finally:
-            self.end(device, turn, begun)
+            self.end(device, turn)
 
     def begin(self, device: Device) -> Turn:
         """A conversation; `end` must follow."""
@@ -235,19 +234,17 @@ class Line:
         )
         return turn
 
-    def end(self, device: Device, turn: Turn, begun: float) -> None:
+    def end(self, device: Device, turn: Turn) -> None:
         """It is over: what it took is counted."""
         self._turn = None
-        ended = self._clock.now()
         characters = (turn.sent + turn.heard) * self.wire.character
         self.record.busy += characters
         self.record.turnarounds += turn.turnaround
         device.conversed(turn.exchanges, characters, turn.turnaround)
-        device.used(ended, ended - begun)
         if turn.passed:
             device.record.unasked += turn.passed
             self._overheard.frames(device, turn.overheard)
-        self._listening.ended(device, turn, ended)
+        self._listening.ended(device, turn, self._clock.now())
         if self._adapter.echoes and not self._echoed:
             self._echoed = True
             log.warning("the adapter echoes: set echo: true", line=self.name)

@@ -2,7 +2,7 @@
 
 import asyncio
 from collections.abc import Sequence
-from contextlib import AbstractContextManager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -20,12 +20,9 @@ Failure = tuple[Poll, Unclear | LineDown]
 class Wire(Protocol):
     """What polling needs of the line."""
 
-    def turn_with(self, device: Device) -> AbstractContextManager[Turn]: ...
-
-    # The same by hand, for polls: there are more of them than of all else together.
     def begin(self, device: Device) -> Turn: ...
 
-    def end(self, device: Device, turn: Turn, begun: float) -> None: ...
+    def end(self, device: Device, turn: Turn) -> None: ...
 
     async def unclear(
         self, device: Device, turn: Turn, error: Unclear, asked: Span | None
@@ -54,19 +51,21 @@ class Poller:
             if failed:
                 await self._failed(device, turn, failed)
         finally:
-            self.wire.end(device, turn, now)
+            self._ended(turn, device, now)
 
-    async def probe(self, device: Device) -> None:
+    async def probe(self, device: Device, now: float) -> None:
         """Ask something harmless whose answer is no other's."""
-        with self.wire.turn_with(device) as turn:
+        turn = self.wire.begin(device)
+        try:
             device.salt += 1
-            try:
-                with suppress(Refused):  # that is an answer too
-                    await device.driver.resync(turn, device.doubt, device.salt)
-            except Unclear as error:
-                await self.wire.unclear(device, turn, error, None)
-            else:
-                self.then.answered(device)
+            with suppress(Refused):  # that is an answer too
+                await device.driver.resync(turn, device.doubt, device.salt)
+        except Unclear as error:
+            await self.wire.unclear(device, turn, error, None)
+        else:
+            self.then.answered(device)
+        finally:
+            self._ended(turn, device, now)
 
     async def _read(self, turn: Turn, poll: Poll) -> Sequence[Failure]:
         """Empty when it was answered."""
@@ -94,3 +93,7 @@ class Poller:
         await self.wire.unclear(device, turn, error, first.block.span)
         for one, why in failed:
             self.then.unread(one, why)
+
+    def _ended(self, turn: Turn, device: Device, begun: float) -> None:
+        self.wire.end(device, turn)
+        device.used(turn.clock.now(), begun)

@@ -58,6 +58,7 @@ class Schedule:
         before = self._polls.get(device, ())
         old = {poll.block.span: poll for poll in before}
         read = {tag: poll.last_good for poll in before for tag in poll.block.tags}
+        seen = {tag for poll in before if poll.seen for tag in poll.block.tags}
         polls = []
         for block in device.blocks:
             known = old.get(block.span)
@@ -69,6 +70,7 @@ class Schedule:
                 polls[-1].due = min(known.due, now + polls[-1].every)
             ages = (at for tag in block.tags if (at := read.get(tag)) is not None)
             polls[-1].last_good = min(ages, default=None)
+            polls[-1].seen = not seen.isdisjoint(block.tags)
         for poll in before:
             poll.live = False
         self._polls[device] = polls
@@ -79,7 +81,10 @@ class Schedule:
         if not poll.live:
             return
         poll.live = False
-        polls = [Poll(poll.device, block, now, last_good=poll.last_good) for block in blocks]
+        polls = [
+            Poll(poll.device, block, now, last_good=poll.last_good, seen=poll.seen)
+            for block in blocks
+        ]
         kept = [other for other in self._polls[poll.device] if other is not poll]
         self._polls[poll.device] = kept + polls
         self._push(polls)
@@ -224,6 +229,7 @@ class Schedule:
         for poll in self._polls[device]:
             poll.due = now
             poll.setbacks = 0
+            poll.last_good = None
         self.plan(device, now)
         for poll in self._polls[device]:
             poll.phased = False

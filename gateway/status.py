@@ -31,6 +31,7 @@ def device_document(device: Device, polls: Sequence[Poll]) -> Document:
         "unasked_frames": record.unasked,
         "frames_heard": record.heard,
         "overruns": record.overruns,
+        "overdue": record.overdue,
         "failures": dict(record.failures),
         "refusals": dict(record.refusals),
         "refused_addresses": [

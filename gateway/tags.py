@@ -28,6 +28,7 @@ class Reason(StrEnum):
     GARBLED = "garbled"  # the device answers, but nothing that can be understood
     REFUSED = "refused"  # the device answers "no": this address does not exist there
     LINE_DOWN = "line-down"  # the port is gone
+    OVERDUE = "overdue"  # the device answers, but this was not asked for too long
     DISABLED = "disabled"  # switched off in the file
     NOT_A_NUMBER = "not-a-number"  # read well, but no value of the tag's type (NaN, bad BCD)
 

@@ -141,8 +141,8 @@ def test_a_measured_turnaround_is_reckoned_with_though_the_plan_stays() -> None:
 
 def test_use_of_the_wire_is_forgotten_by_halves() -> None:
     dev = device([make_tag("D0")])
-    dev.used(100.0, 4.0)
+    dev.used(100.0, 96.0)
     assert dev.recent_use(100.0) == 4.0
     assert dev.recent_use(110.0) == pytest.approx(2.0)
-    dev.used(110.0, 1.0)
+    dev.used(110.0, 109.0)
     assert dev.recent_use(110.0) == pytest.approx(3.0)

@@ -100,7 +100,7 @@ def test_asked_for_too_much_everything_stretches(tmp_path: Path) -> None:
     words = takes(READ_D1_D2)
     assert line.load == pytest.approx(words / 0.02)
     assert line.overloaded
-    assert line.blocks[0].worst_age == pytest.approx(2 * words + words)
+    assert line.blocks[0].worst_age == pytest.approx(2 * 0.02 + words + words)
     assert line.advice() == (
         "line hall is asked for 133% of what it can carry at 19200 baud: multiply the intervals "
         "by 1.33, or poll all tags every 0.03 s, the shortest interval for all"

@@ -166,7 +166,7 @@ def test_seed_13_storm_polls_that_come_and_go_behind_a_late_one_leave_no_places(
         schedule.woke(each, now)
     for _ in range(2000):
         now += 0.5
-        greedy.used(now, 5.0)
+        greedy.used(now, now - 5.0)
         job = schedule.next(now)
         assert isinstance(job, Poll)
         assert job.device is modest

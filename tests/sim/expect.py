@@ -150,7 +150,9 @@ class Expectations:
         """Now and then: nothing piles up, and who is well is served."""
         gateway, judge = self.judge.gateway, self.judge
         while True:
-            await asyncio.sleep(60.0)
+            for _ in range(6):
+                await asyncio.sleep(10.0)
+                self._look_at_ages()
             for line in gateway.lines:
                 schedule = line._schedule
                 polls = sum(len(schedule.polls(device)) for device in line.devices)
@@ -170,6 +172,25 @@ class Expectations:
             judge.story.counts["most timers"] = max(judge.story.counts["most timers"], timers)
             for bus in self.lines.values():
                 self._look_at_shares(bus)
+
+    def _look_at_ages(self) -> None:
+        """No good value is old, whatever goes on: a bound of our own, above the gateway's."""
+        judge = self.judge
+        for bus in self.lines.values():
+            devices = bus.line.devices
+            if not devices:
+                continue
+            longest, _ = self.times(bus.line)
+            one_round = sum(d.verify_reads * d.seconds(b.cost) for d in devices for b in d.blocks)
+            for device in devices:
+                for tag in device.asked:
+                    if judge.gateway.mirror[tag].quality is not Quality.GOOD:
+                        continue
+                    limit = 2 * (2 * tag.every + (len(devices) + 1) * one_round) + 2 * longest
+                    age = judge.now - judge.read_at[tag]
+                    judge.story.counts["looks at ages"] += 1
+                    if age > limit:
+                        judge.broke(f"{tag.key} is still good after {age:.1f} s unread")
 
     def _look_at_shares(self, bus: Bus) -> None:
         """A device that has been well for two minutes, on a line that was, is served."""

@@ -58,6 +58,7 @@ class Judge:
                 self.broke(f"{sample.tag.key} is not configured, but published")
             if sample.quality is not Quality.GOOD:
                 self.story.counts["bad samples"] += 1
+                self.story.counts["overdue"] += sample.reason is Reason.OVERDUE
 
     def shown_alive(self, device: str, alive: bool) -> None:
         self.alive[device] = alive
