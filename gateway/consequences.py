@@ -1,6 +1,7 @@
 """What follows from how a conversation went: for the device, the schedule, and those who watch."""
 
 import asyncio
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
@@ -8,7 +9,16 @@ from typing import Any, Protocol
 import structlog
 
 from gateway.device import Device, Standing
-from gateway.errors import Evidence, Garbled, GatewayError, Refusal, Refused, Unclear, Unsteady
+from gateway.errors import (
+    Evidence,
+    Garbled,
+    GatewayError,
+    LineDown,
+    Refusal,
+    Refused,
+    Unclear,
+    Unsteady,
+)
 from gateway.jobs import Poll
 from gateway.overdue import Overdue
 from gateway.planner import spell
@@ -82,6 +92,12 @@ class Consequences:
                 heard = value.data.hex(" ")
                 log.info("not understood", device=device.name, why=str(value), bytes=heard)
 
+    @property
+    def flowed(self) -> float:
+        """When anything was read last on this line: what was asked before has gone through."""
+        polls = (poll for device in self.schedule.devices for poll in self.schedule.polls(device))
+        return max((at for poll in polls if (at := poll.last_good) is not None), default=-math.inf)
+
     def answered(self, device: Device) -> None:
         """The device said something to the point, good or bad news."""
         if device.standing is Standing.UP and not device.doubtful:
@@ -98,7 +114,7 @@ class Consequences:
     def doubt(self, device: Device, error: Unclear, asked: Span | None) -> Standing:
         """A conversation ended unclear. Returns the device's standing before."""
         before = device.standing
-        device.failed(error, asked)
+        device.failed(error, asked, _now())
         log.info("no good reply", line=self.line, device=device.name, why=str(error))
         self.overdue.watch()
         return before
@@ -204,6 +220,7 @@ class Consequences:
     def line_down(self, why: str) -> None:
         self.overdue.stop()
         for device in self.schedule.devices:
+            device.start(LineDown(why))
             self.upstairs.alive(device, False)
             self.bad(device.tags, Reason.LINE_DOWN, why)
 

@@ -1,11 +1,11 @@
 """One device on a line as the gateway knows it: its plan, its standing, its record."""
 
 import math
-from collections import Counter
+from collections import Counter, deque
 from dataclasses import dataclass, field
 from enum import StrEnum
 
-from gateway.errors import DeviceError, Evidence, Garbled, NoReply
+from gateway.errors import DeviceError, Evidence, Garbled, GatewayError, LineDown, NoReply
 from gateway.lists import with_list
 from gateway.planner import Block, plan
 from gateway.protocols.driver import AnyDriver, Cost, Overhearing, Span, Timing, Windowed
@@ -15,6 +15,7 @@ from gateway.wiretime import Wire
 
 LEARN_EVERY = 50  # exchanges between two looks at the measured turnaround
 WORTH_WHILE = 0.1  # of the wire's time, to be planned anew
+MOST_UNANSWERED = 64  # questions whose time is kept
 HALF_LIFE = 10.0  # seconds in which use of the wire is half forgotten
 
 
@@ -85,12 +86,13 @@ class Device:
     failures: int = 0  # conversations in a row that ended unclear
     doubt: Span | None = None  # the question whose answer may still come
     doubtful: bool = True  # what is heard next may answer an older question
+    unanswered: deque[float] = field(default_factory=lambda: deque(maxlen=MOST_UNANSWERED))
     salt: int = 0
     lists: bool = True  # whether it may be read by a registered list
     registered: tuple[Span, ...] = ()  # the list it holds, as far as we know
     pause: float = 0.0
     next_probe: float = 0.0
-    trouble: DeviceError | None = None
+    trouble: GatewayError | None = None
     record: Record = field(default_factory=Record)
     _use: tuple[float, float] = (0.0, 0.0)  # seconds of the wire, and when that was reckoned
     refusals: Refusals = field(init=False)
@@ -158,8 +160,9 @@ class Device:
         bad = self.refusals.bad
         return max(RETRY, block.every) if bad and block.span in bad else block.every
 
-    def start(self) -> None:
-        """The line was opened: who knows what is still on its way from before."""
+    def start(self, trouble: LineDown | None = None) -> None:
+        """The line was opened, or lost: who knows what is still on its way from before."""
+        self.trouble = trouble
         self.standing = Standing.STARTING
         self.failures = 0
         self.doubtful = not self.broadcast
@@ -172,13 +175,15 @@ class Device:
         self.doubtful = False
         self.doubt = None
         self.trouble = None
+        self.unanswered.clear()
 
-    def failed(self, error: DeviceError, doubt: Span | None) -> None:
+    def failed(self, error: DeviceError, doubt: Span | None, now: float) -> None:
         """A conversation ended unclear; its answer may still be on the way.
 
         `doubt`: what was asked; None for a probe, which leaves an older doubt as it was.
         """
         self.failures += 1
+        self.unanswered.append(now)
         self.registered = ()  # it may have been switched off
         if not (self._slow and isinstance(error, NoReply)):
             self.trouble = error  # who is known to be slow is not called dead: nobody waits for it
@@ -193,13 +198,31 @@ class Device:
             case _:
                 self.record.failures["other"] += 1
 
+    def next_salt(self) -> int:
+        """For a resync. The one after it stays free, for asking once more."""
+        self.salt += 2
+        return self.salt
+
+    def open_questions(self, flowed: float) -> int:
+        """How many may still be answered, where the line is known to have carried since."""
+        since = flowed - self.patience
+        return sum(asked > since for asked in self.unanswered)
+
+    @property
+    def patience(self) -> float:
+        """How long an answer may take: seconds after which none comes any more."""
+        return self.timing.reply_timeout + self.late_guard
+
     @property
     def _slow(self) -> bool:
         trouble = self.trouble
         return isinstance(trouble, Garbled) and trouble.evidence is Evidence.SLOW
 
     def used(self, now: float, begun: float) -> None:
-        """It had the wire since `begun`. Writes do not count: they must not cost it its reads."""
+        """It was polled in its turn, or probed, since `begun`.
+
+        Writes do not count, nor what somebody wants to see now: they must not cost it its reads.
+        """
         self._use = (self.recent_use(now) + now - begun, now)
 
     def recent_use(self, now: float) -> float:

@@ -25,6 +25,7 @@ class Poll:
     last_good: float | None = None  # when it was read last; None: its values are bad
     seen: bool = False  # it was read at least once
     asked: float = 0.0  # when it was handed out last
+    hurried: bool = False  # before its turn, as somebody wants to see it
     phased: bool = True  # it has found its place in the period
     live: bool = True  # False once the device was planned anew
     reads: int = 0  # good ones

@@ -7,7 +7,7 @@ from contextlib import contextmanager, suppress
 
 import structlog
 
-from gateway.clock import Clock
+from gateway.clock import NEVER, Alarm, Clock
 from gateway.consequences import Consequences, Upstairs
 from gateway.device import Device, LineRecord, Standing
 from gateway.echo import Adapter
@@ -46,10 +46,11 @@ class Line:
         upstairs: Upstairs,
         wall: Callable[[], int],
         *,
-        echo: bool = False,
+        echo: bool | None = None,
         seed: int = 0,
     ) -> None:
-        """`wall`: nanoseconds since 1970, for the samples' time stamps."""
+        """`wall`: nanoseconds since 1970, for the samples' time stamps. `echo`: whether the port
+        hears what it says; None: to be found out."""
         self.name = name
         self.devices = devices
         self.wire = wire
@@ -59,7 +60,7 @@ class Line:
         self._open_port = open_port
         self._wall = wall
         self._echo = echo
-        self._adapter = Adapter()
+        self._adapter = Adapter(echo)
         self._echoed = False  # and that has been told
         self._random = random.Random(seed)  # noqa: S311  (jitter, not a secret)
         self._clock = Clock(spin=0.001 if wire.baudrate > FAST else 0.0)
@@ -73,6 +74,7 @@ class Line:
         self._turn: Turn | None = None
         self._down: LineDown | None = None
         self._wake = asyncio.Event()
+        self._expiry = Alarm()
 
     # What others may ask of it
 
@@ -97,7 +99,21 @@ class Line:
         elif not self._schedule.orders.submit(order):
             order.done(Busy(f"line {self.name}: too many orders are waiting; not sent"))
         else:
+            self._expiry.by(order.expires, self._expire)
             self._wake.set()
+
+    def _expire(self) -> float:
+        """What waited too long is not sent any more, also while one conversation takes long.
+
+        Returns when to look again.
+        """
+        orders, now = self._schedule.orders, self._clock.now()
+        for order in orders.expired(now):
+            waited = f"waited {now - order.submitted:.1f} s for the line"
+            refused = isinstance(order, Write) and order.alone
+            sent = "refused together with others, and not sent alone" if refused else "not sent"
+            order.done(Busy(f"{waited}; {sent}"))
+        return orders.first.expires if orders else NEVER
 
     def refresh(self, device: Device, tag: Tag) -> None:
         """Poll the tag's block before all other polls."""
@@ -155,7 +171,7 @@ class Line:
             self._port = await self._open_port(self)
             self.is_open = True
             self.record.came_up(self._clock.now())
-            self._adapter.echoes = None
+            self._adapter.echoes = self._echo
             log.info("line open", line=self.name)
             self._then.line_up()
             self._listening.opened(self._clock.now())
@@ -180,8 +196,7 @@ class Line:
     async def _serve(self) -> None:
         while self._down is None:
             now = self._clock.now()
-            for write in self._schedule.orders.expired(now):
-                write.done(Busy(f"waited {now - write.submitted:.1f} s for the line; not sent"))
+            self._expire()
             match self._listening.next(now) or self._schedule.next(now):
                 case Poll() as poll:
                     await self._poller.poll(poll, now)
@@ -229,8 +244,9 @@ class Line:
             self._clock,
             self.recorder,
             device.driver.station,
-            self._echo,
+            bool(self._echo),
             self._adapter,
+            device.doubtful,
         )
         return turn
 

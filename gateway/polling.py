@@ -14,6 +14,7 @@ from gateway.protocols.driver import Span
 from gateway.reading import read_block
 from gateway.turn import Turn
 
+LONGEST_SETTLING = 10.0  # seconds for old answers to go by
 Failure = tuple[Poll, Unclear | LineDown]
 
 
@@ -51,21 +52,27 @@ class Poller:
             if failed:
                 await self._failed(device, turn, failed)
         finally:
-            self._ended(turn, device, now)
+            self.wire.end(device, turn)
+            if not poll.hurried:
+                device.used(turn.clock.now(), now)
 
     async def probe(self, device: Device, now: float) -> None:
         """Ask something harmless whose answer is no other's."""
         turn = self.wire.begin(device)
         try:
-            device.salt += 1
-            with suppress(Refused):  # that is an answer too
-                await device.driver.resync(turn, device.doubt, device.salt)
+            salt, told_from = device.next_salt(), 0
+            with suppress(Refused):  # a sign of life too, though perhaps of an older question
+                told_from = await device.driver.resync(turn, device.doubt, salt)
+            if device.open_questions(self.then.flowed) > told_from:
+                await turn.settle(LONGEST_SETTLING, device.patience)
+                with suppress(Refused):
+                    await device.driver.resync(turn, device.doubt, salt + 1)
+            self.then.answered(device)
         except Unclear as error:
             await self.wire.unclear(device, turn, error, None)
-        else:
-            self.then.answered(device)
         finally:
-            self._ended(turn, device, now)
+            self.wire.end(device, turn)
+            device.used(turn.clock.now(), now)
 
     async def _read(self, turn: Turn, poll: Poll) -> Sequence[Failure]:
         """Empty when it was answered."""
@@ -93,7 +100,3 @@ class Poller:
         await self.wire.unclear(device, turn, error, first.block.span)
         for one, why in failed:
             self.then.unread(one, why)
-
-    def _ended(self, turn: Turn, device: Device, begun: float) -> None:
-        self.wire.end(device, turn)
-        device.used(turn.clock.now(), begun)

@@ -139,7 +139,7 @@ class Schedule:
             poll = other
         elif hurry:
             self._urgent.popleft()
-        self._hurried = hurry
+        self._hurried = poll.hurried = hurry
         return self._hand_out(poll, now)
 
     def beside(self, poll: Poll, most: int, now: float) -> list[Poll]:

@@ -15,6 +15,7 @@ from gateway.wiretime import Wire
 
 T = TypeVar("T")
 MOST_OVERHEARD = 32  # frames of one conversation
+LONGEST_WAIT = 1.0  # seconds for others to fall silent
 KEPT = 64  # bytes of a failed conversation kept for the log
 
 
@@ -46,6 +47,7 @@ class Turn:
     station: int
     echo: bool = False
     adapter: Adapter = field(default_factory=Adapter)
+    in_doubt: bool = False  # an older question of another turn may still be answered
     started: float = 0.0  # when the first question was sent
     sent: int = 0  # characters, for the statistics
     heard: int = 0
@@ -200,7 +202,7 @@ class Turn:
                 question.heard, self._rest = len(self._rest), b""
                 question.future.set_result(answer)
                 return
-        if self._expired is not None and _accepts(self._expired, frame):
+        if self._expired is not None and self._accepts(self._expired, frame):
             self._expired = None
             self._came_late = True
             if self._late is not None and not self._late.done():
@@ -210,6 +212,12 @@ class Turn:
         if len(self.overheard) < MOST_OVERHEARD:
             self.overheard.append(frame)
         self._foreign = self._foreign or getattr(frame, "station", self.station) != self.station
+
+    def _accepts(self, answers: Callable[[Any], Any], frame: Any) -> bool:
+        try:
+            return answers(frame) is not None
+        except DeviceError:
+            return not self.in_doubt  # a refusal names no question
 
     def _send(self, data: bytes) -> None:
         if self._lost is not None:
@@ -223,9 +231,15 @@ class Turn:
         self.port.write(data)
 
     async def _quiet(self) -> None:
-        """Keep the silence before a request, by the clock: loops may wake early or late."""
+        """Keep the silence before a request, by the clock: loops may wake early or late.
+
+        Raises `Garbled` where it never comes.
+        """
         loop = asyncio.get_running_loop()
+        until = max(self.clock.quiet_since, loop.time()) + self.silence + LONGEST_WAIT
         while (wait := self.clock.quiet_since + self.silence - loop.time()) > 0:
+            if self.clock.quiet_since + self.silence > until:
+                raise Garbled("the line is never quiet, nothing was sent: noise, or another master")
             await asyncio.sleep(wait - self.clock.spin if wait > self.clock.spin else 0)
 
     def _strip_echo(self, data: bytes) -> bytes:
@@ -279,10 +293,3 @@ def _give_up(waiting: "asyncio.Future[bool]") -> None:
 def _fail(question: _Question, error: Exception) -> None:
     if not question.future.done():
         question.future.set_exception(error)
-
-
-def _accepts(answers: Callable[[Any], Any], frame: Any) -> bool:
-    try:
-        return answers(frame) is not None
-    except DeviceError:
-        return True  # a refusal answers the question too

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 from gateway.consequences import Consequences
 from gateway.device import Device
-from gateway.errors import BadValue, GatewayError, LineDown, Refused, Unclear
+from gateway.errors import BadValue, Busy, GatewayError, LineDown, Refused, Unclear
 from gateway.orders import Command, Write
 from gateway.protocols.driver import AnyDriver, Controllable, ScatteredWriter, Span, Talk
 from gateway.tags import Written
@@ -56,8 +56,10 @@ async def look_again(talk: Talk[Any], write: Write, wall: Wall) -> Written | Non
     if rule is None or not (rule.verify or rule.repeat):
         return None
     device = write.device
-    device.salt += 1
-    await device.driver.resync(talk, device.doubt, device.salt)
+    try:
+        await device.driver.resync(talk, device.doubt, device.next_salt())
+    except Refused as error:
+        raise Unclear(f"nor what it says to a question about it: {error}") from error
     if rule.verify and holds(write, await device.driver.read(talk, write.tag.span)):
         return written(write, wall, verified=True)
     in_time = asyncio.get_running_loop().time() < write.expires
@@ -167,7 +169,7 @@ class Writer:
                 return self._denied(device, error)
             except Unclear as error:
                 await self.wire.unclear(device, turn, error, None)
-                return error
+                return error if turn.sent else Busy(str(error))
             if turn.exchanges:
                 self.then.answered(device)
             else:  # as after a broadcast
@@ -192,7 +194,7 @@ class Writer:
                 self.then.schedule.orders.each_alone(group)
                 return []
             except Unclear as error:
-                outcomes.update((one, error) for one in group)
+                outcomes.update((one, error if turn.sent else Busy(str(error))) for one in group)
                 await self.wire.unclear(device, turn, error, group[0].tag.span)
                 return group
             self.then.answered(device)
@@ -213,6 +215,8 @@ class Writer:
             except Unclear as error:
                 unclear = error
                 await self.wire.unclear(device, turn, error, span)
+                if not turn.sent:
+                    return Busy(str(error))
         with self.wire.turn_with(device) as turn:
             try:
                 settled = await look_again(turn, write, self.wall)

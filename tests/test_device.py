@@ -23,7 +23,7 @@ def test_a_device_starts_in_doubt_for_answers_to_an_earlier_gateway_may_still_co
 
 
 def test_an_answer_ends_all_doubt(dev: Device) -> None:
-    dev.failed(NoReply("silence"), Span("D", 0, 10))
+    dev.failed(NoReply("silence"), Span("D", 0, 10), 0.0)
     dev.answered()
     assert (dev.standing, dev.failures, dev.doubtful, dev.doubt) == (Standing.UP, 0, False, None)
     assert dev.diagnosis() == ""
@@ -31,7 +31,7 @@ def test_an_answer_ends_all_doubt(dev: Device) -> None:
 
 def test_a_failure_of_a_device_that_answered_makes_it_failing(dev: Device) -> None:
     dev.answered()
-    dev.failed(NoReply("silence"), Span("D", 0, 10))
+    dev.failed(NoReply("silence"), Span("D", 0, 10), 0.0)
     assert dev.standing is Standing.FAILING
     assert dev.served
     assert dev.doubtful
@@ -40,13 +40,13 @@ def test_a_failure_of_a_device_that_answered_makes_it_failing(dev: Device) -> No
 @pytest.mark.parametrize("standing", [Standing.STARTING, Standing.SILENT])
 def test_a_failure_of_one_that_did_not_leaves_it_so(dev: Device, standing: Standing) -> None:
     dev.standing = standing
-    dev.failed(NoReply("silence"), None)
+    dev.failed(NoReply("silence"), None, 0.0)
     assert dev.standing is standing
 
 
 def test_a_probe_that_fails_does_not_forget_what_may_still_be_answered(dev: Device) -> None:
-    dev.failed(NoReply("silence"), Span("D", 0, 10))
-    dev.failed(NoReply("silence"), None)
+    dev.failed(NoReply("silence"), Span("D", 0, 10), 0.0)
+    dev.failed(NoReply("silence"), None, 0.0)
     assert dev.doubt == Span("D", 0, 10)
 
 
@@ -61,15 +61,15 @@ def test_a_reopened_line_leaves_the_doubt(dev: Device) -> None:
 
 def test_who_is_slow_is_not_called_dead_when_nobody_waits_for_it(dev: Device) -> None:
     dev.trouble = Garbled("it took 0.7 s", evidence=Evidence.SLOW)
-    dev.failed(NoReply("silence"), None)
+    dev.failed(NoReply("silence"), None, 0.0)
     assert "raise reply_timeout" in dev.diagnosis()
-    dev.failed(Garbled("noise"), None)
+    dev.failed(Garbled("noise"), None, 0.0)
     assert "baud rate" in dev.diagnosis()
 
 
 @pytest.mark.parametrize("evidence", [e for e in Evidence if e is not Evidence.SILENCE])
 def test_every_evidence_has_its_sentence(dev: Device, evidence: Evidence) -> None:
-    dev.failed(Garbled("what was heard", evidence=evidence), None)
+    dev.failed(Garbled("what was heard", evidence=evidence), None, 0.0)
     assert "what was heard" in dev.diagnosis()
     assert "not understood" not in dev.diagnosis()
     assert dev.reason is Reason.GARBLED
@@ -77,10 +77,10 @@ def test_every_evidence_has_its_sentence(dev: Device, evidence: Evidence) -> Non
 
 
 def test_silence_has_its_sentence(dev: Device) -> None:
-    dev.failed(NoReply("no reply"), None)
+    dev.failed(NoReply("no reply"), None, 0.0)
     assert dev.diagnosis().startswith("No byte came back")
     assert dev.reason is Reason.NO_REPLY
-    dev.failed(Unclear("something else"), None)
+    dev.failed(Unclear("something else"), None, 0.0)
     assert dev.diagnosis() == "something else"
     assert dev.record.failures["other"] == 1
 

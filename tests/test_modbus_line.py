@@ -355,7 +355,7 @@ def writable(driver: Driver) -> tuple[Tag, Tag]:
 
 def unsaid(line: Plant) -> Plant:
     """The adapter echoes, and the file does not say so."""
-    line.line._echo = False
+    line.line._echo = None
     return line
 
 

@@ -74,3 +74,19 @@ async def test_nothing_is_overdue_on_a_line_that_carries_its_load() -> None:
     assert dev.record.overdue == other.record.overdue == 0
     bad = {s.reason for _, s in line.told if s.quality is Quality.BAD}
     assert bad == set()
+
+
+@on_virtual_time
+async def test_who_is_written_to_all_the_time_is_read_like_the_others() -> None:
+    """The line is asked for twice what it carries, and half of that goes to the writes."""
+    devices = [scattered(20, station=n) for n in (1, 2, 3)]
+    line = plant(devices)
+    async with running(line):
+        await asyncio.sleep(5)
+        for _ in range(3000):
+            if not line.line._schedule.orders:
+                line.submit(devices[0], devices[0].tags[0], 1)
+            await asyncio.sleep(0.02)
+    # What is written is read back each time; of the others none is left behind.
+    reads = [min(poll.reads for poll in line.line.polls(dev)) for dev in devices]
+    assert min(reads) > 0.6 * max(reads)

@@ -29,7 +29,7 @@ def write(device: Device, expires: float = 99.0) -> Write:
 
 
 def doubt(device: Device) -> None:
-    device.failed(NoReply("silence"), None)
+    device.failed(NoReply("silence"), None, 0.0)
 
 
 def served(schedule: Schedule, now: float) -> Poll:

@@ -64,7 +64,7 @@ async def test_what_was_said_is_counted(tmp_path: Path) -> None:
 
 async def test_a_device_in_trouble_says_what_to_look_for(tmp_path: Path) -> None:
     _, device = only(made(tmp_path))
-    device.failed(NoReply("no reply"), None)
+    device.failed(NoReply("no reply"), None, 0.0)
     document = device_document(device, [])
     assert document["failures"] == {"silence": 1}
     assert "check power, wiring" in str(document["diagnosis"])

@@ -158,14 +158,19 @@ async def test_settling_ends_with_the_guard_when_nothing_comes() -> None:
     assert now() - start == pytest.approx(0.4)
 
 
+@pytest.mark.parametrize("in_doubt", [False, True])
 @on_virtual_time
-async def test_a_late_refusal_is_a_late_answer() -> None:
+async def test_a_late_refusal_is_a_late_answer_unless_it_may_answer_something_older(
+    in_doubt: bool,
+) -> None:
     port = Far(VigorStation(1, holes=[("D", 0)]))
     port.after = lambda _: 0.5
     talk = turn(port)
+    talk.in_doubt = in_doubt
     with pytest.raises(NoReply):
         await read(talk)
-    assert await talk.settle(10.0, 0.02) is not None
+    late = await talk.settle(10.0, 0.02)
+    assert (late is None) is in_doubt
 
 
 @on_virtual_time

@@ -148,12 +148,16 @@ class Driver(Protocol[F]):
         """True when the device acknowledged the write, False where nobody ever acknowledges
         (a broadcast). Everything else raises."""
 
-    async def resync(self, talk: Talk[F], doubt: Span | None, salt: int) -> None:
+    async def resync(self, talk: Talk[F], doubt: Span | None, salt: int) -> int:
         """Ask something harmless whose answer cannot be taken for the answer to `doubt`.
 
-        Also the cheapest proof of life. `salt` counts up, so that the answer to an earlier
-        resync is not taken for the answer to this one either (as far as the protocol lets
-        a question be marked). The values read are thrown away.
+        Also the cheapest proof of life. `salt` counts up by two, and is then the question's mark;
+        a second question in the same resync has the mark after it. So the answers to earlier
+        resyncs are not taken for the answer to this one either, as far as the protocol lets a
+        question be marked: returned is from how many open questions, `doubt` among them, this
+        one can be told. The values read are thrown away.
+
+        Raises `Refused` where nothing but refusals came that may answer an older question.
         """
 
 

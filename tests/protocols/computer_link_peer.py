@@ -201,6 +201,8 @@ class Peer:
 class Wire:
     """A `Talk` over bytes: what the driver says goes to `hear`, what comes back to its codec."""
 
+    may_echo = False
+
     def __init__(self, driver: Any, hear: Callable[[bytes], bytes], pieces: int = 1000) -> None:
         self._driver, self._hear, self._pieces = driver, hear, pieces
         self.sent = self.received = 0

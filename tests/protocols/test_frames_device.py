@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from gateway.errors import BadValue, ConfigError, Garbled, NoReply, Refused
+from gateway.errors import BadValue, ConfigError, Garbled, NoReply, Refused, Unclear
 from gateway.protocols.frames import Ask, Field, Frames, Framing, Heard, Listen, Write
 from gateway.stations.vigor import VigorStation
 from tests.doubles import Script
@@ -214,6 +214,31 @@ async def test_a_write_that_nobody_acknowledges_is_never_said_to_be_done() -> No
     assert await one.tell(talk, "text", one.put("text", "AB")) is False
     talk.done()
     assert one.write_cost("text") == (512 + 1, 0)  # the longest text that fits
+
+
+@pytest.mark.parametrize("may_echo", [True, False])
+async def test_an_acknowledgement_that_repeats_the_command_may_be_its_echo(may_echo: bool) -> None:
+    """Then the device must say it, too."""
+    one = Frames(
+        framing=Framing(terminator="<0D>"),
+        write={
+            "set": Write(
+                send="S{value}", value=Field(type="integer", format="04d"), match="S[0-9]{4}"
+            )
+        },
+    )
+    said = b"S1234\r".hex(" ")
+    once, twice = (
+        script(one, f"> {said}", f"< {said}"),
+        script(one, f"> {said}", *[f"< {said}"] * 2),
+    )
+    once.may_echo = twice.may_echo = may_echo
+    assert await one.tell(twice, "set", one.put("set", 1234)) is True
+    if may_echo:
+        with pytest.raises(Unclear):
+            await one.tell(once, "set", one.put("set", 1234))
+    else:
+        assert await one.tell(once, "set", one.put("set", 1234)) is True
 
 
 def test_costs_are_exact_for_the_request_and_the_longest_for_the_reply() -> None:

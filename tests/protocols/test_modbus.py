@@ -468,7 +468,7 @@ async def test_a_resync_differs_from_the_doubt_and_from_the_last_resync(
     span = Span(area.name, start, size)
     cost = driver.cost(span)
     lengths = []
-    for turn in (salt, salt + 1):
+    for turn in (salt, salt + 2):
         talk = Hearing(driver)
         with pytest.raises(NoReply):
             await driver.resync(talk, span, turn)
@@ -477,10 +477,12 @@ async def test_a_resync_differs_from_the_doubt_and_from_the_last_resync(
     assert len({cost.reply, *lengths}) == 3
 
 
-async def test_an_exception_to_a_resync_is_asked_again_and_is_a_sign_of_life() -> None:
+async def test_an_exception_to_a_resync_is_asked_again_in_another_size() -> None:
+    """And a second one says so: both may answer older questions."""
     driver, no = ModbusRtu(station=1), framed(ModbusRtu, 1, bytes((0x83, 2)))
     talk = Hearing(driver, [no], [no])
-    await driver.resync(talk, Span("holding", 65535, 1), 0)
+    with pytest.raises(Refused):
+        await driver.resync(talk, Span("holding", 65535, 1), 0)
     assert len(talk.replies) == len(set(talk.replies)) == 2
 
 

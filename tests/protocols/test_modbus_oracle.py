@@ -91,8 +91,8 @@ async def test_the_oracles_exceptions_are_refusals(
     driver, span = kind(station=station), Span("holding", 7, 2)
     refused = ExceptionResponse(16 if writing else 3, code, device_id=station, transaction=1)
     talk = Hearing(driver, [oracle_encodes(kind, refused)])
-    accepted = writing and code == 5  # and may be done later: not refused
-    with pytest.raises(Unclear if accepted else Refused) as no:
+    perhaps_done = writing and code in (4, 5)  # a failure in the middle, or done later
+    with pytest.raises(Unclear if perhaps_done else Refused) as no:
         await (driver.write(talk, span, [1, 2]) if writing else driver.read(talk, span))
     if isinstance(no.value, Refused):
         assert no.value.code == f"{code:02d}"

@@ -29,7 +29,17 @@ from tests.sim.stations import Troubled
 from tests.sim.story import Story
 from tests.sim.wire import SimWire, Speaker
 
-UNTIMELY = ("very-late", "foreign", "junk", "noise", "noise-after", "vanish", "hang", "flicker")
+UNTIMELY = (
+    "very-late",
+    "foreign",
+    "junk",
+    "noise",
+    "noise-after",
+    "vanish",
+    "hang",
+    "stall",
+    "flicker",
+)
 SPOKE_LATELY = 1.0 + 0.7  # seconds: an answer to unasked words comes within one
 AFTER_ALL = 0.09  # seconds that stations need to take in what goes to all of them
 

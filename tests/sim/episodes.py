@@ -23,7 +23,7 @@ class Episode:
     @property
     def silent(self) -> bool:
         """Nothing of the device is heard meanwhile."""
-        return self.kind in ("deaf", "mute", "vanish", "hang")
+        return self.kind in ("deaf", "mute", "vanish", "hang", "stall")
 
 
 _STATION_KINDS = (
@@ -39,7 +39,17 @@ _STATION_KINDS = (
     "junk",
     "reboot",
 )
-_LINE_KINDS = ("noise", "noise", "noise-after", "vanish", "vanish", "hang", "flicker")
+_LINE_KINDS = (
+    "noise",
+    "noise",
+    "noise-after",
+    "vanish",
+    "vanish",
+    "hang",
+    "stall",
+    "stall",
+    "flicker",
+)
 # TCP loses and invents nothing, but its devices do what they like.
 _NET_STATION_KINDS = tuple(kind for kind in _STATION_KINDS if kind != "junk")
 _NET_LINE_KINDS = ("vanish", "hang", "flicker")

@@ -14,7 +14,7 @@ from tests.sim.episodes import Episode
 from tests.sim.expect import Expectations
 from tests.sim.judge import Judge
 from tests.sim.stations import Troubled
-from tests.sim.wire import Noise
+from tests.sim.wire import Noise, SimWire
 
 DEFAULT_TIMES = 0.5  # seconds, of a device that is not served
 
@@ -61,6 +61,8 @@ class Faults:
                 wire.vanish("unplugged")
             case "hang":
                 wire.hanging = True
+            case "stall" if isinstance(wire, SimWire):
+                wire.stalled = True
             case "gone":
                 tag = self.tags[f"{episode.device}/{episode.tag}"]
                 self.judge.stations[episode.device].vanish(tag)
@@ -103,6 +105,8 @@ class Faults:
                 wire.come_back()
             case "hang":
                 wire.hanging = False
+            case "stall" if isinstance(wire, SimWire):
+                wire.flow()
             case "gone":
                 tag = self.tags[f"{episode.device}/{episode.tag}"]
                 self.judge.stations[episode.device].come_back(tag)

@@ -10,6 +10,7 @@ from gateway.device import Device
 from gateway.errors import BadValue, Busy, GatewayError, LineDown, Offline, Refused
 from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.computer_link.refusals import model_name
+from gateway.protocols.frames.driver import LISTENED
 from gateway.tags import Quality, Tag, Written
 from gateway.values import Kind, Value
 from tests.sim.bus import Bus, summed
@@ -181,6 +182,8 @@ class Person:
         judge.story.counts["fresh"] += 1
         if judge.read_at[tag] >= asked:
             return  # it was read since, and judged then
+        if tag.span.area == LISTENED:
+            return  # nobody can ask for it
         since = asked - most - 1.5
         was = judge.stations[tag.device].was(tag, sample.value, since, judge.now)
         excused = self.bus.hurt_at >= since or self.bus.untimely(tag.device)

@@ -87,7 +87,7 @@ class Plant:
             lambda ear: self.bench.open(self.stations, self.wire, ear),
             self,
             lambda: int(_now() * SECOND),
-            echo=self.bench.echo,
+            echo=self.bench.echo or None,
             seed=self.bench.seed,
         )
 

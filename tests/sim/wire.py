@@ -7,6 +7,7 @@ moments of the loop's clock, and all chance comes from one `random.Random`.
 import asyncio
 import math
 import random
+from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
@@ -14,6 +15,9 @@ from typing import Protocol
 from gateway.errors import LineDown
 from gateway.transport import Ear
 from gateway.wiretime import Wire
+
+
+SERVER_WAITS = 0.25  # seconds between two requests that it has kept
 
 
 class Speaker(Protocol):
@@ -83,6 +87,7 @@ class SimWire:
     noise: Noise = field(default_factory=Noise)
     gone: str = ""  # why the port is not there
     hanging: bool = False  # nothing passes, and nobody is told
+    stalled: bool = False  # the device server keeps what is said, and says it later, in order
     opened: int = 0
     closed: int = 0
     addressed: Callable[[bytes], Sequence[Speaker]] | None = None  # whom a whole request is for
@@ -92,6 +97,7 @@ class SimWire:
         self._generation = 0
         self._sendings: list[_Sending] = []
         self._ours_until = 0.0
+        self._kept: deque[bytes] = deque()  # the first is being said
 
     # The port
 
@@ -106,34 +112,60 @@ class SimWire:
     def write(self, data: bytes) -> None:
         if self._ear is None:
             raise LineDown(self.gone or "closed")
-        now = _now()
-        start = max(now, self._ours_until)
-        sending = _Sending(start, start + len(data) * self.wire.character, data, None)
-        self._ours_until = sending.end
-        self.watch.sent(data, start, sending.end)
+        start = max(_now(), self._ours_until)
+        self._ours_until = start + len(data) * self.wire.character
+        self.watch.sent(data, start, self._ours_until)
         if self.hanging:
             return
+        if self.stalled or self._kept:
+            self._kept.append(data)
+        else:
+            self._say_ours(data, start)
+
+    def flow(self) -> None:
+        """The stall is over."""
+        self.stalled = False
+        if self._kept:
+            self._say_kept()
+
+    def _say_kept(self) -> None:
+        """One after the other, and each answer is waited for a while."""
+        ends = self._say_ours(self._kept[0], _now())
+        self._at(ends + SERVER_WAITS, self._next_kept)
+
+    def _next_kept(self) -> None:
+        self._kept.popleft()
+        if self._kept and not self.stalled:
+            self._say_kept()
+
+    def _say_ours(self, data: bytes, start: float) -> float:
+        sending = _Sending(start, start + len(data) * self.wire.character, data, None)
         for other in self._collide(sending):
             if other.station is not None:
                 self.watch.overlapped(other.station)
         self._at(sending.end, lambda: self._reach_stations(sending))
         if self.echo:
             self._at(sending.end, lambda: self._deliver(sending, sending.data))
+        return sending.end
 
     async def close(self) -> None:
         self.closed += 1
         self._ear = None
-        self._generation += 1
+        self._end()
 
     def vanish(self, why: str) -> None:
         self.gone = why
         ear, self._ear = self._ear, None
-        self._generation += 1
+        self._end()
         if ear is not None:
             ear.lost(LineDown(why))
 
     def come_back(self) -> None:
         self.gone = ""
+
+    def _end(self) -> None:
+        self._generation += 1
+        self._kept.clear()
 
     # The wire
 

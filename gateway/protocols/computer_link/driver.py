@@ -200,9 +200,10 @@ class ComputerLink:
         await talk.tell(self._enquiry("GW", _SWITCH[argument.lower()], ALL_STATIONS))
         return "sent to all stations, none answers"
 
-    async def resync(self, talk: LinkTalk, doubt: Span | None, salt: int) -> None:
+    async def resync(self, talk: LinkTalk, doubt: Span | None, salt: int) -> int:
         """A loopback: its text has a letter that no data reply has, and changes with `salt`."""
         await self._loopback(talk, f"Z{salt & 0xFFFF:04X}")
+        return 0xFFFF
 
     silent_causes = SILENT_CAUSES
 
@@ -255,7 +256,7 @@ class ComputerLink:
 
         reply = self._text_cost(len(area), characters).reply
         answer = await talk.ask(self._enquiry(command, area), reply, answers)
-        if self.send_area_c:
+        if self.send_area_c and not talk.may_echo:  # its echo would acknowledge the next write
             await talk.tell(Ack(self.station))
         return answer
 

@@ -5,9 +5,9 @@ Its frames are named in the file. `listen`: it speaks when it likes. `ask`: it a
 written is named as the tag that writes it.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, TypeVar
 
 from gateway.errors import BadValue, ConfigError, Garbled
 from gateway.protocols.driver import Cost, Talk, Timing
@@ -19,6 +19,8 @@ from gateway.protocols.frames.messages import Ask, Listen, Values, Write, filled
 from gateway.protocols.frames.patterns import check_pattern, longest_match
 from gateway.protocols.frames.presets import written_out
 from gateway.values import Value
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,7 +131,8 @@ class Frames:
         """
         one = self.ask[question]
         reply = self._longest_reply(one.match, one.refused)
-        return await talk.ask(octets(one.send), reply, one.answers)
+        frame = octets(one.send)
+        return await talk.ask(frame, reply, _but_an_echo(talk, frame, one.answers))
 
     def put(self, name: str, value: Value) -> bytes:
         """A value's own bytes in the frame that writes it.
@@ -150,7 +153,8 @@ class Frames:
         if one.match is None:
             await talk.tell(frame)
             return False
-        return await talk.ask(frame, self._longest_reply(one.match, one.refused), one.answers)
+        reply = self._longest_reply(one.match, one.refused)
+        return await talk.ask(frame, reply, _but_an_echo(talk, frame, one.answers))
 
     @property
     def _send(self) -> Framing:
@@ -208,3 +212,19 @@ class Frames:
             kinds = {found.kind for other, found in self._fields() if other == name}
             if len(kinds) > 1:
                 raise ConfigError(f"{name} cannot be {' and '.join(sorted(kinds))} at once")
+
+
+def _but_an_echo(
+    talk: Talk[bytes], said: bytes, answers: Callable[[bytes], T | None]
+) -> Callable[[bytes], T | None]:
+    """`answers`, but for our own words while they may come back: the device must say them again."""
+    echo = said if talk.may_echo else None
+
+    def answer(frame: bytes) -> T | None:
+        nonlocal echo
+        if frame == echo:
+            echo = None
+            return None
+        return answers(frame)
+
+    return answer

@@ -130,7 +130,7 @@ class FrameDriver:
         name = self.spell(Address(span.area, span.start))
         return await self.settings.tell(talk, name, bytes(units))
 
-    async def resync(self, talk: Talk[bytes], doubt: Span | None, salt: int) -> None:
+    async def resync(self, talk: Talk[bytes], doubt: Span | None, salt: int) -> int:
         """Another question than the doubtful one where there is one, else the same once more.
 
         Nothing in such frames says which request they answer: a late reply to the same question
@@ -141,3 +141,4 @@ class FrameDriver:
         others = [question for question in questions if question != doubtful] or questions
         if others:
             await self.settings.read(talk, others[salt % len(others)])
+        return 0

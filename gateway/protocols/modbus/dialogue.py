@@ -1,7 +1,6 @@
 """What is said between the gateway and one Modbus device, whatever the frames are wrapped in."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import count, repeat
 from typing import NamedTuple
@@ -13,7 +12,8 @@ from gateway.protocols.modbus.addressing import Dialect, Limits, Place
 from gateway.protocols.modbus.frame import READ_BITS, Frame, answer_length
 
 _REMEMBERED = 1024  # spans whose question is kept ready
-_RESYNC_SIZES = 4
+_FEWEST_SIZES, _MOST_SIZES = 4, 16  # of the reads that a resync may ask
+_NUMBERS = 0xFFFF
 
 
 class Question(NamedTuple):
@@ -172,28 +172,31 @@ class Dialogue:
             units = pdu.words_of(units, low_first=self.low_first)
         return pdu.write_words_request(wire, units, single=single)
 
-    async def resync(self, talk: Talk[Frame], doubt: Span | None, salt: int) -> None:
+    async def resync(self, talk: Talk[Frame], doubt: Span | None, salt: int) -> int:
         """Read another byte count than `doubt` has, or ask function 08 to repeat a token.
 
         Not while what is repeated may be an echo: a dead device would seem alive.
-        An exception is a sign of life too. It names no address, though: it may be the late
-        answer to `doubt`, and the answer to our question still to come. So another size is asked
-        then, for which that one is no answer, unless questions carry a number.
+        An exception names no address: it may be the late answer to `doubt`, and the answer to our
+        question still to come. So another size is asked then, unless questions carry a number.
         """
         loopback = self.diagnostics and (self.numbered or not talk.may_echo)
+        harmless = self._harmless(doubt)
+        count = len(harmless)
         try:
             if loopback:
                 await self._loopback(talk, salt & 0xFFFF)
             else:
-                await self.read(talk, self._harmless(doubt, salt))
+                await self.read(talk, harmless[salt % count])
         except Refused:
-            if self.numbered or loopback:
-                return
-            with suppress(Refused):
-                await self.read(talk, self._harmless(doubt, salt + 1))
+            if self.numbered:
+                return _NUMBERS
+            if loopback:
+                raise
+            await self.read(talk, harmless[(salt + 1) % count])
+        return _NUMBERS if self.numbered or loopback else max(1, count // 2)
 
-    def _harmless(self, doubt: Span | None, salt: int) -> Span:
-        """A short read near `doubt` whose byte count is neither its own nor that of `salt - 1`."""
+    def _harmless(self, doubt: Span | None) -> Sequence[Span]:
+        """Short reads near `doubt` of different byte counts, none of them its own."""
         places = self.dialect.places
         if doubt is None or self._place(doubt) is None:
             first = (places.get("D") or next(iter(places.values()))).area
@@ -203,12 +206,12 @@ class Dialogue:
         steps = (doubt.size + step - 1) // step
         room = min(self._most(place, reading=True) // place.registers, area.last - area.first + 1)
         # Small ones come first: they lie within what was asked, where the device has something.
-        sizes = [n * step for n in range(1, _RESYNC_SIZES + 2) if n != steps and n * step <= room]
+        most = max(_FEWEST_SIZES, min(steps - 1, _MOST_SIZES))
+        sizes = [n * step for n in range(1, most + 2) if n != steps and n * step <= room][:most]
         if not sizes:  # limited to one unit: the answer to another function differs as well
             other = next(p for p in places.values() if p.function != place.function).area
-            return Span(other.name, other.first, 1)
-        size = sizes[:_RESYNC_SIZES][salt % len(sizes[:_RESYNC_SIZES])]
-        return Span(area.name, min(doubt.start, area.last + 1 - size), size)
+            return [Span(other.name, other.first, 1)]
+        return [Span(area.name, min(doubt.start, area.last + 1 - n), n) for n in sizes]
 
     async def _loopback(self, talk: Talk[Frame], token: int) -> None:
         request = pdu.loopback_request(token)

@@ -74,7 +74,7 @@ class _Modbus:
     ) -> Coroutine[Any, Any, bool]:
         return self._dialogue.write(talk, span, units)
 
-    def resync(self, talk: Talk[Frame], doubt: Span | None, salt: int) -> Coroutine[Any, Any, None]:
+    def resync(self, talk: Talk[Frame], doubt: Span | None, salt: int) -> Coroutine[Any, Any, int]:
         return self._dialogue.resync(talk, doubt, salt)
 
 

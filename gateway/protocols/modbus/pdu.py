@@ -107,6 +107,7 @@ def words_of(dwords: Sequence[int], *, low_first: bool) -> list[int]:
 
 _ACCEPTED = 5
 _WRITES = (5, 6, 15, 16)
+_NOT_DONE = (1, 2, 3, 6, 10)  # exceptions that come before anything is done
 
 
 def raise_refusal(pdu: bytes, function: int) -> None:
@@ -114,7 +115,8 @@ def raise_refusal(pdu: bytes, function: int) -> None:
 
     `Refused` with the exception code in hex; `NoReply` for 0B, by which a gateway tells that
     the device behind it kept silent: nobody knows then whether a write was done. `Unclear` for
-    05 to a write: it was accepted, and may be done later.
+    05 to a write, which was accepted and may be done later, and for every other exception to
+    one that does not say that nothing was done.
     """
     if len(pdu) != 2 or pdu[0] != function | EXCEPTION:
         return
@@ -124,8 +126,7 @@ def raise_refusal(pdu: bytes, function: int) -> None:
     if code == _ACCEPTED and function in _WRITES:
         raise Unclear("accepted, but it takes longer (exception 05): it may be done yet")
     words, refusal = _EXCEPTIONS.get(code, ("unknown exception", Refusal.OTHER))
-    raise Refused(
-        f"exception {code:02X} to function {function:02d}: {words}",
-        code=f"{code:02X}",
-        refusal=refusal,
-    )
+    said = f"exception {code:02X} to function {function:02d}: {words}"
+    if function in _WRITES and code not in _NOT_DONE:
+        raise Unclear(f"{said}; part of it may be done")
+    raise Refused(said, code=f"{code:02X}", refusal=refusal)

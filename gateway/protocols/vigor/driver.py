@@ -131,20 +131,19 @@ class Vigor:
         await self._write_body(talk, WRITE, body)
         return True
 
-    async def resync(self, talk: Talk[Frame], doubt: Span | None, salt: int) -> None:
+    async def resync(self, talk: Talk[Frame], doubt: Span | None, salt: int) -> int:
         """Read M0 and up, in a number of bytes that no open question asks for.
 
-        A refusal names no question: the first may be the late answer to `doubt`, so another
-        mark is asked for. A second one is an answer to us, and proves life as well as data.
+        A refusal names no question: it may be the late answer to `doubt`, so another mark is
+        asked for once.
         """
         doubted = cover(doubt) if doubt is not None else None
         marks = [mark for mark in _MARKS if doubted is None or mark != doubted.size]
-        for attempt in (2 * salt, 2 * salt + 1):
-            try:
-                await self._read_bytes(talk, 0x0080, marks[attempt % len(marks)])
-            except Refused:
-                continue
-            return
+        try:
+            await self._read_bytes(talk, 0x0080, marks[salt % len(marks)])
+        except Refused:
+            await self._read_bytes(talk, 0x0080, marks[(salt + 1) % len(marks)])
+        return len(marks) // 2
 
     async def _read_bytes(self, talk: Talk[Frame], address: int, count: int) -> bytes:
         request = _read_request(self.station, address, count)
