@@ -1,8 +1,8 @@
 """A Zenoh consumer that misses nothing: `python examples/catch_up.py --connect tcp/127.0.0.1:7447`.
 
 It prints every sample of the tags with `history: true` once: `time key value`, in the order of
-time. When a router, the network or a gateway was away, it asks for what it missed by `_time`. Copy
-it, and put your own work where `main` prints.
+time, until Ctrl-C. When a router, the network or a gateway was away, it asks for what it missed by
+`_time`. Copy it, and put your own work where `main` prints.
 
 How it works:
 
@@ -20,6 +20,7 @@ import queue
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from datetime import UTC, datetime, timedelta
 from typing import NamedTuple
 
@@ -198,4 +199,5 @@ def opened(endpoint: str) -> zenoh.Session:
 
 
 if __name__ == "__main__":
-    main()
+    with suppress(KeyboardInterrupt):
+        main()

@@ -4,7 +4,7 @@ import asyncio
 import time
 from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from functools import partial
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 from gateway import __version__
 from gateway.config import Config, DeviceConfig, LineConfig
@@ -12,6 +12,7 @@ from gateway.control import check_command, every_command, speaker
 from gateway.device import Device
 from gateway.errors import Busy, GatewayError, Offline
 from gateway.forecast import LineForecast, forecast
+from gateway.jobs import Poll
 from gateway.line import Line
 from gateway.mirror import Mirror
 from gateway.orders import Obeyed
@@ -23,7 +24,7 @@ from gateway.transport import Ear, Port, SimulatorAddress, open_port, open_simul
 from gateway.values import Value
 
 T = TypeVar("T")
-FRESH_WITHIN = 5.0  # seconds a read-through may take before what is known is answered
+FRESH_WITHIN = 5.0  # seconds a reading may take that somebody waits for
 
 
 def device_of(config: DeviceConfig, line: LineConfig) -> Device:
@@ -60,6 +61,13 @@ def forecasts(config: Config) -> list[LineForecast]:
     ]
 
 
+class _Asker(NamedTuple):
+    """Somebody who waits for a reading later than that of `asked`, by the loop's clock."""
+
+    answer: asyncio.Future[Sample]
+    asked: float
+
+
 class Gateway:
     """Everything below Zenoh: the lines, and what is known of every tag."""
 
@@ -82,7 +90,7 @@ class Gateway:
         self._tags = {tag.key: tag for device in config.devices for tag in device.tags}
         self._places: dict[str, tuple[Line, Device]] = {}
         self._forecasts: dict[str, LineForecast] = {}
-        self._waiting: dict[Tag, list[asyncio.Future[Sample]]] = {}
+        self._waiting: dict[Tag, list[_Asker]] = {}
         for seed, line in enumerate(config.lines):
             self._add_line(line, seed)
         for device in config.devices:
@@ -117,9 +125,8 @@ class Gateway:
         news = self.mirror.update(samples)
         if self._waiting:
             for sample in samples:
-                for waiting in self._waiting.pop(sample.tag, ()):
-                    if not waiting.done():
-                        waiting.set_result(self.mirror[sample.tag])
+                if sample.tag in self._waiting:
+                    self._answer(sample)
         if news:
             self.publish(news)
 
@@ -136,6 +143,10 @@ class Gateway:
 
     def sample(self, tag: Tag) -> Sample:
         return self.mirror[tag]
+
+    def told(self, samples: Sequence[Sample]) -> None:
+        if news := self.mirror.told(samples):
+            self.publish(news)  # as any other: what is published is kept in history too
 
     async def write(self, tag: Tag, value: Value) -> Written:
         """Returns when the device has acknowledged. Raises `GatewayError`, `BadValue` first."""
@@ -164,49 +175,69 @@ class Gateway:
         answer = await outcome
         return Obeyed(answer, self._wall(), loop.time() - started)
 
+    def is_fresh(self, tag: Tag, max_age: float) -> bool:
+        """Whether it was read less than `max_age` seconds ago, or cannot be read now.
+
+        By the clock that nobody sets.
+        """
+        poll = self._poll(tag)
+        if poll is None or not self._places[tag.device][0].is_open:
+            return True
+        if poll.last_good is None or self.mirror[tag].quality is Quality.BAD:
+            return False
+        return asyncio.get_running_loop().time() - poll.last_good < max_age
+
     async def fresh(self, tag: Tag, max_age: float) -> Sample:
-        """A sample at most `max_age` seconds old; simultaneous askers share one exchange.
+        """What is known if that `is_fresh`, or else what is read from now on; simultaneous askers
+        share one exchange.
 
         Bad where the device does not answer. Raises `Busy` when the line did not get to it.
         """
-        known = self.mirror[tag]
-        if tag.device not in self._places:
-            return known
-        if known.quality is Quality.GOOD and self._age(tag) <= max_age:
-            return known
-        line, device = self._places[tag.device]
-        if not line.is_open:
-            return known
-        asked: asyncio.Future[Sample] = asyncio.get_running_loop().create_future()
-        self._waiting.setdefault(tag, []).append(asked)
-        line.refresh(device, tag)
+        poll = self._poll(tag)
+        if poll is None or self.is_fresh(tag, max_age):
+            return self.mirror[tag]
+        asker = _Asker(asyncio.get_running_loop().create_future(), poll.asked)
+        self._waiting.setdefault(tag, []).append(asker)
+        self._hasten(tag)
         try:
             async with asyncio.timeout(FRESH_WITHIN):
-                return await asked
+                return await asker.answer
         except TimeoutError:
             if self.mirror[tag].quality is Quality.BAD:
                 return self.mirror[tag]
             raise Busy(f"{tag.key} could not be read within {FRESH_WITHIN:g} s") from None
         finally:
-            self._forget(tag, asked)
+            self._forget(tag, asker)
 
-    def _forget(self, tag: Tag, asked: "asyncio.Future[Sample]") -> None:
+    def _answer(self, sample: Sample) -> None:
+        """A value whose reading had begun may be older than what made somebody ask: he waits for
+        the next."""
+        tag = sample.tag
+        poll = self._poll(tag)
+        for asker in self._waiting[tag]:
+            if asker.answer.done():
+                continue
+            if sample.quality is Quality.BAD or poll is None or poll.asked > asker.asked:
+                asker.answer.set_result(self.mirror[tag])
+            else:
+                self._hasten(tag)
+
+    def _forget(self, tag: Tag, asker: _Asker) -> None:
         """Of a device that stays silent no sample comes that would."""
-        waiting = self._waiting.get(tag, [])
-        if asked in waiting:
-            waiting.remove(asked)
-            if not waiting:
-                del self._waiting[tag]
+        self._waiting[tag].remove(asker)
+        if not self._waiting[tag]:
+            del self._waiting[tag]
 
-    def _age(self, tag: Tag) -> float:
-        """Seconds since the tag was read, by the clock that nobody sets if it is polled."""
+    def _poll(self, tag: Tag) -> Poll | None:
+        """What reads the tag: nothing where its value comes unasked."""
+        if tag.device not in self._places:
+            return None
         line, device = self._places[tag.device]
-        read = [poll.last_good for poll in line.polls(device) if tag in poll.block.tags]
-        if not read:
-            age = (self._wall() - self.mirror[tag].time) / 1e9
-            return age if age >= 0 else float("inf")
-        now = asyncio.get_running_loop().time()
-        return min((now - at for at in read if at is not None), default=float("inf"))
+        return next((poll for poll in line.polls(device) if tag in poll.block.tags), None)
+
+    def _hasten(self, tag: Tag) -> None:
+        line, device = self._places[tag.device]
+        line.refresh(device, tag)
 
     def status(self) -> Mapping[str, Document]:
         """Documents by path: `status`, `lines/<line>`, `devices/<device>`."""

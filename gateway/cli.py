@@ -118,6 +118,7 @@ def read(
     """The current values, through the running gateway or --direct from the PLC."""
     loaded = load(config)
     wanted = wanted_keys(loaded, tags)
+    complete = True
     if max_age is not None:
         age_of(max_age)  # wrong: said at once, without a gateway
     if without_gateway:
@@ -128,12 +129,13 @@ def read(
         for trouble in dict.fromkeys(f"{s.tag.device}: {s.detail}" for s in samples if s.detail):
             err.print(trouble)
     else:
-        with connected(loaded) as client:
+        with connected(loaded, err.print) as client:
             found = [row for want in wanted for row in client.values(want, max_age)]
             if not found:
                 raise GatewayError(NOTHING)
+            complete = client.complete(wanted, found)
     _print(found, _tags(loaded), as_json=as_json)
-    if not all(show.is_good(row) for row in found):
+    if not (complete and all(show.is_good(row) for row in found)):
         sys.exit(FAILED)
 
 
@@ -163,7 +165,7 @@ def write(
         set_up(LogFormat.TEXT, LogLevel.ERROR)
         answer = direct.told(loaded, known, wanted)
     else:
-        with connected(loaded) as client:
+        with connected(loaded, err.print) as client:
             answer = client.write(tag, wanted)
     if as_json:
         print(json.dumps(answer))
@@ -190,7 +192,7 @@ def control_command(
         set_up(LogFormat.TEXT, LogLevel.ERROR)
         print(asyncio.run(direct.control(loaded, device, command, argument)).answer)
         return
-    with connected(loaded) as client:
+    with connected(loaded, err.print) as client:
         answer = client.control(line_of(loaded, device).name, device, command, argument)
     if "error" in answer:
         _end(show.outcome(device, answer), USER_MISTAKE if answer["error"] in _MISTAKES else FAILED)
@@ -202,8 +204,10 @@ def watch(config: ConfigPath, tags: TagNames = None, as_json: AsJson = False) ->
     """A live table of values; Ctrl-C ends it."""
     loaded = load(config)
     wanted, known = wanted_keys(loaded, tags), _tags(loaded)
-    with connected(loaded) as client, suppress(KeyboardInterrupt):
-        if out.is_terminal and not as_json:
+    live = out.is_terminal and not as_json
+    tell = out.print if live else err.print  # above the table
+    with connected(loaded, tell) as client, suppress(KeyboardInterrupt):
+        if live:
             show.live(out, client.follow(wanted), known)
         else:
             for row in client.follow(wanted):
@@ -214,7 +218,9 @@ def watch(config: ConfigPath, tags: TagNames = None, as_json: AsJson = False) ->
 def scan_command(
     port: Annotated[str, typer.Option(help="/dev/ttyUSB0, COM3, tcp://host:port, rfc2217://...")],
     protocol: Annotated[str, typer.Option(help="vigor, computer-link, modbus-rtu ...")],
-    stations: Annotated[str, typer.Option(help="which to ask: 1-31,40")] = "1-31",
+    stations: Annotated[
+        str | None, typer.Option(help="which to ask: 1-31,40; left out: those up to 31")
+    ] = None,
     baud: Annotated[str | None, typer.Option(help="9600,19200; left out: the likely ones")] = None,
     serial_format: Annotated[
         str | None, typer.Option("--format", help="7E1,8N1; left out: the likely ones")
@@ -255,7 +261,7 @@ def simulate_command(
 @cli.command()
 def health(config: ConfigPath) -> None:
     """Ask the running gateway how it is: exit code 0 when it answers (for containers)."""
-    with connected(load(config)) as client:
+    with connected(load(config), err.print) as client:
         print(json.dumps(client.status()))
 
 

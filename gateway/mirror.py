@@ -18,11 +18,16 @@ class Mirror:
         """`now`: nanoseconds since 1970."""
         self._current = {tag: bad(tag, Reason.STARTING, now) for tag in tags}
         self._published: dict[Tag, Sample] = {}
-        self._unchanged: dict[Tag, Unchanged] = {}  # read again and again since, as they are
+        # Those read again and again since, as they are: each with what knows its time now. Both in
+        # one look-up, so that a thread that looks never takes the one for another's.
+        self._unchanged: dict[Tag, tuple[Sample, Unchanged]] = {}
 
     def __getitem__(self, tag: Tag) -> Sample:
-        sample, unchanged = self._current[tag], self._unchanged.get(tag)
-        return sample if unchanged is None else unchanged.now(sample)
+        known = self._unchanged.get(tag)
+        if known is None:
+            return self._current[tag]
+        sample, unchanged = known
+        return unchanged.now(sample)
 
     def samples(self) -> Iterable[Sample]:
         return map(self.__getitem__, self._current)
@@ -38,9 +43,9 @@ class Mirror:
             tag, value, quality, _, _, _ = sample
             if quality is not good and _same_trouble(current[tag], sample):
                 continue  # it became bad then, not now
+            current[tag] = sample  # first: a thread may look, and must find the one or the other
             if tag in unchanged:
-                unchanged.pop(tag).over = True
-            current[tag] = sample  # last: a thread may look, and must not give it the older time
+                unchanged.pop(tag)[1].over = True
             told = published.get(tag)
             if told is not None and quality is told.quality is good:
                 if told.value == value:
@@ -55,15 +60,29 @@ class Mirror:
                 news.append(sample)
         return news
 
+    def told(self, samples: Iterable[Sample]) -> list[Sample]:
+        """They are published once more, changed or not: a change counts from them. Those come
+        back that are news, their value having moved by less than the deadband."""
+        published = self._published
+        news = []
+        for sample in samples:
+            before = published.get(sample.tag)
+            published[sample.tag] = sample
+            if before is not None and before.value != sample.value:
+                news.append(sample)
+        return news
+
     def _goes_on(self, unchanged: Unchanged) -> bool:
         """Whether these are what is known, so that nothing but their time is new."""
         if unchanged.over:
             return False
-        if self._unchanged.get(unchanged.samples[0].tag) is not unchanged:
+        known = self._unchanged.get(unchanged.samples[0].tag)
+        if known is None or known[1] is not unchanged:
             if not all(self._is_known(sample) for sample in unchanged.samples):
                 unchanged.over = True
                 return False
-            self._unchanged |= {sample.tag: unchanged for sample in unchanged.samples}
+            tags = [sample.tag for sample in unchanged.samples]
+            self._unchanged |= {tag: (self._current[tag], unchanged) for tag in tags}
         return True
 
     def _is_known(self, sample: Sample) -> bool:
@@ -81,8 +100,8 @@ def _worth_telling(told: Sample | None, sample: Sample) -> bool:
     tag = sample.tag
     if tag.publish is Publish.ALWAYS:
         return True
-    if tag.heartbeat is not None and sample.time - told.time >= tag.heartbeat * 1e9:
-        return True
+    if tag.heartbeat is not None and not 0 <= sample.time - told.time < tag.heartbeat * 1e9:
+        return True  # or the clock was set back: nobody knows how long ago that was
     return _changed(tag, told, sample)
 
 

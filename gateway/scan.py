@@ -34,6 +34,8 @@ FORMATS = {
     "modbus-ascii": ("7E1", "8N1", "7O1", "7N2"),
     "modbus-tcp": (),
 }
+# Where a PLC with a port to itself is station 0. In Modbus that is everybody: nobody answers.
+FROM_ZERO = ("vigor", "computer-link")
 # After bytes that made no sense: seconds without one before the next question, and at most.
 QUIET, LONGEST_NOISE = 0.02, 0.5
 Open = Callable[[SerialSettings | None, Ear], Awaitable[Port]]
@@ -92,13 +94,16 @@ def ways(protocol: str, station: int) -> Iterator[tuple[AnyDriver, dict[str, obj
 def planned(
     port: str,
     protocol: str,
-    stations: str = "1-31",
+    stations: str | None = None,
     bauds: str | None = None,
     formats: str | None = None,
     timeout: str = "200ms",
 ) -> Plan:
     """As a person types it. Raises `ConfigError`."""
-    where, numbers = parse_port(port), list(_numbers(stations))
+    where = parse_port(port)
+    if stations is None:
+        stations = "0-31" if protocol in FROM_ZERO else "1-31"
+    numbers = list(dict.fromkeys(_numbers(stations)))
     for number in numbers:
         next(ways(protocol, number))
     if isinstance(where, SimulatorAddress):
@@ -109,7 +114,7 @@ def planned(
         SerialSettings(written.baudrate(baud), written.serial_format(form))
         for form, baud in product(
             formats.split(",") if formats else FORMATS[protocol],
-            map(_number, bauds.split(",")) if bauds else BAUDS,
+            [_number(baud, "9600,19200") for baud in bauds.split(",")] if bauds else BAUDS,
         )
     ]
     if isinstance(where, TcpAddress):
@@ -131,9 +136,9 @@ def _numbers(text: str) -> Iterator[int]:
         yield from range(first, last + 1)
 
 
-def _number(text: str) -> int:
+def _number(text: str, such_as: str = "1-31,40") -> int:
     if not text.strip().isdecimal() or len(text) > 9:
-        raise ConfigError(f"{text!r} is no number: write numbers such as 1-31,40")
+        raise ConfigError(f"{text!r} is no number: write numbers such as {such_as}")
     return int(text)
 
 

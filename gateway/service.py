@@ -4,7 +4,8 @@ import asyncio
 import gc
 import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import AsyncIterator, Callable, Sequence
+from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from typing import Any
 
 import structlog
@@ -57,30 +58,35 @@ async def _serve(config: Config, stop: asyncio.Event, started: Callable[[], None
     if history is not None:
         gateway.publish = _both(history, northbound)
         gateway.documents["history"] = history.document
-        history.start()
-    face = asyncio.create_task(northbound.run(), name="zenoh")
-    on_duty, opened, relieved, stopping = events = [
-        asyncio.create_task(event.wait())
-        for event in (northbound.on_duty, northbound.opened, northbound.relieved, stop)
-    ]
-    lines: list[asyncio.Task[None]] = []
-    try:
-        await _first(on_duty, face, stopping)
-        if on_duty.done():
+    async with AsyncExitStack() as ending:  # what began last ends first
+        if history is not None:
+            ending.push_async_callback(asyncio.to_thread, history.close)
+        face = asyncio.create_task(northbound.run(), name="zenoh")
+        ending.push_async_callback(_ended, [face])
+        sole, on_duty, opened, relieved, stopping = events = [
+            asyncio.create_task(event.wait())
+            for event in (
+                northbound.sole,
+                northbound.on_duty,
+                northbound.opened,
+                northbound.relieved,
+                stop,
+            )
+        ]
+        for event in events:
+            ending.callback(event.cancel)
+        lines: list[asyncio.Task[None]] = []
+        await _first(sole, face, stopping)
+        if sole.done():  # otherwise a gateway that runs already may have this file and these lines
             if history is not None:
-                history.record(list(gateway.mirror.samples()))  # "starting" marks the restart
-            lines = [asyncio.create_task(line.run(), name=line.name) for line in gateway.lines]
+                history.start()
+            await _first(on_duty, face, stopping)
+            if on_duty.done():
+                lines = await _on_the_wire(gateway, history, notebook, ending)
         await _first(opened, face, stopping, relieved)
         if opened.done():
             started()
         await _first(face, stopping, relieved, *lines)
-    finally:
-        for event in events:
-            event.cancel()
-        await _ended(lines)  # the wire first, so that the last outcomes still go out
-        await _ended([face])
-        if history is not None:
-            await asyncio.to_thread(history.close)
     return northbound.relieved.is_set() and not stop.is_set()
 
 
@@ -102,14 +108,36 @@ def _northbound(config: Config, gateway: Gateway, history: Historian | None) -> 
     )
 
 
-async def _keep(notebook: Notebook, gateway: Gateway) -> None:
-    """Write down what was learned, now and then and at the end."""
+async def _on_the_wire(
+    gateway: Gateway, history: Historian | None, notebook: Notebook | None, ending: AsyncExitStack
+) -> list[asyncio.Task[None]]:
+    if history is not None:
+        _record(history, list(gateway.mirror.samples()))  # "starting" marks the restart
+    if notebook is not None:
+        await ending.enter_async_context(_kept(notebook, gateway))
+    lines = [asyncio.create_task(line.run(), name=line.name) for line in gateway.lines]
+    ending.push_async_callback(_ended, lines)  # first of all, so that the last outcomes go out
+    return lines
+
+
+@asynccontextmanager
+async def _kept(notebook: Notebook, gateway: Gateway) -> AsyncIterator[None]:
+    """What is learned meanwhile is written down, now and then and at the end."""
+    over = asyncio.Event()
+    keeping = asyncio.create_task(_keep(notebook, gateway, over), name="state")
     try:
-        while True:
-            await asyncio.sleep(KEEP_EVERY)
-            await asyncio.to_thread(notebook.save, notebook.page(gateway.spoken_to))
+        yield
     finally:
-        notebook.save(notebook.page(gateway.spoken_to))
+        over.set()
+        await keeping
+
+
+async def _keep(notebook: Notebook, gateway: Gateway, over: asyncio.Event) -> None:
+    while not over.is_set():
+        with suppress(TimeoutError):
+            async with asyncio.timeout(KEEP_EVERY):
+                await over.wait()
+        await asyncio.to_thread(notebook.save, notebook.page(gateway.spoken_to))
 
 
 def _history(config: Config) -> Historian | None:
@@ -118,13 +146,19 @@ def _history(config: Config) -> Historian | None:
 
 
 def _both(history: Historian, northbound: Northbound) -> Callable[[Sequence[Sample]], None]:
-    """What is published is kept first, so that whoever misses it can ask for it."""
+    """What is published is kept too, so that whoever misses it can ask for it."""
 
     def publish(news: Sequence[Sample]) -> None:
-        history.record(news)
+        _record(history, news)
         northbound.publish(news)
 
     return publish
+
+
+def _record(history: Historian, samples: Sequence[Sample]) -> None:
+    """In a step of the loop's own, before it takes any question that comes from now on: what goes
+    wrong there holds up neither line nor Zenoh."""
+    asyncio.get_running_loop().call_soon(history.record, samples)
 
 
 async def _ended(tasks: Sequence[asyncio.Task[None]]) -> None:

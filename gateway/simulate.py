@@ -22,6 +22,8 @@ async def serve(
     A line with a `tcp://` port is served on that port of this machine, others on a pty, or all
     on TCP from `tcp` (HOST:PORT) upwards. Raises `ConfigError`, `LineDown`.
     """
+    if links is not None and not links.is_dir():
+        raise ConfigError(f"--links {links}: there is no such folder: make it first")
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):

@@ -35,6 +35,8 @@ _KNOWN = frozenset(
         "minimum",
         "maximum",
         "minProperties",
+        "propertyNames",
+        "not",
     ]
 )
 _ANNOTATIONS = frozenset({"title", "description", "default", "examples"})
@@ -69,6 +71,9 @@ class _Check:
             yield at
         if len(value) < rule.get("minProperties", 0):
             yield at
+        for name in value:
+            if list(self.broken(name, rule.get("propertyNames", {}), at)):
+                yield f"{at}/{name}"
         extra = rule.get("additionalProperties", {})
         for name, inner in value.items():
             inner_rule = rule.get("properties", {}).get(name, extra)
@@ -81,6 +86,8 @@ class _Check:
         for choice in ("anyOf", "oneOf"):
             if choice in rule and all(list(self.broken(value, r, at)) for r in rule[choice]):
                 yield at
+        if "not" in rule and not list(self.broken(value, rule["not"], at)):
+            yield at
         for part in rule.get("allOf", ()):
             yield from self.broken(value, part, at)
         if "if" in rule and not list(self.broken(value, rule["if"], at)):

@@ -4,17 +4,22 @@ import asyncio
 import time
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from gateway.app import Gateway, forecasts
+from gateway.app import FRESH_WITHIN, Gateway, forecasts
 from gateway.config import load
 from gateway.errors import BadValue, LineDown, Offline
 from gateway.northbound import Mode, zenoh_settings
-from gateway.tags import Quality, Reason, Sample
+from gateway.stations.vigor import VigorStation
+from gateway.tags import Quality, Reason, Sample, Tag, good
+from gateway.transport import Ear
 from tests.e2e.processes import vigor_line, write_config
+from tests.sim.bench import WIRE, Bench, Unruly
+from tests.sim.virtual import on_virtual_time
 
 TAGS = {
     "speed": {"address": "D10"},
@@ -158,6 +163,134 @@ async def test_a_fresh_value_of_a_line_that_is_not_open_is_what_is_known(tmp_pat
     watched = made(tmp_path)
     sample = await watched.gateway.fresh(tag(watched, "speed"), 0.0)
     assert (sample.value, sample.quality) == (None, Quality.BAD)
+
+
+@asynccontextmanager
+async def slow_line(
+    folder: Path, every: str = "1s"
+) -> AsyncIterator[tuple[Watched, Unruly, Bench]]:
+    """One station that looks at its memory at once and takes 0.4 s to answer."""
+    lines = {"hall": vigor_line("simulator", {"speed": {"address": "D10"}}, reply_timeout="2s")}
+    path = write_config(folder / "c.yaml", "tcp/127.0.0.1:7447", lines, defaults={"every": every})
+    station, bench = Unruly(VigorStation(1), late=lambda _: 0.4), Bench()
+    opened = partial(bench.open, [station], WIRE)
+    async with running(Watched(Gateway(load(path), open_line=lambda _: opened))) as watched:
+        await watched.until_good("mixer/speed")
+        yield watched, station, bench
+
+
+async def asked(station: Unruly) -> None:
+    """Until the next question has arrived there, which is answered by what it held then."""
+    before = len(station.heard)
+    while len(station.heard) == before:
+        await asyncio.sleep(0.001)
+
+
+@pytest.mark.parametrize("max_age", [0.0, 0.1])
+@on_virtual_time
+async def test_a_reading_that_had_begun_before_the_question_is_no_answer(
+    tmp_path: Path, max_age: float
+) -> None:
+    async with slow_line(tmp_path) as (watched, station, _):
+        await asked(station)
+        station.memory.write("D", 10, [4711])
+        fresh = await watched.gateway.fresh(tag(watched, "speed"), max_age)
+        assert fresh.value == 4711
+
+
+@on_virtual_time
+async def test_a_value_that_came_this_moment_is_not_younger_than_0_s(tmp_path: Path) -> None:
+    async with slow_line(tmp_path, every="1h") as (watched, station, _):
+        for value in (1, 2, 3):
+            station.memory.write("D", 10, [value])
+            assert (await watched.gateway.fresh(tag(watched, "speed"), 0.0)).value == value
+
+
+@on_virtual_time
+async def test_who_waits_for_a_reading_hears_at_once_that_there_will_be_none(
+    tmp_path: Path,
+) -> None:
+    async with slow_line(tmp_path) as (watched, station, bench):
+        await asked(station)
+        asking = asyncio.create_task(watched.gateway.fresh(tag(watched, "speed"), 0.0))
+        await asyncio.sleep(0)
+        bench.vanish()
+        since = asyncio.get_running_loop().time()
+        assert (await asking).reason is Reason.LINE_DOWN
+        assert asyncio.get_running_loop().time() - since < FRESH_WITHIN / 2
+
+
+@on_virtual_time
+async def test_where_the_clock_does_not_tell_which_reading_it_was_another_follows(
+    tmp_path: Path,
+) -> None:
+    """Clocks with ticks of 15 ms are about."""
+    watched = made(tmp_path)
+    gateway, speed, hastened = watched.gateway, tag(watched, "speed"), list[Tag]()
+    [line] = gateway.lines
+    [poll] = [p for p in line.polls(line.devices[0]) if speed in p.block.tags]
+    line.is_open = True
+    line.refresh = lambda _, tag: hastened.append(tag)  # type: ignore[method-assign]
+    poll.asked = 7.0
+    asking = asyncio.create_task(gateway.fresh(speed, 0.0))
+    await asyncio.sleep(0)
+    assert hastened == [speed]
+    gateway.samples([good(speed, 1, time.time_ns())])
+    assert hastened == [speed, speed]
+    poll.asked = 7.015
+    gateway.samples([good(speed, 2, time.time_ns())])
+    assert (await asking).value == 2
+
+
+@on_virtual_time
+async def test_what_comes_unasked_is_answered_as_it_is_known_at_once(tmp_path: Path) -> None:
+    reader = {
+        "protocol": "frames",
+        "framing": {"header": "<STX>", "terminator": "<ETX>"},
+        "listen": {"scan": {"match": "(?P<code>[0-9]+)", "fields": {"code": {"type": "text"}}}},
+        "tags": {"code": {"address": "code", "event": True}},
+    }
+    lines = {"door": {"port": "COM1", "devices": {"reader": reader}}}
+    path = write_config(tmp_path / "c.yaml", "tcp/127.0.0.1:7447", lines)
+    ears: list[Ear] = []
+
+    class Mute:
+        async def close(self) -> None:
+            pass
+
+    async def opened(ear: Ear) -> Any:
+        ears.append(ear)
+        return Mute()
+
+    async with running(Watched(Gateway(load(path), open_line=lambda _: opened))) as watched:
+        await asyncio.sleep(1)
+        gateway, since = watched.gateway, asyncio.get_running_loop().time()
+        code = gateway.tag("reader/code")
+        assert code is not None
+        assert (await gateway.fresh(code, 0.0)).reason is Reason.STARTING
+        ears[0].received(b"\x024006381333931\x03")
+        for max_age in (0.0, 60.0):
+            assert (await gateway.fresh(code, max_age)).value == "4006381333931"
+        assert asyncio.get_running_loop().time() == since
+
+
+def test_what_moved_within_its_deadband_and_is_published_again_is_news_to_all(
+    tmp_path: Path,
+) -> None:
+    """History too, which would be farther off than the deadband from then on."""
+    lines = {"hall": vigor_line("simulator", {"level": {"address": "D10", "deadband": 5}})}
+    path = write_config(tmp_path / "c.yaml", "tcp/127.0.0.1:7447", lines)
+    watched = Watched(Gateway(load(path)))
+    gateway, level = watched.gateway, tag(watched, "level")
+    told = watched.told
+    for value in (100, 104):
+        gateway.samples([good(level, value, time.time_ns())])
+    assert [sample.value for sample in told] == [100]
+    for _ in range(2):
+        gateway.told([gateway.sample(level)])
+    assert [sample.value for sample in told] == [100, 104]
+    gateway.samples([good(level, 96, time.time_ns())])
+    assert [sample.value for sample in told] == [100, 104, 96]
 
 
 def test_zenoh_gets_the_files_settings(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import signal
 import sys
 import time
 from collections.abc import AsyncIterator
@@ -15,7 +16,9 @@ from gateway.northbound import Mode, Northbound, ZenohSettings
 from gateway.orders import Obeyed
 from gateway.payload import Failure, Problem, WriteOutcome
 from gateway.tags import Reason, Written, bad, good
+from tests.e2e.processes import Program
 from tests.history_writer import WEEK, until
+from tests.test_docs import bare, table
 from tests.test_northbound import PlainDevice, PlainPlant, tag
 from tests.zenoh_peer import ZenohPeer, free_endpoint
 
@@ -97,6 +100,35 @@ async def test_history_is_answered_by_zenohs_time_ranges(tmp_path: Path) -> None
         for wrong in ("[now(-1h);30m]", "yesterday", "[..]&limit=-1", "[..]&limit=many"):
             [reply] = await client.get(speed + wrong.replace("&", ";"))
             assert reply.json["error"] == "bad-query", wrong
+
+
+async def test_the_questions_that_the_page_shows_are_answered(tmp_path: Path) -> None:
+    endpoint, now, ever = free_endpoint(), time.time_ns(), 2**63
+    minute, noon = 60 * SECOND, PAST - 86400 * SECOND  # 2026-11-20T12:00:00Z
+    shown = noon + 123_456_000
+    first_and_last = {
+        "[now(-1h)..]": (now - 60 * minute, ever),
+        "[2026-11-20T12:00:00Z..2026-11-20T13:00:00Z[": (noon, noon + 60 * minute - 1),
+        "[now(-10m)..now(-5m)]": (now - 10 * minute, now - 5 * minute),
+        "]2026-11-20T12:00:00.123456Z..];limit=1000": (shown + 1, ever),
+        "[..]": (0, ever),
+    }
+    selectors = [bare(row[0]) for row in table("history.md", "Asking", "selector")]
+    kept = {noon - minute: 1, shown: 2, shown + 1000: 3, now - 7 * minute: 4, now - minute: 5}
+    async with (
+        recording(tmp_path / "h.db") as historian,
+        serving(plant(), historian, endpoint, listen=True),
+        ZenohPeer("client", connect=[endpoint]) as client,
+    ):
+        historian.record(good(SPEED, value, at) for at, value in kept.items())
+        answers = {selector: await client.get(selector) for selector in selectors}
+    assert {
+        selector.partition("_time=")[2]: [reply.json.get("value") for reply in replies]
+        for selector, replies in answers.items()
+    } == {
+        asked: [kept[at] for at in sorted(kept) if first <= at <= last]
+        for asked, (first, last) in first_and_last.items()
+    }
 
 
 async def test_what_became_of_writes_and_commands_is_asked_back_by_time(tmp_path: Path) -> None:
@@ -225,6 +257,24 @@ def nothing_lost_and_nothing_twice(lines: list[str]) -> None:
     speeds = [line.split() for line in lines if "plant/mixer/speed" in line]
     assert [int(words[2]) for words in speeds] == list(range(1, len(speeds) + 1))
     assert not any("late" in words for words in speeds)
+
+
+async def test_ctrl_c_ends_the_consumer_without_a_word(tmp_path: Path) -> None:
+    endpoint = free_endpoint()
+    command = (sys.executable, EXAMPLE, "--connect", endpoint)
+    with Program(*command) as waiting:
+        waiting.says("waiting for")
+        assert waiting.end(signal.SIGINT) == 0
+        assert not waiting.has_said("Traceback")
+    async with (
+        polling(tmp_path / "h.db") as poll,
+        ZenohPeer(Mode.ROUTER, listen=[endpoint]),
+        poll.on_air(endpoint),
+    ):
+        with Program(*command, "--since", MIDNIGHT) as consumer:
+            await asyncio.to_thread(consumer.says, "speed 1")
+            assert await asyncio.to_thread(consumer.end, signal.SIGINT) == 0
+            assert not consumer.has_said("Traceback")
 
 
 async def test_a_consumer_loses_nothing_when_its_router_is_killed(tmp_path: Path) -> None:

@@ -16,7 +16,9 @@ import pytest
 
 from gateway import __version__
 from gateway.cli import main
-from gateway.config import schema
+from gateway.client import connected
+from gateway.config import load, schema
+from gateway.errors import GatewayError
 from tests.e2e.processes import (
     PATIENCE,
     Done,
@@ -44,6 +46,7 @@ TAGS = {
     "run": {"address": "Y20", "write": True},
     "valve": {"address": "D7.3", "write": True},
     "name": {"address": "D600", "type": "string[128]", "every": "5s", "write": True},
+    "level": {"address": "D700", "type": "float32", "write": True},
 }
 Command = Callable[..., Done]
 
@@ -181,7 +184,7 @@ def test_check_prints_the_plan(command: Command, config: Path) -> None:
     assert "worst write latency" in done.out
     rows = [line.split() for line in done.out.splitlines() if line.startswith("  mixer")]
     assert "Y20" in [row[1] for row in rows]
-    assert f"{config}: good, 6 tags on 1 line" in done.out
+    assert f"{config}: good, 7 tags on 1 line" in done.out
     assert "writing mixer/valve (D7.3) reads the word" in done.err
     assert "warning" not in done.err
 
@@ -311,6 +314,7 @@ def test_read_as_json_is_one_document_a_line(running: Path) -> None:
         ("mixer/trim", "-3", "-3", "acknowledged and read back"),
         ("mixer/offset", "-12.5", "-12.5", "acknowledged by the PLC"),
         ("mixer/run", "true", "true", "acknowledged by the PLC"),
+        ("mixer/level", str(10**20), "1.0000000200408773e+20", "acknowledged by the PLC"),
         ("mixer/name", "[bold]12[/bold]", "[bold]12[/bold]", "acknowledged by the PLC"),
         ("mixer/name", "12", "12", "acknowledged by the PLC"),
         ("mixer/name", '"a b"', "a b", "acknowledged by the PLC"),
@@ -399,20 +403,61 @@ def test_watch_never_shows_the_values_of_a_gone_gateway_as_good(tmp_path: Path) 
                 watch.says('"quality": "good"', after=seen)
 
 
-def test_a_write_the_running_gateway_does_not_know_ends_with_2(
-    running: Path, tmp_path: Path
-) -> None:
-    """The file was changed, the gateway not restarted."""
-    newer = json.loads(running.read_text())
-    newer["lines"]["hall"]["devices"]["mixer"]["tags"]["new"] = {"address": "D900", "write": True}
+def test_watch_sees_a_device_change_that_puts_only_blocks(tmp_path: Path) -> None:
+    lines = {"hall": vigor_line("simulator", {"speed": {"address": "D10"}}, blocks="only")}
+    path = write_config(tmp_path / "config.yaml", free_endpoint(), lines)
+    with started(path) as program:
+        program.says("device answers")
+        with gateway("watch", path, "--json") as watch:
+            _says_another(watch, json.loads(watch.says('"quality": "good"'))["value"])
+
+
+@pytest.fixture
+def newer(running: Path, tmp_path: Path) -> Path:
+    """The file was changed, the gateway not restarted: it does not know `mixer/new`."""
+    document = json.loads(running.read_text())
+    mixer = document["lines"]["hall"]["devices"]["mixer"]
+    mixer["tags"]["new"] = {"address": "D900", "write": True}
     path = tmp_path / "newer.yaml"
-    path.write_text(json.dumps(newer))
-    done = plc_gateway("write", path, "mixer/new", "1")
+    path.write_text(json.dumps(document))
+    return path
+
+
+def test_a_write_the_running_gateway_does_not_know_ends_with_2(newer: Path) -> None:
+    done = plc_gateway("write", newer, "mixer/new", "1")
     assert (done.code, done.out) == (2, "")
     assert done.err.startswith("mixer/new: unknown-tag: there is no tag at plant/mixer/new")
-    done = plc_gateway("read", path, "mixer/new")
+    done = plc_gateway("read", newer, "mixer/new")
     assert done.code == 1
     assert "nothing was answered: is the gateway of this file running?" in done.err
+
+
+@pytest.mark.parametrize("tags", [[], ["mixer"], ["mixer/run", "mixer/new"]])
+def test_read_names_what_nobody_answered_and_ends_with_1(newer: Path, tags: list[str]) -> None:
+    done = plc_gateway("read", newer, *tags, "--json")
+    assert done.code == 1
+    assert "mixer/run" in [row["tag"] for row in documents(done.out)]
+    assert done.err == (
+        "nothing was answered for mixer/new: does the gateway run with this file as it is now?\n"
+    )
+
+
+def test_a_frozen_gateway_is_not_sent_what_it_would_write_when_nobody_waits(
+    tmp_path: Path,
+) -> None:
+    lines = {"hall": vigor_line("simulator", TAGS)}
+    path = write_config(tmp_path / "config.yaml", free_endpoint(), lines)
+    with started(path) as program:
+        program.says("device answers")
+        assert plc_gateway("write", path, "mixer/trim", "1").code == 0
+        with connected(load(path), print) as client:
+            os.kill(program.pid, signal.SIGSTOP)
+            with pytest.raises(GatewayError, match="nothing was sent"):
+                client.write("mixer/trim", 2)
+        os.kill(program.pid, signal.SIGCONT)
+        while (read := plc_gateway("read", path, "mixer/trim", "--json", "--max-age", "0s")).code:
+            pass  # it goes on
+        assert [row["value"] for row in documents(read.out)] == [1]
 
 
 def _says_another(watch: Program, value: object) -> None:
@@ -534,7 +579,7 @@ def test_direct_does_not_wait_for_what_nobody_can_read(tmp_path: Path) -> None:
     [
         ("--tcp", "4001", 2, "--tcp 4001: write it as 127.0.0.1:4001"),
         ("--tcp", "127.0.0.1:99999", 2, "write it as 127.0.0.1:4001"),
-        ("--links", "/no/such/folder", 1, "/no/such/folder/hall: "),
+        ("--links", "/no/such/folder", 2, "--links /no/such/folder: there is no such folder"),
     ],
 )
 def test_simulate_refuses_a_bad_place(

@@ -136,16 +136,68 @@ UNREADABLE = [
         "each with a colon",
     ),
     bad("tab", "lines:\n\thall:\n", "2: a tab: YAML is indented with spaces"),
+    bad("tab after a dash", "zenoh:\n  -\ta: 3\n", "2: a tab: YAML is indented with spaces"),
     bad(
         "open bracket",
         "zenoh:\n  listen: [tcp/a:1\nlines: 3\n",
         "3: no YAML: while parsing a flow sequence that begins in line 2, "
-        "did not find expected ',' or ']'",
+        "did not find expected ',' or ']': check commas and brackets, "
+        "and put a text with one of , : [ ] { } # in it in quotes",
     ),
     bad(
         "two colons",
         "gateway:\n  name: a: b\n",
-        "2: no YAML: mapping values are not allowed in this context",
+        "2: no YAML: mapping values are not allowed in this context: check indentation and "
+        "colons of this line and the one before, and put a text with `: ` in it in quotes",
+    ),
+    bad(
+        "indented too far",
+        tags("a: {address: D1}", "  b: {address: D2}"),
+        "9: no YAML: while parsing a block mapping that begins in line 8, "
+        "did not find expected key: check the indentation of this line and the one before",
+    ),
+    bad(
+        "colon left out",
+        tags("a: {address: D1}", "b", "c: {address: D3}"),
+        "10: no YAML: while scanning a simple key that begins in line 9, could not find "
+        "expected ':': check indentation and colons of this line and the one before",
+    ),
+    bad(
+        "percent without quotes",
+        tags("a: {address: D1, unit: %}"),
+        "8: no YAML: while scanning for the next token, found character that cannot start any "
+        "token: put a text that begins with one of % @ ` & * ! | > in quotes",
+    ),
+    bad(
+        "bracket without quotes",
+        tags("a: {address: D1, type: string[16]}"),
+        "8: no YAML: while parsing a flow mapping, did not find expected ',' or '}': check "
+        "commas and brackets, and put a text with one of , : [ ] { } # in it in quotes",
+    ),
+    bad(
+        "quote left open",
+        tags("a: {address: D1, unit: 'rpm}"),
+        "9: no YAML: while scanning a quoted scalar that begins in line 8, "
+        "found unexpected end of stream: close the quote",
+    ),
+    bad(
+        "backslash in double quotes",
+        tags('a: {address: D1, description: "C:\\plant"}'),
+        "8: no YAML: while parsing a quoted scalar, found unknown escape character: "
+        "in double quotes a backslash begins an escape: use single quotes",
+    ),
+    *(
+        bad(
+            f"{what} without end",
+            begin + more * 50_000,
+            "2: more than 50 levels deep: look for a bracket or a dash too many",
+        )
+        for what, begin, more in (
+            ("brackets", "zenoh: {}\nlines: ", "["),
+            ("braces", "zenoh: {}\nlines: ", "{a: "),
+            ("dashes", "lines:\n  ", "- "),
+            ("questions", "lines:\n  ", "? "),
+        )
     ),
     bad("not UTF-8", b"gateway:\n  name: M\xfcller\n", "2: byte 0xfc is no UTF-8: "
         "save the file as UTF-8"),
@@ -211,8 +263,15 @@ SECTIONS = [
     ),
     bad(
         "history without its section",
-        tags("speed: {address: D1, history: true}"),
-        "1: tag mixer/speed has `history: true`, but the file has no `history:` section",
+        tags("speed: {address: D1}", "level: {address: D2, history: true}"),
+        f"9: {M}.tags.level.history: the file has no `history:` section: "
+        "write `history: {path: history.db}` beside `lines:`",
+    ),
+    bad(
+        "history by default without its section",
+        "defaults: {history: true}\n" + tags("speed: {address: D1}", "level: {address: D2}"),
+        f"9: {M}.tags.speed.history: the file has no `history:` section: "
+        "write `history: {path: history.db}` beside `lines:`",
     ),
     bad(
         "web address",
@@ -466,6 +525,17 @@ TAGS = [
         f"8: {M}.tags.a.word_order: C200 has 32 bits by nature: it needs no word_order",
     ),
     bad(
+        "order of what has none",
+        tags("a: {address: M1, word_order: low_first}", "b: {address: D1.3, byte_order: low_first}",
+             "c: {address: D1, word_order: high_first}",
+             'd: {address: D1, type: "string[4]", word_order: high_first}'),
+        f"8: {M}.tags.a.word_order: M1 is bool: only numbers of 32 or 64 bits have a word_order",
+        f"9: {M}.tags.b.byte_order: D1.3 is bool: only words have a byte_order",
+        f"10: {M}.tags.c.word_order: D1 is int16: only numbers of 32 or 64 bits have a word_order",
+        f"11: {M}.tags.d.word_order: D1 is string[4]: only numbers of 32 or 64 bits have a "
+        "word_order",
+    ),
+    bad(
         "numbers beyond all measure",
         tags(f"a: {{address: D1, every: {10**299}}}", f"b: {{address: D1, scale: 0x{'f' * 300}}}",
              f"c: {{address: D1, scale: {'9' * 5000}}}"),
@@ -601,6 +671,19 @@ TAGS = [
         f"9: {M}.tags.a.evry: no setting of a tag: did you mean every?",
         f"9: {M}.tags.a.address: X8: X and Y are numbered in octal, 8 and 9 do not exist",
         f"10: {M}.tags.b.type: M1 is a bit: it can only be bool",
+    ),
+    bad(
+        "a merge of no settings",
+        tags("<<: 5", "a: &a {address: D1}", "b: {<<: [*a, 3]}", "c: {<<: , address: D2}"),
+        f"7: {M}.tags: the `<<` in line 8 brings in no settings: write it as `<<: *name`",
+        f"10: {M}.tags.b: the `<<` in line 10 brings in no settings: write it as `<<: *name`",
+        f"11: {M}.tags.c: the `<<` in line 11 brings in no settings: write it as `<<: *name`",
+    ),
+    bad(
+        "two merges in one mapping",
+        tags("a: &a {address: D1}", "b: &b {address: D2}", "c:", "  <<: *a", "  <<: *b"),
+        f"10: {M}.tags.c: `<<` is written twice, in lines 11 and 12: "
+        "write one, `<<: [*first, *second]`",
     ),
     bad(
         "a mistake in what an anchor brings",
@@ -1036,6 +1119,92 @@ def test_the_schema_finds_what_an_editor_can_find(case: str, where: str, tmp_pat
     assert where in violations(plain(plant), schema())
 
 
+def _station(protocol: str, number: int) -> str:
+    return on_line(f"port: tcp://a:1\ndevices: {{m: {{protocol: {protocol}, station: {number}}}}}")
+
+
+def _port(text: str) -> str:
+    return on_line(f"port: {text}\ndevices: {{m: {{protocol: vigor}}}}")
+
+
+def _zenoh(setting: str) -> str:
+    return f"zenoh: {{{setting}}}\n" + tags("a: {address: D1}")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        *(tags(f"a: {{address: D1, {setting}}}") for setting in (
+            "scale: 0", "scale: 0.0", "every: 0s", "every: 0.0ms", "heartbeat: 0min",
+            'type: "string[0]"', 'type: "string[251]"', 'type: "string[00]"',
+        )),
+        *(_station(*station) for station in (
+            ("vigor", -1), ("vigor", 256), ("computer-link", 32), ("modbus-rtu", 248),
+            ("modbus-ascii", 248), ("modbus-tcp", 256), ("modbus-tcp", 999),
+        )),
+        *(_port(f"COM3\nbaudrate: {rate}") for rate in (0, -9600, 9601)),
+        *(_port(port) for port in (
+            "tcp://", "tcp://10.0.0.7", "'tcp://10.0.0.7:'", "rfc2217://a", "http://a:1", "4001",
+            "10.0.0.7:4001", "udp://a:1", '" COM3"', '""',
+        )),
+        *(_zenoh(setting) for setting in (
+            "listen: [127.0.0.1:7447]", "connect: [tcp]", 'listen: [""]', "prefix: plant/**",
+            'prefix: "@plant"', "prefix: plant/", "prefix: a//b", 'prefix: ""', "user: 5",
+        )),
+        "gateway: {name: my gateway}\n" + tags("a: {address: D1}"),
+        "gateway: {standby: 5}\n" + tags("a: {address: D1}"),
+        "gateway: {standby: a/b}\n" + tags("a: {address: D1}"),
+        "web: {listen: 127.0.0.1}\n" + tags("a: {address: D1}"),
+        *(on_line(f"port: COM3\ndevices: {{{name}: {{protocol: vigor}}}}") for name in (
+            '"a b"', "a/b", '"@a"', '"a*"', '""',
+        )),
+        "lines: {a/b: {port: COM3, devices: {m: {protocol: vigor}}}}\n",
+        *(tags(f"{name}: {{address: D1}}") for name in (
+            '"a b"', "a//b", "/a", "a/", '"@set"', '"a$"', '"a?"', '"a#b"', '""',
+        )),
+    ],
+)  # fmt: skip
+def test_what_the_program_refuses_an_editor_shows(
+    text: str, file: Callable[[str | bytes], Config], tmp_path: Path
+) -> None:
+    with pytest.raises(ConfigErrors):
+        file(text)
+    assert violations(plain(tmp_path / "plant.yaml"), schema())
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        *(tags(f"a: {{address: D1, {setting}}}") for setting in (
+            "unit: true", "unit: 1", "description: 3.5", "every: 0.5s", "every: 10ms",
+            "every: 1 h", "scale: -0.5", 'type: "string[1]"', 'type: "string[128]"',
+            'type: "string[016]"', "unit: °C",
+        )),
+        *(_station(*station) for station in (
+            ("vigor", 0), ("vigor", 255), ("computer-link", 31), ("modbus-rtu", 0),
+            ("modbus-rtu", 247), ("modbus-tcp", 255),
+        )),
+        *(_port(port) for port in (
+            "COM3", "/dev/serial/by-path/pci-0000:00:14.0-usb-0:2:1.0-port0", "/dev/my port",
+            "tcp://10.0.0.7:4001", "tcp://[fe80::1]:502", "rfc2217://ds-1.plant:4001",
+            "simulator", "COM3\nbaudrate: 115200",
+        )),
+        *(_zenoh(setting) for setting in (
+            "listen: [tcp/127.0.0.1:7447, 'tls/[::]:7447#a=b']", "prefix: plant/site-1",
+            "prefix: 7", "prefix: ไฟ/été", "user: gateway", "user: null",
+        )),
+        "gateway: {name: 7, standby: hall}\n" + tags("a: {address: D1}"),
+        "web: {listen: '[::1]:8080'}\n" + tags("a: {address: D1}"),
+        tags("температура: {address: D1}", "mühle/1.a-b_c: {address: D2}", "ไฟ: {address: M1}"),
+    ],
+)  # fmt: skip
+def test_what_the_program_takes_an_editor_does_not_call_wrong(
+    text: str, file: Callable[[str | bytes], Config], tmp_path: Path
+) -> None:
+    assert file(text).lines
+    assert violations(as_editors_see_it(tmp_path / "plant.yaml"), schema()) == []
+
+
 def test_the_schema_offers_the_settings_of_each_protocol_alone() -> None:
     shapes = schema()["$defs"]
     assert {"protocol", "station", "tags", "retries"} <= shapes["vigor"]["properties"].keys()
@@ -1043,6 +1212,11 @@ def test_the_schema_offers_the_settings_of_each_protocol_alone() -> None:
     assert shapes["computer-link"]["properties"]["frame_format"]["enum"] == [1, 4]
     assert "ms" in shapes["computer-link"]["properties"]["message_wait"]["pattern"]
     assert "_dialogue" not in shapes["modbus-rtu"]["properties"]
+
+
+def as_editors_see_it(path: Path) -> Any:
+    """`unit: true` is no text to them."""
+    return read_yaml(path, frozenset())[0].data
 
 
 def plain(path: Path) -> Any:

@@ -1,6 +1,7 @@
 """What README.md and docs/ say is so: files load, programs run, commands, keys and links exist."""
 
 import ast
+import dataclasses
 import json
 import re
 import shlex
@@ -18,13 +19,25 @@ import yaml
 import zenoh
 
 from gateway import cli, payload
-from gateway.config import ConfigErrors, load, schema
+from gateway.config import (
+    Config,
+    ConfigErrors,
+    DeviceConfig,
+    HistoryConfig,
+    LineConfig,
+    ZenohConfig,
+    load,
+    schema,
+)
 from gateway.config.validate import DRIVERS
 from gateway.config.yaml_file import read_yaml
 from gateway.control import TO_ALL, every_command
+from gateway.history import Historian
 from gateway.keys import Keys
+from gateway.northbound import StandbySettings
+from gateway.northbound.duty import Duty
 from gateway.payload import Problem
-from gateway.tags import Reason, Written
+from gateway.tags import Reason, Written, bad, good
 from tests.e2e.processes import ROOT, Program, plc_gateway, started, until
 from tests.zenoh_peer import free_endpoint
 
@@ -236,7 +249,7 @@ def _plant(section: str, name: str, text: str) -> dict[str, Any]:
         case "A device":
             device |= setting
         case "A tag":
-            tag |= setting
+            tag |= setting | ({"type": "float32"} if name == "word_order" else {})
             if name == "history":
                 top = {"history": {}}
         case "write":
@@ -271,7 +284,8 @@ DEFAULTS = [
 
 def test_most_defaults_are_checked() -> None:
     assert len(DEFAULTS) >= 35
-    assert {section for section, _, _ in DEFAULTS} >= set(SECTIONS)
+    # What a line leaves out is as its protocol is used to, or found out.
+    assert {section for section, _, _ in DEFAULTS} >= set(SECTIONS) - {"A line"}
 
 
 @pytest.mark.parametrize(("section", "name", "default"), DEFAULTS)
@@ -340,6 +354,20 @@ def test_what_the_page_calls_refused_is_refused_in_these_words(
 def test_the_schema_beside_the_example_is_the_gateways() -> None:
     """`make schema` writes it."""
     assert json.loads((ROOT / "config.schema.json").read_text("utf-8")) == schema()
+
+
+def test_what_the_page_calls_without_effect_is_what_nothing_follows_from() -> None:
+    section = CONFIGURATION.partition("## Not in effect yet")[2]
+    files = [path for path in (ROOT / "gateway").rglob("*.py") if path.parent.name != "config"]
+    code = "".join(path.read_text("utf-8") for path in files)
+    parts = (Config, LineConfig, DeviceConfig, ZenohConfig, HistoryConfig)
+    unused = {
+        field.name
+        for part in parts
+        for field in dataclasses.fields(part)
+        if not re.search(rf"\.{field.name}\b", code)
+    }
+    assert unused == set(re.findall(r"`(\w+)`", section))
 
 
 # ---- commands ----------------------------------------------------------------------------------
@@ -546,6 +574,21 @@ def test_the_answer_to_a_write_has_the_fields_of_the_page() -> None:
     assert set(names("zenoh.md", "A write", "in the answer")) == set(answer)
 
 
+def test_a_value_has_the_fields_of_the_page() -> None:
+    tag = load(EXAMPLE).devices[0].tags[0]
+    [shown] = [block for block in _blocks("zenoh.md") if block.language == "json"]
+    known = [good(tag, 12.5, 0), bad(tag, Reason.NO_REPLY, 0, "No byte came back")]
+    assert [list(json.loads(line)) for line in shown.text.splitlines()] == [
+        list(json.loads(payload.value(sample))) for sample in known
+    ]
+
+
+def test_a_description_has_the_fields_of_the_page() -> None:
+    tag = load(EXAMPLE).devices[0].tags[0]
+    sentence = TEXT["zenoh.md"].partition("A description holds ")[2].partition(": `null`")[0]
+    assert set(re.findall(r"`(\w+)`", sentence)) == set(json.loads(payload.meta(tag)))
+
+
 def test_the_status_documents_have_the_fields_of_the_page(endpoint: str, tmp_path: Path) -> None:
     program = next(block for block, _ in SNIPPETS if "devices/*" in block.text).text
     head = program.partition("with zenoh.open")[0].replace(ENDPOINT, endpoint)
@@ -554,12 +597,19 @@ def test_the_status_documents_have_the_fields_of_the_page(endpoint: str, tmp_pat
     with Program(sys.executable, path) as asking:
         assert asking.ended() == 0
         found = dict(line.split(maxsplit=1) for line in asking.lines)
+    known: dict[str, Any] = {"history": Historian(tmp_path / "history.db", 1, 10**8).document()}
+    known |= Duty(StandbySettings("hall"), Keys("plant", "demo"), zenoh.Config()).documents()
+    for key, text in found.items():
+        path_there = re.sub(r"/.*", "/", key.removeprefix("plant/@gateway/demo/"))
+        known[path_there] = json.loads(text)
     rows = table("zenoh.md", "State and statistics", "document")
-    assert len(rows) == 4
-    for document, fields in rows:
-        path_like = bare(document).partition("<")[0]
-        [text] = [text for key, text in found.items() if f"/demo/{path_like}" in key][:1]
-        assert set(re.findall(r"`(\w+)`", fields)) <= set(json.loads(text))
+    on_page = {
+        bare(document).partition("<")[0]: set(
+            re.findall(r"`(\w+)`", re.sub(r"\(.*?\)|with .* in the file", "", fields))
+        )
+        for document, fields in rows
+    }
+    assert on_page == {path: set(document) for path, document in known.items()}
 
 
 _DOCUMENTS = """\

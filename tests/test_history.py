@@ -1,5 +1,6 @@
 """History: nothing recorded is lost but what the rules say, whatever the disk does."""
 
+import errno
 import json
 import math
 import os
@@ -21,13 +22,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gateway.errors import BadValue, Busy
-from gateway.history import Historian, TimeRange, time_range
+from gateway.history import Historian, TimeRange, lock, time_range
 from gateway.history.file import HistoryFile
-from gateway.history.reader import Part, in_order
-from gateway.history.recent import MOST_RUNS
+from gateway.history.outcomes import MOST_WAITING
+from gateway.history.reader import Part, Reader, in_order
+from gateway.history.recent import MOST_RUNS, Identity
 from gateway.history.rows import from_row, to_row
 from gateway.history.timerange import EARLIEST, LATEST
-from gateway.history.writer import MOST_WRITES_WAITING
 from gateway.orders import Obeyed
 from gateway.payload import Failure, Problem, WriteOutcome
 from gateway.tags import Quality, Reason, Sample, Tag, Written, bad, good
@@ -385,7 +386,7 @@ def test_what_the_disk_cannot_take_in_time_is_dropped_oldest_first_and_counted(
     historian.record(numbered(50_000))
     lost = (50_000 // 3906 + 1 - MOST_RUNS) * 3906
     assert historian.document()["lost"] == lost
-    for n in range(MOST_WRITES_WAITING + 7):
+    for n in range(MOST_WAITING + 7):
         historian.record_write(WriteOutcome("k", n, Written(n, NOON, 0.1), NOON + n, 0.1))
     historian.start()
     document = until(historian, state="ok", waiting=0)
@@ -425,6 +426,41 @@ def test_every_write_is_kept_with_its_outcome(tmp_path: Path) -> None:
     assert json.loads(late[0]) == lines[1]
 
 
+def write(number: int) -> WriteOutcome:
+    time = NOON + number * SECOND
+    return WriteOutcome("plant/mixer/speed", number, Written(number, time, 0.1), time, 0.1)
+
+
+def written(historian: Historian, asked: str = EVERYTHING) -> list[int]:
+    return [json.loads(line)["value"] for line in historian.writes(asked)]
+
+
+def test_a_write_is_found_at_once_also_while_the_disk_takes_none(tmp_path: Path) -> None:
+    path = tmp_path / "h.db"
+    with history(path) as historian:
+        historian.record_write(write(2))
+        historian.record_write(write(4))
+        until(historian, writes_stored=2)
+        with closing(sqlite3.connect(path, isolation_level=None)) as other:
+            other.execute("BEGIN IMMEDIATE")
+            for number in (5, 1, 3):
+                historian.record_write(write(number))
+            assert written(historian) == [1, 2, 3, 4, 5]
+            assert written(historian, "[2026-11-21T12:00:02Z..2026-11-21T12:00:03Z]") == [2, 3]
+            state_with(historian, "another program")
+            assert written(historian) == [1, 2, 3, 4, 5]
+            other.execute("ROLLBACK")
+        until(historian, writes_stored=5)
+        assert written(historian) == [1, 2, 3, 4, 5]
+
+
+def test_questions_see_each_write_once_while_it_moves_to_disk(tmp_path: Path) -> None:
+    with history(tmp_path / "h.db") as historian:
+        for number in range(500):
+            historian.record_write(write(number))
+            assert written(historian) == list(range(number + 1))
+
+
 # -- trouble -----------------------------------------------------------------------------------
 
 
@@ -440,6 +476,15 @@ def told_by(process: "subprocess.Popen[str]") -> dict[str, Any]:
     assert process.returncode == 0, output
     told: dict[str, Any] = json.loads(output.splitlines()[-1])
     return told
+
+
+def state_with(historian: Historian, words: str) -> None:
+    """Waits at most 10 s until the state has these words."""
+    for _ in range(1000):
+        if words in str(historian.document()["state"]):
+            return
+        time.sleep(0.01)
+    raise TimeoutError(f"never {words}: {historian.document()}")
 
 
 def whole(path: Path) -> bool:
@@ -512,10 +557,7 @@ def test_a_file_that_may_only_be_read_is_reported_and_tried_again(tmp_path: Path
 def test_a_folder_that_comes_late_costs_nothing(tmp_path: Path) -> None:
     historian = Historian(tmp_path / "mounted" / "h.db", WEEK, 10**8)
     historian.start()
-    for _ in range(1000):
-        if str(historian.document()["state"]).startswith("the file cannot be opened"):
-            break
-        time.sleep(0.01)
+    state_with(historian, "the file cannot be opened")
     historian.record(numbered(50))
     with pytest.raises(Busy, match="cannot be opened"):
         historian.samples(SPEED, EVERYTHING, None)
@@ -554,11 +596,7 @@ def test_another_program_that_holds_the_file_only_delays(tmp_path: Path) -> None
             historian.record(numbered(10, 10))
             assert time.perf_counter() - begun < 0.05
             assert values(historian) == list(range(20))
-            for _ in range(1000):
-                if "another program" in str(historian.document()["state"]):
-                    break
-                time.sleep(0.01)
-            assert "another program" in str(historian.document()["state"])
+            state_with(historian, "another program")
             assert values(historian) == list(range(20))
             other.execute("ROLLBACK")
         until(historian, state="ok", waiting=0)
@@ -650,4 +688,185 @@ def test_an_unfinished_run_of_an_earlier_life_is_sorted_at_the_start(tmp_path: P
         assert values(historian) == list(range(200))
     assert sorted_runs(path) == [(1, 100)]
     with closing(HistoryFile(path, 10**8)) as file:
-        assert file.unsorted() == {2: 100}
+        assert file.unsorted() == {2: (NOON + 100 * SECOND, NOON + 199 * SECOND, 100)}
+
+
+# -- another gateway, another file -------------------------------------------------------------
+
+
+def test_a_second_gateway_leaves_the_file_alone_until_the_first_has_ended(tmp_path: Path) -> None:
+    path = tmp_path / "h.db"
+    with history(path, max_size=SMALL) as first:
+        first.record(numbered(100))
+        until(first, waiting=0)
+        second = Historian(path, WEEK, SMALL)
+        second.start()
+        second.record(numbered(100, 5000))
+        state_with(second, "another gateway writes this file")
+        with pytest.raises(Busy, match="another gateway"):
+            second.samples(SPEED, EVERYTHING, None)
+        first.record(numbered(3900, 100))
+        until(first, waiting=0)
+        assert values(first) == list(range(4000))
+        assert first.document()["lost"] == 0
+        assert second.document()["stored"] == 0
+    until(second, state="ok", waiting=0)
+    assert values(second) == [*range(4000), *range(5000, 5100)]
+    assert second.close()
+
+
+def test_a_gateway_that_is_killed_lets_go_of_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "h.db"
+    process = child("run", path)
+    assert process.stdout is not None
+    while not path.exists():
+        process.stdout.readline()
+    historian = Historian(path, WEEK, 10**8)
+    historian.start()
+    state_with(historian, "another gateway writes this file")
+    process.kill()
+    process.stdout.close()
+    process.wait()
+    until(historian, state="ok")
+    assert historian.close()
+
+
+def test_where_the_disk_has_no_locks_history_is_written_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def take(file: int) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(lock, "_take", take)
+    with history(tmp_path / "h.db") as historian:
+        historian.record(numbered(5))
+        until(historian, waiting=0)
+
+
+def test_a_file_opens_in_which_a_run_was_sorted_before_its_end(tmp_path: Path) -> None:
+    """As two gateways that wrote one file have left it."""
+    path = tmp_path / "h.db"
+    with closing(HistoryFile(path, 10**8)) as file:
+        file.store(1, 0, numbered(100))
+        file.sort(1, NOON)
+        file.store(1, 100, numbered(100, 100))
+    with history(path) as historian:
+        assert values(historian) == list(range(200))
+    assert sorted_runs(path) == [(1, 200)]
+
+
+@pytest.mark.parametrize("ended_well", [True, False])
+def test_an_older_file_put_in_place_takes_what_is_in_memory(
+    tmp_path: Path, ended_well: bool
+) -> None:
+    path, older = tmp_path / "h.db", tmp_path / "older.db"
+    with closing(HistoryFile(older, 10**8)) as file:
+        file.store(1, 0, numbered(200))
+        if ended_well:
+            file.sort(1, NOON)
+    with history(path) as historian:
+        historian.record(numbered(50, 1000))
+        until(historian, waiting=0)
+        older.replace(path)
+        until(historian, stored=100)  # once here and once there
+        historian.record(numbered(50, 1050))
+        until(historian, state="ok", waiting=0)
+        assert values(historian) == [*range(200), *range(1000, 1100)]
+        assert historian.document()["lost"] == 0
+    with history(path) as historian:
+        assert values(historian) == [*range(200), *range(1000, 1100)]
+
+
+def test_an_older_copy_in_place_and_then_the_newer_again_lose_nothing(tmp_path: Path) -> None:
+    """Both are the same file by their identity, and number 2 is another run in each."""
+    path, older, newer = tmp_path / "h.db", tmp_path / "older.db", tmp_path / "newer.db"
+    with closing(HistoryFile(path, 10**8)) as file:
+        file.store(1, 0, numbered(100))
+        file.sort(1, NOON)
+    shutil.copy(path, older)
+    with closing(HistoryFile(path, 10**8)) as file:
+        file.store(2, 0, numbered(50, 100))
+        file.sort(2, NOON)
+    with history(path) as historian:
+        historian.record(numbered(50, 1000))
+        until(historian, waiting=0)
+        path.rename(newer)
+        older.rename(path)
+        until(historian, stored=100)
+        newer.replace(path)
+        until(historian, stored=150)
+        historian.record(numbered(50, 1050))
+        until(historian, state="ok", waiting=0)
+        assert set(values(historian)) == {*range(150), *range(1000, 1100)}
+    with history(path) as historian:
+        assert set(values(historian)) == {*range(150), *range(1000, 1100)}
+
+
+def test_an_answer_never_has_the_values_of_another_tag(tmp_path: Path) -> None:
+    """Tags and runs have the same numbers in two files, only that the tags are swapped."""
+    path, other = tmp_path / "h.db", tmp_path / "other.db"
+    for file_path, tags in ((path, (SPEED, DOOR)), (other, (DOOR, SPEED))):
+        with closing(HistoryFile(file_path, 10**8)) as file:
+            for run in (1, 2, 3):
+                for n, of in enumerate(tags):
+                    times = range(NOON + run * SECOND, NOON + (run + 1) * SECOND, SECOND // 10)
+                    file.store(run, 10 * n, [good(of, of.name, time) for time in times])
+                file.sort(run, NOON)
+    with history(path) as historian:
+        historian.record(numbered(1, 1000, tag("level")))
+        until(historian, waiting=0)
+        answer = historian.samples(SPEED, EVERYTHING, None)
+        found = [next(answer).value]
+        other.replace(path)
+        until(historian, state="ok", stored=2)  # once here and once there
+        with pytest.raises(Busy, match="another file"):
+            found.extend(sample.value for sample in answer)
+        assert found == ["speed"] * len(found)
+        assert values(historian) == ["speed"] * 30
+
+
+def test_a_file_that_nobody_has_noticed_yet_answers_no_question_about_the_one_before(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "h.db"
+    everything = TimeRange(EARLIEST, LATEST)
+    with closing(HistoryFile(path, 10**8)) as file:
+        file.store(1, 0, numbered(10))
+        file.sort(1, NOON)
+        reader = Reader(path)
+        assert len(reader.samples(file.identity, SPEED, 1, everything, None)) == 10
+        another = Identity(file.identity.inode, b"another")
+        with pytest.raises(Busy, match="another file"):
+            reader.samples(another, SPEED, 1, everything, None)
+        with pytest.raises(Busy, match="another file"):
+            next(reader.writes(another, 1, everything))
+        shutil.copy(path, tmp_path / "copy.db")
+        (tmp_path / "copy.db").replace(path)
+        with pytest.raises(Busy, match="another file"):
+            reader.samples(file.identity, SPEED, 1, everything, None)
+
+
+def test_a_file_from_before_files_had_an_identity_is_given_one(tmp_path: Path) -> None:
+    path = tmp_path / "h.db"
+    with history(path) as historian:
+        historian.record(numbered(5))
+    with closing(sqlite3.connect(path)) as database:
+        database.execute("DROP TABLE file")
+    with history(path) as historian:
+        assert values(historian) == list(range(5))
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_history_that_fails_in_an_unforeseen_way_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "h.db"
+    with history(path) as historian:
+        monkeypatch.setattr(HistoryFile, "store", lambda *_: 1 // 0)
+        historian.record(numbered(5))
+        state_with(historian, "history has failed: start the gateway again")
+        historian.record(numbered(5, 5))
+        assert values(historian) == list(range(10))
+    monkeypatch.undo()
+    with history(path) as historian:  # nobody holds the file
+        assert values(historian) == []

@@ -20,7 +20,7 @@ from gateway.line import Line
 from gateway.listening import ANSWER_WITHIN
 from gateway.northbound.repeater import Repeater
 from gateway.stations.vigor import VigorStation
-from gateway.tags import Quality, Reason, Sample, Tag, Written
+from gateway.tags import Quality, Reason, Sample, Tag, Written, good
 from gateway.transport import Ear, Port
 from gateway.values import Value
 from gateway.writing import Differs
@@ -240,18 +240,21 @@ async def test_each_of_two_equal_events_is_news() -> None:
 
 async def test_an_event_is_not_published_again_when_the_network_comes_back() -> None:
     tags = [tag for name in ("barcode-reader", "scale") for tag in example(name).devices[0].tags]
-    repeated: list[Any] = []
+    repeated: list[Sample] = []
 
     class Everything:
         def all(self) -> list[Tag]:
             return tags
 
-        def sample(self, tag: Tag) -> Tag:
-            return tag
+        def sample(self, tag: Tag) -> Sample:
+            return good(tag, 1, 0)
+
+        def told(self, samples: Sequence[Sample]) -> None:
+            pass
 
     everything: Any = Everything()
     await Repeater(repeated.extend, everything, everything, everything).publish_all()
-    assert [tag.key for tag in repeated] == ["scale/weight", "scale/state"]
+    assert [sample.tag.key for sample in repeated] == ["scale/weight", "scale/state"]
 
 
 @on_virtual_time

@@ -77,6 +77,36 @@ def test_a_heartbeat_tells_what_has_not_changed() -> None:
     assert values(make_tag("D0", heartbeat=3.0), 7, 7, 7, 7, 7, 7, 7) == [7, 7, 7]
 
 
+def test_a_heartbeat_goes_on_when_the_clock_was_set_back() -> None:
+    tag = make_tag("D0", heartbeat=3.0)
+    times = (3600, 3601, 1, 2, 3, 4, 5)  # seconds: an hour back
+    mirror = Mirror([tag], 0)
+    assert [second for second in times if mirror.update([good(tag, 7, second * SECOND)])] == [
+        3600,
+        1,
+        4,
+    ]
+
+
+def test_a_deadband_counts_from_what_was_told_once_more() -> None:
+    tag = make_tag("D0", deadband=Deadband(5))
+    mirror = Mirror([tag], 0)
+    mirror.update([good(tag, 100, 1)])
+    assert mirror.update([good(tag, 104, 2)]) == []
+    again = [mirror[tag]]
+    assert mirror.told(again) == again  # which is news
+    assert mirror.told(again) == []
+    assert mirror.update([good(tag, 96, 3)]) == [good(tag, 96, 3)]
+
+
+def test_what_was_told_once_more_and_had_not_changed_is_no_news() -> None:
+    starting, known = make_tag("D0"), make_tag("D1", publish=Publish.ALWAYS)
+    mirror = Mirror([starting, known], 0)
+    mirror.update([good(known, 7, 1)])
+    assert mirror.told(list(mirror.samples())) == []
+    assert mirror.update([good(starting, 1, 2)]) == [good(starting, 1, 2)]
+
+
 def test_a_change_of_quality_or_reason_is_told_once() -> None:
     tag = make_tag("D0", deadband=Deadband(100), publish=Publish.ALWAYS)
     assert told(

@@ -29,8 +29,11 @@ from gateway.errors import (
 )
 from gateway.keys import Keys
 from gateway.northbound import Mode, Northbound, ZenohSettings
+from gateway.northbound.directory import Directory
 from gateway.northbound.inbox import LIMIT, Inbox
+from gateway.northbound.links import Links
 from gateway.northbound.publisher import EVENTS_LIMIT, Publisher
+from gateway.northbound.repeater import Repeater
 from gateway.northbound.session import configure
 from gateway.northbound.writes import AT_ONCE
 from gateway.protocols.driver import Address, Span, Unit
@@ -78,6 +81,8 @@ class PlainPlant:
         self.gate.set()
         self.written: list[tuple[str, Value]] = []
         self.read: list[str] = []
+        self.unread: set[str] = set()  # that the line does not get to
+        self.repeated: list[Sample] = []
 
     def devices(self) -> Iterable[PlainDevice]:
         return self._devices
@@ -96,9 +101,17 @@ class PlainPlant:
         self.written.append((tag.key, value))
         return Written(value, time.time_ns(), verified=True, took=0.031)
 
+    def told(self, samples: Sequence[Sample]) -> None:
+        self.repeated += samples
+
+    def is_fresh(self, tag: Tag, max_age: float) -> bool:
+        return time.time_ns() - self.samples[tag.key].time < max_age * 1e9
+
     async def fresh(self, tag: Tag, max_age: float) -> Sample:
-        if time.time_ns() - self.samples[tag.key].time > max_age * 1e9:
+        if not self.is_fresh(tag, max_age):
             self.read.append(tag.key)
+            if tag.key in self.unread:
+                raise Busy(f"{tag.key} could not be read")
             self.samples[tag.key] = good(tag, 4711, time.time_ns())
         return self.samples[tag.key]
 
@@ -251,10 +264,10 @@ async def test_events_beyond_the_limit_are_dropped_and_counted() -> None:
     assert [value for *_, value in session.puts] == [0, *range(EVENTS_LIMIT)]
 
 
-async def test_a_bad_value_is_repeated_with_its_heartbeat_and_keeps_its_time() -> None:
-    plant = PlainPlant(
-        PlainDevice("mixer", (tag("mixer", "speed", heartbeat=0.5), tag("mixer", "level")))
-    )
+@pytest.mark.parametrize("event", [False, True])
+async def test_a_bad_value_is_repeated_with_its_heartbeat_and_keeps_its_time(event: bool) -> None:
+    repeated = tag("mixer", "speed", heartbeat=0.5, event=event)
+    plant = PlainPlant(PlainDevice("mixer", (repeated, tag("mixer", "level"))))
     async with together(plant) as (northbound, client):
         speed, level = (plant.tag(f"mixer/{name}") for name in ("speed", "level"))
         assert speed is not None
@@ -283,6 +296,37 @@ async def test_events_all_arrive_in_order() -> None:
         await heard.next(of("plant/mixer/speed", 499))
         values = [sample.json["value"] for sample in heard.samples]
         assert [value for value in values if value is not None] == list(range(500))
+
+
+async def test_an_event_is_told_once_and_that_nothing_is_known_of_it_as_often_as_all_else() -> None:
+    code, weight = tag("reader", "code", event=True), tag("reader", "weight")
+    plant = PlainPlant(PlainDevice("reader", (code, weight)))
+    directory = Directory(Keys("plant", "demo"), plant.devices())
+    told: list[Sample] = []
+    repeater = Repeater(told.extend, plant, directory, Links())
+    await repeater.publish_all()  # as at a start
+    assert told == [bad(of, Reason.STARTING, plant.sample(of).time) for of in (code, weight)]
+    told.clear()
+    plant.now("reader/code", 4711)
+    heavy = plant.now("reader/weight", 12)
+    await repeater.publish_all()
+    assert told == [heavy]
+    told.clear()
+    gone = plant.samples["reader/code"] = bad(code, Reason.LINE_DOWN, time.time_ns())
+    await repeater.publish_all()
+    assert told == [gone, heavy]
+
+
+async def test_the_plant_is_told_what_is_published_again_before_it_is() -> None:
+    plant, told = mixer(), list[Sample]()
+
+    def publish(samples: Sequence[Sample]) -> None:
+        told.extend(samples)
+        assert plant.repeated == told
+
+    directory = Directory(Keys("plant", "demo"), plant.devices())
+    await Repeater(publish, plant, directory, Links()).publish_all()
+    assert len(told) == 4
 
 
 async def test_a_scan_of_a_device_with_blocks_is_one_put() -> None:
@@ -454,6 +498,58 @@ async def test_max_age_reads_the_device_unless_the_sample_is_younger() -> None:
         [reply] = await client.get("plant/mixer/speed?max_age=soon")
         assert reply.json["error"] == "bad-query"
         assert await client.get("plant/nobody/speed?max_age=soon") == []
+
+
+async def test_what_cannot_be_read_takes_no_other_value_away() -> None:
+    plant = mixer()
+    plant.unread = {"mixer/recipe"}
+    async with together(plant) as (_, client):
+        *values, error = sorted(await client.get("plant/**?max_age=0s"), key=lambda of: not of.ok)
+        assert {reply.key: reply.json["value"] for reply in values} == {
+            "plant/mixer/speed": 4711,
+            "plant/mixer/alarms/door": 4711,
+            "plant/oven/temperature": 4711,
+        }
+        assert error.json == {
+            "error": "busy",
+            "reason": "mixer/recipe could not be read in time",
+            "code": None,
+        }
+        plant.unread |= {"mixer/speed", "mixer/alarms/door"}
+        [error] = await client.get("plant/mixer/*?max_age=0s")
+        assert error.json["reason"].endswith(" and 1 more could not be read in time")
+
+
+async def test_what_gets_too_old_while_another_is_read_is_read_too() -> None:
+    class Slow(PlainPlant):
+        """Reading the speed takes so long that nothing else is young after it."""
+
+        def is_fresh(self, tag: Tag, max_age: float) -> bool:
+            return "mixer/speed" not in self.read and tag.name != "speed"
+
+        async def fresh(self, tag: Tag, max_age: float) -> Sample:
+            if tag.name == "speed":
+                await asyncio.sleep(0)
+            return await super().fresh(tag, max_age)
+
+    plant = Slow(*mixer().devices())
+    async with together(plant) as (_, client):
+        replies = await client.get("plant/mixer/*?max_age=1s")
+        assert {reply.json["value"] for reply in replies} == {4711}
+        assert plant.read == ["mixer/speed", "mixer/recipe"]  # each once
+
+
+async def test_what_turned_bad_after_it_was_read_is_answered_bad_whatever_the_clock_says() -> None:
+    class Failing(PlainPlant):
+        async def fresh(self, tag: Tag, max_age: float) -> Sample:
+            read = await super().fresh(tag, max_age)
+            an_hour_back = read.time - 3600 * 10**9
+            self.samples[tag.key] = bad(tag, Reason.NO_REPLY, an_hour_back)
+            return read
+
+    async with together(Failing(*mixer().devices())) as (_, client):
+        [reply] = await client.get("plant/mixer/speed?max_age=0s")
+        assert (reply.json["value"], reply.json["reason"]) == (None, "no-reply")
 
 
 async def test_a_question_of_the_past_is_refused_where_no_history_is_kept() -> None:

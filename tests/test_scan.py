@@ -51,7 +51,9 @@ class OldLine:
         self.closed += 1
 
 
-def sought(line: OldLine, protocol: str, stations: str = "1-31", port: str = "/dev/ttyS9") -> Plan:
+def sought(
+    line: OldLine, protocol: str, stations: str | None = None, port: str = "/dev/ttyS9"
+) -> Plan:
     return replace(planned(port, protocol, stations), open_port=line.open)
 
 
@@ -65,7 +67,7 @@ async def test_the_speed_and_format_at_which_they_answer_is_found() -> None:
     report = await scan(sought(line, "vigor"), told.append)
     assert stations(report) == [2, 17]
     assert {found.serial for found in report.found} == {RIGHT}
-    assert told == ["asking 31 stations at 9600 7E1", "asking 31 stations at 19200 7E1"]
+    assert told == ["asking 32 stations at 9600 7E1", "asking 32 stations at 19200 7E1"]
     assert line.closed == 2
     assert not report.noises
     assert show.stations(report, "/dev/ttyS9").splitlines() == [
@@ -78,6 +80,26 @@ async def test_the_speed_and_format_at_which_they_answer_is_found() -> None:
         "      station-2: {protocol: vigor, station: 2, tags: {}}",
         "      station-17: {protocol: vigor, station: 17, tags: {}}",
     ]
+
+
+@pytest.mark.parametrize(
+    ("protocol", "first"),
+    [("vigor", 0), ("computer-link", 0), ("modbus-rtu", 1), ("modbus-ascii", 1)],
+)
+def test_station_0_is_asked_where_it_is_a_single_plc(protocol: str, first: int) -> None:
+    assert planned("COM3", protocol).stations == list(range(first, 32))
+
+
+@on_virtual_time
+async def test_a_vigor_at_cp1_is_found() -> None:
+    report = await scan(sought(OldLine(VigorStation(0)), "vigor"))
+    assert stations(report) == [0]
+
+
+@on_virtual_time
+async def test_a_station_that_is_named_twice_is_asked_and_shown_once() -> None:
+    report = await scan(sought(OldLine(VigorStation(1)), "vigor", "1-3,1"))
+    assert show.stations(report, "COM3").count("station-1:") == 1
 
 
 @on_virtual_time
@@ -133,6 +155,19 @@ class Unplugged(OldLine):
         self._ear.lost(LineDown("/dev/ttyS9: unplugged"))
 
 
+@pytest.mark.parametrize(
+    ("protocol", "minutes"),
+    [("vigor", 1.5), ("modbus-rtu", 3), ("modbus-ascii", 3), ("computer-link", 11.5)],
+)
+@on_virtual_time
+async def test_how_long_it_takes_where_nobody_is(protocol: str, minutes: float) -> None:
+    """As docs/operations.md says."""
+    loop = asyncio.get_running_loop()
+    began = loop.time()
+    await scan(sought(OldLine(), protocol))
+    assert loop.time() - began == pytest.approx(60 * minutes, rel=0.15)
+
+
 @pytest.mark.parametrize("framing", ["rtu", "ascii", "tcp"])
 @on_virtual_time
 async def test_modbus(framing: str) -> None:
@@ -166,6 +201,7 @@ async def test_a_port_that_goes_ends_it() -> None:
         ({"stations": "5-4"}, "no station between 5 and 4"),
         ({"stations": "300"}, "station 300 is not 0..255"),
         ({"bauds": "9601"}, "the nearest is 9600"),
+        ({"bauds": "abc"}, "'abc' is no number: write numbers such as 9600,19200"),
         ({"formats": "9Z9"}, "no character format"),
         ({"timeout": "5"}, "no unit|no duration"),
     ],

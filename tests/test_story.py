@@ -1,5 +1,6 @@
 """docs/scada.md: each of its programs is run, against gateways that are set up as it says."""
 
+import json
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -88,6 +89,72 @@ def test_a_program_says_what_the_page_shows(program: Block, shown: Block, beginn
             assert running.ended() == 0
             assert [shape(line) for line in running.lines] == [shape(line) for line in lines]
         assert wanted <= set(map(shape, running.lines))
+
+
+WRITING = next(block for block, _ in PROGRAMS if "def write(" in block.text)
+DONE = '{"value": 7, "time": "", "verified": true, "took": 0.1}'
+REFUSED = '{"error": "refused", "code": "28", "reason": "no such address"}'
+UNCLEAR = '{"error": "unclear", "code": null, "reason": "no reply"}'
+BUSY = '{"error": "busy", "code": null, "reason": "it could not be read"}'
+GOOD = '{"value": 6, "quality": "good", "time": ""}'
+BAD = '{"value": null, "quality": "bad", "reason": "no-reply", "time": ""}'
+MUTE = ""
+NOBODY_KNOWS = "nobody knows, and the PLC could not be read"
+# In the place of a gateway: answers so, or (mute) lets the asker wait until he gives up.
+STAND_IN = """
+import json, sys, zenoh
+
+def answering(data):
+    def answer(query):
+        if not data:
+            kept.append(query)
+        elif "error" in data:
+            query.reply_err(data, encoding=zenoh.Encoding.APPLICATION_JSON)
+        else:
+            query.reply(query.key_expr, data, encoding=zenoh.Encoding.APPLICATION_JSON)
+    return answer
+
+config, answers, kept = zenoh.Config.from_json5(sys.argv[1]), json.loads(sys.argv[2]), []
+with zenoh.open(config) as session:
+    told = [session.declare_queryable(key, answering(data)) for key, data in answers.items()]
+    print("there", flush=True)
+    sys.stdin.read()
+"""
+
+
+@pytest.mark.parametrize(
+    ("answers", "said"),
+    [
+        ((DONE, MUTE), "done: 7"),
+        ((REFUSED, GOOD), "not done: refused, no such address"),
+        ((UNCLEAR, GOOD), "nobody knows; the PLC now holds 6"),
+        ((UNCLEAR, BAD), NOBODY_KNOWS),
+        ((UNCLEAR, BUSY), NOBODY_KNOWS),
+        ((MUTE, GOOD), "nobody knows; the PLC now holds 6"),
+        ((MUTE, MUTE), NOBODY_KNOWS),
+        ((), NOBODY_KNOWS),
+    ],
+)
+def test_a_write_is_done_or_not_done_or_nobody_knows(
+    answers: tuple[str, ...], said: str, tmp_path: Path
+) -> None:
+    endpoint = free_endpoint()
+    stand_in = {"listen": {"endpoints": [endpoint]}, "scouting": {"multicast": {"enabled": False}}}
+    answered = dict(zip(("plant/**/@set", "plant/mixer/*"), answers, strict=False))
+    text, client = inside(Story(tmp_path, tmp_path), WRITING.text), OPEN
+    if answers[:1] == (MUTE,):
+        text = text.replace("timeout=10.0", "timeout=0.2")
+    if answers[1:] == (MUTE,):
+        client = client.replace("{ mode:", "{ queries_default_timeout: 200, mode:")
+    (tmp_path / "scada.json5").write_text(client.replace(ENDPOINT, endpoint), encoding="utf-8")
+    path = tmp_path / "program.py"
+    path.write_text(text, encoding="utf-8")
+    command = (sys.executable, "-c", STAND_IN, json.dumps(stand_in), json.dumps(answered))
+    with Program(*command) as gateway:
+        gateway.says("there")
+        with Program(sys.executable, path) as program:
+            assert program.ended() == 0
+            assert program.lines == [said] * 3
 
 
 def test_with_the_doors_closed_a_viewer_reads_and_does_not_write(end: Story) -> None:

@@ -1,6 +1,7 @@
 """What is read again as it was: its time goes on, nothing else does, and no change is missed."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import fields
 from typing import Any
 
 import pytest
@@ -146,6 +147,71 @@ def test_blocks_planned_anew_begin_anew() -> None:
     for _ in range(3):
         reader.read(9, 9)
         assert [reader.mirror[tag].value for tag in (a, b)] == [9, 9]
+
+
+class Interrupted(Tag):
+    """A tag; whoever looks it up in a dict is interrupted by the last of `by`."""
+
+    by: list[Callable[[], None]] = []  # noqa: RUF012  (emptied by each test)
+
+    def __hash__(self) -> int:
+        if self.by:
+            self.by.pop()()
+        return id(self)
+
+
+def interrupted(again: int) -> tuple[Tag, Mirror]:
+    """A tag that was 1 at 1000, and still when it was read `again`."""
+    plain = make_tag("D0")
+    tag = Interrupted(**{f.name: getattr(plain, f.name) for f in fields(plain) if f.init})
+    mirror = Mirror([tag], 0)
+    told = [good(tag, 1, 1000)]
+    mirror.update(told)
+    if again > 1000:
+        mirror.update(Unchanged(told, again))
+    return tag, mirror
+
+
+def at_look_up(number: int, do: Callable[[], None]) -> None:
+    def alone() -> None:
+        Interrupted.by.clear()
+        do()
+
+    Interrupted.by[:] = [alone, *[lambda: None] * (number - 1)]
+
+
+@pytest.mark.parametrize("again", [1000, 1500])
+@pytest.mark.parametrize("number", [1, 2, 3])
+def test_who_is_interrupted_by_a_change_gives_no_value_the_time_of_another(
+    number: int, again: int
+) -> None:
+    """As an answering thread is by the event loop, wherever it likes."""
+    tag, mirror = interrupted(again)
+
+    def change() -> None:
+        told = [good(tag, 2, 2000)]
+        mirror.update(told)
+        mirror.update(Unchanged(told, 3000))
+
+    at_look_up(number, change)
+    seen = mirror[tag]
+    Interrupted.by.clear()
+    assert seen in [good(tag, 1, again), good(tag, 2, 2000), good(tag, 2, 3000)]
+
+
+@pytest.mark.parametrize("again", [1000, 1500])
+@pytest.mark.parametrize("number", range(1, 7))
+def test_who_looks_in_the_middle_of_a_change_sees_the_one_or_the_other(
+    number: int, again: int
+) -> None:
+    tag, mirror = interrupted(again)
+    seen: list[Sample] = []
+    at_look_up(number, lambda: seen.append(mirror[tag]))
+    mirror.update([good(tag, 2, 2000)])
+    Interrupted.by.clear()
+    seen.append(mirror[tag])
+    assert seen[-1] == good(tag, 2, 2000)
+    assert seen[0] in [good(tag, 1, again), good(tag, 2, 2000)]
 
 
 @on_virtual_time

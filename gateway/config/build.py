@@ -47,6 +47,7 @@ class Builder:
     mistakes: Mistakes
     folder: FilePath
     _devices: dict[str, str] = field(default_factory=dict)  # name -> line it is on
+    _recorded: Path | None = None  # where the first tag with `history: true` stands
 
     def config(self, data: Mapping[str, Any]) -> Config | None:
         """The whole file; None (and mistakes) where not even a stand-in could be made."""
@@ -64,7 +65,7 @@ class Builder:
         self._check_ports(lines, raw_lines)
         if top is None:
             return None
-        self._check_history(top, lines)
+        self._check_history(top)
         return Config(
             name=top.gateway.name,
             state_file=None if top.gateway.state is None else self.folder / top.gateway.state,
@@ -188,6 +189,8 @@ class Builder:
             else:
                 tag = build_tag(source, driver, self.mistakes)
             if tag is not None:
+                if tag.history and self._recorded is None:
+                    self._recorded = place
                 yield tag
 
     def _defaults(self, raw: Mapping[str, Any], path: Path, outer: TagDefaults) -> TagDefaults:
@@ -217,11 +220,12 @@ class Builder:
                     "with all its devices",
                 )
 
-    def _check_history(self, top: FileSection, lines: list[LineConfig]) -> None:
-        kept = next((tag for line in lines for tag in line.tags if tag.history), None)
-        if kept is not None and top.history is None:
+    def _check_history(self, top: FileSection) -> None:
+        if self._recorded is not None and top.history is None:
             self.mistakes.add(
-                (), f"tag {kept.key} has `history: true`, but the file has no `history:` section"
+                (*self._recorded, "history"),
+                "the file has no `history:` section: write `history: {path: history.db}` beside "
+                "`lines:`",
             )
 
     def _zenoh(self, top: FileSection) -> ZenohConfig:

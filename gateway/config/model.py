@@ -23,20 +23,23 @@ from gateway.config import written
 from gateway.config.settings import (
     DEADBAND_SCHEMA,
     FORMAT_SCHEMA,
-    PORT_SCHEMA,
-    TEXT_SCHEMA,
+    SCALE_SCHEMA,
     TYPE_SCHEMA,
+    Baudrate,
     Duration,
     Endpoint,
     FilePath,
     Finite,
+    Group,
     Interval,
     Name,
     OrderName,
+    Port,
+    Prefix,
     Text,
+    WebAddress,
 )
 from gateway.tags import Deadband, Form, Publish
-from gateway.transport.port import PortAddress
 from gateway.values import Order, ValueType
 
 
@@ -59,7 +62,7 @@ class GatewaySection(Section):
     """This gateway's own chunk in the key space."""
     state: FilePath | None = None
     """A file for what was learned of the devices (refused addresses), kept across restarts."""
-    standby: Name | None = None
+    standby: Group | None = None
     """A name shared by two gateways of one plant: one serves, the other stands by."""
     standby_alone: Interval | None = None
     """Go on the wire after so long without any Zenoh link; left out: wait for the network."""
@@ -95,7 +98,7 @@ class TlsSection(Section):
 class ZenohSection(Section):
     """How to join the Zenoh network."""
 
-    prefix: Annotated[str, PlainValidator(written.prefix), WithJsonSchema(TEXT_SCHEMA)] = "plant"
+    prefix: Prefix = "plant"
     """Every key starts with it."""
     mode: Literal["peer", "client", "router"] = "peer"
     """How this session takes part in the network."""
@@ -107,7 +110,7 @@ class ZenohSection(Section):
     """A Zenoh JSON5 file for everything else, laid under these settings."""
     tls: TlsSection | None = None
     """For endpoints that begin with tls/ or quic/."""
-    user: Text | None = None
+    user: str | None = None
     """Our own name where we connect to."""
     password_file: FilePath | None = None
     """Its first line is our password; without it: the variable PLC_GATEWAY_ZENOH_PASSWORD."""
@@ -146,9 +149,7 @@ class HistorySection(Section):
 class WebSection(Section):
     """The status page and /metrics."""
 
-    listen: Annotated[
-        tuple[str, int], PlainValidator(written.web_address), WithJsonSchema({"type": "string"})
-    ] = ("127.0.0.1", 8080)
+    listen: WebAddress = ("127.0.0.1", 8080)
     """Where the page is served."""
 
 
@@ -186,7 +187,7 @@ class TagDefaults(Section):
     """What the words mean; left out: bool for a bit, a whole number otherwise."""
     every: Interval = 1.0
     """How often the tag is read."""
-    scale: Annotated[Finite, AfterValidator(written.scale)] = 1.0
+    scale: Annotated[Finite, AfterValidator(written.scale), WithJsonSchema(SCALE_SCHEMA)] = 1.0
     """value = raw x scale + offset"""
     offset: Finite = 0.0
     """value = raw x scale + offset"""
@@ -267,19 +268,15 @@ class DeviceSection(Section):
 class LineSection(Section):
     """One wire and the devices on it."""
 
-    port: Annotated[PortAddress, PlainValidator(written.port), WithJsonSchema(PORT_SCHEMA)]
+    port: Port
     """A serial port, tcp://host:port, rfc2217://host:port, or simulator."""
-    baudrate: Annotated[
-        int | None,
-        PlainValidator(written.baudrate),
-        WithJsonSchema({"type": "integer", "examples": [9600, 19200]}),
-    ] = None
+    baudrate: Baudrate = None
     """Of the wire, also of the one behind a device server; the protocol's custom if left out."""
     format: Annotated[
         str | None, PlainValidator(written.serial_format), WithJsonSchema(FORMAT_SCHEMA)
     ] = None
     """Data bits, parity, stop bits: 7E1, 8N1; the protocol's custom if left out."""
-    echo: bool = False
+    echo: bool | None = None
     """true: the port hears what it says itself, as some two-wire RS-485 converters do."""
     defaults: dict[str, Any] = {}
     devices: dict[str, Any]

@@ -76,7 +76,7 @@ class LineConfig:
     port: PortAddress
     serial: SerialSettings
     wire: Wire
-    echo: bool  # the port hears what it says
+    echo: bool | None  # whether the port hears what it says; None: not said
     devices: tuple[DeviceConfig, ...]
 
     @property

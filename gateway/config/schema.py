@@ -15,10 +15,17 @@ from gateway.config.model import (
     TagSection,
 )
 from gateway.config.nested import is_duration
-from gateway.config.settings import DURATION_SCHEMA
+from gateway.config.settings import (
+    DURATION_SCHEMA,
+    INTERVAL_SCHEMA,
+    NAME_PATTERN,
+    TAG_NAME_PATTERN,
+)
 from gateway.config.validate import DRIVERS
 from gateway.config.written import BYTES, SECONDS
+from gateway.errors import ConfigError
 
+_TIMES = (DURATION_SCHEMA["pattern"], INTERVAL_SCHEMA["pattern"])
 _PARTS: dict[str, type[Section]] = {"Line": LineSection, "Tag": TagSection, "Defaults": TagDefaults}
 
 
@@ -42,10 +49,10 @@ def schema() -> dict[str, Any]:
             for name in DRIVERS
         ],
     }
-    root["properties"]["lines"] |= {"additionalProperties": _ref("Line"), "minProperties": 1}
+    root["properties"]["lines"] |= _by_name("Line") | {"minProperties": 1}
     root["properties"]["defaults"] = _defaults("file")
     line = shared["Line"]["properties"]
-    line["devices"] |= {"additionalProperties": _ref("Device"), "minProperties": 1}
+    line["devices"] |= _by_name("Device") | {"minProperties": 1}
     line["defaults"] = _defaults("line")
     for part in (root, *shared.values()):
         for setting in part.get("properties", {}).values():
@@ -57,11 +64,14 @@ def _device(protocol: str, shared: dict[str, Any]) -> dict[str, Any]:
     driver = DRIVERS[protocol]
     settings = _hoisted(TypeAdapter(driver).json_schema(), shared)["properties"]
     _mend(driver, settings)
+    if "station" in settings:
+        stations = [number for number in range(256) if _is_station(driver, number)]
+        settings["station"] |= {"minimum": stations[0], "maximum": stations[-1]}
     for inner in set(_dataclasses_in(driver)):
         shared[inner.__name__] |= {"additionalProperties": False}
         _mend(inner, shared[inner.__name__]["properties"])
     common = _hoisted(DeviceSection.model_json_schema(), shared)["properties"]
-    common["tags"] |= {"additionalProperties": _ref("Tag")}
+    common["tags"] |= _by_name("Tag", TAG_NAME_PATTERN)
     common["defaults"] = _defaults("device")
     return {
         "type": "object",
@@ -70,6 +80,15 @@ def _device(protocol: str, shared: dict[str, Any]) -> dict[str, Any]:
         "required": ["protocol"],
         "additionalProperties": False,
     }
+
+
+def _is_station(driver: type[Any], number: int) -> bool:
+    """Whether the protocol has it, in its widest settings: those that hold when left out."""
+    try:
+        driver(station=number)
+    except ConfigError:
+        return False
+    return True
 
 
 def _mend(kind: type[Any], properties: dict[str, Any]) -> None:
@@ -82,7 +101,7 @@ def _mend(kind: type[Any], properties: dict[str, Any]) -> None:
 def _write_default(setting: dict[str, Any]) -> None:
     """As the file would say it: `7d`, not 604800 seconds. One that it cannot say is left out."""
     match setting.get("default", ...), setting.get("pattern"):
-        case float(seconds), pattern if pattern == DURATION_SCHEMA["pattern"]:
+        case float(seconds), pattern if pattern in _TIMES:
             setting["default"] = _in_unit(seconds, SECONDS)
         case int(octets), str():
             setting["default"] = _in_unit(octets, BYTES)
@@ -121,6 +140,10 @@ def _hoisted(part: dict[str, Any], shared: dict[str, Any]) -> dict[str, Any]:
 
 def _ref(name: str) -> dict[str, Any]:
     return {"$ref": f"#/$defs/{name}"}
+
+
+def _by_name(part: str, names: str = NAME_PATTERN) -> dict[str, Any]:
+    return {"additionalProperties": _ref(part), "propertyNames": {"pattern": names}}
 
 
 def _defaults(where: str) -> dict[str, Any]:

@@ -6,6 +6,7 @@ from typing import Annotated, Any
 from pydantic import Field, PlainValidator, WithJsonSchema
 
 from gateway.config import written
+from gateway.transport.port import PortAddress
 from gateway.values import Kind, Order
 
 DURATION_SCHEMA: dict[str, Any] = {
@@ -13,8 +14,15 @@ DURATION_SCHEMA: dict[str, Any] = {
     "pattern": r"^[0-9]+(\.[0-9]+)? ?(ms|s|min|h|d)$",
     "examples": ["500ms", "2s", "15min", "1h", "7d"],
 }
-# `40101` as an address and `7E1` as a format look like numbers to an editor.
-TEXT_SCHEMA = {"type": ["string", "number"]}
+INTERVAL_SCHEMA = DURATION_SCHEMA | {
+    "pattern": r"^(?=[0-9.]*[1-9])[0-9]+(\.[0-9]+)? ?(ms|s|min|h|d)$"
+}
+# `40101` as an address, `7E1` as a format and `true` as a unit look like others to an editor.
+TEXT_SCHEMA: dict[str, Any] = {"type": ["string", "number", "boolean"]}
+# Letters and digits of any script: an editor is told what of ASCII is neither.
+_NAME = r"[^\x00-,/:-@\[-\^`{-\x7f\s]+"
+NAME_PATTERN, TAG_NAME_PATTERN = f"^{_NAME}$", f"^{_NAME}(/{_NAME})*$"
+_CHUNK = r"[^/@*$?#][^/*$?#]*"
 FORMAT_SCHEMA = {
     "anyOf": [
         {"type": "string", "enum": [f"{d}{p}{s}" for d in "78" for p in "NEO" for s in "12"]},
@@ -25,7 +33,7 @@ _KINDS = [kind.value for kind in Kind if kind is not Kind.STRING]
 TYPE_SCHEMA = {
     "anyOf": [
         {"type": "string", "enum": _KINDS},
-        {"type": "string", "pattern": r"^string\[[0-9]+\]$"},
+        {"type": "string", "pattern": r"^string\[0*([1-9][0-9]?|1[0-9]{2}|2[0-4][0-9]|250)\]$"},
     ]
 }
 DEADBAND_SCHEMA = {
@@ -34,17 +42,47 @@ DEADBAND_SCHEMA = {
         {"type": "string", "pattern": r"^[0-9]+(\.[0-9]+)? ?%$"},
     ]
 }
-_ENDPOINT_SCHEMA = {"type": "string", "examples": ["tcp/127.0.0.1:7447"]}
-_ORDER_SCHEMA = {"type": "string", "enum": [order.value for order in Order]}
-PORT_SCHEMA = {
+SCALE_SCHEMA = {"type": "number", "not": {"const": 0}}
+_ENDPOINT_SCHEMA = {
     "type": "string",
+    "pattern": r"^[a-z][a-z0-9_-]*/[^\s/]\S*$",
+    "examples": ["tcp/127.0.0.1:7447"],
+}
+_ORDER_SCHEMA = {"type": "string", "enum": [order.value for order in Order]}
+_HOST = r"(\[[0-9A-Fa-f:.%]+\]|[^\[\]/:\s]+)"
+_PORT_SCHEMA = {
+    "type": "string",
+    # One of the network, or a path: no other scheme, and no `host:port` without any.
+    "pattern": rf"^((tcp|rfc2217)://{_HOST}:[0-9]{{1,5}}"
+    r"|(?![A-Za-z][A-Za-z0-9+.-]+://|([^/\\:\s]+:)?[0-9]+$)\S(.*\S)?)$",
     "examples": ["/dev/ttyUSB0", "COM3", "tcp://10.0.0.7:4001", "rfc2217://host:port", "simulator"],
 }
 
 Duration = Annotated[float, PlainValidator(written.duration), WithJsonSchema(DURATION_SCHEMA)]
-Interval = Annotated[float, PlainValidator(written.interval), WithJsonSchema(DURATION_SCHEMA)]
+Interval = Annotated[float, PlainValidator(written.interval), WithJsonSchema(INTERVAL_SCHEMA)]
 Text = Annotated[str, Field(strict=True), WithJsonSchema(TEXT_SCHEMA)]
-Name = Annotated[str, PlainValidator(written.name), WithJsonSchema(TEXT_SCHEMA)]
+Name = Annotated[
+    str, PlainValidator(written.name), WithJsonSchema(TEXT_SCHEMA | {"pattern": NAME_PATTERN})
+]
+Group = Annotated[
+    str, PlainValidator(written.name), WithJsonSchema({"type": "string", "pattern": NAME_PATTERN})
+]
+Prefix = Annotated[
+    str,
+    PlainValidator(written.prefix),
+    WithJsonSchema(TEXT_SCHEMA | {"pattern": f"^{_CHUNK}(/{_CHUNK})*$"}),
+]
+Port = Annotated[PortAddress, PlainValidator(written.port), WithJsonSchema(_PORT_SCHEMA)]
+Baudrate = Annotated[
+    int | None,
+    PlainValidator(written.baudrate),
+    WithJsonSchema({"type": "integer", "enum": list(written.BAUDRATES)}),
+]
+WebAddress = Annotated[
+    tuple[str, int],
+    PlainValidator(written.web_address),
+    WithJsonSchema({"type": "string", "pattern": f"^{_HOST}:[0-9]{{1,5}}$"}),
+]
 FilePath = Annotated[Path, PlainValidator(written.path), WithJsonSchema({"type": "string"})]
 OrderName = Annotated[Order, PlainValidator(written.order), WithJsonSchema(_ORDER_SCHEMA)]
 Endpoint = Annotated[str, PlainValidator(written.endpoint), WithJsonSchema(_ENDPOINT_SCHEMA)]

@@ -179,11 +179,16 @@ def _unsuited(
     source: TagSource, area: Area, first: str, kind: ValueType
 ) -> Iterator[tuple[str, str]]:
     """Settings that such a tag cannot have."""
+    spelt = source.own.address
     if source.own.event:
         yield "event", f"{first} is polled: events are what a device says unasked"
     if area.unit is Unit.DWORD:
         for setting in filter(source.says, ("word_order", "byte_order")):
             yield setting, f"{first} has 32 bits by nature: it needs no {setting}"
+    elif source.says("word_order") and not (kind.is_number and kind.words > 1):
+        yield "word_order", f"{spelt} is {kind}: only numbers of 32 or 64 bits have a word_order"
+    if kind.kind is Kind.BOOL and source.says("byte_order"):
+        yield "byte_order", f"{spelt} is {kind}: only words have a byte_order"
     if not kind.is_number:
         for setting in filter(source.says, ("scale", "offset", "deadband")):
             yield setting, f"a {kind} has no {setting}: only numbers have"

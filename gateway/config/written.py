@@ -23,6 +23,7 @@ BYTES = {"kB": 10**3, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
 _PERCENT = re.compile(r"([0-9]+(?:\.[0-9]+)?) ?%\Z")
 _WEB = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[^\[\]/:\s]+):([0-9]{1,5})\Z")
 _ENDPOINT = re.compile(r"[a-z][a-z0-9_-]*/[^\s/]\S*\Z")
+_SERVER = re.compile(r"(?:([^/\\:\s]+):)?([0-9]+)\Z")  # as in its manual: `4001`, `10.0.0.7:4001`
 _FORMAT = re.compile(r"[78][NEO][12]\Z")
 # Rates that serial ports and PLCs know; a slip of the keyboard is rarely one of them.
 BAUDRATES = (
@@ -147,7 +148,11 @@ def scale(factor: float) -> float:
 
 
 def port(text: object) -> PortAddress:
-    return parse_port(_text(text))
+    text = _text(text)
+    if match := _SERVER.match(text):
+        host = match[1] or "host"
+        raise ConfigError(f"{text} is no port: of a device server write tcp://{host}:{match[2]}")
+    return parse_port(text)
 
 
 def baudrate(value: object) -> int:

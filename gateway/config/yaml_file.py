@@ -8,6 +8,7 @@ anything that only makes sense to a Python program.
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -19,6 +20,21 @@ Entries = dict[str, tuple[yaml.Node, yaml.Node]]
 
 _KINDS = {yaml.ScalarNode: "str", yaml.SequenceNode: "seq", yaml.MappingNode: "map"}
 _TAGS = {kind: f"tag:yaml.org,2002:{name}" for kind, name in _KINDS.items()}
+_DEEPEST = 50  # levels; a configuration has less than ten
+_TOO_DEEP = f"more than {_DEEPEST} levels deep: look for a bracket or a dash too many"
+
+
+def _descend(loader: Any, parent: yaml.Node | None, _index: object) -> None:
+    """The reader calls itself for each level, and some thousands of them are a crash."""
+    loader.depth += 1
+    if loader.depth > _DEEPEST and parent is not None:
+        raise yaml.MarkedYAMLError(problem=_TOO_DEEP, problem_mark=parent.start_mark)
+
+
+def _ascend(loader: Any) -> None:
+    loader.depth -= 1
+
+
 # libyaml is ten times faster; PyYAML's own reader serves where it was built without. What a
 # scalar means is decided here, so PyYAML's own search for it (half of its time) is left out.
 _LOADER: Any = type(
@@ -26,8 +42,9 @@ _LOADER: Any = type(
     (yaml.CBaseLoader if yaml.__with_libyaml__ else yaml.BaseLoader,),
     {
         "resolve": lambda _self, kind, _value, _implicit: _TAGS[kind],
-        "descend_resolver": lambda _self, _node, _index: None,
-        "ascend_resolver": lambda _self: None,
+        "depth": 0,
+        "descend_resolver": _descend,
+        "ascend_resolver": _ascend,
     },
 )
 
@@ -46,6 +63,18 @@ _WORDS: dict[str, object] = {
 }
 # What an alias may blow a small file up to; ten times a gateway of 10,000 tags.
 _MOST_NODES = 2_000_000
+# What helps where the reader uses such words; of several the first.
+_REMEDIES = {
+    "escape character": "in double quotes a backslash begins an escape: use single quotes",
+    "quoted scalar": "close the quote",
+    "mapping values": "check indentation and colons of this line and the one before, "
+    "and put a text with `: ` in it in quotes",
+    "simple key": "check indentation and colons of this line and the one before",
+    "parsing a block": "check the indentation of this line and the one before",
+    "parsing a flow": "check commas and brackets, "
+    "and put a text with one of , : [ ] { } # in it in quotes",
+    "scanning": "put a text that begins with one of % @ ` & * ! | > in quotes",
+}
 _PLAIN_TAGS = set(_TAGS.values())
 _NUMERIC = frozenset("+-.0123456789")
 
@@ -84,7 +113,7 @@ class YamlFile:
 
     def _plain(self, node: yaml.Node, path: Path, mistakes: Mistakes) -> Any:
         self._nodes += 1
-        if self._nodes > _MOST_NODES or id(node) in self._open or len(path) > 50:
+        if self._nodes > _MOST_NODES or id(node) in self._open or len(path) > _DEEPEST:
             raise ConfigErrors(
                 [f"{self.name}:{_line(node.start_mark)}: its anchors repeat without end"]
             )
@@ -104,6 +133,7 @@ class YamlFile:
         else:
             assert isinstance(node, yaml.MappingNode)  # noqa: S101  YAML has no fourth kind
             self._check_keys(node, path, mistakes)
+            self._check_merges(node, path, mistakes)
             result = {
                 name: self._plain(value, (*path, name), mistakes)
                 for name, (_, value) in self._of(node).items()
@@ -117,7 +147,7 @@ class YamlFile:
             line = _line(key.start_mark)
             if not isinstance(key, yaml.ScalarNode):
                 mistakes.add(path, f"the key in line {line} is no plain name")
-            elif key.value in first and key.value != "<<":
+            elif key.value in first and not _is_merge(key):
                 both = "in one line" if first[key.value] == line else f"in line {line}"
                 mistakes.add(
                     (*path, key.value),
@@ -125,6 +155,19 @@ class YamlFile:
                 )
             else:
                 first[key.value] = line
+
+    def _check_merges(self, node: yaml.MappingNode, path: Path, mistakes: Mistakes) -> None:
+        merges = [(_line(key.start_mark), value) for key, value in node.value if _is_merge(key)]
+        for line, value in merges:
+            if not all(isinstance(one, yaml.MappingNode) for one in _parts(value)):
+                mistakes.add(
+                    path, f"the `<<` in line {line} brings in no settings: write it as `<<: *name`"
+                )
+        if len(merges) > 1:
+            lines = " and ".join(str(line) for line, _ in merges)
+            mistakes.add(
+                path, f"`<<` is written twice, in lines {lines}: write one, `<<: [*first, *second]`"
+            )
 
     def _of(self, node: yaml.MappingNode) -> Entries:
         """The entries by name, first key first; what `<<` brings in gives way to the rest."""
@@ -192,17 +235,21 @@ def _syntax(name: str, text: str, error: yaml.MarkedYAMLError) -> str:
     problem = error.problem or "not understood"
     rows = text.splitlines()
     row = rows[line - 1] if line <= len(rows) else ""
-    if "\t" in row[: len(row) - len(row.lstrip())]:
+    if "\t" in row[: len(row) - len(row.lstrip(" \t-"))]:
         return f"{name}:{line}: a tab: YAML is indented with spaces"
     if problem == "but found another document":
         return f"{name}:{line}: a second document (`---`): a configuration is one document"
     if problem.startswith("found undefined alias"):
         return f"{name}:{line}: an alias (*) without its anchor (&) before it"
-    context = f" {error.context}" if error.context else ""
+    if problem == _TOO_DEEP:
+        return f"{name}:{line}: {problem}"
+    context = error.context or ""
     begun = ""
     if error.context_mark and _line(error.context_mark) != line:
         begun = f" that begins in line {_line(error.context_mark)}"
-    return f"{name}:{line}: no YAML:{context}{begun}{',' if context else ''} {problem}"
+    told = f"{context}{begun}, {problem}" if context else problem
+    remedies = (remedy for word, remedy in _REMEDIES.items() if word in told)
+    return f"{name}:{line}: no YAML: {': '.join([told, *islice(remedies, 1)])}"
 
 
 def _line(mark: Any) -> int:
@@ -221,13 +268,16 @@ def _scalar(text: str) -> object:
     return float(text) if _FLOAT.match(text) else text
 
 
-def _is_merge(key: yaml.ScalarNode) -> bool:
-    return key.value == "<<" and key.style in (None, "")
+def _is_merge(key: yaml.Node) -> bool:
+    return isinstance(key, yaml.ScalarNode) and key.value == "<<" and key.style in (None, "")
 
 
 def _merged(node: yaml.MappingNode) -> Iterator[yaml.MappingNode]:
     for key, value in node.value:
-        if isinstance(key, yaml.ScalarNode) and _is_merge(key):
-            for one in value.value if isinstance(value, yaml.SequenceNode) else [value]:
-                if isinstance(one, yaml.MappingNode):
-                    yield one
+        if _is_merge(key):
+            yield from (one for one in _parts(value) if isinstance(one, yaml.MappingNode))
+
+
+def _parts(value: yaml.Node) -> list[yaml.Node]:
+    """What one `<<` brings in: a mapping, or a list of them."""
+    return value.value if isinstance(value, yaml.SequenceNode) else [value]

@@ -6,6 +6,7 @@ inserted in the middle, so a commit writes few pages however many tags there are
 oldest run frees whole pages at the beginning. Every method is one transaction.
 """
 
+import os
 import sqlite3
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -15,7 +16,9 @@ from pathlib import Path
 
 import structlog
 
-from gateway.history.recent import Shelved
+from gateway.history.lock import locked
+from gateway.history.outcomes import Outcome
+from gateway.history.recent import Extent, Identity, Shelved
 from gateway.history.rows import to_row
 from gateway.tags import Sample
 
@@ -48,6 +51,11 @@ CREATE VIEW history AS
     FROM recent JOIN tag ON tag.id = recent.tag;
 """
 
+_MARK = """
+CREATE TABLE file (mark BLOB);
+INSERT INTO file VALUES (randomblob(16));
+"""
+
 # Many rows in one statement: for each statement the interpreter lock is given away and must be
 # had again, which takes long when the event loop is busy.
 _INSERTS = [
@@ -58,25 +66,29 @@ _INSERTS = [
 
 
 class HistoryFile:
-    """The one connection that writes. Raises `sqlite3.Error` and `OSError` as they come."""
+    """The one connection that writes. Raises `sqlite3.Error` and `OSError` as they come.
+
+    While it is open no other gateway can open the file, which is a `BlockingIOError` there.
+    """
 
     def __init__(self, path: Path, max_size: int) -> None:
         self.path = path
         self._log = Path(f"{path}-wal")  # made once: every new path costs the interpreter a string
         # What is in the log and not yet in the file proper counts as well.
         self.log_limit = max(256 * 1024, min(4 * 1024 * 1024, max_size // 16))
-        self._database = _opened(path)
         with ExitStack() as undo:
+            undo.callback(os.close, locked(path))
+            self._database = _opened(path)
             undo.callback(self._database.close)
             pages = max(16, self.log_limit // (2 * 4096))
             self._database.execute(f"PRAGMA wal_autocheckpoint = {pages}")
             self._database.execute(f"PRAGMA journal_size_limit = {self.log_limit}")
-            self.inode = path.stat().st_ino
             self._tags = dict(self._database.execute("SELECT key, id FROM tag"))
-            undo.pop_all()
+            self.identity = identity(self._database, path)
+            self._held = undo.pop_all()
 
     def close(self) -> None:
-        self._database.close()
+        self._held.close()
 
     # -- writing --
 
@@ -107,8 +119,8 @@ class HistoryFile:
             self._database.execute("INSERT INTO tag VALUES (?, ?)", (number, key))
         return number
 
-    def store_writes(self, outcomes: Sequence[tuple[int, str]], most: int) -> None:
-        """Outcomes with their time, as on the `writes` key; the newest `most` are kept."""
+    def store_writes(self, outcomes: Sequence[Outcome], most: int) -> int:
+        """Returns the number of the last; the newest `most` are kept."""
         with self._transaction():
             self._database.executemany(
                 "INSERT INTO written (time, outcome) VALUES (?, ?)", outcomes
@@ -116,24 +128,31 @@ class HistoryFile:
             self._database.execute(
                 "DELETE FROM written WHERE id <= (SELECT max(id) FROM written) - ?", (most,)
             )
+            return self.last_write()
 
     def sort(self, run: int, now: int) -> Shelved | None:
-        """Moves a run from `recent` to `sample`; None if there is nothing of it."""
+        """Moves a run from `recent` to `sample`, also where the beginning of it is there already;
+        None if there is nothing of it."""
         with self._transaction():
             [(first, last, count)] = self._database.execute(
                 "SELECT min(time), max(time), count(*) FROM recent WHERE run = ?", (run,)
             )
             if not count:
                 return None
-            shelved = Shelved(run, first, last, count, now)
             self._database.execute(
                 "INSERT INTO sample SELECT run, tag, time, n, value, kind, bad FROM recent"
                 " WHERE run = ? ORDER BY tag, time, n",
                 (run,),
             )
-            self._database.execute("INSERT INTO run VALUES (?, ?, ?, ?, ?)", shelved)
+            self._database.execute(
+                "INSERT INTO run VALUES (?, ?, ?, ?, ?) ON CONFLICT (run) DO UPDATE SET"
+                " first = min(first, excluded.first), last = max(last, excluded.last),"
+                " samples = samples + excluded.samples, closed = excluded.closed",
+                (run, first, last, count, now),
+            )
             self._database.execute("DELETE FROM recent WHERE run = ?", (run,))
-        return shelved
+            [row] = self._database.execute("SELECT * FROM run WHERE run = ?", (run,))
+        return Shelved(*row)
 
     def drop(self, run: int) -> None:
         with self._transaction():
@@ -168,9 +187,17 @@ class HistoryFile:
     def shelved(self) -> list[Shelved]:
         return [Shelved(*row) for row in self._database.execute("SELECT * FROM run ORDER BY run")]
 
-    def unsorted(self) -> dict[int, int]:
-        """Runs in `recent`, with how many samples each has there."""
-        return dict(self._database.execute("SELECT run, max(n) + 1 FROM recent GROUP BY run"))
+    def unsorted(self) -> dict[int, Extent]:
+        """Runs in `recent`, with what there is of each."""
+        rows = self._database.execute(
+            "SELECT run, min(time), max(time), count(*) FROM recent GROUP BY run ORDER BY run"
+        )
+        return {run: Extent(*extent) for run, *extent in rows}
+
+    def last_write(self) -> int:
+        """The number of the last outcome of a write, 0 where there is none."""
+        [(number,)] = self._database.execute("SELECT ifnull(max(id), 0) FROM written")
+        return int(number)
 
     def size(self) -> int:
         """Bytes on disk, the log included."""
@@ -189,7 +216,7 @@ class HistoryFile:
     def is_there(self) -> bool:
         """Whether the path still names the file that is open."""
         try:
-            return self.path.stat().st_ino == self.inode
+            return self.path.stat().st_ino == self.identity.inode
         except FileNotFoundError:
             return False
 
@@ -206,6 +233,12 @@ class HistoryFile:
         finally:
             if self._database.in_transaction:
                 self._database.execute("ROLLBACK")
+
+
+def identity(database: sqlite3.Connection, path: Path) -> Identity:
+    """Of the file that is open, unless it has left its path meanwhile."""
+    [(mark,)] = database.execute("SELECT mark FROM file")
+    return Identity(path.stat().st_ino, mark)
 
 
 def is_damage(error: sqlite3.Error) -> bool:
@@ -244,8 +277,10 @@ def _prepare(database: sqlite3.Connection, path: Path) -> None:
     if not tables:
         database.executescript(
             f"BEGIN IMMEDIATE; PRAGMA application_id = {APPLICATION};"
-            f" PRAGMA user_version = {SCHEMA_VERSION}; {_SCHEMA} COMMIT;"
+            f" PRAGMA user_version = {SCHEMA_VERSION}; {_SCHEMA} {_MARK} COMMIT;"
         )
+    elif not database.execute("SELECT 1 FROM sqlite_schema WHERE name = 'file'").fetchall():
+        database.executescript(f"BEGIN IMMEDIATE; {_MARK} COMMIT;")  # older files had none
 
 
 def move_aside(path: Path, why: str) -> None:

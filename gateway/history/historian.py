@@ -3,11 +3,13 @@
 import sqlite3
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from heapq import merge
 from itertools import islice
 from pathlib import Path
 
 from gateway import payload
 from gateway.errors import BadValue, Busy
+from gateway.history.outcomes import Outcomes
 from gateway.history.reader import Part, Reader, in_order
 from gateway.history.recent import Recent, Shelved
 from gateway.history.timerange import TimeRange, time_range
@@ -34,8 +36,11 @@ class Historian:
         longest = max(256, min(LONGEST_RUN, max_size // 1024))
         self._wall = wall
         self._recent = Recent(longest, min(OLDEST_RUN, keep / 20))
+        self._outcomes = Outcomes()
         self._reader = Reader(path)
-        self._writer = Writer(path, keep, max_size, self._recent, self._reader, wall)
+        self._writer = Writer(
+            path, keep, max_size, self._recent, self._outcomes, self._reader, wall
+        )
 
     def start(self) -> None:
         """Begins to write. A file that cannot be opened is tried again: see `document`."""
@@ -53,7 +58,7 @@ class Historian:
 
     def record_write(self, outcome: WriteOutcome) -> None:
         """Keeps the line that also goes to the `writes` key."""
-        self._writer.add_write(outcome.time, payload.write_outcome(outcome).decode())
+        self._outcomes.add(outcome.time, payload.write_outcome(outcome).decode())
 
     def document(self) -> Mapping[str, object]:
         """For the status: `state` is `ok` or one sentence; counts since the start."""
@@ -65,8 +70,8 @@ class Historian:
             "stored": writer.stored,
             "waiting": recent.waiting,
             "lost": recent.lost,
-            "writes_stored": writer.writes_stored,
-            "writes_lost": writer.writes_lost,
+            "writes_stored": self._outcomes.stored,
+            "writes_lost": self._outcomes.lost,
             "bytes": writer.size,
             "oldest": None if oldest is None else payload.rfc3339(oldest),
         }
@@ -98,26 +103,27 @@ class Historian:
         return wanted
 
     def _writes(self, wanted: TimeRange) -> Iterator[str]:
+        pending = self._outcomes.pending(wanted)
+        stored = self._reader.writes(pending.file, pending.last, wanted)
         try:
-            yield from self._reader.writes(wanted)
-        except sqlite3.Error as error:
+            for outcome in merge(stored, pending.outcomes, key=lambda outcome: outcome.time):
+                yield outcome.told
+        except (sqlite3.Error, OSError) as error:
             raise Busy(f"history cannot be read: {error}") from error
 
     def _samples(self, tag: Tag, wanted: TimeRange, limit: int | None) -> Iterator[Sample]:
-        shelf, newest = self._recent.of(tag.key)
+        file, shelf, newest = self._recent.of(tag.key)
         runs = [run for run in shelf if run.first <= wanted.last and run.last >= wanted.first]
 
-        def part(number: int, run: Shelved) -> Part:
+        def part(run: Shelved) -> Part:
             return Part(
-                run.first, lambda: self._reader.samples(tag, number, run.number, wanted, limit)
+                run.first, lambda: self._reader.samples(file, tag, run.number, wanted, limit)
             )
 
+        parts = [*map(part, runs), *(_part_of(run, wanted) for run in newest)]
         try:
-            number = self._reader.tag(tag.key) if runs else None
-            parts = [] if number is None else [part(number, run) for run in runs]
-            parts += [_part_of(run, wanted) for run in newest]
             yield from in_order(parts)
-        except sqlite3.Error as error:
+        except (sqlite3.Error, OSError) as error:
             raise Busy(f"history cannot be read: {error}") from error
 
 

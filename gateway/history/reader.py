@@ -9,6 +9,10 @@ from heapq import heappop, heappush
 from pathlib import Path
 from typing import NamedTuple
 
+from gateway.errors import Busy
+from gateway.history.file import identity
+from gateway.history.outcomes import Outcome
+from gateway.history.recent import Identity
 from gateway.history.rows import from_row
 from gateway.history.timerange import TimeRange
 from gateway.tags import Sample, Tag
@@ -49,7 +53,11 @@ def _push(
 
 class Reader:
     """Connections that only read. No question holds one for longer than one run takes: a long
-    read would keep SQLite from emptying its log."""
+    read would keep SQLite from emptying its log.
+
+    Runs and tags have numbers of their own in every file, so each question says which file it
+    means. Raises `sqlite3.Error`, `OSError`, and `Busy` where there is another file now.
+    """
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -57,37 +65,32 @@ class Reader:
         self._idle: list[sqlite3.Connection] = []
         self._age = 0  # of the file: connections to an older one are not used again
 
-    def tag(self, key: str) -> int | None:
-        """The tag's number in the file. Raises `sqlite3.Error`, as all that follows."""
-        with self._connection() as database:
-            row = database.execute("SELECT id FROM tag WHERE key = ?", (key,)).fetchone()
-        return None if row is None else int(row[0])
-
     def samples(
-        self, tag: Tag, number: int, run: int, wanted: TimeRange, limit: int | None
+        self, file: Identity | None, tag: Tag, run: int, wanted: TimeRange, limit: int | None
     ) -> list[Sample]:
         """The first of one run: all of them without a limit."""
-        with self._connection() as database:
+        with self._connection(file) as database:
             rows = database.execute(
                 "SELECT time, value, kind, bad FROM sample"
-                " WHERE run = ? AND tag = ? AND time BETWEEN ? AND ? ORDER BY time, n LIMIT ?",
-                (run, number, *wanted, -1 if limit is None else limit),
+                " WHERE run = ? AND tag = (SELECT id FROM tag WHERE key = ?)"
+                " AND time BETWEEN ? AND ? ORDER BY time, n LIMIT ?",
+                (run, tag.key, *wanted, -1 if limit is None else limit),
             ).fetchall()
         return [from_row(tag, row) for row in rows]
 
-    def writes(self, wanted: TimeRange) -> Iterator[str]:
-        """The outcomes of writes in the order of time."""
+    def writes(self, file: Identity | None, last: int, wanted: TimeRange) -> Iterator[Outcome]:
+        """The outcomes of writes in the order of time; `last`: none with a higher number."""
         after = (wanted.first, -1)
         while True:
-            with self._connection() as database:
+            with self._connection(file) as database:
                 rows = database.execute(
-                    "SELECT time, id, outcome FROM written"
-                    " WHERE (time, id) > (?, ?) AND time <= ? ORDER BY time, id LIMIT 1000",
-                    (*after, wanted.last),
+                    "SELECT time, id, outcome FROM written WHERE (time, id) > (?, ?)"
+                    " AND time <= ? AND id <= ? ORDER BY time, id LIMIT 1000",
+                    (*after, wanted.last, last),
                 ).fetchall()
             if not rows:
                 return
-            yield from (outcome for _, _, outcome in rows)
+            yield from (Outcome(time, told) for time, _, told in rows)
             after = rows[-1][:2]
 
     def renew(self) -> None:
@@ -99,7 +102,7 @@ class Reader:
             database.close()
 
     @contextmanager
-    def _connection(self) -> Iterator[sqlite3.Connection]:
+    def _connection(self, file: Identity | None) -> Iterator[sqlite3.Connection]:
         with self._lock:
             age = self._age
             database = self._idle.pop() if self._idle else None
@@ -109,6 +112,8 @@ class Reader:
             )
         with ExitStack() as undo:
             undo.callback(database.close)
+            if identity(database, self._path) != file:
+                raise Busy("history cannot be read: another file has taken its place")
             yield database
             undo.pop_all()
         with self._lock:

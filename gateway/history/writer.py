@@ -7,13 +7,13 @@ again every second until it works.
 import sqlite3
 import threading
 import time
-from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 
 import structlog
 
 from gateway.history.file import Foreign, HistoryFile, is_damage, move_aside
+from gateway.history.outcomes import Outcomes
 from gateway.history.reader import Reader
 from gateway.history.recent import Recent, Run, Shelved
 
@@ -23,7 +23,6 @@ COMMIT_EVERY = 0.05  # seconds
 SYNC_EVERY = 1.0  # seconds of samples that a power cut may cost
 RETRY_EVERY = 1.0  # seconds
 MOST_AT_ONCE = 8192  # samples in one transaction
-MOST_WRITES_WAITING = 10_000
 MOST_ASIDE = 3  # damaged files moved away since the start; then the disk is to blame
 ROOM_OF_A_WRITE = 1024  # bytes on disk, at most a tenth of the file are writes
 _SENTENCES = {
@@ -47,6 +46,7 @@ class Writer:
         keep: float,
         max_size: int,
         recent: Recent,
+        outcomes: Outcomes,
         reader: Reader,
         wall: Callable[[], int],
     ) -> None:
@@ -54,19 +54,16 @@ class Writer:
         self.readable = False  # the file was opened once, so that the shelf is complete
         self.size = 0
         self.stored = 0
-        self.writes_stored = 0
-        self.writes_lost = 0
         self._path = path
         self._keep = int(keep * 1e9)
         self._max_size = max_size
         self._recent = recent
+        self._outcomes = outcomes
         self._reader = reader
         self._wall = wall
         self._file: HistoryFile | None = None
         self._aside = 0
         self._begun: list[Run] = []  # runs with a number, not yet sorted
-        self._writes: deque[tuple[int, str]] = deque()
-        self._writes_lock = threading.Lock()
         self._may_expire = 2  # runs, for their age
         self._next_expiry = 0.0
         self._next_sync = 0.0
@@ -81,20 +78,24 @@ class Writer:
 
     def close(self, within: float) -> bool:
         """Stores what waits and ends; whether that was done within so many seconds."""
+        if self._thread.ident is None:  # never started
+            return True
         self._closing.set()
         self._thread.join(within)
         return not self._thread.is_alive()
 
-    def add_write(self, time: int, outcome: str) -> None:
-        with self._writes_lock:
-            if len(self._writes) >= MOST_WRITES_WAITING:
-                self._writes.popleft()
-                self.writes_lost += 1
-            self._writes.append((time, outcome))
-
     # -- the history thread --
 
     def _run(self) -> None:
+        ended = False
+        try:
+            self._write()
+            ended = True
+        finally:
+            if not ended:  # nobody has foreseen that, and Python prints where it was
+                self._failed("history has failed: start the gateway again")
+
+    def _write(self) -> None:
         ending = False
         while not ending:
             started = time.monotonic()
@@ -103,7 +104,7 @@ class Writer:
                 self._try()
             self._closing.wait(max(0.0, started + COMMIT_EVERY - time.monotonic()))
         self._let_go()
-        if (waiting := self._recent.waiting) or self._writes:
+        if (waiting := self._recent.waiting) or self._outcomes:
             log.error("history ends with samples that no disk took", samples=waiting)
 
     def _try(self) -> None:
@@ -124,17 +125,14 @@ class Writer:
 
     def _take_stock(self, file: HistoryFile) -> None:
         """What of the samples in memory is in the file, which may be another one now."""
-        self._recent.reshelve(file.shelved())
         unsorted = file.unsorted()
-        self._begun.clear()
-        for run in self._recent.runs():
-            self._recent.stored(run, unsorted.pop(run.number, 0))
-            if run.stored:
-                self._begun.append(run)
-            else:
-                run.number = 0
-        for number in unsorted:  # left by an earlier life, or dropped from memory
-            file.sort(number, self._wall())
+        self._recent.opened(file.identity, file.shelved(), unsorted)
+        self._outcomes.opened(file.identity, file.last_write())
+        self._begun = [run for run in self._recent.runs() if run.number]
+        begun = {run.number for run in self._begun}
+        for number in unsorted:
+            if number not in begun:  # left by an earlier life, or dropped from memory
+                file.sort(number, self._wall())
         self._recent.reshelve(file.shelved())
         self._reader.renew()
         self.readable = True
@@ -145,6 +143,7 @@ class Writer:
         if now >= self._next_sync:
             self._next_sync = now + SYNC_EVERY
             if not file.is_there():
+                file.empty_log()  # or SQLite would put it into whatever took the file's place
                 raise FileNotFoundError(0, "the file was taken away")
             file.sync(full=True)
         self._store_writes(file)
@@ -169,18 +168,16 @@ class Writer:
             self._recent.stored(run, upto)
 
     def _store_writes(self, file: HistoryFile) -> None:
-        with self._writes_lock:
-            writes = list(self._writes)
-            self._writes.clear()
-        if not writes:
+        if not self._outcomes:
             return
+        most = max(100, self._max_size // 10 // ROOM_OF_A_WRITE)
+        begun = self._outcomes.begin(file.last_write())
         try:
-            file.store_writes(writes, max(100, self._max_size // 10 // ROOM_OF_A_WRITE))
+            last = file.store_writes(begun, most)
         except sqlite3.Error:
-            with self._writes_lock:  # back, before what came meanwhile
-                self._writes.extendleft(reversed(writes))
+            self._outcomes.undone()
             raise
-        self.writes_stored += len(writes)
+        self._outcomes.done(last)
 
     def _sort(self, file: HistoryFile) -> None:
         for run in list(self._begun):

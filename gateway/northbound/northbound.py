@@ -76,9 +76,12 @@ class Northbound:
         `commanded` takes commands such as stop; without it there are none.
         """
         self.keys = Keys(settings.prefix, name)
+        self.sole = asyncio.Event()  # set when files and lines may be touched, see `run`
         self.opened = asyncio.Event()  # everything is declared, all current values are queued
         self._config = configure(settings)
         self._retry = settings.mode is Mode.CLIENT
+        if self._retry:
+            self.sole.set()  # it listens to nobody, and may wait for its router for ever
         self._writers = None if writers is None else Writers(writers)
         self._links = Links()
         self._duty = Duty(standby, self.keys, self._config)
@@ -140,11 +143,13 @@ class Northbound:
 
         Once only: for another session make another `Northbound`. Raises `GatewayError` when the
         session cannot be opened (a client waits for its router), and an `ExceptionGroup` with
-        whatever ended it later.
+        whatever ended it later. Once it is open, which sets `sole`, no gateway started a second
+        time gets so far: the endpoint is taken.
         """
         for exposure in secrets.exposures(self._config):
             log.warning(exposure)
         session = await opened(self._config, retry=self._retry)
+        self.sole.set()
         try:
             await self._serve(session)
         finally:

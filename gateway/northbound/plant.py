@@ -1,6 +1,6 @@
 """What the Zenoh side needs from the rest of the gateway, and nothing more."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Literal, Protocol
 
 from gateway.tags import Sample, Tag, Written
@@ -36,12 +36,19 @@ class Plant(Protocol):
         older of two values.
         """
 
+    def told(self, samples: Sequence[Sample]) -> None:
+        """They are about to be published again: what is worth telling is reckoned from them."""
+
     async def write(self, tag: Tag, value: Value) -> Written:
         """Returns when the device has acknowledged. Raises `GatewayError`; `Busy` and `BadValue`
         only when nothing was sent. Cancelled when nobody waits any more."""
 
+    def is_fresh(self, tag: Tag, max_age: float) -> bool:
+        """Whether what is known is younger than `max_age` seconds, or nothing could be read."""
+
     async def fresh(self, tag: Tag, max_age: float) -> Sample:
-        """A sample not older than `max_age` seconds, read from the device if need be."""
+        """What is known where it `is_fresh`, or what the device says when it is asked from now
+        on. Raises `Busy` when it could not be asked in time."""
 
     def status(self) -> Mapping[str, Mapping[str, object]]:
         """Documents by path: `status`, `lines/<line>`, `devices/<device>`."""

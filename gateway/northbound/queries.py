@@ -7,7 +7,7 @@ threads: `narrow` ones of one key, and `wide` ones of a wildcard, which must not
 import asyncio
 import threading
 import time
-from collections.abc import Callable, Coroutine, Iterable
+from collections.abc import Callable, Coroutine, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -15,8 +15,7 @@ from functools import partial
 import structlog
 import zenoh
 
-from gateway import payload
-from gateway.errors import BadValue, GatewayError
+from gateway.errors import BadValue, Busy
 from gateway.keys import Asked, Family, asked, max_age
 from gateway.northbound.controls import Controls
 from gateway.northbound.directory import Directory
@@ -25,7 +24,7 @@ from gateway.northbound.replies import Replies
 from gateway.northbound.writes import ANSWER_WITHIN, Writes, asker
 from gateway.orders import Obeyed
 from gateway.payload import Failure, Problem
-from gateway.tags import Sample, Written
+from gateway.tags import Tag, Written
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 
@@ -150,30 +149,44 @@ class Queries:
             self._soon(query, partial(self._replies.status, documents))
 
     async def _fresh(self, query: zenoh.Query, wanted: Asked) -> None:
-        answer: Answer = partial(
-            self._replies.outcome, Failure(Problem.UNCLEAR, "no answer in time")
-        )
+        ending = Failure(Problem.UNCLEAR, "the gateway is ending")
+        answer: Answer = partial(self._replies.outcome, ending)
         try:
-            samples = await self._read(wanted, query.parameters.get("max_age") or "")
-            answer = partial(self._replies.fresh, samples)
-        except TimeoutError:
-            pass
+            tags = self._directory.find(wanted.of)
+            unread = await self._read(tags, query.parameters.get("max_age") or "")
+            answer = partial(self._replies.fresh, tags, unread)
         except BadValue as error:
             answer = partial(self._replies.outcome, Failure(Problem.BAD_QUERY, str(error)))
-        except GatewayError as error:
-            answer = partial(self._replies.outcome, payload.failure(error))
         finally:
             self._soon(query, answer)
 
-    async def _read(self, wanted: Asked, age_text: str) -> list[Sample]:
-        tags = self._directory.find(wanted.of)
+    async def _read(self, tags: Sequence[Tag], age_text: str) -> list[Tag]:
+        """Reads those that are too old, and what gets too old meanwhile; each once at most.
+
+        Returns those that could not be read in time.
+        """
+        unread = list[Tag]()
         if not tags:
-            return []  # another gateway's
+            return unread  # another gateway's
         age = max_age(age_text)
         if len(tags) > FRESH_LIMIT:
             raise BadValue(f"{len(tags)} tags are meant; max_age reads at most {FRESH_LIMIT}")
-        async with asyncio.timeout(ANSWER_WITHIN):
-            return await asyncio.gather(*(self._plant.fresh(tag, age) for tag in tags))
+        until = asyncio.get_running_loop().time() + ANSWER_WITHIN
+        left = dict.fromkeys(tags)
+        while old := [tag for tag in left if not self._plant.is_fresh(tag, age)]:
+            for tag in old:
+                del left[tag]
+            read = await asyncio.gather(*(self._read_one(tag, age, until) for tag in old))
+            unread += [tag for tag, was_read in zip(old, read, strict=True) if not was_read]
+        return unread
+
+    async def _read_one(self, tag: Tag, age: float, until: float) -> bool:
+        try:
+            async with asyncio.timeout_at(until):
+                await self._plant.fresh(tag, age)
+        except (Busy, TimeoutError):
+            return False
+        return True
 
     def _task(self, work: Coroutine[None, None, None]) -> None:
         task = asyncio.get_running_loop().create_task(work)

@@ -1,5 +1,7 @@
 """What is told again: all values after a return to the network, which keeps nothing, and bad
-ones with their heartbeat. Good ones are repeated as they are read."""
+ones with their heartbeat. Good ones are repeated as they are read.
+
+An event is told once; that nothing is known of it is no event, and told like the others."""
 
 import asyncio
 from collections.abc import Callable, Sequence
@@ -34,10 +36,12 @@ class Repeater:
         self._links = links
 
     async def publish_all(self) -> None:
-        tags = [tag for tag in self._directory.all() if not tag.event]  # an event is told once
+        tags = self._directory.all()
         for start in range(0, len(tags), _AT_ONCE):
-            chunk = tags[start : start + _AT_ONCE]
-            self._publish([self._plant.sample(tag) for tag in chunk])
+            known = [self._plant.sample(tag) for tag in tags[start : start + _AT_ONCE]]
+            again = [s for s in known if not s.tag.event or s.quality is Quality.BAD]
+            self._plant.told(again)
+            self._publish(again)
             await asyncio.sleep(0)
 
     async def run(self) -> None:
@@ -60,7 +64,7 @@ class Repeater:
             await self.publish_all()
 
     async def _beat(self) -> None:
-        tags = [tag for tag in self._directory.all() if tag.heartbeat and not tag.event]
+        tags = [tag for tag in self._directory.all() if tag.heartbeat]
         told: dict[Tag, float] = {}  # when each bad value was, by the loop's clock
         while tags:
             await asyncio.sleep(_LOOK_EVERY)

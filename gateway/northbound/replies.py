@@ -1,6 +1,6 @@
 """What is said to a question, on an answering thread: values, descriptions, status, outcomes."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 
 import zenoh
 
@@ -11,7 +11,7 @@ from gateway.northbound import forms
 from gateway.northbound.directory import Directory
 from gateway.northbound.plant import History, Plant
 from gateway.payload import Failure, Problem
-from gateway.tags import Sample, Tag, Written
+from gateway.tags import Tag, Written
 
 _NOT_ALL = "the gateway is ending: this is not all"
 _NO_HISTORY = Failure(Problem.NO_HISTORY, "no history is kept here: ask without _time")
@@ -68,12 +68,15 @@ class Replies:
         sample = self._plant.sample(tag)
         forms.reply(query, self._keys.value(tag.key), sample, stamp)
 
-    def fresh(self, samples: Iterable[Sample], query: zenoh.Query) -> None:
-        """What was just read, or what has been read since."""
-        for sample in samples:
-            stamp = self._stamp()
-            newest = max(sample, self._plant.sample(sample.tag), key=lambda of: of.time)
-            forms.reply(query, self._keys.value(sample.tag.key), newest, stamp)
+    def fresh(self, tags: Sequence[Tag], unread: Sequence[Tag], query: zenoh.Query) -> None:
+        """As they are known now, but for those that could not be read: one error for them all."""
+        for tag in tags:
+            if tag not in unread:
+                self._value(query, tag)
+        if unread:
+            more = f" and {len(unread) - 1} more" if len(unread) > 1 else ""
+            reason = f"{unread[0].key}{more} could not be read in time"
+            self.outcome(Failure(Problem.BUSY, reason), query)
 
     def history(self, wanted: Asked, query: zenoh.Query) -> None:
         tags = self._directory.find(wanted.of)

@@ -1,6 +1,7 @@
 """The one Zenoh session: configured, opened and closed without ever holding the event loop."""
 
 import asyncio
+import errno
 import json
 import threading
 from collections.abc import Callable
@@ -204,7 +205,9 @@ async def opened(config: zenoh.Config, *, retry: bool) -> zenoh.Session:
             raise
         except zenoh.ZError as error:
             if not retry:
-                raise GatewayError(f"Zenoh cannot be opened: {_plain(error)}") from None
+                raise GatewayError(
+                    f"Zenoh cannot be opened: {_plain(error)}{_hint(error)}"
+                ) from None
             tell = log.warning if pause == _SHORTEST_RETRY else log.debug  # once is enough
             tell("no Zenoh router yet: it is tried again", error=_plain(error))
         await asyncio.sleep(pause)
@@ -214,6 +217,11 @@ async def opened(config: zenoh.Config, *, retry: bool) -> zenoh.Session:
 def _plain(error: zenoh.ZError) -> str:
     """Zenoh's sentence without the place in its source."""
     return str(error).partition(" at /")[0]
+
+
+def _hint(error: zenoh.ZError) -> str:
+    in_use = f"os error {errno.EADDRINUSE}" in str(error)
+    return ": perhaps this gateway is running already" if in_use else ""
 
 
 async def off_loop(function: Callable[..., T], *arguments: object) -> T:

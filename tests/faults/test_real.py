@@ -151,7 +151,7 @@ async def test_the_station_killed_and_started_again(tmp_path: Path) -> None:
 def test_restarts_leave_nothing_behind(tmp_path: Path) -> None:
     """Ended kindly and killed by turns: no process, no file, no lock, no name on the port, and no
     file descriptor in the PLC's process. What SQLite keeps beside a file after a kill goes with
-    the next."""
+    the next; the file that is locked stays, and nobody holds it."""
     tty = str(tmp_path / "tty")
     tags = {**TAGS, "speed": {**TAGS["speed"], "history": True}}
     with station("pty", tty) as plc:
@@ -162,7 +162,7 @@ def test_restarts_leave_nothing_behind(tmp_path: Path) -> None:
             {"hall": vigor_line(tty, tags)},
             history={"path": str(tmp_path / "history.db")},
         )
-        files = set(tmp_path.rglob("*")) | {tmp_path / "history.db"}
+        files = set(tmp_path.rglob("*")) | {tmp_path / "history.db", tmp_path / "history.db.lock"}
         kept_open = len(list(Path(f"/proc/{plc.pid}/fd").iterdir()))
         for number in range(RESTARTS):
             kindly = number % 2 == 1

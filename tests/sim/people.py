@@ -19,7 +19,7 @@ from tests.sim.stations import Troubled
 
 SOON = 1.0  # seconds: what nobody acknowledges has arrived by then, or never will
 NOT_SENT = (Busy, Offline, LineDown)
-_QUIET = ("deaf", "reboot", "vanish", "flicker", "hang")
+_QUIET = ("deaf", "reboot", "vanish", "flicker", "hang", "stall")
 
 
 @dataclass(eq=False)

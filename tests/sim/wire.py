@@ -16,7 +16,6 @@ from gateway.errors import LineDown
 from gateway.transport import Ear
 from gateway.wiretime import Wire
 
-
 SERVER_WAITS = 0.25  # seconds between two requests that it has kept
 
 

@@ -1,30 +1,35 @@
-"""The command line as a Zenoh client of a running gateway."""
+"""One session to a running gateway: ask, write, follow."""
 
 import json
-import math
 import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import replace
+from functools import partial
+from itertools import pairwise
 from queue import SimpleQueue
 from typing import NamedTuple
 
 import orjson
 import zenoh
 
+from gateway.client.typed import matches, parse_value
 from gateway.config import Config
 from gateway.control import TO_ALL
-from gateway.errors import ConfigError, GatewayError
+from gateway.errors import GatewayError
 from gateway.keys import Keys
 from gateway.northbound import Mode, zenoh_settings
 from gateway.northbound.session import configure
 from gateway.payload import rfc3339
-from gateway.values import Value
+from gateway.tags import Tag
+from gateway.values import Kind, Value
 
 TOKEN_VARIABLE = "PLC_GATEWAY_WRITE_TOKEN"  # noqa: S105  (the name of a variable)
 PATIENCE = 10.0  # seconds a question may take
 NOTHING = "nothing was answered: is the gateway of this file running?"
+_CHANGED = "does the gateway run with this file as it is now?"
+_NAMED = 10  # tags in one sentence
 
 
 class Shown(NamedTuple):
@@ -35,26 +40,48 @@ class Shown(NamedTuple):
 
 
 class Client:
-    """One session to the gateway of a configuration. Blocking calls, for the command line only."""
+    """One session to the gateway of a configuration. Blocking calls, for the command line only.
 
-    def __init__(self, session: zenoh.Session, keys: Keys) -> None:
+    Tags that are not in the configuration are another gateway's, and left out. `tell` gets
+    sentences for people.
+    """
+
+    def __init__(self, session: zenoh.Session, config: Config, tell: Callable[[str], None]) -> None:
         self._session = session
-        self._keys = keys
+        self._keys = Keys(config.zenoh.prefix, config.name)
+        self._tags = {tag.key: tag for device in config.devices for tag in device.tags}
+        self._only_blocks = [device for device in config.devices if device.blocks == "only"]
+        self._tell = tell
+        self._doubled: set[str] = set()  # devices, told of
 
     def values(self, wanted: str, max_age: str | None = None) -> list[Shown]:
-        """The current values of the tags a key expression (without the prefix) names."""
+        """The current values of the tags a key expression (without the prefix) names, by name.
+
+        Where two gateways answer for a device, both values of each of its tags, and it is told.
+        """
         selector = self._keys.value(wanted) + (f"?max_age={max_age}" if max_age else "")
         found = []
-        for reply in self._ask(selector, None):
+        for reply in self._ask(selector):
             if reply.err is not None:
                 raise GatewayError(_reason(reply.err.payload.to_bytes()))
             if reply.ok is not None and (shown := self._shown(reply.ok)) is not None:
                 found.append(shown)
-        return sorted(found)
+        found.sort(key=lambda row: row.tag)
+        self._tell_of_doubled(found)
+        return found
+
+    def complete(self, wanted: list[str], rows: Sequence[Shown]) -> bool:
+        """Whether each wanted tag of the file is in a row; those that are not are told."""
+        answered = {row.tag for row in rows}
+        lost = [key for key in self._tags if key not in answered and matches(key, wanted)]
+        if lost:
+            more = f" and {len(lost) - _NAMED} more" if len(lost) > _NAMED else ""
+            self._tell(f"nothing was answered for {', '.join(lost[:_NAMED])}{more}: {_CHANGED}")
+        return not lost
 
     def status(self, path: str = "status") -> dict[str, object]:
         """`status`, `lines/<line>` or `devices/<device>` of the gateway."""
-        for reply in self._ask(self._keys.status(path), None):
+        for reply in self._ask(self._keys.status(path)):
             if reply.ok is not None:
                 return _document(reply.ok.payload.to_bytes())
         raise GatewayError("the gateway does not answer")
@@ -62,27 +89,18 @@ class Client:
     def write(self, tag: str, value: Value) -> dict[str, object]:
         """The outcome as the gateway told it: `value ...` or `error ...`.
 
-        Raises `GatewayError` when nobody answered: then nobody knows whether it was done.
+        Raises `GatewayError` when nobody was there to hear it, or nobody answered.
         """
-        token = os.environ.get(TOKEN_VARIABLE)
-        replies = self._ask(self._keys.set(tag), orjson.dumps(value), token)
-        for reply in replies:
-            answer = reply.ok or reply.err
-            if answer is not None:
-                return _document(answer.payload.to_bytes())
-        raise GatewayError(f"no gateway answered for {tag}: is it running?")
+        # Not orjson, which knows no integer beyond 64 bits: a float tag takes one.
+        return self._order(self._keys.set(tag), json.dumps(value).encode())
 
     def control(self, line: str, device: str, command: str, argument: str) -> dict[str, object]:
         """What the device said: `answer ...` or `error ...`. Raises as `write`."""
         to_all = command == TO_ALL
         key = self._keys.to_all(line) if to_all else self._keys.command(device, command)
-        for reply in self._ask(key, argument.encode(), os.environ.get(TOKEN_VARIABLE)):
-            answer = reply.ok or reply.err
-            if answer is not None:
-                return _document(answer.payload.to_bytes())
-        raise GatewayError(f"no gateway answered at {key}: is it running?")
+        return self._order(key, argument.encode())
 
-    def follow(self, wanted: Sequence[str]) -> Iterator[Shown]:
+    def follow(self, wanted: list[str]) -> Iterator[Shown]:
         """The current values, then every change as it comes, without end.
 
         When the gateway goes, what was good is bad: `no-gateway`; when it returns, its values
@@ -91,13 +109,14 @@ class Client:
         news: SimpleQueue[Shown | bool] = SimpleQueue()
         seen: set[str] = set()
         with ExitStack() as stack:
-            for want in wanted:
-                stack.enter_context(self._subscribed(want, news.put))
+            for subscriber in self._subscribed(wanted, news.put):
+                stack.enter_context(subscriber)
             for watcher in self._gateway_seen(news.put):
                 stack.enter_context(watcher)
             rows = self._all(wanted)
             if not rows:
                 raise GatewayError(NOTHING)
+            self.complete(wanted, rows)
             there = True
             while True:
                 seen.update(row.tag for row in rows)
@@ -116,16 +135,35 @@ class Client:
                     case row:  # without a gateway it is one that came late
                         rows = [row] if there else []
 
-    def _all(self, wanted: Sequence[str]) -> list[Shown]:
+    def _all(self, wanted: list[str]) -> list[Shown]:
         return [row for want in wanted for row in self.values(want)]
 
-    def _subscribed(self, wanted: str, told: Callable[[Shown], None]) -> zenoh.Subscriber[None]:
+    def _subscribed(
+        self, wanted: list[str], told: Callable[[Shown], None]
+    ) -> Iterator[zenoh.Subscriber[None]]:
+        """To the values, and to the blocks of the devices that put nothing else."""
+
         def arrived(sample: zenoh.Sample) -> None:
             got = self._shown(sample)
             if got is not None:
                 told(got)
 
-        return self._session.declare_subscriber(self._keys.value(wanted), arrived)
+        def unpacked(tags: dict[str, str], sample: zenoh.Sample) -> None:
+            with suppress(orjson.JSONDecodeError):
+                for name, known in _document(sample.payload.to_bytes()).items():
+                    if name in tags and isinstance(known, dict):
+                        told(Shown(tags[name], known))
+
+        for want in wanted:
+            yield self._session.declare_subscriber(self._keys.value(want), arrived)
+        for device in self._only_blocks:
+            # Event tags are put one by one in any case.
+            mine = [tag for tag in device.tags if not tag.event and matches(tag.key, wanted)]
+            if mine:
+                yield self._session.declare_subscriber(
+                    self._keys.block(device.name),
+                    partial(unpacked, {tag.name: tag.key for tag in mine}),
+                )
 
     def _gateway_seen(
         self, told: Callable[[bool], None]
@@ -144,35 +182,61 @@ class Client:
             self._session.info.declare_transport_events_listener(link),
         )
 
-    def _ask(
-        self, selector: str, payload: bytes | None, token: str | None = None
-    ) -> list[zenoh.Reply]:
+    def _ask(self, selector: str) -> list[zenoh.Reply]:
         try:
             return list(
                 self._session.get(
-                    selector,
-                    payload=payload,
-                    attachment=token,
-                    timeout=PATIENCE,
-                    consolidation=zenoh.ConsolidationMode.NONE,
+                    selector, timeout=PATIENCE, consolidation=zenoh.ConsolidationMode.NONE
                 )
             )
         except zenoh.ZError as error:
             raise GatewayError(f"{selector}: {error}") from None
 
+    def _order(self, key: str, payload: bytes) -> dict[str, object]:
+        """What was answered to a write or a command, which is sent only if somebody takes it.
+
+        Its gateway is asked for its state before. Zenoh's own messages stay in order, so who
+        takes the order is known then; and a frozen gateway does not get what it would do later,
+        when nobody waits for it any more.
+        """
+        with self._session.declare_querier(key, timeout=PATIENCE) as querier:
+            self._ask(self._keys.status("status"))
+            if not querier.matching_status.matching:  # type: ignore[attr-defined]  # no bool
+                raise GatewayError(f"no gateway takes {key}: nothing was sent; {_CHANGED}")
+            for reply in querier.get(payload=payload, attachment=os.environ.get(TOKEN_VARIABLE)):
+                answer = reply.ok or reply.err
+                with suppress(orjson.JSONDecodeError):  # Zenoh's own `Timeout` is none
+                    if answer is not None:
+                        return _document(answer.payload.to_bytes())
+        raise GatewayError(f"{key}: no answer: nobody knows whether it was done")
+
     def _shown(self, sample: zenoh.Sample) -> Shown | None:
-        tag = self._keys.tag(str(sample.key_expr))
+        tag = self._tags.get(self._keys.tag(str(sample.key_expr)) or "")
         with suppress(orjson.JSONDecodeError):
             if tag is not None and sample.attachment is not None:
-                return Shown(tag, _raw(sample, sample.attachment.to_bytes()))
+                return Shown(tag.key, _raw(tag, sample, sample.attachment.to_bytes()))
             if tag is not None and sample.kind == zenoh.SampleKind.PUT:
-                return Shown(tag, _document(sample.payload.to_bytes()))
+                return Shown(tag.key, _document(sample.payload.to_bytes()))
         return None
+
+    def _tell_of_doubled(self, rows: list[Shown]) -> None:
+        """`rows` are the sorted answers to one question."""
+        doubled = {
+            self._tags[row.tag].device
+            for row, following in pairwise(rows)
+            if row.tag == following.tag
+        }
+        for device in sorted(doubled - self._doubled):
+            self._tell(f"more than one gateway answers for {device}: their values may differ")
+        self._doubled |= doubled
 
 
 @contextmanager
-def connected(config: Config) -> Iterator[Client]:
-    """A client of the gateway that `config` describes. Raises `GatewayError` when none is there."""
+def connected(config: Config, tell: Callable[[str], None]) -> Iterator[Client]:
+    """A client of the gateway that `config` describes, which may `tell` people something.
+
+    Raises `GatewayError` when none is there.
+    """
     own = config.zenoh
     endpoints = own.connect if own.mode == "client" else own.listen or own.connect
     if not endpoints:
@@ -194,45 +258,10 @@ def connected(config: Config) -> Iterator[Client]:
             "or use --direct"
         ) from None
     try:
-        yield Client(session, Keys(own.prefix, config.name))
+        yield Client(session, config, tell)
     finally:
-        session.close()  # type: ignore[no-untyped-call]  # Zenoh's stub lacks it
-
-
-def wanted_keys(config: Config, names: list[str] | None) -> list[str]:
-    """The key expressions of what was named: tags, devices, wildcards. Raises `ConfigError`."""
-    if not names:
-        return ["**"]
-    known = [tag.key for device in config.devices for tag in device.tags]
-    devices = {device.name for device in config.devices}
-    wanted = []
-    for name in names:
-        if name in devices:
-            name = f"{name}/**"
-        try:
-            found = any(matches(key, [name]) for key in known)
-        except zenoh.ZError:
-            raise ConfigError(f"{name} is no tag, and no wildcard such as 'mixer/**'") from None
-        if not found:
-            raise ConfigError(f"there is no tag or device {name}")
-        wanted.append(name)
-    return wanted
-
-
-def matches(key: str, wanted: list[str]) -> bool:
-    """Raises `ZError` for what is no key expression."""
-    return any(zenoh.KeyExpr(want).intersects(zenoh.KeyExpr(key)) for want in wanted)
-
-
-def parse_value(text: str) -> Value:
-    """A value as typed in a shell: a JSON scalar (`true`, `12.5`, `"AB"`), or else text."""
-    try:
-        value = json.loads(text)
-    except ValueError:
-        return text
-    if isinstance(value, float) and not math.isfinite(value):
-        return text  # NaN and 1e999 are no JSON
-    return value if isinstance(value, (bool, int, float, str)) else text
+        with suppress(zenoh.ZError):  # it times out now and then where the gateway is frozen
+            session.close()  # type: ignore[no-untyped-call]  # Zenoh's stub lacks it
 
 
 def _lost(tag: str) -> Shown:
@@ -246,11 +275,13 @@ def _reachable(endpoint: str) -> str:
     return endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
 
 
-def _raw(sample: zenoh.Sample, about: bytes) -> dict[str, object]:
+def _raw(tag: Tag, sample: zenoh.Sample, about: bytes) -> dict[str, object]:
     """What a tag with `payload: raw` says, as the others say it."""
-    known = sample.kind == zenoh.SampleKind.PUT
-    text = sample.payload.to_bytes().decode("utf-8", "replace")
-    return {"value": parse_value(text) if known else None, **_document(about)}
+    value: Value | None = None
+    if sample.kind == zenoh.SampleKind.PUT:
+        text = sample.payload.to_bytes().decode("utf-8", "replace")
+        value = text if tag.layout.type.kind is Kind.STRING else parse_value(text)
+    return {"value": value, **_document(about)}
 
 
 def _document(data: bytes) -> dict[str, object]:
