@@ -14,7 +14,6 @@ from gateway.protocols.driver import Span
 from gateway.reading import read_block
 from gateway.turn import Turn
 
-LONGEST_SETTLING = 10.0  # seconds for old answers to go by
 Failure = tuple[Poll, Unclear | LineDown]
 
 
@@ -64,7 +63,7 @@ class Poller:
             with suppress(Refused):  # a sign of life too, though perhaps of an older question
                 told_from = await device.driver.resync(turn, device.doubt, salt)
             if device.open_questions(self.then.flowed) > told_from:
-                await turn.settle(LONGEST_SETTLING, device.patience)
+                await turn.settle(device.patience, device.patience)
                 with suppress(Refused):
                     await device.driver.resync(turn, device.doubt, salt + 1)
             self.then.answered(device)

@@ -14,7 +14,7 @@ from gateway.protocols.frames.driver import LISTENED
 from gateway.tags import Quality, Tag, Written
 from gateway.values import Kind, Value
 from tests.sim.bus import Bus, summed
-from tests.sim.judge import Judge
+from tests.sim.judge import STALLED_ON, Judge
 from tests.sim.stations import Troubled
 
 SOON = 1.0  # seconds: what nobody acknowledges has arrived by then, or never will
@@ -45,7 +45,10 @@ class Person:
         begin = since - self.judge.began - 1.0
         now = self.judge.now - self.judge.began
         return any(
-            e.device in ("", device) and e.kind in _QUIET and e.start <= now and e.end >= begin
+            e.device in ("", device)
+            and e.kind in _QUIET
+            and e.start <= now
+            and e.end + STALLED_ON * (e.kind == "stall") >= begin
             for e in self.bus.episodes
         )
 
