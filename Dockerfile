@@ -17,6 +17,8 @@ WORKDIR /data
 VOLUME /data
 EXPOSE 7447
 # Nothing is written outside /data: run with --read-only --tmpfs /tmp.
+# Where users_file closes the gateway: -e PLC_GATEWAY_CLI_USER -e PLC_GATEWAY_CLI_PASSWORD, as in
+# docs/security.md.
 HEALTHCHECK --interval=30s --timeout=10s --start-period=15s \
     CMD ["plc-gateway", "health", "/etc/plc-gateway/config.yaml"]
 ENTRYPOINT ["plc-gateway"]

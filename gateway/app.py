@@ -233,7 +233,7 @@ class Gateway:
         if tag.device not in self._places:
             return None
         line, device = self._places[tag.device]
-        return next((poll for poll in line.polls(device) if tag in poll.block.tags), None)
+        return line.reader(device, tag)
 
     def _hasten(self, tag: Tag) -> None:
         line, device = self._places[tag.device]

@@ -11,8 +11,8 @@ from typing import Annotated, NoReturn
 import typer
 from rich.console import Console
 
-from gateway import __version__, app, direct, scan, service, show, simulate
-from gateway.client import NOTHING, Shown, connected, matches, parse_value, wanted_keys
+from gateway import __version__, app, direct, northbound, scan, service, show, simulate
+from gateway.client import Shown, connected, matches, parse_value, wanted_keys
 from gateway.config import Config, load
 from gateway.config import schema as config_schema
 from gateway.control import check_command, line_of
@@ -90,6 +90,7 @@ def check(
 ) -> None:
     """Validate the file and print what it will do to each line. Sends nothing."""
     loaded = load(config)
+    northbound.check(loaded)
     lines = app.forecasts(loaded)
     few = sum(len(line.blocks) for line in lines) <= 100
     out.print(show.plan(lines, every_block=few if blocks is None else blocks))
@@ -132,7 +133,7 @@ def read(
         with connected(loaded, err.print) as client:
             found = [row for want in wanted for row in client.values(want, max_age)]
             if not found:
-                raise GatewayError(NOTHING)
+                raise GatewayError(client.nothing)
             complete = client.complete(wanted, found)
     _print(found, _tags(loaded), as_json=as_json)
     if not (complete and all(show.is_good(row) for row in found)):

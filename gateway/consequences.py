@@ -66,7 +66,7 @@ class Consequences:
                 log.info("address is there now", device=device.name, block=spell(poll.block))
                 self._replan(device)
             self._settle(device)
-        elif device.learn():
+        if not refusals.searching and device.learn():
             log.info("planned anew", device=device.name, turnaround=device.reckoned)
             self.schedule.plan(device, now)
 
@@ -126,7 +126,9 @@ class Consequences:
         """
         if late is not None:
             device.record.late += 1
-            device.doubtful = False
+            if device.open_questions(self.flowed) <= 1:  # otherwise perhaps of an older one
+                device.doubtful = False
+                device.unanswered.clear()
             total = device.timing.reply_timeout + late
             device.trouble = Garbled(
                 f"it took {total:.2f} s, reply_timeout is {device.timing.reply_timeout:g} s",
@@ -209,9 +211,9 @@ class Consequences:
 
     def hasten(self, device: Device, tag: Tag) -> None:
         """Read the tag's block before all other polls."""
-        for poll in self.schedule.polls(device):
-            if tag in poll.block.tags:
-                self.schedule.hasten(poll)
+        poll = self.schedule.reader(device, tag)
+        if poll is not None:
+            self.schedule.hasten(poll)
 
     def bad(self, tags: Sequence[Tag], reason: Reason, detail: str) -> None:
         now = self.wall()

@@ -98,13 +98,16 @@ class Device:
     refusals: Refusals = field(init=False)
     reckoned: float | None = field(init=False)  # the turnaround planned with; None: the usual
     _learn_at: int = LEARN_EVERY
+    _tried: float = 0.0  # the turnaround that the last plan was tried with
     broadcast: bool = field(init=False)  # written or listened to, but never asked anything
     window: int = field(init=False)  # questions that may be open at once
 
     def __post_init__(self) -> None:
         self.refusals = Refusals(self.driver.cost)
         self.reckoned = self.turnaround
-        self.broadcast = not any(self.driver.areas[tag.span.area].readable for tag in self.tags)
+        areas = self.driver.areas
+        used = [areas[tag.span.area] for tag in self.tags] or areas.values()
+        self.broadcast = not any(area.readable for area in used)
         self.doubtful = not self.broadcast
         self.window = self.driver.window if isinstance(self.driver, Windowed) else 1
         self.plan()
@@ -148,6 +151,9 @@ class Device:
             return False
         self._learn_at = self.record.exchanges + LEARN_EVERY
         self.reckoned = measured
+        if abs(measured - self._tried) < WORTH_WHILE * self._tried:
+            return False
+        self._tried = measured
         now, blocks = self.load, self.blocks
         self.plan()
         if self.load < (1 - WORTH_WHILE) * now:

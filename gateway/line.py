@@ -124,6 +124,10 @@ class Line:
         """What is asked of it, with what was measured."""
         return self._schedule.polls(device)
 
+    def reader(self, device: Device, tag: Tag) -> Poll | None:
+        """What reads the tag; None where its value comes unasked."""
+        return self._schedule.reader(device, tag)
+
     # The ear of the port
 
     def received(self, data: bytes) -> None:
@@ -187,6 +191,7 @@ class Line:
 
     async def _close(self) -> None:
         self.is_open = False
+        self._then.overdue.stop()
         for write in self._schedule.orders.withdraw():
             write.done(LineDown(f"line {self.name} went down; not sent"))
         port, self._port = self._port, None
@@ -206,6 +211,8 @@ class Line:
                 case Write() as write:
                     others = self._schedule.orders.companions(write, together)
                     await self._writer.write(write, others)
+                    if self._schedule.orders:  # some may be back, refused together
+                        self._expiry.by(self._schedule.orders.first.expires, self._expire)
                 case Command() as command:
                     await self._writer.command(command)
                 case Probe(device):
@@ -246,6 +253,7 @@ class Line:
             device.driver.station,
             bool(self._echo),
             self._adapter,
+            self._listening.beside(device),
             device.doubtful,
         )
         return turn

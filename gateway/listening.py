@@ -3,9 +3,11 @@
 A line that has no such device never comes here but for one look at an empty table.
 """
 
+import asyncio
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 import structlog
 
@@ -35,7 +37,10 @@ class Answer:
     until: float
 
     async def give(self, talk: Talk[bytes]) -> None:
-        await talk.tell(self.frame)
+        try:
+            await talk.tell(self.frame)
+        except Garbled as error:
+            log.warning("not answered", device=self.device.name, why=str(error))
 
 
 @dataclass(slots=True, eq=False)
@@ -92,14 +97,22 @@ class Listening:
         for speaker in self._speakers:
             self._take(speaker, speaker.listener.received(data, now), now)
 
+    def beside(self, device: Device) -> Callable[[bytes], None] | None:
+        """For what it says in a conversation with it, and is no answer."""
+        for speaker in self._speakers:
+            if speaker.device is device:
+                return partial(self._beside, speaker)
+        return None
+
+    def _beside(self, speaker: _Speaker, frame: bytes) -> None:
+        now = asyncio.get_running_loop().time()
+        self._take(speaker, speaker.listener.overheard([frame], now), now)
+
     def ended(self, device: Device, turn: Turn, now: float) -> None:
         """A conversation is over: what was half heard before it is void."""
         self._echo = turn.unreturned
         for speaker in self._speakers:
-            own = speaker.device is device
-            if own:
-                self._take(speaker, speaker.listener.overheard(turn.overheard, now), now)
-            if turn.heard or (turn.sent and not own):
+            if turn.heard or (turn.sent and speaker.device is not device):
                 speaker.listener.disturbed(now)
 
     @property

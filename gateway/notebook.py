@@ -5,8 +5,10 @@ search is made once and not after every start. Lost or spoilt it costs nothing b
 """
 
 import os
+import threading
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any
 
 import orjson
@@ -18,14 +20,20 @@ from gateway.refusals import Learned
 
 log = structlog.get_logger("gateway")
 FORM = 1
+LATEST = 2**63 - 1  # ns since 1970: the year 2262
 
 
 class Notebook:
-    """One file. Reading and writing block: `save` belongs on a thread."""
+    """One file, and a thread that writes it: a disk that stands still holds up nobody."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._written: bytes | None = None
+        self._trouble: str | None = None
+        self._pages: SimpleQueue[bytes | None] = SimpleQueue()  # None: the last was before
+        self._thread = threading.Thread(target=self._save_all, name="state", daemon=True)
+
+    # -- any thread --
 
     def recall(self, devices: Iterable[Device]) -> None:
         """Plan the devices around what is known. A file that cannot be read is moved aside."""
@@ -45,6 +53,31 @@ class Notebook:
             option=orjson.OPT_INDENT_2 | orjson.OPT_SORT_KEYS,
         )
 
+    def start(self) -> None:
+        """Begins to write what `keep` and `end` are given."""
+        self._thread.start()
+
+    def keep(self, page: bytes) -> None:
+        """Never waits. While a page waits for the disk none is added: a later one says it all."""
+        if self._pages.empty():
+            self._pages.put(page)
+
+    def end(self, page: bytes) -> None:
+        """Never waits: the last page, which `close` waits for."""
+        self._pages.put(page)
+        self._pages.put(None)
+
+    def close(self, within: float) -> None:
+        """Blocks, at most so many seconds. After that the page is in the file, if ever."""
+        if self._thread.ident is not None:  # otherwise never started
+            self._thread.join(max(0.0, within))
+
+    # -- its own thread --
+
+    def _save_all(self) -> None:
+        while (page := self._pages.get()) is not None:
+            self.save(page)
+
     def save(self, page: bytes) -> None:
         """Put the page in the file's place, whole or not at all. Trouble is logged, once."""
         if page == self._written:
@@ -57,8 +90,13 @@ class Notebook:
                 os.fsync(file.fileno())
             beside.replace(self._path)
         except OSError as error:
-            log.warning("nothing kept for a restart", file=str(self._path), why=str(error))
-        self._written = page
+            if self._trouble != str(error):
+                self._trouble = str(error)
+                log.warning("nothing kept for a restart", file=str(self._path), why=str(error))
+            return
+        self._written, self._trouble = page, None
+
+    # -- when it is read --
 
     def _read(self) -> Mapping[str, Learned]:
         try:
@@ -71,10 +109,17 @@ class Notebook:
         try:
             return _pages(orjson.loads(data))
         except (ValueError, TypeError, KeyError, AttributeError) as error:
-            aside = self._path.with_name(self._path.name + ".bad")
-            log.warning("spoilt, moved aside", file=str(self._path), to=str(aside), why=repr(error))
-            self._path.replace(aside)
+            self._move_aside(repr(error))
             return {}
+
+    def _move_aside(self, why: str) -> None:
+        aside = self._path.with_name(self._path.name + ".bad")
+        try:
+            self._path.replace(aside)
+        except OSError as error:
+            log.warning("spoilt", file=str(self._path), why=why, not_moved_aside=str(error))
+        else:
+            log.warning("spoilt, moved aside", file=str(self._path), to=str(aside), why=why)
 
 
 def _pages(document: Mapping[str, Any]) -> dict[str, Learned]:
@@ -98,10 +143,18 @@ def _learned(page: Mapping[str, list[Mapping[str, object]]]) -> Learned:
     refused = tuple(
         (
             Span(str(row["area"]), int(str(row["start"])), int(str(row["size"]))),
-            int(str(row["since"])),
+            _time(str(row["since"])),
             str(row["code"]),
         )
         for row in page["refused"]
     )
     cuts = tuple((str(area), int(number)) for area, number in page["cuts"])
     return Learned(refused, cuts)
+
+
+def _time(text: str) -> int:
+    """ns since 1970. Raises ValueError for what could not be shown."""
+    time = int(text)
+    if not 0 <= time <= LATEST:
+        raise ValueError(f"{text} is no time")
+    return time

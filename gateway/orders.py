@@ -77,8 +77,13 @@ class OrderQueue:
     def first(self) -> Order:
         return self._orders[0]
 
-    def take(self) -> Order:
-        return self._orders.popleft()
+    def undoubted(self) -> Order | None:
+        """Takes out the first to a device that is not in doubt."""
+        for order in self._orders:
+            if not order.device.doubtful:
+                self._orders.remove(order)
+                return order
+        return None
 
     def submit(self, order: Order) -> bool:
         """False when too many orders wait already."""

@@ -138,7 +138,9 @@ class Refusals:
         known = [tag for tag in tags if tag.span.area in by_area]
         for span, since, code in learned.refused:
             there = tuple(tag for tag in known if _within(tag.span, span))
-            if there:
+            if [(i.start, i.end) for i in items_of(there)] == [
+                (span.start, span.start + span.size)
+            ]:
                 self.bad[span] = BadRange(span, since, code, there)
                 self._cuts |= _bounds(span)
 

@@ -10,6 +10,7 @@ from gateway.device import Device, Standing
 from gateway.jobs import NOWHERE, PAUSE_FIRST, PAUSE_LONGEST, URGENT, Idle, Job, Poll, Probe
 from gateway.orders import OrderQueue
 from gateway.planner import Block
+from gateway.tags import Tag
 
 GOLDEN = 0.6180339887498949  # its multiples spread evenly, however many there are
 SILENT_SHARE = 0.05  # of the wire's time, for all silent stations together
@@ -19,7 +20,8 @@ ROOM = 16  # places in a queue beside twice those that count
 class Schedule:
     """Decides who speaks next on one line.
 
-    Orders go first, but not twice in a row while a poll is due. Polls go by earliest deadline,
+    Orders go first, but not twice in a row while a poll is due; behind one for a device in doubt
+    those of others do not wait while something has just failed. Polls go by earliest deadline,
     over all devices; when the line is asked for more than it carries, the devices that have had
     the wire for the shortest time of late go first. What somebody wants to see now goes before
     other polls, but not twice in a row while one is due. A late poll is done once, not once per
@@ -43,6 +45,7 @@ class Schedule:
         self._crowded = ROOM  # the same in `_ready`
         self._urgent: deque[Poll] = deque()
         self._polls: dict[Device, list[Poll]] = {}
+        self._readers: dict[Device, dict[Tag, Poll]] = {}  # made when somebody asks
         self.orders = OrderQueue()
         self._wrote = False
         self._hurried = False
@@ -74,6 +77,7 @@ class Schedule:
         for poll in before:
             poll.live = False
         self._polls[device] = polls
+        self._readers.pop(device, None)
         self._push(polls)
 
     def replace(self, poll: Poll, blocks: Iterable[Block], now: float) -> None:
@@ -87,6 +91,7 @@ class Schedule:
         ]
         kept = [other for other in self._polls[poll.device] if other is not poll]
         self._polls[poll.device] = kept + polls
+        self._readers.pop(poll.device, None)
         self._push(polls)
 
     def reachable(self, device: Device, now: float) -> bool:
@@ -104,13 +109,23 @@ class Schedule:
     def polls(self, device: Device) -> Sequence[Poll]:
         return self._polls[device]
 
+    def reader(self, device: Device, tag: Tag) -> Poll | None:
+        """What reads this tag of the device; None where nothing does."""
+        readers = self._readers.get(device)
+        if readers is None:
+            readers = {tag: poll for poll in self._polls[device] for tag in poll.block.tags}
+            self._readers[device] = readers
+        return readers.get(tag)
+
     # What to do now
 
     def next(self, now: float) -> Job:
         self._ripen(now)
         due = bool(self._ready or self._urgent)
         if self.orders and not (self._wrote and due):
-            return self._next_order()
+            order = self._next_order(now, due)
+            if order is not None:
+                return order
         self._wrote = False
         until = self._waiting[0][0] if self._waiting else float("inf")
         strangers = [device for device in self.devices if not device.served]
@@ -120,12 +135,15 @@ class Schedule:
             until = min(until, allowed)
         return self._next_poll(now) if due else Idle(until)
 
-    def _next_order(self) -> Job:
-        order = self.orders.first
-        if order.device.doubtful:
-            return Probe(order.device)
-        self._wrote = True
-        return self.orders.take()
+    def _next_order(self, now: float, due: bool) -> Job | None:
+        first = self.orders.first.device
+        if first.doubtful and self._failed_lane <= now:
+            return Probe(first)
+        order = self.orders.undoubted()
+        if order is not None:
+            self._wrote = True
+            return order
+        return None if due else Probe(first)
 
     def _next_poll(self, now: float) -> Job:
         hurry = bool(self._urgent) and not (self._hurried and self._ready)
@@ -201,6 +219,8 @@ class Schedule:
         if not poll.phased:
             poll.phased = True
             poll.due -= every * next(self._phases)
+        if poll.last_good is None and poll.block.span not in poll.device.refusals.bad:
+            poll.due = min(poll.due, now + PAUSE_LONGEST)  # who knows what was the matter
         poll.tries = 0
         self._push([poll])
 

@@ -4,8 +4,9 @@ import asyncio
 import gc
 import signal
 import sys
+import time
 from collections.abc import AsyncIterator, Callable, Sequence
-from contextlib import AsyncExitStack, asynccontextmanager, suppress
+from contextlib import AsyncExitStack, asynccontextmanager
 from typing import Any
 
 import structlog
@@ -25,6 +26,9 @@ SWITCH = 0.0005
 COLLECT = (5000, 5, 100)
 
 KEEP_EVERY = 10.0  # seconds
+# Seconds from the signal, of the 2 there are: Zenoh takes 1.5 at most, the disk has what is left.
+END_WITHIN = 1.8
+KEPT_WITHIN = 0.5  # seconds that a lost state file is worth
 
 
 async def run(config: Config, started: Callable[[], None] = lambda: None) -> None:
@@ -59,10 +63,8 @@ async def _serve(config: Config, stop: asyncio.Event, started: Callable[[], None
         gateway.publish = _both(history, northbound)
         gateway.documents["history"] = history.document
     async with AsyncExitStack() as ending:  # what began last ends first
-        if history is not None:
-            ending.push_async_callback(asyncio.to_thread, history.close)
         face = asyncio.create_task(northbound.run(), name="zenoh")
-        ending.push_async_callback(_ended, [face])
+        ending.push_async_callback(_put_away, face, history, notebook)
         sole, on_duty, opened, relieved, stopping = events = [
             asyncio.create_task(event.wait())
             for event in (
@@ -112,7 +114,7 @@ async def _on_the_wire(
     gateway: Gateway, history: Historian | None, notebook: Notebook | None, ending: AsyncExitStack
 ) -> list[asyncio.Task[None]]:
     if history is not None:
-        _record(history, list(gateway.mirror.samples()))  # "starting" marks the restart
+        history.record(gateway.mirror.samples())  # "starting" marks the restart
     if notebook is not None:
         await ending.enter_async_context(_kept(notebook, gateway))
     lines = [asyncio.create_task(line.run(), name=line.name) for line in gateway.lines]
@@ -123,21 +125,35 @@ async def _on_the_wire(
 @asynccontextmanager
 async def _kept(notebook: Notebook, gateway: Gateway) -> AsyncIterator[None]:
     """What is learned meanwhile is written down, now and then and at the end."""
-    over = asyncio.Event()
-    keeping = asyncio.create_task(_keep(notebook, gateway, over), name="state")
+    notebook.start()
+    keeping = asyncio.create_task(_keep(notebook, gateway), name="state")
     try:
         yield
     finally:
-        over.set()
-        await keeping
+        keeping.cancel()
+        notebook.end(notebook.page(gateway.spoken_to))
 
 
-async def _keep(notebook: Notebook, gateway: Gateway, over: asyncio.Event) -> None:
-    while not over.is_set():
-        with suppress(TimeoutError):
-            async with asyncio.timeout(KEEP_EVERY):
-                await over.wait()
-        await asyncio.to_thread(notebook.save, notebook.page(gateway.spoken_to))
+async def _keep(notebook: Notebook, gateway: Gateway) -> None:
+    while True:
+        await asyncio.sleep(KEEP_EVERY)
+        notebook.keep(notebook.page(gateway.spoken_to))
+
+
+async def _put_away(
+    face: asyncio.Task[None], history: Historian | None, notebook: Notebook | None
+) -> None:
+    """First Zenoh, so that what is told last is kept too, then the files: a disk may stand still,
+    and nobody on the network shall have to wait for it."""
+    by = time.monotonic() + END_WITHIN
+    try:
+        await _ended([face])
+    finally:
+        if notebook is not None:
+            left = min(KEPT_WITHIN, by - time.monotonic())
+            await asyncio.to_thread(notebook.close, left)
+        if history is not None:
+            await asyncio.to_thread(history.close, by - time.monotonic())
 
 
 def _history(config: Config) -> Historian | None:
@@ -149,16 +165,10 @@ def _both(history: Historian, northbound: Northbound) -> Callable[[Sequence[Samp
     """What is published is kept too, so that whoever misses it can ask for it."""
 
     def publish(news: Sequence[Sample]) -> None:
-        _record(history, news)
         northbound.publish(news)
+        history.record(news)  # before the loop takes a question of whoever has seen them
 
     return publish
-
-
-def _record(history: Historian, samples: Sequence[Sample]) -> None:
-    """In a step of the loop's own, before it takes any question that comes from now on: what goes
-    wrong there holds up neither line nor Zenoh."""
-    asyncio.get_running_loop().call_soon(history.record, samples)
 
 
 async def _ended(tasks: Sequence[asyncio.Task[None]]) -> None:

@@ -76,12 +76,28 @@ def live(screen: Console, news: Iterable[Shown], tags: dict[str, Tag]) -> None:
     """A table of the newest, until the news end."""
     rows: dict[str, Shown] = {}
 
-    def table() -> Table:
-        return samples([rows[tag] for tag in sorted(rows)], tags)
+    def table() -> RenderableType:
+        return fitting(screen, [rows[tag] for tag in sorted(rows)], tags)
 
     with Live(console=screen, refresh_per_second=5, get_renderable=table):
         for row in news:
             rows[row.tag] = row
+
+
+def fitting(screen: Console, rows: Sequence[Shown], tags: dict[str, Tag]) -> RenderableType:
+    """The table, or of one that is higher than the screen its head and how many rows are left."""
+    room = len(rows) if len(rows) < screen.height else max(screen.height - 2, 0)
+    while room and _height(screen, samples(rows[:room], tags)) + (room < len(rows)) > screen.height:
+        room -= 1  # a long text takes several lines
+    table = samples(rows[:room], tags)
+    if room == len(rows):
+        return table
+    note = f"{len(rows) - room} more: name the tags you want to see, or enlarge the window"
+    return Group(table, Text(note, overflow="ellipsis", no_wrap=True))
+
+
+def _height(screen: Console, table: Table) -> int:
+    return len(screen.render_lines(table))
 
 
 def typed() -> str:

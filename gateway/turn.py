@@ -47,6 +47,7 @@ class Turn:
     station: int
     echo: bool = False
     adapter: Adapter = field(default_factory=Adapter)
+    beside: Callable[[Any], None] | None = None  # gets what answers nothing, at once
     in_doubt: bool = False  # an older question of another turn may still be answered
     started: float = 0.0  # when the first question was sent
     sent: int = 0  # characters, for the statistics
@@ -173,17 +174,23 @@ class Turn:
             return 0.0
         until = start + guard
         if self._expired is None:
-            while (wait := min(self.clock.quiet_since + gap, until) - loop.time()) > 0:
-                if self._lost is not None:
+            while self._lost is None:
+                quiet = min(self.clock.quiet_since + gap, until)
+                if quiet <= loop.time():
                     break
-                await asyncio.sleep(wait)
+                await self._late_until(quiet)
             return None
-        if self._lost is not None:
+        if self._lost is not None or not await self._late_until(until):
             return None
+        return loop.time() - start
+
+    async def _late_until(self, end: float) -> bool:
+        """Whether the late answer came before `end`; sooner, where the port is lost."""
+        loop = asyncio.get_running_loop()
         self._late = loop.create_future()
-        timer = loop.call_at(until, _give_up, self._late)
+        timer = loop.call_at(end, _give_up, self._late)
         try:
-            return loop.time() - start if await self._late else None
+            return await self._late
         finally:
             timer.cancel()
 
@@ -209,6 +216,8 @@ class Turn:
                 self._late.set_result(True)
             return
         self.passed += 1
+        if self.beside is not None:
+            self.beside(frame)
         if len(self.overheard) < MOST_OVERHEARD:
             self.overheard.append(frame)
         self._foreign = self._foreign or getattr(frame, "station", self.station) != self.station

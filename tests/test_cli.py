@@ -221,6 +221,47 @@ def test_check_leaves_brackets_alone(command: Command, tmp_path: Path) -> None:
     assert f"{path}: good, 1 tag on 1 line\n" in command("check", path).out
 
 
+MISTAKES: dict[str, tuple[dict[str, Any], str]] = {
+    "client of nobody": ({"mode": "client", "listen": []}, "say in `connect` which router"),
+    "no port": (
+        {"listen": ["tcp/foo"]},
+        "1: zenoh.listen[0]: 'tcp/foo': write it as tcp/host:port",
+    ),
+    "twice": ({"listen": ["tcp/[::1]:7447"] * 2}, "1: zenoh.listen: tcp/[::1]:7447 is there twice"),
+    "no certificate": ({"listen": ["tls/localhost:7447"]}, "'tls/localhost:7447': it needs a cert"),
+    "certificate": (
+        {"tls": {"certificate": "text", "key": "text"}},
+        "text holds no certificate in PEM form",
+    ),
+    "no JSON5": ({"config_file": "text"}, "zenoh config_file"),
+    "misspelt": ({"config_file": "misspelt"}, "unknown field `acces_control`"),
+    "open to all": ({"users_file": "open"}, "open is open to everybody on this machine"),
+    "no users": ({"users_file": "text"}, "text, line 1: write it as name:password"),
+    "writers": ({}, "writers.file"),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_check_says_what_run_would_refuse_and_both_end_with_2(
+    command: Command, tmp_path: Path, mistake: str
+) -> None:
+    zenoh, says = MISTAKES[mistake]
+    for name, text in (("text", "hello\n"), ("misspelt", "{acces_control: {}}"), ("open", "a:b\n")):
+        (tmp_path / name).write_text(text)
+        (tmp_path / name).chmod(0o644 if name == "open" else 0o600)
+    path = write_config(
+        tmp_path / "config.yaml",
+        free_endpoint(),
+        {"hall": vigor_line("simulator", TAGS)},
+        zenoh={"listen": [free_endpoint()], **zenoh},
+        writers={"file": "text"} if mistake == "writers" else None,
+    )
+    checked = command("check", path)
+    assert (checked.code, checked.out) == (2, "")
+    assert says in checked.err
+    assert plc_gateway("run", path) == checked
+
+
 # -- read, write, watch: mistakes of the user --------------------------------------------------
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from gateway.client import Client, connected, parse_value, wanted_keys
+from gateway.client import Client, Shown, connected, parse_value, wanted_keys
 from gateway.config import Config, load
 from gateway.errors import ConfigError, GatewayError
 from tests.e2e.processes import gateway, vigor_line, write_config
@@ -90,6 +90,23 @@ def test_no_way_to_the_gateway(config: Config) -> None:
         pass
 
 
+def test_in_a_standby_group_the_others_are_found_where_the_gateway_connects(
+    config: Config,
+) -> None:
+    """At its own endpoint nobody answers while it stands by."""
+    here, there = free_endpoint(), free_endpoint()
+    own = replace(config.zenoh, listen=(here,), connect=(there,))
+    group = replace(config, zenoh=own, standby="hall")
+    at_the_router = replace(config, zenoh=replace(own, listen=(there,)))
+    rows = saying(("mixer/speed", good(1), None))
+    with (
+        answering(replace(config, zenoh=own), {}),
+        answering(at_the_router, {"plant/**": rows}),
+        connected(group, print) as client,
+    ):
+        assert rows_of(client, "**") == [("mixer/speed", 1)]
+
+
 # -- with somebody in the gateway's place ------------------------------------------------------
 
 
@@ -166,6 +183,72 @@ def test_what_is_not_in_the_file_is_another_gateways(config: Config) -> None:
         there.put("plant/press/speed", good(3))
         there.put("plant/mixer/speed", good(4))
         assert next(news) == ("mixer/speed", json.loads(good(4)))
+
+
+def shown_as(news: Iterator[Shown]) -> object:
+    document = next(news).document
+    return document.get("reason") or document["value"]
+
+
+def test_a_value_that_comes_late_from_a_gone_gateway_is_not_shown(config: Config) -> None:
+    answer = saying(("mixer/speed", good(1), None))
+    with (
+        answering(config, {}) as there,
+        connected(config, print) as client,
+        closing(client.follow(["**"])) as news,
+    ):
+        served = there.declare_queryable("plant/**", answer)
+        token = there.liveliness().declare_token("plant/@gateway/demo")
+        assert shown_as(news) == 1
+        served.undeclare()
+        token.undeclare()
+        assert shown_as(news) == "no-gateway"
+        there.put("plant/mixer/speed", good(2))
+        served = there.declare_queryable("plant/**", saying(("mixer/speed", good(3), None)))
+        token = there.liveliness().declare_token("plant/@gateway/demo")
+        assert shown_as(news) == 3
+
+
+def test_in_a_standby_group_whoever_sends_values_is_asked_and_then_shown(tmp_path: Path) -> None:
+    """The token of the one that takes over was there before, and says nothing new."""
+    path = write_config(
+        tmp_path / "config.yaml",
+        free_endpoint(),
+        {"hall": vigor_line("simulator", {"speed": {"address": "D10"}})},
+        gateway={"name": "demo", "standby": "hall"},
+    )
+    with answering(load(path), {}) as there:
+        served = there.declare_queryable("plant/**", saying(("mixer/speed", good(1), None)))
+        alive = there.liveliness()
+        own, other = (alive.declare_token(f"plant/@gateway/{name}") for name in ("demo", "other"))
+        with gateway("watch", path, "--json") as watch:
+            watch.says('"value": 1')
+            served.undeclare()
+            own.undeclare()
+            watch.says("no-gateway")
+            served = there.declare_queryable("plant/**", saying(("mixer/speed", good(2), None)))
+            there.put("plant/mixer/speed", good(2))
+            watch.says('"value": 2')
+        other.undeclare()
+
+
+def test_in_a_standby_group_the_end_of_one_that_does_not_serve_spoils_nothing(
+    config: Config,
+) -> None:
+    group = replace(config, standby="hall")
+    with (
+        answering(config, {"plant/**": saying(("mixer/speed", good(1), None))}) as there,
+        connected(group, print) as client,
+        closing(client.follow(["**"])) as news,
+    ):
+        token = there.liveliness().declare_token("plant/@gateway/other")
+        assert shown_as(news) == 1
+        token.undeclare()
+        assert shown_as(news) == 1  # asked again
+        there.put("plant/mixer/speed", good(2))
+        while (value := shown_as(news)) == 1:
+            pass
+        assert value == 2
 
 
 @pytest.mark.parametrize(

@@ -5,8 +5,9 @@ import pytest
 from gateway.device import Device, Standing
 from gateway.errors import Evidence, Garbled, NoReply, Unclear
 from gateway.protocols.driver import Span
+from gateway.protocols.modbus import ModbusRtu
 from gateway.tags import Reason
-from tests.sim.plant import device, make_tag, words
+from tests.sim.plant import WIRE, device, make_tag, words
 
 
 @pytest.fixture
@@ -101,8 +102,29 @@ def test_the_load_is_the_share_of_the_lines_time(dev: Device) -> None:
 
 
 def test_a_device_without_a_readable_tag_is_a_broadcast() -> None:
-    assert device([]).broadcast
+    everybody = ModbusRtu(station=0)
+    tags = (make_tag("holding:1", everybody),)
+    assert Device("all", everybody, WIRE, everybody.timing, tags, 0.5).broadcast
     assert not device([make_tag("D0")]).broadcast
+
+
+def test_a_device_without_tags_that_could_be_read_is_none() -> None:
+    """It may be told to run and to stop: a late answer must not acknowledge the next command."""
+    assert not device([]).broadcast
+    assert device([]).doubtful
+
+
+def test_nothing_is_planned_where_the_turnaround_is_as_it_was(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    dev, planned = device([make_tag("D0"), make_tag("D42")]), list[float]()
+    monkeypatch.setattr(Device, "plan", lambda self: planned.append(self.reckoned))
+    for turnaround in (0.030, 0.031, 0.029, 0.028, 0.040):
+        dev.record.turnaround = turnaround
+        dev.record.exchanges += 50
+        dev.learn()
+        assert dev.reckoned == turnaround
+    assert planned == [0.030, 0.040]
 
 
 def test_a_measured_turnaround_that_changes_the_optimum_plans_anew() -> None:

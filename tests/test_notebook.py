@@ -51,6 +51,18 @@ def test_addresses_without_a_tag_are_forgotten(tmp_path: Path) -> None:
     assert len(after.blocks) == 1
 
 
+def test_an_address_that_is_read_in_another_way_now_is_asked_for(tmp_path: Path) -> None:
+    """The range that was refused is no item of the new plan: it would stay refused for ever."""
+    before = device([make_tag("D100", type="float64")])
+    (block,) = before.blocks
+    assert not before.refusals.refused(block, 1_000, "28")
+    notebook = Notebook(tmp_path / "state.json")
+    notebook.save(notebook.page([before]))
+    after = dev(100, 102)
+    notebook.recall([after])
+    assert after.refusals.bad == {}
+
+
 def test_no_file_is_nothing_known(tmp_path: Path) -> None:
     after = dev(1, 2)
     Notebook(tmp_path / "none.json").recall([after])

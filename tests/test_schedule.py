@@ -10,9 +10,10 @@ from gateway.device import Device, Standing
 from gateway.errors import NoReply
 from gateway.jobs import PAUSE_FIRST, PAUSE_LONGEST, Idle, Poll, Probe
 from gateway.orders import WAITING_ORDERS, Write
+from gateway.protocols.modbus import ModbusRtu
 from gateway.schedule import SILENT_SHARE, Schedule
 from gateway.tags import WriteRule
-from tests.sim.plant import device, make_tag
+from tests.sim.plant import WIRE, device, make_tag
 
 
 def up(*numbers: int, every: float = 1.0, station: int = 1) -> Device:
@@ -147,6 +148,29 @@ def test_a_device_in_doubt_is_probed_before_anything_else() -> None:
     assert isinstance(schedule.next(0.0), Poll)
 
 
+def test_a_write_does_not_wait_behind_one_for_a_device_that_has_just_failed() -> None:
+    dead, well = up(0), up(0, station=2)
+    schedule = Schedule([dead, well], 0.0)
+    first, second, other = write(dead), write(dead), write(well)
+    for one in (first, second, other):
+        schedule.orders.submit(one)
+    doubt(dead)
+    assert isinstance(schedule.next(0.0), Probe)
+    schedule.failed(2.0, took=2.0)
+    assert schedule.next(2.0) is other
+    assert served(schedule, 2.0).device is well
+    assert isinstance(schedule.next(4.5), Probe)
+
+
+def test_a_bad_poll_is_tried_again_within_a_minute_however_rarely_it_is_asked() -> None:
+    dev = up(0, every=86_400.0)
+    schedule = Schedule([dev], 0.0)
+    job = schedule.next(0.0)
+    assert isinstance(job, Poll)
+    schedule.polled(job, 0.0)  # it was busy, say: nothing is known
+    assert isinstance(schedule.next(PAUSE_LONGEST), Poll)
+
+
 def test_a_wanted_poll_of_a_device_in_doubt_stays_wanted() -> None:
     dev = up(0, 1000)
     schedule = Schedule([dev], 0.0)
@@ -265,7 +289,9 @@ def test_a_silent_device_is_reachable_only_when_its_probe_is_allowed() -> None:
 
 
 def test_a_broadcast_device_is_never_asked() -> None:
-    dev = device([])
+    everybody = ModbusRtu(station=0)
+    tags = (make_tag("holding:1", everybody),)
+    dev = Device("all", everybody, WIRE, everybody.timing, tags, 0.5)
     assert dev.broadcast
     schedule = Schedule([dev], 0.0)
     assert schedule.next(0.0) == Idle(float("inf"))

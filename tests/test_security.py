@@ -3,12 +3,13 @@
 import asyncio
 import hashlib
 import json
+import os
 import re
 import subprocess
 import sys
 import time
-from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import AbstractContextManager, asynccontextmanager, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ import pytest
 import structlog
 import zenoh
 
+from gateway.client.connection import PASSWORD_VARIABLE, USER_VARIABLE
 from gateway.config.plain import TlsConfig
 from gateway.errors import ConfigError
 from gateway.northbound import Northbound, ZenohSettings, secrets
@@ -27,14 +29,14 @@ from gateway.orders import Obeyed
 from gateway.payload import Failure, Problem, WriteOutcome
 from gateway.tags import Written
 from tests.conftest import needs
-from tests.e2e.processes import Program
+from tests.e2e.processes import PATIENCE, Done, Program, started, vigor_line, write_config
 from tests.test_controls import Below
 from tests.test_northbound import PlainPlant, mixer, until
 from tests.zenoh_peer import ZenohPeer, free_endpoint
 
 PAGE = Path(__file__).parent.parent / "docs" / "security.md"
 GATEWAY_RULES, ROUTER_RULES = re.findall(r"```json5\n(.*?)```", PAGE.read_text(), re.DOTALL)
-PASSWORDS = {name: f"of-{name}-5f0c1" for name in ("gateway", "viewer", "operator")}
+PASSWORDS = {name: f"of-{name}-5f0c1" for name in ("gateway", "viewer", "operator", "health")}
 RECIPE = "plant/mixer/recipe/@set"
 TOKEN = "Zm9vYmFyYmF6cXV4Zm9vYmFyYmF6cXV4"  # noqa: S105  (of a test)
 SALT = "0123456789abcdef"
@@ -200,8 +202,11 @@ async def refused(peer: ZenohPeer) -> bool:
 # -- certificates ------------------------------------------------------------------------------
 
 
-def certificates(folder: Path) -> Callable[[str], tuple[Path, Path]]:
-    """An authority `ca.pem`, and what signs certificates with it: name -> certificate, key."""
+def certificates(folder: Path) -> Callable[..., tuple[Path, Path]]:
+    """An authority `ca.pem`, and what signs certificates with it: name -> certificate, key.
+
+    A second argument is what the certificate is valid for, instead of this machine.
+    """
     openssl = needs("openssl")
 
     def run(*arguments: object) -> None:
@@ -211,9 +216,9 @@ def certificates(folder: Path) -> Callable[[str], tuple[Path, Path]]:
     made = ["-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes", "-days", "2"]
     run("req", "-x509", *made, "-keyout", "ca.key", "-out", "ca.pem", "-subj", "/CN=plant")
 
-    def signed(name: str) -> tuple[Path, Path]:
+    def signed(name: str, names: str = "DNS:localhost,IP:127.0.0.1") -> tuple[Path, Path]:
         certificate, key = folder / f"{name}.pem", folder / f"{name}.key"
-        (folder / "san").write_text("subjectAltName=DNS:localhost,IP:127.0.0.1\n")
+        (folder / "san").write_text(f"subjectAltName={names}\n")
         made_one = [*made[:-2], "-keyout", key, "-out", f"{name}.csr", "-subj", f"/CN={name}"]
         run("req", *made_one)
         run("x509", "-req", "-in", f"{name}.csr", "-CA", "ca.pem", "-CAkey", "ca.key",
@@ -246,6 +251,178 @@ async def test_mutual_tls_lets_in_whom_the_authority_signed(tmp_path: Path) -> N
         stranger = ZenohPeer("client", connect=[endpoint], config=anonymous)
         assert await refused(stranger)
     assert plant.written == [("mixer/recipe", 7)]
+
+
+# -- the command line, where the doors are closed ----------------------------------------------
+
+TAGS = {"speed": {"address": "D100"}, "recipe": {"address": "D500", "write": True}}
+
+
+def typed(user: str | None, *arguments: object, password: str | None = None) -> Done:
+    """`plc-gateway ...`, typed by somebody who says who he is, or by nobody. `watch` ends with
+    whoever reads one line of it."""
+    known = {}
+    if user is not None:
+        known = {USER_VARIABLE: user, PASSWORD_VARIABLE: password or PASSWORDS[user]}
+    command = f"{sys.executable} -m gateway {' '.join(map(str, arguments))}"
+    done = subprocess.run(
+        ["sh", "-c", f"{command} | head -n 1" if arguments[0] == "watch" else command],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+        env={**os.environ, **known},
+        check=False,
+    )
+    assert "Traceback" not in done.stderr, done.stderr
+    return Done(done.returncode, done.stdout, done.stderr)
+
+
+def plant_file(folder: Path, **zenoh_settings: Any) -> Path:
+    lines = {"hall": vigor_line("simulator", TAGS)}
+    settings = {"prefix": "plant", **zenoh_settings}
+    return write_config(folder / "plant.yaml", "", lines, zenoh=settings)
+
+
+def tls_endpoint() -> str:
+    return free_endpoint().replace("tcp/", "tls/")
+
+
+@contextmanager
+def closed_by_itself(folder: Path) -> Iterator[Path]:
+    """As in docs/scada.md."""
+    certificate, key = certificates(folder)("gateway")
+    (folder / "access.json5").write_text(GATEWAY_RULES)
+    path = plant_file(
+        folder,
+        listen=[tls_endpoint().replace("127.0.0.1", "0.0.0.0")],
+        tls={"ca": "ca.pem", "certificate": certificate.name, "key": key.name},
+        users_file=users(folder).name,
+        config_file="access.json5",
+    )
+    with started(path) as program:
+        program.says("device answers")
+        yield path
+
+
+@contextmanager
+def closed_by_a_router(folder: Path) -> Iterator[Path]:
+    """A gateway in mode `router` stands for one: its rules are those of the page."""
+    certificate, key = certificates(folder)("router")
+    endpoint = tls_endpoint()
+    tls = {"ca": "ca.pem", "certificate": certificate.name, "key": key.name}
+    (folder / "access.json5").write_text(ROUTER_RULES)
+    router = {
+        "mode": "router",
+        "prefix": "other",
+        "listen": [endpoint],
+        "tls": tls,
+        "users_file": users(folder).name,
+        "config_file": "access.json5",
+    }
+    lines = {"hall": vigor_line("simulator", {})}
+    password = secret(folder / "password.txt", PASSWORDS["gateway"])
+    path = plant_file(
+        folder,
+        listen=[],
+        connect=[endpoint],
+        tls={"ca": "ca.pem"},
+        user="gateway",
+        password_file=password.name,
+    )
+    with (
+        started(write_config(folder / "router.yaml", "", lines, zenoh=router)),
+        started(path) as it,
+    ):
+        it.says("device answers")
+        it.says("Zenoh link up")
+        yield path
+
+
+@pytest.mark.parametrize("closed", [closed_by_itself, closed_by_a_router])
+def test_behind_closed_doors_the_command_line_may_what_its_user_may(
+    closed: Callable[[Path], AbstractContextManager[Path]], tmp_path: Path
+) -> None:
+    with closed(tmp_path) as path:
+        while typed("viewer", "read", path).code:
+            pass  # the first values are on their way
+        assert json.loads(typed("viewer", "watch", path, "--json").out)["quality"] == "good"
+        assert typed("operator", "write", path, "mixer/recipe", "7").code == 0
+        done = typed("operator", "read", path, "mixer/recipe", "--json", "--max-age", "0s")
+        assert (done.code, json.loads(done.out)["value"]) == (0, 7)
+        done = typed("viewer", "write", path, "mixer/recipe", "8")
+        assert (done.code, done.out) == (1, "")
+        assert "nothing was sent; may viewer do this, and does the gateway run" in done.err
+        # Enough for a container, and no more.
+        assert json.loads(typed("health", "health", path).out)["name"] == "demo"
+        done = typed("health", "read", path)
+        assert (done.code, done.out) == (1, "")
+        assert "nothing was answered: " in done.err
+        assert "may health ask it?" in done.err
+        done = typed("operator", "read", path, password="wrong")  # noqa: S106  (it is none)
+        assert (done.code, done.out) == (1, "")
+        assert "does not let operator in: a wrong name or password" in done.err
+        assert len(done.err.splitlines()) == 1
+
+
+def test_without_a_name_the_command_line_is_told_how_to_say_one(tmp_path: Path) -> None:
+    with closed_by_itself(tmp_path) as path:
+        for command in ("read", "health"):
+            done = typed(None, command, path)
+            assert (done.code, done.out) == (1, "")
+            assert "lets nobody in without name and password" in done.err
+            assert f"set {USER_VARIABLE} and {PASSWORD_VARIABLE}" in done.err
+
+
+def test_at_a_router_the_gateways_own_user_may_ask_whether_it_is_well_and_no_more(
+    tmp_path: Path,
+) -> None:
+    with closed_by_a_router(tmp_path) as path:
+        while (done := typed(None, "health", path)).code:
+            pass  # the router learns of the gateway
+        assert json.loads(done.out)["name"] == "demo"
+        done = typed(None, "read", path)
+        assert (done.code, done.out) == (1, "")
+        assert "may gateway ask it?" in done.err
+
+
+def test_with_mutual_tls_the_command_line_shows_the_certificate_of_the_gateway(
+    tmp_path: Path,
+) -> None:
+    certificate, key = certificates(tmp_path)("gateway")
+    own = {"ca": "ca.pem", "certificate": certificate.name, "key": key.name, "mutual": True}
+    path = plant_file(tmp_path, listen=[tls_endpoint()], tls=own)
+    with started(path):
+        assert typed(None, "health", path).code == 0
+
+
+def test_without_mutual_tls_nobody_at_the_shell_needs_the_private_key(tmp_path: Path) -> None:
+    with closed_by_itself(tmp_path) as path:
+        (tmp_path / "gateway.key").write_text("not for the command line")
+        assert typed("operator", "health", path).code == 0
+
+
+def test_a_certificate_that_does_not_hold_the_address_is_named_as_the_reason(
+    tmp_path: Path,
+) -> None:
+    certificate, key = certificates(tmp_path)("gateway", "DNS:gateway.plant")
+    own = {"ca": "ca.pem", "certificate": certificate.name, "key": key.name}
+    endpoint = tls_endpoint()
+    path = plant_file(tmp_path, listen=[endpoint.replace("127.0.0.1", "0.0.0.0")], tls=own)
+    with started(path):
+        done = typed(None, "read", path)
+    assert (done.code, done.out) == (1, "")
+    assert done.err.startswith(f"{endpoint} shows a certificate that is not believed: ")
+    assert "not valid for '127.0.0.1'" in done.err
+
+
+@pytest.mark.parametrize("given", [USER_VARIABLE, PASSWORD_VARIABLE])
+def test_a_name_without_a_password_is_a_mistake_and_so_is_the_reverse(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, given: str
+) -> None:
+    monkeypatch.setenv(given, "operator")
+    done = typed(None, "read", plant_file(tmp_path, listen=[free_endpoint()]))
+    assert (done.code, done.out) == (2, "")
+    assert done.err == f"{USER_VARIABLE} and {PASSWORD_VARIABLE} belong together: set both\n"
 
 
 # -- who wrote ---------------------------------------------------------------------------------
@@ -384,6 +561,41 @@ def test_a_secret_that_everybody_can_read_is_refused(tmp_path: Path, setting: st
     with pytest.raises(ConfigError, match="is open to everybody on this machine: run chmod") as one:
         configure(settings)
     assert "hunter2-x" not in str(one.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("viewer secret-x", "line 1: write it as name:password"),
+        ("viewer:a\n# a note\noperator:secret-x", "line 2: write it as name:password"),
+        ("viewer:\n", "line 1: write it as name:password"),
+        (":secret-x\n", "line 1: write it as name:password"),
+        ("", "names nobody, and would let everybody in"),
+        ("\n \n", "names nobody, and would let everybody in"),
+    ],
+)
+def test_a_users_file_that_says_not_who_may_connect_is_refused(
+    tmp_path: Path, text: str, says: str
+) -> None:
+    with pytest.raises(ConfigError, match=says) as raised:
+        configure(ZenohSettings(users_file=secret(tmp_path / "users.txt", text)))
+    assert "secret-x" not in str(raised.value)
+
+
+def test_what_is_no_certificate_or_key_is_named(tmp_path: Path) -> None:
+    signed = certificates(tmp_path)
+    certificate, key = signed("gateway")
+    _, other_key = signed("operator")
+    none = secret(tmp_path / "none", "hello\n")
+    for tls, says in (
+        (TlsConfig(ca=none), f"zenoh.tls.ca {none} holds no certificate"),
+        (TlsConfig(certificate=none, key=key), f"zenoh.tls.certificate {none} holds no"),
+        (TlsConfig(certificate=certificate, key=none), f"zenoh.tls.key {none} is no PEM key"),
+        (TlsConfig(certificate=certificate, key=other_key), f"not that of {certificate}"),
+    ):
+        with pytest.raises(ConfigError) as raised:
+            configure(ZenohSettings(tls=tls))
+        assert says in str(raised.value)
 
 
 def test_the_password_comes_from_the_file_or_the_environment(
@@ -527,8 +739,8 @@ class ZenohRefused:
 def test_what_others_can_reach_unprotected_is_told(
     listen: str, setup: dict[str, Any], says: list[str]
 ) -> None:
-    config = configure(ZenohSettings(listen=(listen,)))
-    for path, value in setup.items():
+    config = configure(ZenohSettings())
+    for path, value in {"listen/endpoints": [listen], **setup}.items():
         config.insert_json5(path, json.dumps(value))
     told = secrets.exposures(config)
     assert len(told) == len(says)

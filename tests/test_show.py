@@ -53,6 +53,38 @@ def test_good_and_bad_samples_side_by_side(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("count", "height", "shown"),
+    [(3, 4, 3), (3, 3, 1), (22, 12, 10), (22, 23, 22), (22, 22, 20), (2, 1, 0), (0, 5, 0)],
+)
+def test_a_table_higher_than_the_screen_says_how_many_rows_are_hidden(
+    tmp_path: Path, count: int, height: int, shown: int
+) -> None:
+    lines = on_a_screen(tmp_path, 200, height, ["7"] * count)
+    table = lines[: 1 + shown]
+    assert [line.split()[0] for line in table] == ["tag", *(f"mixer/t{n}" for n in range(shown))]
+    more = f"{count - shown} more: name the tags you want to see, or enlarge the window"
+    assert lines[1 + shown :] == ([more] if count > shown else [])
+
+
+def test_a_text_of_several_lines_takes_the_room_of_others(tmp_path: Path) -> None:
+    lines = on_a_screen(tmp_path, 80, 10, ["some words " * 6] * 6)
+    assert len(lines) <= 10
+    shown = sum(line.startswith("mixer/t") for line in lines)
+    assert 1 <= shown < 6
+    assert lines[-1].startswith(f"{6 - shown} more: ")
+
+
+def on_a_screen(folder: Path, width: int, height: int, values: list[str]) -> list[str]:
+    tags = tags_of(folder, {})
+    document = {"quality": "good", "time": "2026-11-20T12:00:00.123456Z"}
+    rows = [Shown(f"mixer/t{n}", {"value": value, **document}) for n, value in enumerate(values)]
+    screen = Console(width=width, height=height, markup=False, emoji=False, highlight=False)
+    with screen.capture() as capture:
+        screen.print(show.fitting(screen, rows, tags))
+    return [line.rstrip() for line in capture.get().splitlines()]
+
+
+@pytest.mark.parametrize(
     ("seconds", "text"),
     [(0.0123, "12.3 ms"), (0.9994, "999.4 ms"), (1.434, "1.43 s"), (float("inf"), "inf s")],
 )

@@ -21,7 +21,7 @@ from gateway.tags import Quality, Reason, Tag, WriteRule, Written
 from gateway.transport import Ear
 from gateway.wiretime import Wire
 from tests.sim.bench import WIRE, Bench
-from tests.sim.plant import Outcome, Plant, make_tag, running
+from tests.sim.plant import Outcome, Plant, device, make_tag, plant, running
 from tests.sim.virtual import on_virtual_time
 
 GUARD = 0.5
@@ -90,12 +90,14 @@ def told_wrong(line: Plant) -> list[object]:
     return [(s.tag.text, s.value) for s in good if s.value != s.tag.address.number]
 
 
-@pytest.mark.parametrize("stall", [6.0, 12.0, 30.0])
+@pytest.mark.parametrize(
+    ("retries", "stall"), [(2, 6.0), (2, 12.0), (2, 30.0), (4, 4.0), (6, 5.0), (10, 8.0)]
+)
 @pytest.mark.parametrize("wanted", [True, False])
 @pytest.mark.parametrize("driver", [ModbusRtu(station=1), ModbusAscii(station=1), Vigor(station=1)])
 @on_virtual_time
 async def test_after_a_stall_no_old_answer_is_taken_for_a_new_one(
-    driver: AnyDriver, wanted: bool, stall: float
+    driver: AnyDriver, wanted: bool, retries: int, stall: float
 ) -> None:
     """Nothing is lost: the answers to all that was asked meanwhile come one after the other."""
     area = "D" if driver.protocol == "vigor" else "holding:"
@@ -103,6 +105,7 @@ async def test_after_a_stall_no_old_answer_is_taken_for_a_new_one(
     tags = [make_tag(f"{area}{n}", driver, device="plc", type="uint16") for n in numbers]
     server = DeviceServer()
     line, dev, memory = behind(server, driver, *tags)
+    dev.timing = replace(dev.timing, retries=retries)
     for number in range(4000):
         memory.write(area.strip(":"), number, [number])
     async with running(line):
@@ -301,3 +304,71 @@ async def test_on_a_line_that_is_down_no_device_is_up() -> None:
         await asyncio.sleep(5)
         assert dev.standing is Standing.UP
         assert dev.diagnosis() == ""
+
+
+@pytest.mark.parametrize("reply_timeout", [0.5, 5.0])
+@on_virtual_time
+async def test_a_port_that_goes_while_the_line_settles_is_noticed_at_once(
+    reply_timeout: float,
+) -> None:
+    driver = ModbusRtu(station=1)
+    tag = make_tag("holding:100", driver, device="plc", every=0.2)
+    server = DeviceServer()
+    line, dev, _ = behind(server, driver, tag)
+    dev.timing = replace(driver.timing, reply_timeout=reply_timeout, retries=10)
+    async with running(line):
+        await asyncio.sleep(5)
+        server.flows.clear()
+        await asyncio.sleep(8 * dev.patience)
+        asked = len(server.sent)
+        server.flows.set()
+        await asyncio.sleep(0.4)
+        assert len(server.sent) <= asked + 1  # it settles
+        assert server.ear is not None
+        gone = now()
+        server.ear.lost(LineDown("pulled out"))
+        await asyncio.sleep(0.01)
+        assert line.lives[-1] == (pytest.approx(gone, abs=0.01), "plc", False)
+
+
+@on_virtual_time
+async def test_one_refused_address_does_not_keep_the_turnaround_from_being_learned() -> None:
+    tags = [make_tag(f"D{66 * n}", device="plc1", every=0.5) for n in range(10)]
+    dev = device(tags, reply_timeout=0.5)
+    line = plant([dev])
+    line.stations[0].inner.holes.add(("D", 66))
+    async with running(line):
+        await asyncio.sleep(20)
+        line.stations[0].late = lambda _: 0.4
+        await asyncio.sleep(120)
+        assert dev.reckoned == pytest.approx(0.405, abs=0.02)
+        known = dev.record.overdue
+        await asyncio.sleep(60)
+        assert dev.record.overdue == known
+
+
+@on_virtual_time
+async def test_writes_refused_together_are_answered_when_their_time_is_over() -> None:
+    """They are put back one by one, after the timer had found nobody waiting."""
+    driver = ComputerLink(station=1)
+    tags = [make_tag(f"D{n}", driver, device="plc", write=WriteRule()) for n in (100, 200, 300)]
+    server = DeviceServer()
+    line, dev, _ = behind(server, driver, *tags)
+    dev.timing = replace(driver.timing, reply_timeout=15.0)
+    refuse = b"\x1501FF06"
+    answer = line.stations[0].hear
+
+    def hear(data: bytes, at: float) -> list[bytes]:
+        return [refuse] if data[5:7] == b"WT" else answer(data, at)
+
+    line.stations[0].hear = hear  # type: ignore[method-assign]
+    async with running(line):
+        await asyncio.sleep(5)
+        line.submit(dev, tags[2], 7)  # arms the timer, and is done
+        await asyncio.sleep(4.98)
+        outcomes = [line.submit(dev, tag, n) for n, tag in enumerate(tags[:2])]
+        server.deaf_to = lambda request: request[5:7] == b"WW"  # one by one they get lost
+        await asyncio.sleep(20.0)
+        late = outcomes[1]
+        assert isinstance(late.once, Busy)
+        assert late.at - late.asked < 6.0

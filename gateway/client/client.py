@@ -4,8 +4,7 @@ import json
 import os
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
-from dataclasses import replace
+from contextlib import AbstractContextManager, ExitStack, suppress
 from functools import partial
 from itertools import pairwise
 from queue import SimpleQueue
@@ -19,15 +18,12 @@ from gateway.config import Config
 from gateway.control import TO_ALL
 from gateway.errors import GatewayError
 from gateway.keys import Keys
-from gateway.northbound import Mode, zenoh_settings
-from gateway.northbound.session import configure
 from gateway.payload import rfc3339
 from gateway.tags import Tag
 from gateway.values import Kind, Value
 
 TOKEN_VARIABLE = "PLC_GATEWAY_WRITE_TOKEN"  # noqa: S105  (the name of a variable)
 PATIENCE = 10.0  # seconds a question may take
-NOTHING = "nothing was answered: is the gateway of this file running?"
 _CHANGED = "does the gateway run with this file as it is now?"
 _NAMED = 10  # tags in one sentence
 
@@ -43,16 +39,30 @@ class Client:
     """One session to the gateway of a configuration. Blocking calls, for the command line only.
 
     Tags that are not in the configuration are another gateway's, and left out. `tell` gets
-    sentences for people.
+    sentences for people. `user` is the name we are known by, where we gave one.
     """
 
-    def __init__(self, session: zenoh.Session, config: Config, tell: Callable[[str], None]) -> None:
+    def __init__(
+        self,
+        session: zenoh.Session,
+        config: Config,
+        tell: Callable[[str], None],
+        user: str | None = None,
+    ) -> None:
         self._session = session
         self._keys = Keys(config.zenoh.prefix, config.name)
+        self._stands_by = config.standby is not None
         self._tags = {tag.key: tag for device in config.devices for tag in device.tags}
         self._only_blocks = [device for device in config.devices if device.blocks == "only"]
         self._tell = tell
+        self._user = user
         self._doubled: set[str] = set()  # devices, told of
+
+    @property
+    def nothing(self) -> str:
+        """What may be wrong when nobody answers. Zenoh denies without a word."""
+        allowed = f", and may {self._user} ask it" if self._user else ""
+        return f"nothing was answered: is the gateway of this file running{allowed}?"
 
     def values(self, wanted: str, max_age: str | None = None) -> list[Shown]:
         """The current values of the tags a key expression (without the prefix) names, by name.
@@ -84,7 +94,7 @@ class Client:
         for reply in self._ask(self._keys.status(path)):
             if reply.ok is not None:
                 return _document(reply.ok.payload.to_bytes())
-        raise GatewayError("the gateway does not answer")
+        raise GatewayError(self.nothing)
 
     def write(self, tag: str, value: Value) -> dict[str, object]:
         """The outcome as the gateway told it: `value ...` or `error ...`.
@@ -103,11 +113,11 @@ class Client:
     def follow(self, wanted: list[str]) -> Iterator[Shown]:
         """The current values, then every change as it comes, without end.
 
-        When the gateway goes, what was good is bad: `no-gateway`; when it returns, its values
-        are asked for again. Raises `GatewayError` when there is none to begin with.
+        When the gateway goes, what was good is bad: `no-gateway`; when it returns, or another of
+        its standby group goes on duty, the values are asked for again. Raises `GatewayError` when
+        there is none to begin with.
         """
         news: SimpleQueue[Shown | bool] = SimpleQueue()
-        seen: set[str] = set()
         with ExitStack() as stack:
             for subscriber in self._subscribed(wanted, news.put):
                 stack.enter_context(subscriber)
@@ -115,25 +125,29 @@ class Client:
                 stack.enter_context(watcher)
             rows = self._all(wanted)
             if not rows:
-                raise GatewayError(NOTHING)
+                raise GatewayError(self.nothing)
             self.complete(wanted, rows)
+            known: set[str] = set()  # what nobody knows any more is left out
             there = True
             while True:
-                seen.update(row.tag for row in rows)
+                known.update(row.tag for row in rows)
                 yield from rows
-                match news.get():
-                    case True:  # what arrives meanwhile is newer, and handed on after this
-                        there = True
-                        try:
-                            rows = self._all(wanted)
-                        except GatewayError:
-                            rows = []
-                            news.put(True)
-                    case False:
-                        there = False
-                        rows = [_lost(tag) for tag in sorted(seen)]
-                    case row:  # without a gateway it is one that came late
-                        rows = [row] if there else []
+                event = news.get()
+                if there and isinstance(event, Shown):
+                    rows = [event]
+                    continue
+                # What comes while there is no gateway is late, or from one that took over: asked,
+                # only the latter answers. What arrives meanwhile is newer, and handed on after it.
+                try:
+                    rows = self._all(wanted) if event else []
+                except GatewayError:
+                    rows = []
+                    news.put(True)
+                    continue
+                there = bool(rows)
+                lost = known.difference(row.tag for row in rows)
+                known -= lost
+                yield from map(_lost, sorted(lost))
 
     def _all(self, wanted: list[str]) -> list[Shown]:
         return [row for want in wanted for row in self.values(want)]
@@ -168,17 +182,23 @@ class Client:
     def _gateway_seen(
         self, told: Callable[[bool], None]
     ) -> tuple[AbstractContextManager[object], ...]:
-        """True when the gateway comes, False when it goes, or the only link to it."""
+        """True when it is to be asked again, False when it is gone, or the only link to it.
+
+        In a standby group whoever goes or comes may be the one that served or will.
+        """
+        seen = self._keys.own
+        if self._stands_by:
+            seen = f"{seen.rpartition('/')[0]}/*"
 
         def token(sample: zenoh.Sample) -> None:
-            told(sample.kind == zenoh.SampleKind.PUT)
+            told(self._stands_by or sample.kind == zenoh.SampleKind.PUT)
 
         def link(event: zenoh.TransportEvent) -> None:
             if event.kind == zenoh.SampleKind.DELETE:  # when it is back, the token says so
                 told(False)
 
         return (
-            self._session.liveliness().declare_subscriber(self._keys.own, token),
+            self._session.liveliness().declare_subscriber(seen, token),
             self._session.info.declare_transport_events_listener(link),
         )
 
@@ -202,7 +222,8 @@ class Client:
         with self._session.declare_querier(key, timeout=PATIENCE) as querier:
             self._ask(self._keys.status("status"))
             if not querier.matching_status.matching:  # type: ignore[attr-defined]  # no bool
-                raise GatewayError(f"no gateway takes {key}: nothing was sent; {_CHANGED}")
+                may = f"may {self._user} do this, and " if self._user else ""
+                raise GatewayError(f"no gateway takes {key}: nothing was sent; {may}{_CHANGED}")
             for reply in querier.get(payload=payload, attachment=os.environ.get(TOKEN_VARIABLE)):
                 answer = reply.ok or reply.err
                 with suppress(orjson.JSONDecodeError):  # Zenoh's own `Timeout` is none
@@ -231,48 +252,10 @@ class Client:
         self._doubled |= doubled
 
 
-@contextmanager
-def connected(config: Config, tell: Callable[[str], None]) -> Iterator[Client]:
-    """A client of the gateway that `config` describes, which may `tell` people something.
-
-    Raises `GatewayError` when none is there.
-    """
-    own = config.zenoh
-    endpoints = own.connect if own.mode == "client" else own.listen or own.connect
-    if not endpoints:
-        raise GatewayError("zenoh.listen and zenoh.connect are empty: no way to the gateway")
-    settings = replace(
-        zenoh_settings(own),
-        mode=Mode.CLIENT,
-        listen=(),
-        connect=tuple(_reachable(endpoint) for endpoint in endpoints),
-        users_file=None,
-    )
-    setup = configure(settings)
-    setup.insert_json5("listen/endpoints", "[]")
-    try:
-        session = zenoh.open(setup)
-    except zenoh.ZError:
-        raise GatewayError(
-            f"no gateway at {', '.join(settings.connect)}: start it with `plc-gateway run`, "
-            "or use --direct"
-        ) from None
-    try:
-        yield Client(session, config, tell)
-    finally:
-        with suppress(zenoh.ZError):  # it times out now and then where the gateway is frozen
-            session.close()  # type: ignore[no-untyped-call]  # Zenoh's stub lacks it
-
-
 def _lost(tag: str) -> Shown:
     """Nobody knows the value any more."""
     now = rfc3339(time.time_ns())
     return Shown(tag, {"value": None, "quality": "bad", "reason": "no-gateway", "time": now})
-
-
-def _reachable(endpoint: str) -> str:
-    """An endpoint that listens everywhere is reached on this machine."""
-    return endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
 
 
 def _raw(tag: Tag, sample: zenoh.Sample, about: bytes) -> dict[str, object]:

@@ -28,6 +28,7 @@ from gateway.config.settings import (
     Baudrate,
     Duration,
     Endpoint,
+    Endpoints,
     FilePath,
     Finite,
     Group,
@@ -102,7 +103,7 @@ class ZenohSection(Section):
     """Every key starts with it."""
     mode: Literal["peer", "client", "router"] = "peer"
     """How this session takes part in the network."""
-    listen: list[Endpoint] = ["tcp/127.0.0.1:7447"]
+    listen: Endpoints = ["tcp/127.0.0.1:7447"]
     """Endpoints to listen at; loopback unless you say otherwise."""
     connect: list[Endpoint] = []
     """Endpoints to connect to."""

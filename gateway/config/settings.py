@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import Field, PlainValidator, WithJsonSchema
+from pydantic import AfterValidator, Field, PlainValidator, WithJsonSchema
 
 from gateway.config import written
 from gateway.transport.port import PortAddress
@@ -86,4 +86,5 @@ WebAddress = Annotated[
 FilePath = Annotated[Path, PlainValidator(written.path), WithJsonSchema({"type": "string"})]
 OrderName = Annotated[Order, PlainValidator(written.order), WithJsonSchema(_ORDER_SCHEMA)]
 Endpoint = Annotated[str, PlainValidator(written.endpoint), WithJsonSchema(_ENDPOINT_SCHEMA)]
+Endpoints = Annotated[list[Endpoint], AfterValidator(written.once)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]

@@ -23,6 +23,7 @@ BYTES = {"kB": 10**3, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
 _PERCENT = re.compile(r"([0-9]+(?:\.[0-9]+)?) ?%\Z")
 _WEB = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[^\[\]/:\s]+):([0-9]{1,5})\Z")
 _ENDPOINT = re.compile(r"[a-z][a-z0-9_-]*/[^\s/]\S*\Z")
+_WITH_PORT = ("tcp", "udp", "tls", "quic", "ws")
 _SERVER = re.compile(r"(?:([^/\\:\s]+):)?([0-9]+)\Z")  # as in its manual: `4001`, `10.0.0.7:4001`
 _FORMAT = re.compile(r"[78][NEO][12]\Z")
 # Rates that serial ports and PLCs know; a slip of the keyboard is rarely one of them.
@@ -130,7 +131,29 @@ def endpoint(text: object) -> str:
     """A Zenoh endpoint: `tcp/127.0.0.1:7447`."""
     if not isinstance(text, str) or not _ENDPOINT.match(text):
         raise ConfigError(f"{shown(text)} is no Zenoh endpoint: write it as tcp/127.0.0.1:7447")
+    check_address(text)
     return text
+
+
+def check_address(endpoint: str) -> None:
+    """Raises `ConfigError` where Zenoh could neither listen nor connect."""
+    protocol, slash, address = endpoint.partition("/")
+    if not slash or not address:
+        raise ConfigError(f"{endpoint!r}: write it as tcp/127.0.0.1:7447")
+    if protocol not in (*_WITH_PORT, "unixsock-stream"):
+        raise ConfigError(f"{endpoint!r}: {protocol} is none of {', '.join(_WITH_PORT)}")
+    if protocol == "unixsock-stream":
+        return
+    host, _, port = address.partition("?")[0].partition("#")[0].rpartition(":")
+    if not host or not port.isdecimal() or int(port) > 65535:
+        raise ConfigError(f"{endpoint!r}: write it as {protocol}/host:port")
+
+
+def once(endpoints: list[str]) -> list[str]:
+    for number, endpoint in enumerate(endpoints):
+        if endpoint in endpoints[:number]:
+            raise ConfigError(f"{endpoint} is there twice")
+    return endpoints
 
 
 def web_address(text: object) -> tuple[str, int]:

@@ -33,6 +33,7 @@ class Historian:
         self, path: Path, keep: float, max_size: int, wall: Callable[[], int] = time.time_ns
     ) -> None:
         """`keep`: seconds; `max_size`: bytes, the database's log included."""
+        path = path.resolve()  # SQLite has its log beside the file, not beside a link to it
         longest = max(256, min(LONGEST_RUN, max_size // 1024))
         self._wall = wall
         self._recent = Recent(longest, min(OLDEST_RUN, keep / 20))

@@ -4,6 +4,7 @@
 cancelled. Nothing it does holds the event loop, and nothing below it knows Zenoh.
 """
 
+from gateway.northbound.check import check
 from gateway.northbound.duty import StandbySettings
 from gateway.northbound.northbound import Northbound
 from gateway.northbound.plant import Device, History, Plant
@@ -17,5 +18,6 @@ __all__ = [
     "Plant",
     "StandbySettings",
     "ZenohSettings",
+    "check",
     "zenoh_settings",
 ]

@@ -96,7 +96,10 @@ class Queries:
             case Family.VALUE if query.parameters.get("_time") is not None:
                 self._widely(query, partial(self._replies.history, wanted))
             case Family.VALUE if query.parameters.get("max_age") is not None:
-                self._task(self._fresh(query, wanted))
+                if wanted.is_wild:
+                    self._in_wide_room(query, self._fresh(query, wanted))
+                else:
+                    self._task(self._fresh(query, wanted))
             case _ if wanted.is_wild or wanted.family is Family.BLOCK:
                 self._widely(query, partial(self._replies.current, wanted))
             case _:
@@ -188,10 +191,17 @@ class Queries:
             return False
         return True
 
-    def _task(self, work: Coroutine[None, None, None]) -> None:
+    def _task(self, work: Coroutine[None, None, None]) -> asyncio.Task[None]:
         task = asyncio.get_running_loop().create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._ended)
+        return task
+
+    def _in_wide_room(self, query: zenoh.Query, work: Coroutine[None, None, None]) -> None:
+        if self._has_wide_room(query):
+            self._task(work).add_done_callback(lambda _: self._open_wide.release())
+        else:
+            work.close()
 
     def _ended(self, task: asyncio.Task[None]) -> None:
         self._tasks.discard(task)
@@ -209,13 +219,19 @@ class Queries:
         self._narrow.submit(self._finish_all, batch).add_done_callback(_report)
 
     def _widely(self, query: zenoh.Query, answer: Answer) -> None:
-        if not self._open_wide.acquire(blocking=False):
-            self._open.release()
-            self.refuse(query)
+        if not self._has_wide_room(query):
             return
         future = self._wide.submit(self._finish, query, answer)
         future.add_done_callback(lambda _: self._open_wide.release())
         future.add_done_callback(_report)
+
+    def _has_wide_room(self, query: zenoh.Query) -> bool:
+        """Otherwise the query is refused."""
+        if self._open_wide.acquire(blocking=False):
+            return True
+        self._open.release()
+        self.refuse(query)
+        return False
 
     # -- any thread --
 

@@ -54,6 +54,21 @@ def password(file: Path | None) -> str | None:
     return found
 
 
+def check_users(path: Path) -> None:
+    """Raises `ConfigError` for a file that Zenoh would not take, or take to mean everybody."""
+    named = False
+    for number, line in enumerate(readable_secret(path, "zenoh.users_file").splitlines(), 1):
+        name, _, password = line.partition(":")
+        if line.strip():
+            if not name.strip() or not password.strip():
+                raise ConfigError(
+                    f"zenoh.users_file {path}, line {number}: write it as name:password"
+                )
+            named = True
+    if not named:
+        raise ConfigError(f"zenoh.users_file {path} names nobody, and would let everybody in")
+
+
 def holds_secret(zenoh_file: str) -> bool:
     """Whether the text of a Zenoh file has a password or a private key in itself."""
     return _SECRET.search(zenoh_file) is not None

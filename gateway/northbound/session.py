@@ -14,9 +14,10 @@ from typing import TypeVar
 import structlog
 import zenoh
 
+from gateway.config import written
 from gateway.config.plain import TlsConfig, ZenohConfig
 from gateway.errors import ConfigError, GatewayError
-from gateway.northbound import secrets
+from gateway.northbound import certificates, secrets
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 
@@ -105,6 +106,7 @@ def configure(settings: ZenohSettings) -> zenoh.Config:
             _check(side, endpoint)
         if endpoints:
             config.insert_json5(f"{side}/endpoints", json.dumps(endpoints))
+    certificates.check_shown(config, settings.listen)
     if settings.mode is Mode.CLIENT and json.loads(config.get_json("connect/endpoints")) == []:
         raise ConfigError("zenoh mode client: say in `connect` which router it is a client of")
     return config
@@ -142,6 +144,7 @@ def _tls(tls: TlsConfig | None) -> dict[str, object]:
         return {}
     if tls.key is not None:
         secrets.closed_to_others(tls.key, "zenoh.tls.key")
+    certificates.check_files(tls)
     files = {
         "root_ca_certificate": tls.ca,
         "listen_certificate": tls.certificate,
@@ -157,7 +160,7 @@ def _tls(tls: TlsConfig | None) -> dict[str, object]:
 def _users(settings: ZenohSettings) -> dict[str, object]:
     found: dict[str, object] = {}
     if settings.users_file is not None:
-        secrets.closed_to_others(settings.users_file, "zenoh.users_file")
+        secrets.check_users(settings.users_file)
         found["transport/auth/usrpwd/dictionary_file"] = str(settings.users_file)
     if settings.user is not None:
         password = secrets.password(settings.password_file)
@@ -171,22 +174,11 @@ def _users(settings: ZenohSettings) -> dict[str, object]:
     return found
 
 
-_WITH_PORT = ("tcp", "udp", "tls", "quic", "ws")
-
-
 def _check(side: str, endpoint: str) -> None:
-    protocol, slash, address = endpoint.partition("/")
-    if not slash or not address:
-        raise ConfigError(f"zenoh {side} {endpoint!r}: write it as tcp/127.0.0.1:7447")
-    if protocol not in (*_WITH_PORT, "unixsock-stream"):
-        raise ConfigError(
-            f"zenoh {side} {endpoint!r}: {protocol} is none of {', '.join(_WITH_PORT)}"
-        )
-    if protocol == "unixsock-stream":
-        return
-    host, _, port = address.partition("?")[0].partition("#")[0].rpartition(":")
-    if not host or not port.isdecimal() or int(port) > 65535:
-        raise ConfigError(f"zenoh {side} {endpoint!r}: write it as {protocol}/host:port")
+    try:
+        written.check_address(endpoint)
+    except ConfigError as error:
+        raise ConfigError(f"zenoh {side} {error}") from None
 
 
 async def opened(config: zenoh.Config, *, retry: bool) -> zenoh.Session:

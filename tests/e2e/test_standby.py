@@ -8,7 +8,9 @@ from collections.abc import AsyncIterator
 from contextlib import ExitStack, asynccontextmanager
 from pathlib import Path
 
-from tests.e2e.processes import Program, free_port
+import pytest
+
+from tests.e2e.processes import Program, free_port, station
 from tests.zenoh_peer import ZenohPeer, free_endpoint
 
 # The command itself; only the longest wait is shorter, so that the suite is.
@@ -110,3 +112,33 @@ async def test_two_gateways_of_a_group_share_one_wire(tmp_path: Path) -> None:
                     await line.until(1, within=3)
                     assert line.most == 1
                     assert await asyncio.to_thread(a.end) == 0
+
+
+async def says(program: Program, words: str, after: int = 0) -> int:
+    """How many lines there are up to the one that says so, after so many."""
+    line = await asyncio.to_thread(program.says, words, after=after)
+    return program.lines.index(line, after) + 1
+
+
+@pytest.mark.parametrize("watched", ["a", "b"])
+async def test_watch_goes_on_with_whichever_gateway_of_the_group_serves(
+    tmp_path: Path, watched: str
+) -> None:
+    """By the file of either of them; and when nobody is left all is bad at once."""
+    router_at, port, good, gone = free_endpoint(), free_port(), '"good"', '"no-gateway"'
+    with ExitStack() as programs:
+        programs.enter_context(station("tcp", str(port)))
+        async with ZenohPeer("router", listen=[router_at]):
+            a = programs.enter_context(gateway(tmp_path, "a", router_at, port))
+            await says(a, "device answers")
+            b = programs.enter_context(gateway(tmp_path, "b", router_at, port))
+            file = tmp_path / f"{watched}.yaml"
+            watch = programs.enter_context(
+                Program(sys.executable, "-m", "gateway", "watch", file, "mixer/speed", "--json")
+            )
+            seen = await says(watch, good)
+            a.end(signal.SIGKILL)
+            seen = await says(watch, gone, after=seen)
+            seen = await says(watch, good, after=seen)
+            b.end(signal.SIGKILL)
+            await says(watch, gone, after=seen)

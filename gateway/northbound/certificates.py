@@ -1,0 +1,46 @@
+"""Certificates and keys, looked at before Zenoh is: it finds out late, and says less."""
+
+import ssl
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+
+import zenoh
+
+from gateway.config.plain import TlsConfig
+from gateway.errors import ConfigError
+
+
+def check_files(tls: TlsConfig) -> None:
+    """Raises `ConfigError` for what is no certificate, or no key, or not the one's key."""
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    for name, file in (("ca", tls.ca), ("certificate", tls.certificate)):
+        if file is not None:
+            with _told(f"zenoh.tls.{name} {file}", "holds no certificate in PEM form"):
+                context.load_verify_locations(file)
+    if tls.certificate is not None and tls.key is not None:
+        wrong = f"is no PEM key without a password, or not that of {tls.certificate}"
+        with _told(f"zenoh.tls.key {tls.key}", wrong):
+            context.load_cert_chain(tls.certificate, tls.key, password="")
+
+
+def check_shown(config: zenoh.Config, listen: Sequence[str]) -> None:
+    """Raises `ConfigError` where an endpoint is to show a certificate and has none."""
+    link = "transport/link/tls/listen_certificate"
+    if any(config.get_json(name) != "null" for name in (link, f"{link}_base64")):
+        return
+    for endpoint in listen:
+        if endpoint.startswith(("tls/", "quic/")) and "#" not in endpoint:
+            raise ConfigError(
+                f"zenoh listen {endpoint!r}: it needs a certificate: write beside `listen` "
+                "`tls: {certificate: gateway.pem, key: gateway.key}`"
+            )
+
+
+@contextmanager
+def _told(called: str, wrong: str) -> Iterator[None]:
+    try:
+        yield
+    except ssl.SSLError:
+        raise ConfigError(f"{called} {wrong}") from None
+    except OSError as error:
+        raise ConfigError(f"{called}: {error.strerror}") from None
