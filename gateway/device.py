@@ -14,6 +14,7 @@ from gateway.tags import Reason, Tag
 from gateway.wiretime import Wire
 
 LEARN_EVERY = 50  # exchanges between two looks at the measured turnaround
+MOST_PLANNED = 2000  # tags times intervals, while lines run: some tenths of a second
 WORTH_WHILE = 0.1  # of the wire's time, to be planned anew
 MOST_UNANSWERED = 64  # questions whose time is kept
 HALF_LIFE = 10.0  # seconds in which use of the wire is half forgotten
@@ -151,7 +152,7 @@ class Device:
             return False
         self._learn_at = self.record.exchanges + LEARN_EVERY
         self.reckoned = measured
-        if abs(measured - self._tried) < WORTH_WHILE * self._tried:
+        if abs(measured - self._tried) < WORTH_WHILE * self._tried or self._takes_long:
             return False
         self._tried = measured
         now, blocks = self.load, self.blocks
@@ -160,6 +161,11 @@ class Device:
             return True
         self.blocks = blocks
         return False
+
+    @property
+    def _takes_long(self) -> bool:
+        """To plan, while all lines wait."""
+        return len(self.tags) * len({tag.every for tag in self.tags}) > MOST_PLANNED
 
     def interval(self, block: Block) -> float:
         """How often the block is asked: refused addresses only rarely."""

@@ -150,3 +150,19 @@ def test_the_work_grows_with_the_number_of_items_not_with_its_square() -> None:
 
     work(200)  # warm
     assert work(4000) < 40 * max(work(400), 1e-3)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_where_characters_cost_next_to_nothing_the_cheapest_ways_are_enough(
+    seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As on a network, with many intervals: then not all ways are followed."""
+    chance = random.Random(seed)
+    row = [(unit, 1) for unit in sorted(chance.sample(range(300), 200))]
+    intervals = [chance.choice((0.1, 0.5, 1.0, 2.0, 10.0, 60.0)) for _ in row]
+    seconds = wire(row, 0.006, 2e-6, 125)
+    found = cover(intervals, seconds, even=True)
+    check_served(found, intervals)
+    monkeypatch.setattr("gateway.cover.MOST", 10**9)
+    least = cover(intervals, seconds, even=True)
+    assert spent(found, seconds) == pytest.approx(spent(least, seconds))
