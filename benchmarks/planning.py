@@ -3,8 +3,8 @@
 Registers of one Modbus device at 19200 baud in rows of several shapes, wanted at one interval or
 at several that were drawn at random for each register, which is the hardest case there is. The
 processor's time for ten thousand of them, and how many times that is of the time for a thousand.
-Then fewer, two of three at random, on a network, where characters cost next to nothing, so that every
-request may reach far and there are many ways to choose from.
+Then fewer, two of three at random, on a network, where characters cost next to nothing: every
+request may reach far, and there are many ways to choose from.
 """
 
 import random

@@ -67,10 +67,12 @@ class Notebook:
         self._pages.put(page)
         self._pages.put(None)
 
-    def close(self, within: float) -> None:
-        """Blocks, at most so many seconds. After that the page is in the file, if ever."""
-        if self._thread.ident is not None:  # otherwise never started
-            self._thread.join(max(0.0, within))
+    def close(self, within: float) -> bool:
+        """Blocks, at most so many seconds; whether the thread has come to its end."""
+        if self._thread.ident is None:  # never started
+            return True
+        self._thread.join(max(0.0, within))
+        return not self._thread.is_alive()
 
     # -- its own thread --
 

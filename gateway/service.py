@@ -27,7 +27,7 @@ COLLECT = (5000, 5, 100)
 
 KEEP_EVERY = 10.0  # seconds
 # Seconds from the signal, of the 2 there are: Zenoh takes 1.5 at most, the disk has what is left.
-END_WITHIN = 1.8
+END_WITHIN = 1.7
 KEPT_WITHIN = 0.5  # seconds that a lost state file is worth
 
 
@@ -130,8 +130,8 @@ async def _kept(notebook: Notebook, gateway: Gateway) -> AsyncIterator[None]:
     try:
         yield
     finally:
-        keeping.cancel()
         notebook.end(notebook.page(gateway.spoken_to))
+        await _ended([keeping])
 
 
 async def _keep(notebook: Notebook, gateway: Gateway) -> None:
@@ -149,11 +149,14 @@ async def _put_away(
     try:
         await _ended([face])
     finally:
+        if history is not None:
+            left = by - time.monotonic()
+            if not await asyncio.to_thread(history.close, left):
+                log.error("history did not end in time: what the disk has not taken is lost")
         if notebook is not None:
             left = min(KEPT_WITHIN, by - time.monotonic())
-            await asyncio.to_thread(notebook.close, left)
-        if history is not None:
-            await asyncio.to_thread(history.close, by - time.monotonic())
+            if not await asyncio.to_thread(notebook.close, left):
+                log.warning("the disk did not take in time what was learned of the devices")
 
 
 def _history(config: Config) -> Historian | None:

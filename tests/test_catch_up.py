@@ -4,24 +4,27 @@ import asyncio
 import json
 import signal
 import sys
+import threading
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from gateway import payload
 from gateway.history import Historian
 from gateway.northbound import Mode, Northbound, ZenohSettings
+from gateway.northbound.plant import History
 from gateway.orders import Obeyed
 from gateway.payload import Failure, Problem, WriteOutcome
-from gateway.tags import Reason, Written, bad, good
+from gateway.tags import Reason, Sample, Tag, Written, bad, good
 from tests.e2e.processes import Program
 from tests.history_writer import WEEK, until
 from tests.test_docs import bare, table
 from tests.test_northbound import PlainDevice, PlainPlant, tag
 from tests.zenoh_peer import ZenohPeer, free_endpoint
 
+T = TypeVar("T")
 EXAMPLE = Path(__file__).parents[1] / "examples" / "catch_up.py"
 SPEED = tag("mixer", "speed", history=True)
 DOOR = tag("mixer", "door", history=True)
@@ -48,7 +51,7 @@ async def recording(path: Path) -> AsyncIterator[Historian]:
 
 @asynccontextmanager
 async def serving(
-    below: PlainPlant, historian: Historian, endpoint: str, *, listen: bool = False
+    below: PlainPlant, historian: History, endpoint: str, *, listen: bool = False
 ) -> AsyncIterator[Northbound]:
     settings = ZenohSettings(
         mode=Mode.PEER,
@@ -100,6 +103,46 @@ async def test_history_is_answered_by_zenohs_time_ranges(tmp_path: Path) -> None
         for wrong in ("[now(-1h);30m]", "yesterday", "[..]&limit=-1", "[..]&limit=many"):
             [reply] = await client.get(speed + wrong.replace("&", ";"))
             assert reply.json["error"] == "bad-query", wrong
+
+
+class Slow:
+    """A history that tells nothing before it may, and keeps what it was asked for."""
+
+    def __init__(self) -> None:
+        self.asked: dict[str, list[int]] = {}  # range -> every `now`
+        self.go = threading.Event()
+
+    def samples(self, tag: Tag, time_range: str, limit: int | None, now: int) -> Iterator[Sample]:
+        return self._told(time_range, now, [good(tag, 1, PAST)])
+
+    def writes(self, time_range: str, limit: int | None, now: int) -> Iterator[str]:
+        return self._told(time_range, now, ["{}"])
+
+    def _told(self, time_range: str, now: int, told: list[T]) -> Iterator[T]:
+        self.asked.setdefault(time_range, []).append(now)
+        assert self.go.wait(20)
+        return iter(told)
+
+
+async def test_now_is_when_a_question_is_taken_for_all_its_tags() -> None:
+    endpoint, slow = free_endpoint(), Slow()
+    async with (
+        serving(plant(), slow, endpoint, listen=True) as northbound,
+        ZenohPeer("client", connect=[endpoint]) as client,
+    ):
+        begun, queries = time.time_ns(), northbound.counters()["queries"]
+        values = [f"plant/mixer/*?_time=[now(-{n}s)..]" for n in range(1, 6)]
+        selectors = [*values, "plant/@gateway/demo/writes?_time=[now(-9s)..]"]
+        answers = asyncio.create_task(client.many([(selector, None) for selector in selectors]))
+        while northbound.counters()["queries"] < queries + len(selectors) and not answers.done():
+            await asyncio.sleep(0.01)
+        taken = time.time_ns()
+        slow.go.set()
+        await answers
+    assert sorted(len(nows) for nows in slow.asked.values()) == [1, *(3 for _ in values)]
+    for nows in slow.asked.values():
+        assert begun <= nows[0] <= taken
+        assert set(nows) == {nows[0]}
 
 
 async def test_the_questions_that_the_page_shows_are_answered(tmp_path: Path) -> None:

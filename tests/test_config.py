@@ -262,6 +262,13 @@ SECTIONS = [
         "1: history.max_size: 1 is no size: write it as 500MB or 1GB",
     ),
     bad(
+        "history in the file of the state",
+        "gateway:\n  state: data/../history.db\nhistory: {keep: 7d}\n"
+        + tags("speed: {address: D1}"),
+        "2: gateway.state: history is kept in history.db: two files are needed, such as "
+        "history.db and state.json",
+    ),
+    bad(
         "history without its section",
         tags("speed: {address: D1}", "level: {address: D2, history: true}"),
         f"9: {M}.tags.level.history: the file has no `history:` section: "

@@ -1,6 +1,7 @@
 """History: nothing recorded is lost but what the rules say, whatever the disk does."""
 
 import errno
+import fcntl
 import json
 import math
 import os
@@ -24,7 +25,7 @@ from hypothesis import strategies as st
 from gateway.errors import BadValue, Busy
 from gateway.history import Historian, TimeRange, lock, time_range
 from gateway.history.file import HistoryFile
-from gateway.history.outcomes import MOST_WAITING
+from gateway.history.outcomes import MOST_WAITING, Outcome
 from gateway.history.reader import Part, Reader, in_order
 from gateway.history.recent import MOST_RUNS, Identity
 from gateway.history.rows import from_row, to_row
@@ -208,6 +209,18 @@ def test_ranges_limits_and_unknown_tags(tmp_path: Path) -> None:
             historian.samples(SPEED, "yesterday", None)
 
 
+def test_now_is_when_it_was_asked_not_when_it_is_answered(tmp_path: Path) -> None:
+    with history(tmp_path / "h.db", wall=lambda: NOON + 50 * SECOND) as historian:
+        historian.record(numbered(100))
+        for number in range(10):
+            historian.record_write(write(number))
+        asked = NOON + 5 * SECOND
+        found = historian.samples(SPEED, "[now(-2s)..now()]", None, asked)
+        assert [sample.value for sample in found] == [3, 4, 5]
+        told = historian.writes("[now(-2s)..now()]", None, asked)
+        assert [json.loads(line)["value"] for line in told] == [3, 4, 5]
+
+
 def test_two_samples_of_one_moment_are_both_kept_in_their_order(tmp_path: Path) -> None:
     with history(tmp_path / "h.db", max_size=SMALL) as historian:
         historian.record(good(SPEED, n, NOON) for n in range(5000))
@@ -308,6 +321,75 @@ def test_a_slow_reader_gets_all_and_holds_up_neither_log_nor_writer(tmp_path: Pa
     assert found == list(range(60_000))
 
 
+def flooded(historian: Historian, first: int, last: int) -> None:
+    for start in range(first, last, 1000):
+        historian.record(numbered(1000, start))
+        until(historian, waiting=0)
+
+
+def test_an_answer_whose_rest_is_dropped_meanwhile_ends_with_an_error(tmp_path: Path) -> None:
+    with history(tmp_path / "h.db", max_size=SMALL) as historian:
+        flooded(historian, 0, 20_000)
+        answer = historian.samples(SPEED, EVERYTHING, None)
+        found = [next(answer).value for _ in range(10)]
+        flooded(historian, 20_000, 45_000)
+        with pytest.raises(Busy, match="dropped meanwhile"):
+            found.extend(sample.value for sample in answer)
+        assert found == list(range(len(found)))
+
+
+def test_an_answer_not_yet_begun_begins_with_what_is_left(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    at_once = Reader.samples
+
+    def late(reader: Reader, *asked: Any) -> list[Sample] | None:
+        monkeypatch.undo()
+        first = historian.document()["oldest"]
+        for start in range(20_000, 60_000, 1000):
+            if historian.document()["oldest"] == first:
+                flooded(historian, start, start + 1000)
+        return at_once(reader, *asked)
+
+    with history(tmp_path / "h.db", max_size=SMALL) as historian:
+        flooded(historian, 0, 20_000)
+        monkeypatch.setattr(Reader, "samples", late)
+        found = values(historian)
+        assert isinstance(found[0], int)
+        assert found[0] > 0
+        assert found == list(range(found[0], 20_000))
+
+
+def test_a_run_that_has_the_number_of_one_that_is_gone_is_another(tmp_path: Path) -> None:
+    path = tmp_path / "h.db"
+    with closing(HistoryFile(path, 10**8)) as file:
+        file.store(1, 0, numbered(10))
+        before = file.sort(1, NOON)
+        file.drop(1)
+        file.store(1, 0, numbered(10, 10))
+        after = file.sort(1, NOON + SECOND)
+        assert before is not None
+        assert after is not None
+        everything = TimeRange(EARLIEST, LATEST)
+        reader = Reader(path)
+        assert reader.samples(file.identity, SPEED, before, everything, None) is None
+        assert reader.samples(file.identity, SPEED, after, everything, None)
+
+
+def test_writes_that_are_dropped_while_they_are_told_end_the_answer(tmp_path: Path) -> None:
+    path = tmp_path / "h.db"
+    everything = TimeRange(EARLIEST, LATEST)
+    with closing(HistoryFile(path, 10**8)) as file:
+        outcomes = [Outcome(NOON + n, str(n)) for n in range(2500)]
+        last = file.store_writes(outcomes, 2500)
+        told = Reader(path).writes(file.identity, last, everything)
+        found = [next(told).told for _ in range(10)]
+        assert file.store_writes([Outcome(NOON + 2500, "2500")], 500) == 2501
+        with pytest.raises(Busy, match="dropped meanwhile"):
+            found.extend(outcome.told for outcome in told)
+        assert found == [str(n) for n in range(len(found))]
+
+
 # -- what is kept ------------------------------------------------------------------------------
 
 
@@ -329,6 +411,25 @@ def test_the_oldest_go_first_when_the_file_is_full(tmp_path: Path) -> None:
     assert found == list(range(found[0], 150_000))
     assert len(found) > 15_000  # of 2 MB some use is made
     assert time_range(f"[{oldest}..]", 0).first == NOON + found[0] * SECOND
+
+
+def test_behind_a_link_the_log_counts_too(tmp_path: Path) -> None:
+    (tmp_path / "disk").mkdir()
+    path, real = tmp_path / "h.db", tmp_path / "disk" / "h.db"
+    path.symlink_to(real)
+    with history(path) as historian:
+        historian.record(numbered(1000))
+        until(historian, waiting=0)
+        assert Path(f"{real}-wal").stat().st_size > 0
+
+        def all_files() -> int:
+            return real.stat().st_size + Path(f"{real}-wal").stat().st_size
+
+        for _ in range(1000):
+            if historian.document()["bytes"] == all_files():
+                break
+            time.sleep(0.01)
+        assert historian.document()["bytes"] == all_files()
 
 
 def test_a_smaller_limit_shrinks_the_file(tmp_path: Path) -> None:
@@ -618,6 +719,32 @@ def test_a_file_that_is_no_database_is_moved_aside(tmp_path: Path, what: bytes) 
     assert aside.read_bytes() == what
 
 
+def test_behind_a_link_the_file_is_moved_aside_and_not_the_link(tmp_path: Path) -> None:
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    path, real = tmp_path / "h.db", disk / "h.db"
+    path.symlink_to(real)
+    real.write_bytes(b"not a database " * 500)
+    with history(path) as historian:
+        historian.record(numbered(5))
+    assert len(asides(disk)) == 1
+    assert path.readlink() == real
+    with history(path) as historian:
+        assert values(historian) == list(range(5))
+
+
+def test_a_link_to_itself_is_said_and_waits(tmp_path: Path) -> None:
+    path = tmp_path / "h.db"
+    path.symlink_to(path)
+    historian = Historian(path, WEEK, 10**8)
+    historian.start()
+    state_with(historian, "the file cannot be opened")
+    historian.record(numbered(5))
+    path.unlink()
+    until(historian, state="ok", waiting=0)
+    assert historian.close(10)
+
+
 def test_a_database_of_another_program_is_moved_aside_untouched(tmp_path: Path) -> None:
     path = tmp_path / "h.db"
     with closing(sqlite3.connect(path)) as other:
@@ -731,6 +858,24 @@ def test_a_gateway_that_is_killed_lets_go_of_the_file(tmp_path: Path) -> None:
     assert historian.close()
 
 
+def test_the_lock_holds_over_nfs_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """There it is one of a range of bytes, which a file that is only read cannot have."""
+
+    def flock(file: int, how: int) -> None:
+        fcntl.lockf(file, how)
+
+    monkeypatch.setattr(lock.fcntl, "flock", flock)
+    path = tmp_path / "h.db"
+    file = lock.locked(path)
+    command = (
+        "import fcntl, sys; fcntl.lockf(open(sys.argv[1], 'r+'), fcntl.LOCK_EX | fcntl.LOCK_NB)"
+    )
+    another = [sys.executable, "-c", command, f"{path}.lock"]
+    assert b"BlockingIOError" in subprocess.run(another, capture_output=True, check=False).stderr
+    os.close(file)
+    assert subprocess.run(another, capture_output=True, check=False).stderr == b""
+
+
 def test_where_the_disk_has_no_locks_history_is_written_all_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -832,18 +977,19 @@ def test_a_file_that_nobody_has_noticed_yet_answers_no_question_about_the_one_be
     everything = TimeRange(EARLIEST, LATEST)
     with closing(HistoryFile(path, 10**8)) as file:
         file.store(1, 0, numbered(10))
-        file.sort(1, NOON)
+        run = file.sort(1, NOON)
+        assert run is not None
         reader = Reader(path)
-        assert len(reader.samples(file.identity, SPEED, 1, everything, None)) == 10
+        assert len(reader.samples(file.identity, SPEED, run, everything, None) or []) == 10
         another = Identity(file.identity.inode, b"another")
         with pytest.raises(Busy, match="another file"):
-            reader.samples(another, SPEED, 1, everything, None)
+            reader.samples(another, SPEED, run, everything, None)
         with pytest.raises(Busy, match="another file"):
             next(reader.writes(another, 1, everything))
         shutil.copy(path, tmp_path / "copy.db")
         (tmp_path / "copy.db").replace(path)
         with pytest.raises(Busy, match="another file"):
-            reader.samples(file.identity, SPEED, 1, everything, None)
+            reader.samples(file.identity, SPEED, run, everything, None)
 
 
 def test_a_file_from_before_files_had_an_identity_is_given_one(tmp_path: Path) -> None:

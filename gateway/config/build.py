@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from os.path import realpath
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -226,6 +227,15 @@ class Builder:
                 (*self._recorded, "history"),
                 "the file has no `history:` section: write `history: {path: history.db}` beside "
                 "`lines:`",
+            )
+        if top.history is None or top.gateway.state is None:
+            return
+        history, state = self.folder / top.history.path, self.folder / top.gateway.state
+        if realpath(history) == realpath(state):
+            self.mistakes.add(
+                ("gateway", "state"),
+                f"history is kept in {top.history.path}: two files are needed, such as "
+                "history.db and state.json",
             )
 
     def _zenoh(self, top: FileSection) -> ZenohConfig:

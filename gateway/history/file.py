@@ -68,7 +68,8 @@ _INSERTS = [
 class HistoryFile:
     """The one connection that writes. Raises `sqlite3.Error` and `OSError` as they come.
 
-    While it is open no other gateway can open the file, which is a `BlockingIOError` there.
+    `path` is that of the file itself, not of a link to it. While it is open no other gateway can
+    open the file, which is a `BlockingIOError` there.
     """
 
     def __init__(self, path: Path, max_size: int) -> None:

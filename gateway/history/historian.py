@@ -3,8 +3,10 @@
 import sqlite3
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import partial
 from heapq import merge
 from itertools import islice
+from os.path import realpath
 from pathlib import Path
 
 from gateway import payload
@@ -33,7 +35,7 @@ class Historian:
         self, path: Path, keep: float, max_size: int, wall: Callable[[], int] = time.time_ns
     ) -> None:
         """`keep`: seconds; `max_size`: bytes, the database's log included."""
-        path = path.resolve()  # SQLite has its log beside the file, not beside a link to it
+        path = Path(realpath(path))  # SQLite has its log beside the file, not beside a link to it
         longest = max(256, min(LONGEST_RUN, max_size // 1024))
         self._wall = wall
         self._recent = Recent(longest, min(OLDEST_RUN, keep / 20))
@@ -54,7 +56,8 @@ class Historian:
     # -- event loop --
 
     def record(self, samples: Iterable[Sample]) -> None:
-        """Keeps those of tags with `history: true`."""
+        """Keeps those of tags with `history: true`, in memory: whatever a disk does, or the thread
+        that writes, is not felt here."""
         self._recent.add(samples)
 
     def record_write(self, outcome: WriteOutcome) -> None:
@@ -79,26 +82,32 @@ class Historian:
 
     # -- any thread --
 
-    def samples(self, tag: Tag, time_range: str, limit: int | None) -> Iterator[Sample]:
+    def samples(
+        self, tag: Tag, time_range: str, limit: int | None, now: int | None = None
+    ) -> Iterator[Sample]:
         """The samples of a tag in a range of Zenoh's form, in the order of time.
 
-        With a limit the first so many: the rest follows by asking again from the last one's time.
+        `now` is what the range means by it: ns since 1970, when it was asked. With a limit the
+        first so many: the rest follows by asking again from the last one's time.
         Raises `BadValue` for a range or limit that cannot be understood, and `Busy`, also in the
-        middle, when the file cannot be read now: what came until then is not all there is.
+        middle, when the file cannot be read now or what was not yet given out has been dropped:
+        what came until then is not all there is.
         """
-        wanted = self._range(time_range, limit)
+        wanted = self._range(time_range, limit, now)
         return islice(self._samples(tag, wanted, limit), limit)
 
-    def writes(self, time_range: str, limit: int | None = None) -> Iterator[str]:
+    def writes(
+        self, time_range: str, limit: int | None = None, now: int | None = None
+    ) -> Iterator[str]:
         """Outcomes of writes as on the `writes` key (JSON), by the time they ended. Raises as
         `samples` does."""
-        wanted = self._range(time_range, limit)
+        wanted = self._range(time_range, limit, now)
         return islice(self._writes(wanted), limit)
 
-    def _range(self, text: str, limit: int | None) -> TimeRange:
+    def _range(self, text: str, limit: int | None, now: int | None) -> TimeRange:
         if limit is not None and not 1 <= limit <= MOST_ASKED:
             raise BadValue("limit is not between 1 and 1000000000")
-        wanted = time_range(text, self._wall())
+        wanted = time_range(text, self._wall() if now is None else now)
         if not self._writer.readable:
             raise Busy(f"history cannot be read: {self._writer.trouble}")
         return wanted
@@ -115,15 +124,20 @@ class Historian:
     def _samples(self, tag: Tag, wanted: TimeRange, limit: int | None) -> Iterator[Sample]:
         file, shelf, newest = self._recent.of(tag.key)
         runs = [run for run in shelf if run.first <= wanted.last and run.last >= wanted.first]
+        begun = False
 
-        def part(run: Shelved) -> Part:
-            return Part(
-                run.first, lambda: self._reader.samples(file, tag, run.number, wanted, limit)
-            )
+        def found(run: Shelved) -> list[Sample]:
+            samples = self._reader.samples(file, tag, run, wanted, limit)
+            if samples is None and begun:
+                raise Busy("history has dropped meanwhile what was to come next: ask again")
+            return samples or []  # gone before anything was said: as if asked a moment later
 
-        parts = [*map(part, runs), *(_part_of(run, wanted) for run in newest)]
+        parts = [Part(run.first, partial(found, run)) for run in runs]
+        parts += [_part_of(run, wanted) for run in newest]
         try:
-            yield from in_order(parts)
+            for sample in in_order(parts):
+                begun = True
+                yield sample
         except (sqlite3.Error, OSError) as error:
             raise Busy(f"history cannot be read: {error}") from error
 

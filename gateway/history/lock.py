@@ -32,9 +32,9 @@ def locked(path: Path) -> int:
     if anybody else in this process closed the database. The system lets go of it when a process
     ends, in whatever way. Raises `OSError`, of type `BlockingIOError` where it is taken.
     """
-    beside = f"{path.resolve()}.lock"
+    beside = f"{path}.lock"
     try:
-        file = os.open(beside, os.O_RDONLY | os.O_CREAT, 0o666)
+        file = _opened(beside)
     except OSError as error:
         said = f"the file cannot be opened ({beside}: {error.strerror})"
         raise OSError(error.errno, said) from None
@@ -46,3 +46,11 @@ def locked(path: Path) -> int:
             raise BlockingIOError(error.errno, "another gateway writes this file") from None
         log.warning("this disk has no locks: one gateway only may write here", path=str(path))
     return file
+
+
+def _opened(path: str) -> int:
+    """For writing where that is allowed: over NFS there is no lock without."""
+    try:
+        return os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+    except PermissionError:
+        return os.open(path, os.O_RDONLY | os.O_CREAT, 0o666)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 from gateway.errors import Busy
 from gateway.history.file import identity
 from gateway.history.outcomes import Outcome
-from gateway.history.recent import Identity
+from gateway.history.recent import Identity, Shelved
 from gateway.history.rows import from_row
 from gateway.history.timerange import TimeRange
 from gateway.tags import Sample, Tag
@@ -66,21 +66,26 @@ class Reader:
         self._age = 0  # of the file: connections to an older one are not used again
 
     def samples(
-        self, file: Identity | None, tag: Tag, run: int, wanted: TimeRange, limit: int | None
-    ) -> list[Sample]:
-        """The first of one run: all of them without a limit."""
+        self, file: Identity | None, tag: Tag, run: Shelved, wanted: TimeRange, limit: int | None
+    ) -> list[Sample] | None:
+        """The first of one run: all of them without a limit. None where the run is gone."""
         with self._connection(file) as database:
             rows = database.execute(
                 "SELECT time, value, kind, bad FROM sample"
                 " WHERE run = ? AND tag = (SELECT id FROM tag WHERE key = ?)"
                 " AND time BETWEEN ? AND ? ORDER BY time, n LIMIT ?",
-                (run, tag.key, *wanted, -1 if limit is None else limit),
+                (run.number, tag.key, *wanted, -1 if limit is None else limit),
             ).fetchall()
-        return [from_row(tag, row) for row in rows]
+            # It goes with its samples, and its number is given to another one.
+            there = database.execute(
+                "SELECT 1 FROM run WHERE run = ? AND closed = ?", (run.number, run.closed)
+            ).fetchall()
+        return [from_row(tag, row) for row in rows] if there else None
 
     def writes(self, file: Identity | None, last: int, wanted: TimeRange) -> Iterator[Outcome]:
         """The outcomes of writes in the order of time; `last`: none with a higher number."""
         after = (wanted.first, -1)
+        begun = False
         while True:
             with self._connection(file) as database:
                 rows = database.execute(
@@ -88,6 +93,10 @@ class Reader:
                     " AND time <= ? AND id <= ? ORDER BY time, id LIMIT 1000",
                     (*after, wanted.last, last),
                 ).fetchall()
+                there = database.execute("SELECT 1 FROM written WHERE id = ?", after[1:]).fetchall()
+            if begun and not there:  # nor perhaps those that came after it
+                raise Busy("history has dropped meanwhile what was to come next: ask again")
+            begun = True
             if not rows:
                 return
             yield from (Outcome(time, told) for time, _, told in rows)

@@ -81,7 +81,7 @@ class Writer:
         if self._thread.ident is None:  # never started
             return True
         self._closing.set()
-        self._thread.join(within)
+        self._thread.join(max(0.0, within))
         return not self._thread.is_alive()
 
     # -- the history thread --

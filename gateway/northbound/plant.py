@@ -55,12 +55,12 @@ class Plant(Protocol):
 
 
 class History(Protocol):
-    """Samples of the past, by Zenoh's own time ranges."""
+    """Samples of the past, by Zenoh's own time ranges; `now`: ns since 1970, when it was asked."""
 
-    def samples(self, tag: Tag, time_range: str, limit: int | None) -> Iterator[Sample]:
+    def samples(self, tag: Tag, time_range: str, limit: int | None, now: int) -> Iterator[Sample]:
         """In the order of time, the first `limit`; called from an answering thread. Raises
         `BadValue` for a range that cannot be understood, and `Busy`, also in the middle, when
         the past cannot be read now."""
 
-    def writes(self, time_range: str, limit: int | None) -> Iterator[str]:
+    def writes(self, time_range: str, limit: int | None, now: int) -> Iterator[str]:
         """What was told of writes and commands, as on the `writes` key. Raises likewise."""

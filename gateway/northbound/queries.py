@@ -90,11 +90,11 @@ class Queries:
             case Family.COMMAND if self._controls is not None:
                 self._task(self._command(query, self._controls))
             case Family.STATUS if query.parameters.get("_time") is not None:
-                self._widely(query, self._replies.writes)
+                self._widely(query, partial(self._replies.writes, time.time_ns()))
             case Family.STATUS:
                 self._task(self._status(query))
             case Family.VALUE if query.parameters.get("_time") is not None:
-                self._widely(query, partial(self._replies.history, wanted))
+                self._widely(query, partial(self._replies.history, wanted, time.time_ns()))
             case Family.VALUE if query.parameters.get("max_age") is not None:
                 if wanted.is_wild:
                     self._in_wide_room(query, self._fresh(query, wanted))

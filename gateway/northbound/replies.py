@@ -78,7 +78,8 @@ class Replies:
             reason = f"{unread[0].key}{more} could not be read in time"
             self.outcome(Failure(Problem.BUSY, reason), query)
 
-    def history(self, wanted: Asked, query: zenoh.Query) -> None:
+    def history(self, wanted: Asked, now: int, query: zenoh.Query) -> None:
+        """`now`: ns since 1970, when the query was taken."""
         tags = self._directory.find(wanted.of)
         if self._history is None:
             if tags:  # else another gateway's, which may keep one
@@ -89,7 +90,7 @@ class Replies:
             asked = query.parameters.get("_time") or ""
             for tag in tags:
                 key = self._keys.value(tag.key)
-                for sample in self._history.samples(tag, asked, limit):
+                for sample in self._history.samples(tag, asked, limit, now):
                     if self._ended:
                         raise Busy(_NOT_ALL)
                     forms.reply(query, key, sample, self._stamp())
@@ -98,8 +99,8 @@ class Replies:
         except GatewayError as error:
             self.outcome(payload.failure(error), query)
 
-    def writes(self, query: zenoh.Query) -> None:
-        """Of the past; every reply is on the key on which it was published."""
+    def writes(self, now: int, query: zenoh.Query) -> None:
+        """Of the past; every reply is on the key on which it was published. `now` as there."""
         if not query.key_expr.intersects(self._keys.writes):
             return
         if self._history is None:
@@ -107,7 +108,8 @@ class Replies:
             return
         try:
             limit = _limit(query.parameters.get("limit"))
-            for told in self._history.writes(query.parameters.get("_time") or "", limit):
+            asked = query.parameters.get("_time") or ""
+            for told in self._history.writes(asked, limit, now):
                 if self._ended:
                     raise Busy(_NOT_ALL)
                 self._reply(query, self._keys.writes, told.encode(), self._stamp())

@@ -2,8 +2,11 @@
 
 import asyncio
 import json
+import math
+import os
 import socket
 import sys
+import time
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, contextmanager
 from pathlib import Path
@@ -11,6 +14,10 @@ from typing import Any
 
 import pytest
 
+from gateway import service
+from gateway.history import Historian
+from gateway.northbound.inbox import Inbox
+from gateway.tags import good
 from tests.e2e.processes import (
     Program,
     free_port,
@@ -21,16 +28,18 @@ from tests.e2e.processes import (
     vigor_line,
     write_config,
 )
+from tests.history_writer import WEEK, tag
+from tests.history_writer import until as history_says
 from tests.zenoh_peer import ZenohPeer, free_endpoint
 
 TAGS = {f"d{n}": {"address": f"D{n}"} for n in range(700, 708)}
 # The command itself; only that the state is written at once when there is news.
 SOON = "import gateway.service as s; s.KEEP_EVERY = 0.05; from gateway.cli import main; main()"
-# The command itself, with a history that can keep nothing.
+# The command itself, with a history that fails as soon as there is something to store.
 BROKEN = """
-from gateway.history import Historian
-def record(self, samples): raise IndexError("the history is broken")
-Historian.record = record
+from gateway.history.file import HistoryFile
+def store(self, run, start, samples): raise IndexError("the history is broken")
+HistoryFile.store = store
 from gateway.cli import main; main()
 """
 
@@ -165,6 +174,7 @@ async def test_a_history_that_fails_keeps_nothing_from_being_published(tmp_path:
     )
     with Program(sys.executable, "-c", BROKEN, "run", path) as program:
         program.says("on Zenoh")
+        program.says("history has failed")
         async with ZenohPeer("client", connect=[endpoint]) as client:
             heard = await client.subscribe("plant/mixer/speed")
             for _ in range(3):
@@ -172,3 +182,66 @@ async def test_a_history_that_fails_keeps_nothing_from_being_published(tmp_path:
                 heard.forget()
         assert not program.has_said("line failed")
         assert await asyncio.to_thread(program.end) == 0
+
+
+async def test_what_was_published_is_found_by_the_next_question(tmp_path: Path) -> None:
+    """One turn of the loop: a line tells something, then what has arrived is taken."""
+    speed = tag("speed")
+    found: dict[str, list[object]] = {}
+
+    def answer(question: str) -> None:
+        found[question] = [sample.value for sample in historian.samples(speed, "[..]", None)]
+
+    class Network:
+        def publish(self, _news: object) -> None:
+            inbox("of who has just seen it")
+
+    historian = Historian(tmp_path / "h.db", WEEK, 10**8)
+    historian.start()
+    await asyncio.to_thread(history_says, historian, state="ok")
+    inbox = Inbox(answer, lambda _: None)
+    network: Any = Network()
+    loop = asyncio.get_running_loop()
+    loop.call_soon(service._both(historian, network), [good(speed, 1, time.time_ns())])
+    inbox("an earlier one")  # so that those that come now are taken in the same turn
+    for _ in range(3):
+        await asyncio.sleep(0)
+    assert found == {"an earlier one": [1], "of who has just seen it": [1]}
+    assert await asyncio.to_thread(historian.close)
+
+
+def test_a_disk_that_stands_still_keeps_nothing_from_ending(tmp_path: Path) -> None:
+    path, _, _ = _plant(tmp_path)
+    os.mkfifo(tmp_path / "state.json.new")  # whose writer waits for a reader
+    with Program(sys.executable, "-c", SOON, "run", path) as program:
+        program.says("on Zenoh")
+        assert program.end() == 0
+        assert program.has_said("did not take in time what was learned")
+        assert not program.has_said("Traceback")
+
+
+async def test_the_disk_has_the_time_that_zenoh_leaves() -> None:
+    """Together less than the 2 s in which the gateway ends."""
+    zenoh_takes = 0.3
+
+    class Disk:
+        given = math.inf
+
+        def close(self, within: float) -> bool:
+            self.given = within
+            return True
+
+    async def zenoh() -> None:
+        try:
+            await asyncio.Event().wait()
+        finally:
+            await asyncio.sleep(zenoh_takes)
+
+    history, notebook = Disk(), Disk()
+    as_history: Any = history
+    as_notebook: Any = notebook
+    face = asyncio.create_task(zenoh())
+    await asyncio.sleep(0)
+    await service._put_away(face, as_history, as_notebook)
+    assert history.given <= service.END_WITHIN - zenoh_takes < 2
+    assert notebook.given <= service.KEPT_WITHIN

@@ -40,13 +40,13 @@ class Person:
         count = what if summed(self.device) else f"{what} without a sum"
         self.judge.story.counts[count] += 1
 
-    def deaf(self, device: str, since: float) -> bool:
+    def deaf(self, device: str, since: float, kinds: tuple[str, ...] = _QUIET) -> bool:
         """Whether the device need not have heard what was sent after `since`."""
         begin = since - self.judge.began - 1.0
         now = self.judge.now - self.judge.began
         return any(
             e.device in ("", device)
-            and e.kind in _QUIET
+            and e.kind in kinds
             and e.start <= now
             and e.end + STALLED_ON * (e.kind == "stall") >= begin
             for e in self.bus.episodes
@@ -118,8 +118,11 @@ class Person:
         true = true and obeyed <= most
         if true:
             return
+        done = isinstance(outcome, Written)
         if bus.hurt_at >= since:
             self.blind("blind writes")
+        elif obeyed and (holds or not done) and self.deaf(tag.device, since, ("stall",)):
+            judge.story.counts["older writes that a stalled link brought"] += 1
         elif tag.shape is not None and bus.untimely(tag.device):
             judge.story.counts["stale acknowledgements of frames"] += 1
         else:
