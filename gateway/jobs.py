@@ -63,7 +63,8 @@ class Poll:
 
     @property
     def deadline(self) -> float:
-        return self.due + self.every
+        """An address asked for rarely, as it was refused, does not wait as long when it is due."""
+        return self.due + self.block.every
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -11,6 +11,7 @@ from gateway.errors import NoReply
 from gateway.jobs import PAUSE_FIRST, PAUSE_LONGEST, Idle, Poll, Probe
 from gateway.orders import WAITING_ORDERS, Write
 from gateway.protocols.modbus import ModbusRtu
+from gateway.refusals import RETRY
 from gateway.schedule import SILENT_SHARE, Schedule
 from gateway.tags import WriteRule
 from tests.sim.plant import WIRE, device, make_tag
@@ -169,6 +170,14 @@ def test_a_bad_poll_is_tried_again_within_a_minute_however_rarely_it_is_asked() 
     assert isinstance(job, Poll)
     schedule.polled(job, 0.0)  # it was busy, say: nothing is known
     assert isinstance(schedule.next(PAUSE_LONGEST), Poll)
+
+
+def test_a_refused_address_is_asked_for_rarely_but_then_does_not_wait_as_long_again() -> None:
+    dev = up(0)
+    (poll,) = Schedule([dev], 0.0).polls(dev)
+    assert not dev.refusals.refused(poll.block, 0, "28")
+    assert poll.every == RETRY
+    assert poll.deadline == poll.due + 1.0
 
 
 def test_a_wanted_poll_of_a_device_in_doubt_stays_wanted() -> None:

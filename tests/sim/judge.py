@@ -12,8 +12,8 @@ from tests.sim.bus import Bus, summed
 from tests.sim.gadgets import Gadget
 from tests.sim.stations import Troubled
 from tests.sim.story import Story
+from tests.sim.wire import SimWire
 
-STALLED_ON = 120.0  # seconds that a device server may need to say what it has kept
 MOST_TROUBLES = 20  # noted in one run
 
 
@@ -114,10 +114,8 @@ class Judge:
         start, end, value = station.said[-1]
         passed = start - self.began
         well = bus.line.is_open and bus.line.record.since < start - 2.0
-        troubled = any(
-            e.start < passed + 2.0 and e.end > passed - (STALLED_ON if e.kind == "stall" else 5.0)
-            for e in bus.episodes
-        )
+        troubled = any(e.start < passed + 2.0 and e.end > passed - 5.0 for e in bus.episodes)
+        troubled = troubled or (isinstance(bus.wire, SimWire) and bus.wire.behind > start - 5.0)
         if well and not troubled and not bus.collides:
             limit = end - start + station.wrapping.gap + 0.1
             asyncio.get_running_loop().call_later(limit, self._must_be_told, name, start, value)

@@ -97,6 +97,7 @@ class SimWire:
         self._sendings: list[_Sending] = []
         self._ours_until = 0.0
         self._kept: deque[bytes] = deque()  # the first is being said
+        self._behind = -math.inf
 
     # The port
 
@@ -121,6 +122,11 @@ class SimWire:
         else:
             self._say_ours(data, start)
 
+    @property
+    def behind(self) -> float:
+        """When the device server had something to say yet, last."""
+        return _now() if self.stalled or self._kept else self._behind
+
     def flow(self) -> None:
         """The stall is over."""
         self.stalled = False
@@ -134,6 +140,7 @@ class SimWire:
 
     def _next_kept(self) -> None:
         self._kept.popleft()
+        self._behind = _now()
         if self._kept and not self.stalled:
             self._say_kept()
 
