@@ -19,11 +19,12 @@ class Asked(NamedTuple):
 
 def asked(devices: Sequence[Device]) -> list[Asked]:
     """What their plans ask."""
-    return [
-        Asked(device, block, device.verify_reads * device.seconds(block.cost))
-        for device in devices
-        for block in device.blocks
-    ]
+    return [asked_of(device, block) for device in devices for block in device.blocks]
+
+
+def asked_of(device: Device, block: Block) -> Asked:
+    """One block, read as often as its device wants to be believed."""
+    return Asked(device, block, device.verify_reads * device.seconds(block.cost))
 
 
 def load_of(blocks: Sequence[Asked]) -> float:

@@ -60,9 +60,7 @@ def forecast(name: str, devices: Sequence[Device], wire: Wire) -> LineForecast:
     load = load_of(blocks)
     longest = max((one.seconds for one in blocks), default=0.0)
     write = max((_longest_write(device) for device in devices), default=0.0)
-    silence = max(
-        (device.timing.reply_timeout + device.late_guard for device in devices), default=0.0
-    )
+    silence = max((device.patience for device in devices), default=0.0)
     cycle = sum(one.seconds for one in blocks)
     unasked = [
         (device, sum(tag.span.area == LISTENED for tag in device.tags)) for device in devices

@@ -268,7 +268,7 @@ class Line:
         if turn.passed:
             device.record.unasked += turn.passed
             self._overheard.frames(device, turn.overheard)
-        self._listening.ended(device, turn, self._clock.now())
+        self._listening.ended(device, turn)
         if self._adapter.echoes and not self._echoed:
             self._echoed = True
             log.warning("the adapter echoes: set echo: true", line=self.name)

@@ -105,15 +105,15 @@ class Listening:
         return None
 
     def _beside(self, speaker: _Speaker, frame: bytes) -> None:
-        now = asyncio.get_running_loop().time()
+        now = _now()
         self._take(speaker, speaker.listener.overheard([frame], now), now)
 
-    def ended(self, device: Device, turn: Turn, now: float) -> None:
+    def ended(self, device: Device, turn: Turn) -> None:
         """A conversation is over: what was half heard before it is void."""
         self._echo = turn.unreturned
         for speaker in self._speakers:
             if turn.heard or (turn.sent and speaker.device is not device):
-                speaker.listener.disturbed(now)
+                speaker.listener.disturbed(_now())
 
     @property
     def due(self) -> float:
@@ -237,3 +237,7 @@ class Listening:
 
     def _note(self, device: Device, damage: Garbled) -> None:
         log.info("not understood", device=device.name, why=str(damage), bytes=damage.data.hex(" "))
+
+
+def _now() -> float:
+    return asyncio.get_running_loop().time()

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import structlog
 
-from gateway.ages import Asked, worst_ages
+from gateway.ages import asked_of, worst_ages
 from gateway.device import Device, Standing
 from gateway.jobs import Poll
 from gateway.planner import spell
@@ -59,7 +59,7 @@ class Overdue:
         devices = self.schedule.devices
         failing = any(device.standing is Standing.FAILING for device in devices)
         stretch = 1.0 if failing else 2.0
-        held_up = max(device.timing.reply_timeout + device.late_guard for device in devices)
+        held_up = max(device.patience for device in devices)
         for poll, age in zip(*self._worst_ages(), strict=True):
             if poll.device.standing is Standing.FAILING:
                 yield poll, 2 * poll.block.every
@@ -72,8 +72,7 @@ class Overdue:
         plan = [(device, self.schedule.polls(device), device.reckoned) for device in served]
         polls = [poll for _, polls, _ in plan for poll in polls]
         if plan != self._reckoned:
-            seconds = (p.device.verify_reads * p.device.seconds(p.block.cost) for p in polls)
-            blocks = [Asked(p.device, p.block, s) for p, s in zip(polls, seconds, strict=True)]
+            blocks = [asked_of(poll.device, poll.block) for poll in polls]
             self._reckoned, self._ages = plan, worst_ages(blocks)
         return polls, self._ages
 
