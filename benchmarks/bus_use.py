@@ -22,10 +22,11 @@ from typing import NamedTuple
 import structlog
 
 from benchmarks.words import words
-from gateway.device import Device
+from gateway.engine.device import Device
+from gateway.engine.forecast import forecast
 from gateway.errors import GatewayError
-from gateway.forecast import forecast
-from gateway.line import Line
+from gateway.line.line import Line
+from gateway.planning.wire_timing import Wire, character_bits
 from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.driver import AnyDriver
 from gateway.protocols.modbus import ModbusRtu
@@ -36,7 +37,6 @@ from gateway.stations.station import Station
 from gateway.stations.vigor import VigorStation
 from gateway.tags import Sample, Tag, Written
 from gateway.transport import SerialPath, SerialSettings, open_port
-from gateway.wiretime import Wire, character_bits
 
 TURNAROUND = 0.005
 BLOCKS, WORDS = 4, 64

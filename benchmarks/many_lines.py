@@ -17,14 +17,15 @@ from pathlib import Path
 
 import structlog
 
-from gateway.device import Device
-from gateway.line import Line
-from gateway.mirror import Mirror
+from gateway.engine.device import Device
+from gateway.line.line import Line
+from gateway.planning.wire_timing import Wire
 from gateway.protocols.vigor import Vigor
+from gateway.simulator.port import open_simulator
 from gateway.stations.vigor import VigorStation
 from gateway.tags import Sample
-from gateway.transport import Ear, Port, open_simulator
-from gateway.wiretime import Wire
+from gateway.tags.mirror import Mirror
+from gateway.transport import Ear, Port
 from tests.sim.plant import make_tag
 from tests.sim.virtual import run_virtual
 

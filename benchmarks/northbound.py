@@ -34,12 +34,12 @@ from typing import Literal, NamedTuple
 import structlog
 import zenoh
 
-from gateway.mirror import Mirror
 from gateway.northbound import Mode, Northbound, ZenohSettings
 from gateway.northbound.session import configure
 from gateway.protocols.driver import Address, Span, Unit
 from gateway.service import COLLECT, SWITCH
 from gateway.tags import Sample, Tag, WriteRule, Written, good
+from gateway.tags.mirror import Mirror
 from gateway.values import Layout, Value, parse_type
 from tests.zenoh_peer import free_endpoint
 

@@ -9,12 +9,12 @@ import argparse
 from collections.abc import Iterable
 from pathlib import Path
 
-from gateway.planner import plan
+from gateway.planning.planner import plan
+from gateway.planning.wire_timing import Wire
 from gateway.protocols.driver import Address, Cost, Span, Unit
 from gateway.protocols.modbus import ModbusRtu
 from gateway.tags import Tag
 from gateway.values import Layout, parse_type
-from gateway.wiretime import Wire
 
 TURNAROUND = 0.010
 LIMIT = 125  # registers of one request

@@ -13,10 +13,10 @@ from dataclasses import replace
 from functools import partial
 
 from benchmarks.words import words
-from gateway.planner import Seconds, plan
+from gateway.planning.planner import Seconds, plan
+from gateway.planning.wire_timing import Wire
 from gateway.protocols.modbus import ModbusRtu
 from gateway.tags import Tag
-from gateway.wiretime import Wire
 
 DRIVER = ModbusRtu(station=1)
 SECONDS = partial(Wire(19200, 11).exchange, timing=DRIVER.timing, turnaround=0.010)

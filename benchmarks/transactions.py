@@ -28,24 +28,24 @@ import structlog
 from pymodbus.client import AsyncModbusSerialClient, AsyncModbusTcpClient
 
 from benchmarks.words import words
-from gateway.device import Device
-from gateway.line import Line
-from gateway.mirror import Mirror
+from gateway.engine.device import Device
+from gateway.line.line import Line
+from gateway.planning.wire_timing import NETWORK_BAUD, Wire
 from gateway.protocols.driver import AnyDriver
 from gateway.protocols.modbus import ModbusRtu, ModbusTcp
 from gateway.protocols.vigor import Vigor
 from gateway.tags import Sample, Tag
+from gateway.tags.mirror import Mirror
 from gateway.transport import Ear, Port, SerialPath, SerialSettings, TcpAddress, open_port
 from gateway.transport.loop import new_event_loop
-from gateway.wiretime import NETWORK_BAUD, Wire
 
 INTEROP = Path(__file__).parent.parent / "tests" / "interop"
 WORDS, FIRST = 64, 100
 VIGOR_STATION = """
 import asyncio, sys
 from gateway.stations.vigor import VigorStation
-from gateway.transport.serve import serve_on_pty, serve_on_tcp
-from gateway.wiretime import Wire
+from gateway.simulator.serve import serve_on_pty, serve_on_tcp
+from gateway.planning.wire_timing import Wire
 
 async def main():
     wire = Wire(115200, 10)

@@ -7,27 +7,28 @@ from functools import partial
 from typing import NamedTuple, TypeVar
 
 from gateway import __version__
-from gateway.config import Config, DeviceConfig, LineConfig
-from gateway.control import check_command, every_command, speaker
-from gateway.device import Device
+from gateway.config import Config, LineConfig
+from gateway.config.commands import check_command, every_command, speaker
+from gateway.engine.device import Device, DeviceSettings
+from gateway.engine.forecast import LineForecast, forecast
+from gateway.engine.jobs import Poll
+from gateway.engine.requests import Obeyed
 from gateway.errors import Busy, GatewayError, Offline
-from gateway.forecast import LineForecast, forecast
-from gateway.jobs import Poll
-from gateway.line import Line
-from gateway.mirror import Mirror
-from gateway.orders import Obeyed
-from gateway.payload import rfc3339
-from gateway.simulation import station_for
-from gateway.status import Document, device_document, line_document
+from gateway.line.line import Line
+from gateway.northbound.payload import rfc3339
+from gateway.northbound.status import Document, device_document, line_document
+from gateway.simulator.plant import station_for
+from gateway.simulator.port import open_simulator
 from gateway.tags import Quality, Reason, Sample, Tag, Written, bad
-from gateway.transport import Ear, Port, SimulatorAddress, open_port, open_simulator
+from gateway.tags.mirror import Mirror
+from gateway.transport import Ear, Port, SimulatorAddress, open_port
 from gateway.values import Value
 
 T = TypeVar("T")
 FRESH_WITHIN = 5.0  # seconds a reading may take that somebody waits for
 
 
-def device_of(config: DeviceConfig, line: LineConfig) -> Device:
+def device_of(config: DeviceSettings, line: LineConfig) -> Device:
     return Device(
         name=config.name,
         driver=config.driver,
@@ -36,7 +37,7 @@ def device_of(config: DeviceConfig, line: LineConfig) -> Device:
         tags=config.tags,
         late_guard=config.late_guard,
         verify_reads=config.verify_reads,
-        turnaround=config.turnaround_configured,
+        turnaround=config.turnaround,
         control=config.control,
     )
 
@@ -135,7 +136,7 @@ class Gateway:
 
     # What Zenoh asks
 
-    def devices(self) -> Iterable[DeviceConfig]:
+    def devices(self) -> Iterable[DeviceSettings]:
         return self.config.devices
 
     def tag(self, key: str) -> Tag | None:

@@ -14,8 +14,8 @@ import structlog
 from gateway.app import Gateway
 from gateway.config import Config
 from gateway.history import Historian
+from gateway.history.state_file import Notebook
 from gateway.northbound import Northbound, StandbySettings, zenoh_settings
-from gateway.notebook import Notebook
 from gateway.tags import Sample
 
 log = structlog.get_logger("gateway")

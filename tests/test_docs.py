@@ -18,25 +18,25 @@ import typer.main
 import yaml
 import zenoh
 
-from gateway import cli, payload
+from gateway.cli.main import main as cli
 from gateway.config import (
     Config,
     ConfigErrors,
-    DeviceConfig,
     HistoryConfig,
     LineConfig,
     ZenohConfig,
     load,
     schema,
 )
+from gateway.config.commands import TO_ALL, every_command
 from gateway.config.validate import DRIVERS
 from gateway.config.yaml_file import read_yaml
-from gateway.control import TO_ALL, every_command
+from gateway.engine.device import DeviceSettings
 from gateway.history import Historian
-from gateway.keys import Keys
-from gateway.northbound import StandbySettings
+from gateway.northbound import StandbySettings, payload
 from gateway.northbound.duty import Duty
-from gateway.payload import Problem
+from gateway.northbound.keys import Keys
+from gateway.northbound.payload import Problem
 from gateway.tags import Reason, Written, bad, good
 from tests.e2e.processes import ROOT, Program, plc_gateway, started, until
 from tests.zenoh_peer import free_endpoint
@@ -360,7 +360,7 @@ def test_what_the_page_calls_without_effect_is_what_nothing_follows_from() -> No
     section = CONFIGURATION.partition("## Not in effect yet")[2]
     files = [path for path in (ROOT / "gateway").rglob("*.py") if path.parent.name != "config"]
     code = "".join(path.read_text("utf-8") for path in files)
-    parts = (Config, LineConfig, DeviceConfig, ZenohConfig, HistoryConfig)
+    parts = (Config, LineConfig, DeviceSettings, ZenohConfig, HistoryConfig)
     unused = {
         field.name
         for part in parts

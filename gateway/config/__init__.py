@@ -9,7 +9,6 @@ from gateway.config.build import Builder
 from gateway.config.messages import ConfigErrors
 from gateway.config.plain import (
     Config,
-    DeviceConfig,
     HistoryConfig,
     LineConfig,
     WebConfig,
@@ -21,7 +20,6 @@ from gateway.config.yaml_file import read_yaml
 __all__ = [
     "Config",
     "ConfigErrors",
-    "DeviceConfig",
     "HistoryConfig",
     "LineConfig",
     "WebConfig",

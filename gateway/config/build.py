@@ -19,7 +19,6 @@ from gateway.config.model import (
 )
 from gateway.config.plain import (
     Config,
-    DeviceConfig,
     HistoryConfig,
     LineConfig,
     TlsConfig,
@@ -35,6 +34,7 @@ from gateway.config.validate import (
     section,
     unknown,
 )
+from gateway.engine.device import DeviceSettings
 from gateway.errors import ConfigError
 from gateway.protocols.driver import AnyDriver, Timing
 from gateway.protocols.frames import FrameDriver
@@ -115,7 +115,7 @@ class Builder:
 
     def _device(
         self, name: str, raw: object, path: Path, outer: TagDefaults
-    ) -> DeviceConfig | None:
+    ) -> DeviceSettings | None:
         if not isinstance(raw, dict):
             section(DeviceSection, raw, path, self.mistakes, "a device")
             return None
@@ -135,11 +135,11 @@ class Builder:
             silence_chars=usual.silence_chars,
             retries=usual.retries if settings.retries is None else settings.retries,
         )
-        return DeviceConfig(
+        return DeviceSettings(
             name=name,
             driver=driver,
             timing=timing,
-            turnaround_configured=settings.turnaround,
+            turnaround=settings.turnaround,
             late_guard=_either(settings.late_guard, timing.reply_timeout),
             verify_reads=settings.verify_reads,
             blocks=settings.blocks,

@@ -5,15 +5,15 @@ from collections.abc import Sequence
 from gateway.config.customs import custom
 from gateway.config.messages import Mistakes, Path
 from gateway.config.model import LineSection
-from gateway.config.plain import DeviceConfig
+from gateway.engine.device import DeviceSettings
+from gateway.planning.wire_timing import NETWORK_BAUD, Wire, character_bits
 from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.frames import FrameDriver
 from gateway.transport.port import SerialSettings, SimulatorAddress, TcpAddress
-from gateway.wiretime import NETWORK_BAUD, Wire, character_bits
 
 
 def check_line(
-    line: LineSection, devices: Sequence[DeviceConfig], path: Path, mistakes: Mistakes
+    line: LineSection, devices: Sequence[DeviceSettings], path: Path, mistakes: Mistakes
 ) -> None:
     """Note what cannot live together on this line."""
     stations: dict[int, str] = {}
@@ -49,7 +49,7 @@ def check_line(
             )
 
 
-def _check_listening(devices: Sequence[DeviceConfig], path: Path, mistakes: Mistakes) -> None:
+def _check_listening(devices: Sequence[DeviceSettings], path: Path, mistakes: Mistakes) -> None:
     """Of what comes unasked nobody could tell which of two devices said it."""
     speakers = [
         device.name
@@ -66,8 +66,8 @@ def _check_listening(devices: Sequence[DeviceConfig], path: Path, mistakes: Mist
 
 def _check_network(
     line: LineSection,
-    devices: Sequence[DeviceConfig],
-    device: DeviceConfig,
+    devices: Sequence[DeviceSettings],
+    device: DeviceSettings,
     path: Path,
     mistakes: Mistakes,
 ) -> None:
@@ -86,7 +86,7 @@ def _check_network(
 
 
 def line_wire(
-    line: LineSection, devices: Sequence[DeviceConfig], path: Path, mistakes: Mistakes
+    line: LineSection, devices: Sequence[DeviceSettings], path: Path, mistakes: Mistakes
 ) -> tuple[SerialSettings, Wire]:
     """Speed and format, as written or as all protocols of the line are used to."""
     customs = {device.driver.protocol: custom(device.driver) for device in devices}

@@ -2,12 +2,11 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
-from gateway.protocols.driver import AnyDriver, Timing
+from gateway.engine.device import DeviceSettings
+from gateway.planning.wire_timing import Wire
 from gateway.tags import Tag
 from gateway.transport.port import PortAddress, SerialSettings, SimulatorAddress
-from gateway.wiretime import Wire
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,22 +52,6 @@ class WebConfig:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class DeviceConfig:
-    """One station on a line. Times are seconds."""
-
-    name: str
-    driver: AnyDriver
-    timing: Timing  # the protocol's, with what the file says of this device
-    turnaround_configured: float | None  # None: measured
-    late_guard: float  # how long a late reply is waited for before anyone speaks again
-    verify_reads: int  # so many readings in a row must agree
-    blocks: bool | Literal["only"]  # one put per scan with all changed tags: also, or only that
-    control: bool  # may be told to run, stop ...
-    enabled: bool
-    tags: tuple[Tag, ...]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class LineConfig:
     """One wire and the devices on it."""
 
@@ -77,7 +60,7 @@ class LineConfig:
     serial: SerialSettings
     wire: Wire
     echo: bool | None  # whether the port hears what it says; None: not said
-    devices: tuple[DeviceConfig, ...]
+    devices: tuple[DeviceSettings, ...]
 
     @property
     def simulated(self) -> bool:
@@ -103,5 +86,5 @@ class Config:
     lines: tuple[LineConfig, ...]
 
     @property
-    def devices(self) -> tuple[DeviceConfig, ...]:
+    def devices(self) -> tuple[DeviceSettings, ...]:
         return tuple(device for line in self.lines for device in line.devices)

@@ -9,14 +9,14 @@ from itertools import islice
 from os.path import realpath
 from pathlib import Path
 
-from gateway import payload
 from gateway.errors import BadValue, Busy
 from gateway.history.outcomes import Outcomes
 from gateway.history.reader import Part, Reader, in_order
 from gateway.history.recent import Recent, Shelved
 from gateway.history.timerange import TimeRange, time_range
 from gateway.history.writer import Writer
-from gateway.payload import WriteOutcome
+from gateway.northbound import payload
+from gateway.northbound.payload import WriteOutcome
 from gateway.tags import Sample, Tag
 
 LONGEST_RUN = 32_768  # samples

@@ -10,10 +10,10 @@ from collections.abc import Callable
 
 import structlog
 
-from gateway import payload
+from gateway.engine.requests import Obeyed
+from gateway.northbound import payload
 from gateway.northbound.limiter import Limiter
-from gateway.orders import Obeyed
-from gateway.payload import Failure, Problem, WriteOutcome
+from gateway.northbound.payload import Failure, Problem, WriteOutcome
 from gateway.tags import Written
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)

@@ -12,15 +12,14 @@ from typing import Protocol
 import orjson
 import zenoh
 
-from gateway import payload
-from gateway.control import TO_ALL, NotControlled
+from gateway.config.commands import TO_ALL, NotControlled
+from gateway.engine.requests import Obeyed
 from gateway.errors import BadValue, GatewayError
-from gateway.keys import Keys
-from gateway.northbound import forms
+from gateway.northbound import forms, payload
+from gateway.northbound.keys import Keys
+from gateway.northbound.payload import Failure, Problem, WriteOutcome
 from gateway.northbound.writers import Asker, NotAllowed, Writers
 from gateway.northbound.writes import ANSWER_WITHIN
-from gateway.orders import Obeyed
-from gateway.payload import Failure, Problem, WriteOutcome
 
 _LONGEST_ARGUMENT = 1000  # bytes; a loopback takes 254 characters at most
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import zenoh
 
-from gateway.keys import Keys
+from gateway.northbound.keys import Keys
 from gateway.northbound.plant import Device
 from gateway.tags import Tag
 

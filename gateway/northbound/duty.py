@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import structlog
 import zenoh
 
-from gateway.keys import Keys
+from gateway.northbound.election import Role, Sign, Stand, Standby
 from gateway.northbound.inbox import Inbox
+from gateway.northbound.keys import Keys
 from gateway.northbound.session import as_client, off_loop, opened
-from gateway.standby import Role, Sign, Stand, Standby
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 

@@ -7,7 +7,7 @@ DELETE of the key, with the reason in the attachment.
 
 import zenoh
 
-from gateway import payload
+from gateway.northbound import payload
 from gateway.tags import Form, Sample
 
 _DROP = zenoh.CongestionControl.DROP

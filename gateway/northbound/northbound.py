@@ -11,16 +11,16 @@ from typing import TypeVar
 import structlog
 import zenoh
 
-from gateway import payload
 from gateway.errors import GatewayError
-from gateway.keys import Keys
-from gateway.northbound import secrets
+from gateway.northbound import payload, secrets
 from gateway.northbound.audit import Audit
 from gateway.northbound.controls import Commanded, Controls
 from gateway.northbound.directory import Directory
 from gateway.northbound.duty import Duty, StandbySettings
 from gateway.northbound.inbox import Inbox
+from gateway.northbound.keys import Keys
 from gateway.northbound.links import Links
+from gateway.northbound.payload import WriteOutcome
 from gateway.northbound.plant import History, Plant
 from gateway.northbound.publisher import Publisher
 from gateway.northbound.queries import Queries
@@ -37,7 +37,6 @@ from gateway.northbound.session import (
 )
 from gateway.northbound.writers import Writers
 from gateway.northbound.writes import PutWrites, Writes
-from gateway.payload import WriteOutcome
 from gateway.tags import Sample
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)

@@ -22,9 +22,8 @@ from itertools import count
 import structlog
 import zenoh
 
-from gateway import payload
-from gateway.keys import Keys
-from gateway.northbound import forms
+from gateway.northbound import forms, payload
+from gateway.northbound.keys import Keys
 from gateway.tags import Sample, Tag
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)

@@ -15,15 +15,15 @@ from functools import partial
 import structlog
 import zenoh
 
+from gateway.engine.requests import Obeyed
 from gateway.errors import BadValue, Busy
-from gateway.keys import Asked, Family, asked, max_age
 from gateway.northbound.controls import Controls
 from gateway.northbound.directory import Directory
+from gateway.northbound.keys import Asked, Family, asked, max_age
+from gateway.northbound.payload import Failure, Problem
 from gateway.northbound.plant import Plant
 from gateway.northbound.replies import Replies
 from gateway.northbound.writes import ANSWER_WITHIN, Writes, asker
-from gateway.orders import Obeyed
-from gateway.payload import Failure, Problem
 from gateway.tags import Tag, Written
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)

@@ -4,13 +4,12 @@ from collections.abc import Callable, Sequence
 
 import zenoh
 
-from gateway import payload
 from gateway.errors import BadValue, Busy, GatewayError
-from gateway.keys import Asked, Family, Keys
-from gateway.northbound import forms
+from gateway.northbound import forms, payload
 from gateway.northbound.directory import Directory
+from gateway.northbound.keys import Asked, Family, Keys
+from gateway.northbound.payload import Failure, Problem
 from gateway.northbound.plant import History, Plant
-from gateway.payload import Failure, Problem
 from gateway.tags import Tag, Written
 
 _NOT_ALL = "the gateway is ending: this is not all"

@@ -12,13 +12,13 @@ from collections.abc import Callable
 import structlog
 import zenoh
 
-from gateway import payload
 from gateway.errors import Busy, GatewayError
-from gateway.keys import Keys, asked
+from gateway.northbound import payload
 from gateway.northbound.directory import Directory
+from gateway.northbound.keys import Keys, asked
+from gateway.northbound.payload import Failure, Problem, WriteOutcome
 from gateway.northbound.plant import Plant
 from gateway.northbound.writers import LONGEST_TOKEN, Asker, NotAllowed, Writers
-from gateway.payload import Failure, Problem, WriteOutcome
 from gateway.tags import Tag, Written
 from gateway.values import Value
 

@@ -13,7 +13,6 @@ from gateway.transport.port import (
 )
 from gateway.transport.rfc2217 import open_rfc2217
 from gateway.transport.serial_port import open_serial
-from gateway.transport.simulator import open_simulator
 from gateway.transport.tcp import open_tcp
 
 
@@ -46,6 +45,5 @@ __all__ = [
     "SimulatorAddress",
     "TcpAddress",
     "open_port",
-    "open_simulator",
     "parse_port",
 ]

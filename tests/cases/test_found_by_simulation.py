@@ -11,10 +11,10 @@ import pytest
 
 from gateway.app import Gateway
 from gateway.config import load
+from gateway.engine.jobs import Poll
+from gateway.engine.schedule import Schedule
 from gateway.errors import Busy, GatewayError
-from gateway.jobs import Poll
 from gateway.protocols.computer_link import ComputerLink
-from gateway.schedule import Schedule
 from gateway.tags import Quality, Reason
 from tests.sim.bench import Bench, Unruly
 from tests.sim.links import link_device, link_station

@@ -13,9 +13,9 @@ lines on its standard input and answers each with `ok …`:
 import asyncio
 import sys
 
+from gateway.planning.wire_timing import Wire, character_bits
+from gateway.simulator.serve import Served, serve_on_pty, serve_on_tcp
 from gateway.stations.vigor import VigorStation
-from gateway.transport.serve import Served, serve_on_pty, serve_on_tcp
-from gateway.wiretime import Wire, character_bits
 
 WIRE = Wire(19200, character_bits("7E1"))
 

@@ -5,14 +5,14 @@ import random
 from dataclasses import dataclass
 from typing import Any
 
+from gateway.planning.wire_timing import Wire
 from gateway.protocols.driver import Timing
 from gateway.protocols.modbus import ModbusAscii, ModbusRtu
+from gateway.simulator.serve import serve_on_pty
 from gateway.stations.modbus import ModbusStation
 from gateway.transport import Ear, SerialPath, SerialSettings, open_port
-from gateway.transport.serve import serve_on_pty
-from gateway.wiretime import Wire
+from tests.line.test_line import Device, Witness
 from tests.sim.plant import Bench, Plant, Unruly, clock_word, make_tag, running
-from tests.test_line import Device, Witness
 
 WIRE = Wire(115200, 10)
 TIMEOUT, SECONDS = 0.05, 6.0

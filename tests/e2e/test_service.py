@@ -40,7 +40,7 @@ BROKEN = """
 from gateway.history.file import HistoryFile
 def store(self, run, start, samples): raise IndexError("the history is broken")
 HistoryFile.store = store
-from gateway.cli import main; main()
+from gateway.cli.main import main; main()
 """
 
 

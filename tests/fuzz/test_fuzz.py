@@ -15,12 +15,12 @@ from hypothesis import strategies as st
 
 from gateway.config import ConfigErrors, load
 from gateway.errors import BadValue, GatewayError
-from gateway.payload import wanted
+from gateway.northbound.payload import wanted
 from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.driver import AnyDriver, Span
 from gateway.protocols.modbus import ModbusAscii, ModbusRtu, ModbusTcp
 from gateway.protocols.vigor import Vigor
-from gateway.simulation import station_for
+from gateway.simulator.plant import station_for
 
 EXAMPLES = int(os.environ.get("EXAMPLES", "150"))
 often = settings(

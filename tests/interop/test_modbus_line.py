@@ -11,11 +11,11 @@ from typing import Any
 
 import pytest
 
-from gateway.device import Device
+from gateway.engine.device import Device
+from gateway.planning.wire_timing import NETWORK_BAUD, Wire
 from gateway.protocols.modbus import ModbusAscii, ModbusRtu, ModbusTcp
 from gateway.tags import Quality, Reason, WriteRule, Written
 from gateway.transport import Ear, SerialPath, SerialSettings, TcpAddress, open_port
-from gateway.wiretime import NETWORK_BAUD, Wire
 from tests.e2e.processes import plc_gateway, write_config
 from tests.interop.peers import HERE, free_port, pty_pair, running
 from tests.sim.plant import Bench, Outcome, Plant, make_tag

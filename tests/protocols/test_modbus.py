@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gateway.errors import BadValue, ConfigError, DeviceError, NoReply, Refusal, Refused
+from gateway.planning.wire_timing import Wire
 from gateway.protocols.driver import Address, Cost, Driver, Span
 from gateway.protocols.modbus import Frame, ModbusAscii, ModbusRtu, ModbusTcp
 from gateway.stations.modbus import ModbusStation
-from gateway.wiretime import Wire
 from tests.doubles import Script
 from tests.protocols.modbus_peer import KINDS, Hearing
 from tests.vectors import vectors

@@ -7,10 +7,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from gateway.errors import LineDown
+from gateway.planning.wire_timing import Wire
+from gateway.simulator.port import open_simulator
 from gateway.stations.station import Memory
 from gateway.stations.vigor import VigorStation
-from gateway.transport import Ear, Port, open_simulator
-from gateway.wiretime import Wire
+from gateway.transport import Ear, Port
 
 WIRE = Wire(19200, 10)
 TURNAROUND = 0.005

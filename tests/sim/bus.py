@@ -5,8 +5,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 from gateway.config import LineConfig
-from gateway.device import Device, Standing
-from gateway.line import Line
+from gateway.engine.device import Device, Standing
+from gateway.line.line import Line
 from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.frames import FrameDriver
 from gateway.tags import Tag

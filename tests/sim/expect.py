@@ -4,11 +4,11 @@ import asyncio
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from gateway.device import Device, Standing
-from gateway.line import Line
+from gateway.engine.device import Device, Standing
+from gateway.line.line import Line
+from gateway.planning.bad_addresses import RETRY
 from gateway.protocols.frames import FrameDriver
 from gateway.protocols.frames.driver import LISTENED
-from gateway.refusals import RETRY
 from gateway.tags import Quality, Reason, Tag
 from tests.sim.bus import UNTIMELY, Bus, summed
 from tests.sim.episodes import CALM, Episode

@@ -4,12 +4,12 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-from gateway.device import Device
+from gateway.engine.device import Device
+from gateway.planning.wire_timing import Wire
 from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.driver import AnyDriver
 from gateway.stations.computer_link import ComputerLinkStation
 from gateway.tags import Tag
-from gateway.wiretime import Wire
 from tests.sim.plant import WIRE, Bench, Plant, Unruly, make_tag
 
 

@@ -9,16 +9,16 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from gateway.device import Device
+from gateway.engine.device import Device
 from gateway.errors import GatewayError
-from gateway.line import Line
+from gateway.line.line import Line
+from gateway.planning.wire_timing import Wire
 from gateway.protocols.driver import AnyDriver, Span, Timing, Unit
 from gateway.protocols.vigor import Vigor
 from gateway.stations.station import Memory
 from gateway.stations.vigor import VigorStation
 from gateway.tags import Quality, Reason, Sample, Tag, Written
 from gateway.values import Layout, Value, parse_type
-from gateway.wiretime import Wire
 from tests.sim.bench import WIRE, Bench, Unruly
 
 SECOND = 1_000_000_000

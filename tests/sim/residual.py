@@ -22,15 +22,15 @@ from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from gateway.device import Device
+from gateway.engine.device import Device
 from gateway.errors import DeviceError, NoReply
+from gateway.line.reading import read_block
+from gateway.planning.wire_timing import Wire
 from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.driver import Address, AnyDriver, Span
 from gateway.protocols.modbus import ModbusAscii, ModbusRtu
 from gateway.protocols.vigor import Vigor
-from gateway.reading import read_block
-from gateway.simulation import station_for
-from gateway.wiretime import Wire
+from gateway.simulator.plant import station_for
 from tests.sim.plant import make_tag
 from tests.sim.wire import Format, Noise, spoil
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 from gateway.protocols.driver import AnyDriver, Unit
 from gateway.protocols.frames import FrameDriver
-from gateway.simulation import station_for
+from gateway.simulator.plant import station_for
 from gateway.stations.station import Memory, Station
 from gateway.tags import Tag
 from gateway.values import Value

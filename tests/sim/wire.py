@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from gateway.errors import LineDown
+from gateway.planning.wire_timing import Wire
 from gateway.transport import Ear
-from gateway.wiretime import Wire
 
 SERVER_WAITS = 0.25  # seconds between two requests that it has kept
 

@@ -17,7 +17,8 @@ from typing import Any
 import structlog
 
 from gateway.app import Gateway
-from gateway.config import DeviceConfig, LineConfig, load
+from gateway.config import LineConfig, load
+from gateway.engine.device import DeviceSettings
 from gateway.protocols.frames import FrameDriver
 from gateway.protocols.frames.driver import LISTENED
 from gateway.tags import Sample
@@ -143,7 +144,7 @@ class World:
             addressed=None if bus.protocol in ("vigor", "frames") else addressed,
         )
 
-    def _station(self, device: DeviceConfig, line: LineConfig, chance: random.Random) -> Troubled:
+    def _station(self, device: DeviceSettings, line: LineConfig, chance: random.Random) -> Troubled:
         words = [tag.span.area for tag in device.tags if tag.name == "scaled"]
         missing = {(words[0], n) for n in self.drawn.missing.get(device.name, ())}
         inner = station_of(device.driver, device.name)

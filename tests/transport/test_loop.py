@@ -8,13 +8,13 @@ from typing import Any, TypeVar
 
 import pytest
 
-from gateway.clock import Clock
+from gateway.line.clock import Clock
+from gateway.line.transaction import Turn
+from gateway.line.wire_log import Recorder
+from gateway.planning.wire_timing import Wire
 from gateway.protocols.driver import Span
 from gateway.protocols.modbus import ModbusRtu
-from gateway.recorder import Recorder
 from gateway.transport import SerialPath, SerialSettings, loop, open_port
-from gateway.turn import Turn
-from gateway.wiretime import Wire
 from tests.conftest import lacking
 from tests.transport.ends import Heard, Master
 from tests.vectors import vectors

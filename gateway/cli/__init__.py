@@ -1,0 +1,1 @@
+"""The commands of `plc-gateway`, and the Zenoh client that they use."""

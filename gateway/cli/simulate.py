@@ -1,0 +1,58 @@
+"""`plc-gateway simulate`: the configured devices as simulated PLCs for other programs."""
+
+import asyncio
+import signal
+from collections.abc import Callable
+from contextlib import AsyncExitStack
+from pathlib import Path
+
+from gateway.config import Config, LineConfig
+from gateway.errors import ConfigError
+from gateway.planning.wire_timing import NETWORK_BAUD
+from gateway.simulator.plant import station_for
+from gateway.simulator.serve import Served, serve_on_pty, serve_on_tcp
+from gateway.transport import TcpAddress
+
+
+async def serve(
+    config: Config, tcp: str | None, links: Path | None, say: Callable[[str], None]
+) -> None:
+    """Serve every line until SIGTERM or SIGINT.
+
+    A line with a `tcp://` port is served on that port of this machine, others on a pty, or all
+    on TCP from `tcp` (HOST:PORT) upwards. Raises `ConfigError`, `LineDown`.
+    """
+    if links is not None and not links.is_dir():
+        raise ConfigError(f"--links {links}: there is no such folder: make it first")
+    stop = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, stop.set)
+    host, port = (None, 0) if tcp is None else _address(tcp)
+    async with AsyncExitStack() as stack:
+        for offset, line in enumerate(config.lines):
+            place = None if host is None else (host, port + offset)
+            served = await _serve(line, place, links)
+            stack.push_async_callback(served.close)
+            stations = ", ".join(str(device.driver.station) for device in line.devices)
+            say(f"line {line.name}: stations {stations} at {served.address}")
+        say("Ctrl-C ends it.")
+        await stop.wait()
+
+
+async def _serve(line: LineConfig, place: tuple[str, int] | None, links: Path | None) -> Served:
+    stations = [station_for(device.driver, device.tags) for device in line.devices]
+    if place is None and isinstance(line.port, TcpAddress):
+        place = ("127.0.0.1", line.port.port)
+    if place is not None:
+        wired = line.wire.baudrate != NETWORK_BAUD
+        return await serve_on_tcp(stations, line.wire, *place, paced=wired)
+    link = None if links is None else str(links / line.name)
+    return await serve_on_pty(stations, line.wire, link)
+
+
+def _address(text: str) -> tuple[str, int]:
+    host, _, port = text.rpartition(":")
+    if not host or not port.isdecimal() or not 1 <= int(port) <= 65535:
+        raise ConfigError(f"--tcp {text}: write it as 127.0.0.1:4001")
+    return host, int(port)

@@ -1,0 +1,1 @@
+"""The rules of one line, pure: the next job, and the effects of its result."""

@@ -1,0 +1,91 @@
+"""The state of lines and devices as documents: what status keys, status page and people read."""
+
+from collections.abc import Mapping, Sequence
+
+from gateway.engine.device import Device
+from gateway.engine.forecast import LineForecast
+from gateway.engine.jobs import Poll
+from gateway.line.line import Line
+from gateway.northbound.payload import rfc3339
+from gateway.planning.bad_addresses import BadRange
+from gateway.planning.planner import spell
+
+MOST_REQUESTS = 200
+Document = Mapping[str, object]
+
+
+def device_document(device: Device, polls: Sequence[Poll]) -> Document:
+    """One device. Times in seconds, counts since the start."""
+    record = device.record
+    return {
+        "protocol": device.driver.protocol,
+        "station": device.driver.station,
+        "standing": device.standing.value,
+        "diagnosis": device.diagnosis(),
+        "exchanges": record.exchanges,
+        "writes": record.writes,
+        "slowest_write": round(record.slowest_write, 4),
+        "wire_time": round(record.wire_time, 3),
+        "turnaround": None if record.turnaround is None else round(record.turnaround, 4),
+        "late_replies": record.late,
+        "unasked_frames": record.unasked,
+        "frames_heard": record.heard,
+        "overruns": record.overruns,
+        "overdue": record.overdue,
+        "failures": dict(record.failures),
+        "refusals": dict(record.refusals),
+        "refused_addresses": [
+            refused_sentence(device, bad) for bad in device.refusals.bad.values()
+        ],
+        "requests": [_request(poll) for poll in polls[:MOST_REQUESTS]],
+    }
+
+
+def _request(poll: Poll) -> Document:
+    """One block: how often it is wanted and how often it came."""
+    return {
+        "tags": spell(poll.block),
+        "every": poll.block.every,
+        "measured_every": round(poll.mean_gap, 4) if poll.mean_gap else None,
+        "worst_age": round(poll.worst_gap, 4) if poll.worst_gap else None,
+        "reads": poll.reads,
+        "overruns": poll.overruns,
+    }
+
+
+def refused_sentence(device: Device, bad: BadRange) -> str:
+    """`D512..D519 of mixer: refused with 28 since 2026-11-20T12:00:00.000000Z`."""
+    first, last = bad.tags[0].text, bad.tags[-1].text
+    where = first if first == last else f"{first}..{last}"
+    return f"{where} of {device.name}: refused with {bad.code} since {rfc3339(bad.since)}"
+
+
+def line_document(line: Line, expected: LineForecast, now: float) -> Document:
+    """One line: what was promised and what was measured. `now` by the loop's clock."""
+    record = line.record
+    open_for = now - record.since if line.is_open else 0.0
+    busy = record.busy + record.turnarounds
+    slowest = max((device.record.slowest_write for device in line.devices), default=0.0)
+    open_in_all = record.open_before + open_for
+    exchanges = sum(device.record.exchanges for device in line.devices)
+    return {
+        "open": line.is_open,
+        "trouble": record.trouble,
+        "opened": record.opened,
+        "open_for": round(open_for, 1),
+        "baudrate": line.wire.baudrate,
+        "devices": {device.name: device.standing.value for device in line.devices},
+        "busy_time": round(busy, 3),
+        "measured": {
+            "load": round(busy / open_in_all, 4) if open_in_all else None,
+            "requests_per_second": round(exchanges / open_in_all, 3) if open_in_all else None,
+            "slowest_write": round(slowest, 4),
+        },
+        "unasked_bytes": record.unasked,
+        "expected": {
+            "load": round(expected.load, 4),
+            "requests_per_second": round(expected.requests, 3),
+            "cycle": round(expected.cycle, 4),
+            "worst_write": round(expected.worst_write, 4),
+        },
+    }

@@ -1,0 +1,1 @@
+"""The requests that read all tags at the least wire time."""

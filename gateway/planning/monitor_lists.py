@@ -1,0 +1,59 @@
+"""Scattered addresses read through a list that the PLC remembers, where that is cheaper.
+
+A PLC keeps one list: the one is chosen that saves the most wire time.
+"""
+
+from collections.abc import Collection, Sequence
+
+from gateway.planning.planner import Block, Seconds
+from gateway.protocols.driver import AnyDriver, Monitor, Span, Unit
+
+
+def with_list(
+    blocks: Sequence[Block], driver: AnyDriver, seconds: Seconds, refused: Collection[Span] = ()
+) -> tuple[Block, ...]:
+    """The plan, with the blocks that a list reads cheaper put together in one.
+
+    Blocks that are `refused` stay apart: one of their addresses would have the list refused.
+    """
+    if not isinstance(driver, Monitor):
+        return tuple(blocks)
+    best: tuple[float, Block, list[Block]] | None = None
+    for every in sorted({block.every for block in blocks}):
+        for bits in (True, False):
+            alike = [
+                block
+                for block in blocks
+                if block.every == every
+                and block.span not in refused
+                and (driver.areas[block.span.area].unit is Unit.BIT) is bits
+            ]
+            found = _listed(alike, driver, seconds)
+            if found is not None and (best is None or found[0] > best[0]):
+                best = found
+    if best is None:
+        return tuple(blocks)
+    _, block, replaced = best
+    return (*(other for other in blocks if other not in replaced), block)
+
+
+def _listed(
+    blocks: Sequence[Block], driver: Monitor[object], seconds: Seconds
+) -> tuple[float, Block, list[Block]] | None:
+    """What a list saves per second, the block that reads it, and those it stands for."""
+    taken: list[Block] = []
+    spans: tuple[Span, ...] = ()
+    for block in sorted(blocks, key=lambda block: (len(block.tags), block.span)):
+        more = (*spans, *dict.fromkeys(tag.span for tag in block.tags))
+        if driver.monitor_cost(more) is not None:
+            taken.append(block)
+            spans = more
+    cost = driver.monitor_cost(spans) if len(taken) > 1 else None
+    if cost is None:
+        return None
+    every = taken[0].every
+    saved = (sum(seconds(block.cost) for block in taken) - seconds(cost)) / every
+    if saved <= 0:
+        return None
+    tags = tuple(tag for block in taken for tag in block.tags)
+    return saved, Block(spans[0], every, tags, cost, listed=spans), taken

@@ -1,0 +1,168 @@
+"""Tags -> blocks: what to ask a device so that the wire is busy the shortest time.
+
+Tags of one area share blocks. Which, and how often each block is asked, is found exactly
+(`cover`) from the driver's own character costs, the line's speed, the silence before a request
+and the station's turnaround; no fixed gap is right at every baud rate. A slower tag rides in a
+faster block where that costs less than asking for it apart.
+"""
+
+from bisect import bisect_left
+from collections import defaultdict, deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+from gateway.errors import ConfigError
+from gateway.planning.coalesce import Request, cover
+from gateway.protocols.driver import AnyDriver, Cost, Span, Unit
+from gateway.tags import Publish, Quality, Reason, Sample, Tag, bad, of_field
+from gateway.values import Value
+
+Seconds = Callable[[Cost], float]
+Decode = Callable[[Sequence[int]], Value | None]
+LONG_ROW = 300  # items of one area
+Cuts = frozenset[tuple[str, int]]  # (area, n): no block may hold both n - 1 and n
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Block:
+    """One request and the tags it feeds.
+
+    `listed`: the spans of a list registered in the PLC, where the block is read by one.
+    """
+
+    span: Span
+    every: float
+    tags: tuple[Tag, ...]
+    cost: Cost
+    listed: tuple[Span, ...] = ()
+    parts: tuple[tuple[Tag, Decode, slice], ...] = field(init=False, repr=False)
+    of_fields: bool = field(init=False, repr=False)  # of a frame: values, not words
+    eager: bool = field(init=False, repr=False)  # to be told of though nothing changed
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "parts", tuple(self._parts()))
+        object.__setattr__(self, "of_fields", self.tags[0].shape is not None)
+        eager = any(tag.heartbeat or tag.publish is Publish.ALWAYS for tag in self.tags)
+        object.__setattr__(self, "eager", eager or self.of_fields)
+
+    def _parts(self) -> Iterator[tuple[Tag, Decode, slice]]:
+        """Each tag with its decoder and where its units stand among those that are read."""
+        begins, place = {}, 0
+        for span in self.listed:
+            begins[span] = place
+            place += span.size
+        for tag in self.tags:
+            begin = begins.get(tag.span, tag.span.start - self.span.start)
+            yield tag, tag.decode, slice(begin, begin + tag.span.size)
+
+    def decode(self, units: Sequence[int], time: int) -> list[Sample]:
+        """The samples of all tags; `time` is when the reply arrived (ns since 1970)."""
+        if self.of_fields:
+            return [of_field(tag, units[part.start], time) for tag, _, part in self.parts]
+        good, new = Quality.GOOD, tuple.__new__  # half of what the constructor takes: it is much
+        return [
+            bad(tag, Reason.NOT_A_NUMBER, time)
+            if (value := decode(units[part])) is None
+            else new(Sample, (tag, value, good, time, None, ""))
+            for tag, decode, part in self.parts
+        ]
+
+
+@dataclass(slots=True)
+class Item:
+    """Tags that any block takes all or none of: equal or overlapping spans."""
+
+    start: int
+    end: int  # exclusive
+    every: float  # as often as the most impatient of them wants it
+    tags: list[Tag]
+
+
+def plan(
+    tags: Iterable[Tag], driver: AnyDriver, seconds: Seconds, cuts: Cuts = frozenset()
+) -> tuple[Block, ...]:
+    """Cover every readable tag of one device at the least wire time.
+
+    `seconds` says how long an exchange of a given cost takes on this line with this station.
+    The result is in the order of areas and addresses and depends on nothing but the arguments.
+    """
+    areas: dict[str, list[Tag]] = defaultdict(list)
+    for tag in tags:
+        if driver.areas[tag.span.area].readable:
+            areas[tag.span.area].append(tag)
+    blocks: list[Block] = []
+    for area in sorted(areas):
+        blocks += _plan_area(area, areas[area], driver, seconds, cuts)
+    return tuple(blocks)
+
+
+def _plan_area(
+    area: str, tags: list[Tag], driver: AnyDriver, seconds: Seconds, cuts: Cuts
+) -> list[Block]:
+    items = items_of(tags)
+    fences = sorted(n for name, n in cuts if name == area)
+    splits = frozenset(
+        i + 1 for i, (a, b) in enumerate(pairwise(items)) if _between(a.end, b.start, fences)
+    )
+
+    def exchange(first: int, last: int) -> float | None:
+        start = items[first].start
+        cost = driver.cost(Span(area, start, items[last].end - start))
+        return None if cost is None else seconds(cost)
+
+    # In very long rows of packed bits a request may cost a character more than the least.
+    even = driver.areas[area].unit is not Unit.BIT or len(items) > LONG_ROW
+    try:
+        requests = cover([item.every for item in items], exchange, splits, even=even)
+    except ValueError as error:
+        culprit = items[error.args[0]].tags[0].text
+        raise ConfigError(f"{culprit} cannot be read in one request") from None
+    return list(_blocks(area, items, requests, driver))
+
+
+def _blocks(
+    area: str, items: Sequence[Item], requests: Sequence[Request], driver: AnyDriver
+) -> Iterator[Block]:
+    """A tag goes with the fastest request that reaches over it: that one is fresher."""
+    members: dict[Request, list[Tag]] = {request: [] for request in requests}
+    waiting = deque(requests)
+    over: list[Request] = []  # those that reach over the item
+    for number, item in enumerate(items):
+        over = [request for request in over if request.last >= number]
+        while waiting and waiting[0].first == number:
+            over.append(waiting.popleft())
+        members[min(over, key=lambda request: request.every)] += item.tags
+    for request, tags in members.items():
+        start = items[request.first].start
+        span = Span(area, start, items[request.last].end - start)
+        cost = driver.cost(span)
+        if cost is not None and tags:
+            yield Block(span, request.every, tuple(tags), cost)
+
+
+def _between(end: int, start: int, fences: Sequence[int]) -> bool:
+    """Whether a cut lies between an item that ends at `end` and the next one at `start`."""
+    place = bisect_left(fences, end)
+    return place < len(fences) and fences[place] <= start
+
+
+def items_of(tags: Iterable[Tag]) -> list[Item]:
+    """Tags by address; those that overlap (bits of one word, two views of one value) as one."""
+    items: list[Item] = []
+    for tag in sorted(tags, key=lambda tag: (tag.span.start, tag.span.size, tag.name)):
+        end = tag.span.start + tag.span.size
+        if items and tag.span.start < items[-1].end:
+            items[-1].tags.append(tag)
+            items[-1].end = max(items[-1].end, end)
+            items[-1].every = min(items[-1].every, tag.every)
+        else:
+            items.append(Item(tag.span.start, end, tag.every, [tag]))
+    return items
+
+
+def spell(block: Block) -> str:
+    """`D7.3..D10`: the first and the last address of a block as the file writes them."""
+    first = min(block.tags, key=lambda tag: tag.span)
+    last = max(block.tags, key=lambda tag: (tag.span.area, tag.span.start + tag.span.size))
+    return first.text if first is last else f"{first.text}..{last.text}"

@@ -1,0 +1,1 @@
+"""Simulated plants: the stations of a configuration, served in memory, on TCP or on a pty."""

@@ -1,0 +1,203 @@
+"""Simulated stations for other programs: on a pseudo terminal, or on a TCP port."""
+
+import asyncio
+import os
+import tty
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Protocol, cast
+
+from gateway.planning.wire_timing import Wire
+from gateway.simulator.port import HalfDuplex
+from gateway.stations.station import Station
+from gateway.transport.trouble import line_down
+
+_MOST_READ = 4096  # bytes
+
+
+class Served(Protocol):
+    """Stations that other programs can reach."""
+
+    @property
+    def address(self) -> str:
+        """What to write after `port:` to reach them."""
+
+    async def close(self) -> None: ...
+
+
+async def serve_on_pty(
+    stations: Sequence[Station],
+    wire: Wire,
+    link: str | None = None,
+    *,
+    turnaround: float = 0.005,
+    paced: bool = True,
+) -> Served:
+    """Stations on a pseudo terminal, at the wire's speed; `link` is a symbolic link to make to it.
+
+    A link that points elsewhere is replaced, anything else at that path is left alone.
+    Raises `LineDown`.
+    """
+    try:
+        master, slave = os.openpty()
+    except OSError as error:
+        raise line_down("pseudo terminal", error) from error
+    served = _Pty(master, slave, stations, wire, turnaround, paced=paced)
+    if link is not None:
+        try:
+            served.link(Path(link))
+        except OSError as error:
+            await served.close()
+            raise line_down(link, error) from error
+    return served
+
+
+class _Pty:
+    def __init__(
+        self,
+        master: int,
+        slave: int,
+        stations: Sequence[Station],
+        wire: Wire,
+        turnaround: float,
+        *,
+        paced: bool,
+    ) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._master = master
+        self._slave = slave  # kept open, or the master would end when its first user leaves
+        self._name = os.ttyname(slave)
+        self.address = self._name
+        self._link: Path | None = None
+        self._bus = HalfDuplex(stations, wire, self._deliver, turnaround, paced=paced)
+        tty.setraw(slave)
+        os.set_blocking(master, False)
+        self._loop.add_reader(master, self._readable)
+
+    def link(self, path: Path) -> None:
+        """Raises `OSError`."""
+        if path.is_symlink():
+            path.unlink()
+        path.symlink_to(self._name)
+        self._link = path
+        self.address = str(path)
+
+    def _readable(self) -> None:
+        with suppress(BlockingIOError):
+            self._bus.send(os.read(self._master, _MOST_READ))
+
+    def _deliver(self, data: bytes) -> None:
+        # Nobody reads and the terminal is full: lost, as on a wire.
+        with suppress(BlockingIOError):
+            os.write(self._master, data)
+
+    async def close(self) -> None:
+        if self._bus.cut:
+            return
+        self._bus.close()
+        self._loop.remove_reader(self._master)
+        os.close(self._master)
+        os.close(self._slave)
+        if self._link is not None:
+            with suppress(OSError):
+                if self._link.readlink() == Path(self._name):  # not somebody else's by now
+                    self._link.unlink()
+
+
+async def serve_on_tcp(
+    stations: Sequence[Station],
+    wire: Wire,
+    host: str,
+    port: int,
+    *,
+    turnaround: float = 0.005,
+    paced: bool = True,
+) -> Served:
+    """Stations on a TCP port; port 0 takes a free one. Raises `LineDown`.
+
+    Paced, there is one wire behind the port as behind a device server: what a station says goes
+    to everybody connected. Not paced (Modbus TCP), every connection has its own.
+    """
+    served = _Tcp(stations, wire, turnaround, paced=paced)
+    try:
+        await served.listen(host, port)
+    except (OSError, OverflowError) as error:  # OverflowError: a port number above 65535
+        raise line_down(f"{host}:{port}", error) from error
+    return served
+
+
+class _Tcp:
+    def __init__(
+        self, stations: Sequence[Station], wire: Wire, turnaround: float, *, paced: bool
+    ) -> None:
+        self.address = ""
+        self._connections: set[_Connection] = set()
+        self._server: asyncio.Server | None = None
+
+        def bus(deliver: Callable[[bytes], None]) -> HalfDuplex:
+            return HalfDuplex(stations, wire, deliver, turnaround, paced=paced)
+
+        self._bus = bus
+        self._shared = bus(self._to_all) if paced else None
+
+    async def listen(self, host: str, port: int) -> None:
+        """Raises `OSError`."""
+        loop = asyncio.get_running_loop()
+        self._server = await loop.create_server(self._connection, host, port)
+        name, number = self._server.sockets[0].getsockname()[:2]
+        self.address = f"tcp://[{name}]:{number}" if ":" in name else f"tcp://{name}:{number}"
+
+    def _connection(self) -> "_Connection":
+        return _Connection(self._connections, self._shared, self._bus)
+
+    def _to_all(self, data: bytes) -> None:
+        for connection in self._connections:
+            connection.send(data)
+
+    async def close(self) -> None:
+        server, self._server = self._server, None
+        if server is None:
+            return
+        server.close()
+        if self._shared is not None:
+            self._shared.close()
+        for connection in list(self._connections):
+            await connection.close()
+        await server.wait_closed()
+
+
+class _Connection(asyncio.Protocol):
+    def __init__(
+        self,
+        others: "set[_Connection]",
+        shared: HalfDuplex | None,
+        own: Callable[[Callable[[bytes], None]], HalfDuplex],
+    ) -> None:
+        self._others = others
+        self._shared = shared
+        self._bus = shared or own(self.send)
+        self._transport: asyncio.Transport | None = None
+        self._gone = asyncio.Event()
+
+    def send(self, data: bytes) -> None:
+        if self._transport is not None and not self._transport.is_closing():
+            self._transport.write(data)
+
+    async def close(self) -> None:
+        if self._transport is not None:
+            self._transport.abort()
+            await self._gone.wait()
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self._transport = cast(asyncio.Transport, transport)
+        self._others.add(self)
+
+    def data_received(self, data: bytes) -> None:
+        self._bus.send(data)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._others.discard(self)
+        if self._shared is None:
+            self._bus.close()
+        self._gone.set()

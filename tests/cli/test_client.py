@@ -1,0 +1,379 @@
+"""What the command line makes of what is typed, and of what comes from Zenoh."""
+
+import json
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from gateway.cli.client import Client, Shown, connected, parse_value, wanted_keys
+from gateway.config import Config, load
+from gateway.errors import ConfigError, GatewayError
+from tests.e2e.processes import gateway, vigor_line, write_config
+from tests.zenoh_peer import free_endpoint
+
+TIME = "2026-11-20T12:00:00.123456Z"
+Answer = Callable[[zenoh.Query], None]
+Order = Callable[[Client], object]
+ORDERS: list[Order] = [
+    lambda client: client.write("mixer/speed", 5),
+    lambda client: client.control("hall", "mixer", "stop", ""),
+]
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> Config:
+    tags = {
+        "speed": {"address": "D10"},
+        "alarms/door": {"address": "M12"},
+        "label": {"address": "D20", "type": "string[8]", "payload": "raw"},
+        "count": {"address": "D30", "payload": "raw"},
+    }
+    lines = {"hall": vigor_line("simulator", tags)}
+    return load(write_config(tmp_path / "config.yaml", free_endpoint(), lines))
+
+
+@pytest.mark.parametrize(
+    ("typed", "value"),
+    [
+        ("12", 12),
+        ("-3.5", -3.5),
+        ("true", True),
+        ('"12"', "12"),
+        ("AB", "AB"),
+        ("", ""),
+        ("[1]", "[1]"),
+        ("null", "null"),
+        ('{"value": 1}', '{"value": 1}'),
+        ("NaN", "NaN"),
+        ("-Infinity", "-Infinity"),
+        ("1e999", "1e999"),
+        ("9" * 5000, "9" * 5000),
+    ],
+)
+def test_a_typed_value_is_a_json_scalar_or_text(typed: str, value: object) -> None:
+    parsed = parse_value(typed)
+    assert parsed == value
+    assert type(parsed) is type(value)
+
+
+@pytest.mark.parametrize(
+    ("names", "keys"),
+    [
+        (None, ["**"]),
+        ([], ["**"]),
+        (["mixer"], ["mixer/**"]),
+        (["mixer/speed"], ["mixer/speed"]),
+        (["mixer/alarms/door", "mixer/*"], ["mixer/alarms/door", "mixer/*"]),
+        (["**/door"], ["**/door"]),
+    ],
+)
+def test_names_become_keys(config: Config, names: list[str] | None, keys: list[str]) -> None:
+    assert wanted_keys(config, names) == keys
+
+
+@pytest.mark.parametrize(
+    "name", ["mixer/sped", "oven", "*/sped", "", "/", "mixer/", "mixer//speed", "a?b", "a#b", "***"]
+)
+def test_names_that_mean_nothing(config: Config, name: str) -> None:
+    with pytest.raises(ConfigError):
+        wanted_keys(config, ["mixer/speed", name])
+
+
+def test_no_way_to_the_gateway(config: Config) -> None:
+    nowhere = replace(config, zenoh=replace(config.zenoh, listen=(), connect=()))
+    with pytest.raises(GatewayError, match="no way to the gateway"), connected(nowhere, print):
+        pass
+
+
+def test_in_a_standby_group_the_others_are_found_where_the_gateway_connects(
+    config: Config,
+) -> None:
+    """At its own endpoint nobody answers while it stands by."""
+    here, there = free_endpoint(), free_endpoint()
+    own = replace(config.zenoh, listen=(here,), connect=(there,))
+    group = replace(config, zenoh=own, standby="hall")
+    at_the_router = replace(config, zenoh=replace(own, listen=(there,)))
+    rows = saying(("mixer/speed", good(1), None))
+    with (
+        answering(replace(config, zenoh=own), {}),
+        answering(at_the_router, {"plant/**": rows}),
+        connected(group, print) as client,
+    ):
+        assert rows_of(client, "**") == [("mixer/speed", 1)]
+
+
+# -- with somebody in the gateway's place ------------------------------------------------------
+
+
+@contextmanager
+def answering(config: Config, answers: dict[str, Answer]) -> Iterator[zenoh.Session]:
+    """A Zenoh session where the gateway would be, with these queryables."""
+    setup = zenoh.Config()
+    settings = {
+        "mode": "peer",
+        "listen/endpoints": list(config.zenoh.listen),
+        "scouting/multicast/enabled": False,
+    }
+    for path, value in settings.items():
+        setup.insert_json5(path, json.dumps(value))
+    with zenoh.open(setup) as session:
+        declared = [session.declare_queryable(key, answer) for key, answer in answers.items()]
+        yield session
+        declared.clear()
+
+
+def saying(*rows: tuple[str, bytes, dict[str, object] | None]) -> Answer:
+    """The rows that are asked for: tag, payload, and for bare values what is beside it."""
+
+    def answer(query: zenoh.Query) -> None:
+        with query:
+            for tag, data, about in rows:
+                if query.key_expr.intersects(f"plant/{tag}"):
+                    beside = None if about is None else json.dumps(about)
+                    query.reply(f"plant/{tag}", data, attachment=beside)
+
+    return answer
+
+
+def good(value: object) -> bytes:
+    return json.dumps({"value": value, "quality": "good", "time": TIME}).encode()
+
+
+def rows_of(client: Client, wanted: str) -> list[tuple[str, object]]:
+    return [(row.tag, row.document["value"]) for row in client.values(wanted)]
+
+
+@pytest.mark.parametrize("text", ["12.50", "1e5", "true", " 7", "AB", ""])
+def test_a_bare_text_is_shown_as_it_is(config: Config, text: str) -> None:
+    known = {"quality": "good", "time": TIME}
+    rows = ("mixer/label", text.encode(), known), ("mixer/count", b"7", known)
+    with answering(config, {"plant/**": saying(*rows)}), connected(config, print) as client:
+        assert rows_of(client, "mixer/*") == [("mixer/count", 7), ("mixer/label", text)]
+
+
+def test_two_gateways_for_one_device_are_told_once_and_shown_by_tag(config: Config) -> None:
+    first = saying(("mixer/speed", good(1), None), ("mixer/alarms/door", good(True), None))
+    other = saying(("mixer/speed", good(2), None), ("mixer/alarms/door", good(False), None))
+    told: list[str] = []
+    with (
+        answering(config, {"plant/**": first, "plant/mixer/**": other}),
+        connected(config, told.append) as client,
+    ):
+        rows = rows_of(client, "**")
+        client.values("mixer/speed")
+    assert [tag for tag, _ in rows] == ["mixer/alarms/door"] * 2 + ["mixer/speed"] * 2
+    assert {value for tag, value in rows if tag == "mixer/speed"} == {1, 2}
+    assert told == ["more than one gateway answers for mixer: their values may differ"]
+
+
+def test_what_is_not_in_the_file_is_another_gateways(config: Config) -> None:
+    rows = ("press/speed", good(1), None), ("mixer/speed", good(2), None)
+    with (
+        answering(config, {"plant/**": saying(*rows)}) as there,
+        connected(config, print) as client,
+        closing(client.follow(["**"])) as news,
+    ):
+        assert rows_of(client, "**") == [("mixer/speed", 2)]
+        assert next(news).tag == "mixer/speed"
+        there.put("plant/press/speed", good(3))
+        there.put("plant/mixer/speed", good(4))
+        assert next(news) == ("mixer/speed", json.loads(good(4)))
+
+
+def shown_as(news: Iterator[Shown]) -> object:
+    document = next(news).document
+    return document.get("reason") or document["value"]
+
+
+def test_a_value_that_comes_late_from_a_gone_gateway_is_not_shown(config: Config) -> None:
+    answer = saying(("mixer/speed", good(1), None))
+    with (
+        answering(config, {}) as there,
+        connected(config, print) as client,
+        closing(client.follow(["**"])) as news,
+    ):
+        served = there.declare_queryable("plant/**", answer)
+        token = there.liveliness().declare_token("plant/@gateway/demo")
+        assert shown_as(news) == 1
+        served.undeclare()
+        token.undeclare()
+        assert shown_as(news) == "no-gateway"
+        there.put("plant/mixer/speed", good(2))
+        served = there.declare_queryable("plant/**", saying(("mixer/speed", good(3), None)))
+        token = there.liveliness().declare_token("plant/@gateway/demo")
+        assert shown_as(news) == 3
+
+
+def test_in_a_standby_group_whoever_sends_values_is_asked_and_then_shown(tmp_path: Path) -> None:
+    """The token of the one that takes over was there before, and says nothing new."""
+    path = write_config(
+        tmp_path / "config.yaml",
+        free_endpoint(),
+        {"hall": vigor_line("simulator", {"speed": {"address": "D10"}})},
+        gateway={"name": "demo", "standby": "hall"},
+    )
+    with answering(load(path), {}) as there:
+        served = there.declare_queryable("plant/**", saying(("mixer/speed", good(1), None)))
+        alive = there.liveliness()
+        own, other = (alive.declare_token(f"plant/@gateway/{name}") for name in ("demo", "other"))
+        with gateway("watch", path, "--json") as watch:
+            watch.says('"value": 1')
+            served.undeclare()
+            own.undeclare()
+            watch.says("no-gateway")
+            served = there.declare_queryable("plant/**", saying(("mixer/speed", good(2), None)))
+            there.put("plant/mixer/speed", good(2))
+            watch.says('"value": 2')
+        other.undeclare()
+
+
+def test_in_a_standby_group_the_end_of_one_that_does_not_serve_spoils_nothing(
+    config: Config,
+) -> None:
+    group = replace(config, standby="hall")
+    with (
+        answering(config, {"plant/**": saying(("mixer/speed", good(1), None))}) as there,
+        connected(group, print) as client,
+        closing(client.follow(["**"])) as news,
+    ):
+        token = there.liveliness().declare_token("plant/@gateway/other")
+        assert shown_as(news) == 1
+        token.undeclare()
+        assert shown_as(news) == 1  # asked again
+        there.put("plant/mixer/speed", good(2))
+        while (value := shown_as(news)) == 1:
+            pass
+        assert value == 2
+
+
+@pytest.mark.parametrize(
+    ("wanted", "missing"),
+    [
+        (["mixer/speed"], ""),
+        (["mixer/speed", "mixer/count"], "mixer/count"),
+        (["**"], "mixer/alarms/door, mixer/label, mixer/count"),
+    ],
+)
+def test_what_nobody_answered_is_named(config: Config, wanted: list[str], missing: str) -> None:
+    told: list[str] = []
+    with (
+        answering(config, {"plant/**": saying(("mixer/speed", good(1), None))}),
+        connected(config, told.append) as client,
+    ):
+        rows = [row for want in wanted for row in client.values(want)]
+        assert client.complete(wanted, rows) is not bool(missing)
+    named = [sentence.removeprefix("nothing was answered for ") for sentence in told]
+    assert [sentence.partition(":")[0] for sentence in named] == [missing] * bool(missing)
+
+
+def test_of_very_many_only_some_are_named(tmp_path: Path) -> None:
+    lines = {"hall": vigor_line("simulator", {f"d{i}": {"address": f"D{i}"} for i in range(50)})}
+    many = load(write_config(tmp_path / "many.yaml", free_endpoint(), lines))
+    told: list[str] = []
+    with answering(many, {}), connected(many, told.append) as client:
+        assert not client.complete(["**"], [])
+    assert "mixer/d0, mixer/d1, " in told[0]
+    assert "mixer/d9 and 40 more: " in told[0]
+
+
+@pytest.mark.parametrize("order", ORDERS, ids=["write", "command"])
+def test_an_order_that_nobody_takes_is_not_sent_and_that_is_said(
+    config: Config, order: Order
+) -> None:
+    asked: list[str] = []
+
+    def note(query: zenoh.Query) -> None:
+        with query:
+            asked.append(str(query.key_expr))
+
+    answers = {"plant/**": note, "plant/@gateway/**": note, "plant/press/**/@set": note}
+    with (
+        answering(config, answers),
+        connected(config, print) as client,
+        pytest.raises(GatewayError, match=r"no gateway takes plant/mixer/.*: nothing was sent"),
+    ):
+        order(client)
+    assert asked == ["plant/@gateway/demo/status"]
+
+
+@pytest.mark.parametrize("order", ORDERS, ids=["write", "command"])
+@pytest.mark.parametrize("said", [[], [b"Timeout"]], ids=["nothing", "what Zenoh says in the end"])
+def test_an_order_that_is_not_answered_may_have_been_done_and_that_is_said(
+    config: Config, order: Order, said: list[bytes]
+) -> None:
+    def take(query: zenoh.Query) -> None:
+        with query:
+            for words in said:
+                query.reply_err(words)
+
+    with (
+        answering(config, {"plant/*/*/@set": take, "plant/*/@stop": take}),
+        connected(config, print) as client,
+        pytest.raises(GatewayError, match="no answer: nobody knows whether it was done"),
+    ):
+        order(client)
+
+
+@pytest.mark.parametrize("value", [10**20, -(2**63) - 1, 12.5, True, 7, "\u00e9\u4e2d"])
+def test_any_value_that_a_tag_may_take_can_be_sent(config: Config, value: object) -> None:
+    def echo(query: zenoh.Query) -> None:
+        with query:
+            assert query.payload is not None
+            sent = json.loads(query.payload.to_bytes())
+            query.reply(query.key_expr, json.dumps({"value": repr(sent)}))
+
+    with answering(config, {"plant/mixer/**/@set": echo}), connected(config, print) as client:
+        assert client.write("mixer/speed", value) == {"value": repr(value)}
+
+
+def test_of_a_block_only_what_is_wanted_and_in_the_file_is_watched(tmp_path: Path) -> None:
+    tags = {name: {"address": f"D{n}"} for n, name in enumerate(("speed", "level", "a/b"))}
+    lines = {"hall": vigor_line("simulator", tags, blocks="only")}
+    path = write_config(tmp_path / "config.yaml", free_endpoint(), lines)
+    first = saying(*((f"mixer/{name}", good(1), None) for name in tags))
+    bad = {"value": None, "quality": "bad", "reason": "no-reply", "time": TIME}
+    block = {"level": bad, "old": bad, "a/b": bad, "speed": json.loads(good(2))}
+    with (
+        answering(load(path), {"plant/**": first}) as there,
+        gateway("watch", path, "mixer/speed", "mixer/a/**", "--json", merged=False) as watch,
+    ):
+        watch.says("mixer/a/b")
+        there.put("plant/mixer/@block", b"no JSON")
+        there.put("plant/mixer/@block", json.dumps(block))
+        watch.says('"value": 2')
+        assert watch.end(signal.SIGINT) == 0
+        shown = [json.loads(line) for line in watch.lines]
+    assert [row["tag"] for row in shown] == ["mixer/speed", "mixer/a/b", "mixer/a/b", "mixer/speed"]
+    assert shown[2] == {"tag": "mixer/a/b", **bad}
+
+
+def test_an_event_of_a_device_that_puts_only_blocks_is_watched_once(tmp_path: Path) -> None:
+    """It is put by itself too, as no other value of such a device."""
+    reader = {
+        "protocol": "frames",
+        "framing": {"preset": "vigor-rs", "header": "<STX>", "terminator": "<ETX>"},
+        "listen": {
+            "scan": {"match": "(?P<code>[0-9]{1,40})", "fields": {"code": {"type": "text"}}}
+        },
+        "blocks": "only",
+        "tags": {"code": {"address": "code", "event": True}},
+    }
+    line = {"port": "COM9", "baudrate": 9600, "format": "8N1", "devices": {"reader": reader}}
+    path = write_config(tmp_path / "config.yaml", free_endpoint(), {"conveyor": line})
+    first = saying(("reader/code", good("1"), None))
+    with (
+        answering(load(path), {"plant/**": first}) as there,
+        gateway("watch", path, "--json", merged=False) as watch,
+    ):
+        watch.says('"1"')
+        there.put("plant/reader/@block", json.dumps({"code": json.loads(good("2"))}))
+        for code in ("2", "3"):
+            there.put("plant/reader/code", good(code))
+        watch.says('"3"')
+        assert watch.end(signal.SIGINT) == 0
+        assert [json.loads(line)["value"] for line in watch.lines] == ["1", "2", "3"]

@@ -1,0 +1,104 @@
+"""The ages that `check` promises, held against the schedule on lines drawn at random."""
+
+import random
+
+import pytest
+
+from gateway.engine.ages import asked, load_of, worst_ages
+from gateway.engine.device import Device
+from gateway.engine.jobs import Idle, Poll
+from gateway.engine.requests import Write
+from gateway.engine.schedule import Schedule
+from gateway.tags import WriteRule
+from tests.sim.plant import device, make_tag
+
+A_WRITE = 0.03  # seconds of the wire
+COUNTS, INTERVALS = (1, 1, 3, 10, 30), (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
+
+
+def answering(station: int, *intervals: float) -> Device:
+    """One block of one word for each interval."""
+    tags = [
+        make_tag(f"D{66 * n}", every=every, write=WriteRule()) for n, every in enumerate(intervals)
+    ]
+    found = device(tags, station=station)
+    found.answered()
+    return found
+
+
+def drawn(chance: random.Random) -> list[Device]:
+    def intervals() -> list[float]:
+        groups = chance.choice((1, 1, 2, 3))
+        return [
+            every
+            for _ in range(groups)
+            for every in [chance.choice(INTERVALS)] * chance.choice(COUNTS)
+        ]
+
+    return [answering(n + 1, *intervals()) for n in range(chance.choice((1, 2, 3, 5, 8)))]
+
+
+def ages(devices: list[Device], seconds: float, written: Device | None = None) -> dict[Poll, float]:
+    """The worst of each poll, on a wire that takes what is reckoned. `written`: all the time."""
+    schedule, now, worst = Schedule(devices, 0.0), 0.0, dict[Poll, float]()
+    while now < seconds:
+        if written is not None and not schedule.orders:
+            write = Write(written, written.tags[0], [1], now, now + 99, lambda _: None)
+            schedule.orders.submit(write)
+        match schedule.next(now):
+            case Poll(device=of, last_good=before) as poll:
+                begun = now
+                now += of.seconds(poll.block.cost)
+                if before is not None and before > seconds / 10:  # all have found their places
+                    worst[poll] = max(worst.get(poll, 0.0), now - before)
+                poll.read(now)
+                schedule.polled(poll, now)
+                of.used(now, begun)
+            case Write():
+                now += A_WRITE
+            case Idle(until):
+                now = until if written is None else now + 0.001
+    polls = [poll for device in devices for poll in schedule.polls(device)]
+    return {poll: worst.get(poll, now - (poll.last_good or 0.0)) for poll in polls}
+
+
+def over(found: dict[Poll, float]) -> float:
+    """How much the worst was above what was promised; 1.0: nothing."""
+    blocks = asked([*dict.fromkeys(poll.device for poll in found)])
+    promised = dict(zip([(b.device, b.block) for b in blocks], worst_ages(blocks), strict=True))
+    return max(age / promised[poll.device, poll.block] for poll, age in found.items())
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_no_value_gets_older_than_promised(seed: int) -> None:
+    devices = drawn(random.Random(seed))
+    overloaded = load_of(asked(devices)) > 1
+    assert over(ages(devices, 120.0)) <= (1.25 if overloaded else 1.0)
+
+
+def test_a_big_device_among_small_ones_waits_longer_and_that_is_promised() -> None:
+    """All have the same share of the wire, and it needs ten times what the others need."""
+    small = [answering(n, *[0.5] * 10) for n in range(1, 10)]
+    big = answering(10, *[0.5] * 100)
+    found = ages([*small, big], 300.0)
+    assert over(found) <= 1.0
+    by_device = {
+        one: [age for p, age in found.items() if p.device is one] for one in (small[0], big)
+    }
+    assert min(by_device[big]) > 20.0
+    assert max(by_device[small[0]]) < 3.0
+
+
+def test_who_is_written_to_all_the_time_is_read_like_the_others() -> None:
+    devices = [answering(n, *[0.5] * 20) for n in (1, 2, 3)]
+    found = ages(devices, 300.0, written=devices[0])
+    worst = [max(age for poll, age in found.items() if poll.device is one) for one in devices]
+    assert max(worst) < 1.1 * min(worst)
+    assert max(worst) < 4.0  # without the writes 1.5: they take half of the wire
+
+
+def test_intervals_of_one_device_wait_alike() -> None:
+    """By earliest deadline the slow ones are not stretched as the fast ones are."""
+    [fast, slow] = worst_ages(asked([answering(1, *[0.1] * 10, *[10.0] * 100)]))[::109]
+    assert fast > 0.3
+    assert slow - fast == pytest.approx(2 * (10.0 - 0.1))

@@ -1,0 +1,147 @@
+"""`check`'s figures against a reckoning by hand from the frames in the Vigor manual.
+
+On the line: 10 bits a character at 19200 baud (7E1), 5 ms of quiet before a request, and a station
+that takes 5 ms to answer.
+"""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gateway.app import device_of, forecasts
+from gateway.config import load
+from gateway.engine.forecast import LineForecast, forecast
+from tests.e2e.processes import vigor_line, write_config
+from tests.vectors import vectors
+
+LENGTH = {vector.id: len(vector.frame) for vector in vectors("vigor")}
+READ_D1_D2 = LENGTH["vigor-003"] + LENGTH["vigor-004"]
+READ_M8_M15 = LENGTH["vigor-014"] + LENGTH["vigor-015"]
+WRITE_D1 = LENGTH["vigor-007"] + LENGTH["vigor-006"]
+FORCE_M10 = LENGTH["vigor-008"] + LENGTH["vigor-009"]
+TWO_WORDS = {"a": {"address": "D1"}, "b": {"address": "D2"}}
+
+
+def takes(characters: int) -> float:
+    return 0.005 + characters * 10 / 19200 + 0.005
+
+
+def reckoned(folder: Path, tags: dict[str, Any], **settings: Any) -> LineForecast:
+    line = vigor_line("simulator", tags, **{"turnaround": "5ms", **settings})
+    path = write_config(
+        folder / "c.yaml", "tcp/127.0.0.1:7447", {"hall": line}, defaults={"every": "1s"}
+    )
+    [found] = forecasts(load(path))
+    return found
+
+
+def test_one_block_of_two_words(tmp_path: Path) -> None:
+    line = reckoned(tmp_path, TWO_WORDS)
+    [block] = line.blocks
+    assert tuple(block.block.cost) == (LENGTH["vigor-003"], LENGTH["vigor-004"])
+    assert block.seconds == pytest.approx(takes(READ_D1_D2))
+    assert line.load == pytest.approx(takes(READ_D1_D2))
+    assert line.cycle == pytest.approx(takes(READ_D1_D2))
+    assert (line.requests, line.characters) == (1, READ_D1_D2)
+    assert not line.overloaded
+    assert line.advice() == ""
+
+
+def test_intervals_count(tmp_path: Path) -> None:
+    tags = {"d": {"address": "D1", "every": "250ms"}, "m": {"address": "M8", "every": "2s"}}
+    tags["e"] = {"address": "D2", "every": "250ms"}
+    line = reckoned(tmp_path, tags)
+    words, bits = takes(READ_D1_D2), takes(READ_M8_M15)
+    assert line.load == pytest.approx(4 * words + bits / 2)
+    assert line.requests == pytest.approx(4.5)
+    assert line.characters == pytest.approx(4 * READ_D1_D2 + READ_M8_M15 / 2)
+    assert line.cycle == pytest.approx(words + bits)
+
+
+def test_the_worst_age_is_an_interval_the_longest_wait_and_the_exchange(tmp_path: Path) -> None:
+    """At worst both polls come due just as the longer exchange has begun: three in a row."""
+    tags = {**TWO_WORDS, "m": {"address": "M8"}}
+    line = reckoned(tmp_path, tags)
+    words, bits = takes(READ_D1_D2), takes(READ_M8_M15)
+    wait = words + words + bits
+    ages = {row.block.tags[0].text: row.worst_age for row in line.blocks}
+    assert ages == {"D1": pytest.approx(1 + wait + words), "M8": pytest.approx(1 + wait + bits)}
+
+
+@pytest.mark.parametrize(
+    ("address", "rule", "exchanges"),
+    [
+        ("D1", True, [WRITE_D1]),
+        ("M10", True, [FORCE_M10]),
+        ("D1", {"verify": True}, [WRITE_D1, LENGTH["vigor-012"] + LENGTH["vigor-002"]]),
+        ("D1.3", True, [LENGTH["vigor-012"] + LENGTH["vigor-002"], WRITE_D1]),
+    ],
+)
+def test_a_write_waits_for_the_exchange_before_it(
+    tmp_path: Path, address: str, rule: Any, exchanges: list[int]
+) -> None:
+    line = reckoned(tmp_path, {"w": {"address": address, "write": rule}})
+    [read] = line.blocks
+    assert line.worst_write == pytest.approx(read.seconds + sum(map(takes, exchanges)))
+
+
+def test_a_silent_station_costs_its_time_out_and_its_guard(tmp_path: Path) -> None:
+    tags = {"w": {"address": "D1", "write": True}}
+    line = reckoned(tmp_path, tags, reply_timeout="200ms", late_guard="1s")
+    assert line.worst_write_silent == pytest.approx(line.worst_write + 0.2 + 1.0)
+
+
+def test_asked_for_too_much_everything_stretches(tmp_path: Path) -> None:
+    tags = {name: {**tag, "every": "20ms"} for name, tag in TWO_WORDS.items()}
+    line = reckoned(tmp_path, tags)
+    words = takes(READ_D1_D2)
+    assert line.load == pytest.approx(words / 0.02)
+    assert line.overloaded
+    assert line.blocks[0].worst_age == pytest.approx(2 * 0.02 + words + words)
+    assert line.advice() == (
+        "line hall is asked for 133% of what it can carry at 19200 baud: multiply the intervals "
+        "by 1.33, or poll all tags every 0.03 s, the shortest interval for all"
+    )
+
+
+def test_what_is_advised_fits(tmp_path: Path) -> None:
+    tags = {f"d{i}": {"address": f"D{200 * i}", "every": "50ms"} for i in range(20)}
+    line = reckoned(tmp_path, tags)
+    assert line.overloaded
+    longer = {name: {**tag, "every": f"{line.cycle + 0.01:.2f}s"} for name, tag in tags.items()}
+    assert not reckoned(tmp_path, longer).overloaded
+    stretched = {name: {**t, "every": f"{50 * line.load + 1:.0f}ms"} for name, t in tags.items()}
+    assert not reckoned(tmp_path, stretched).overloaded
+
+
+def test_a_slower_line_takes_longer(tmp_path: Path) -> None:
+    """8E1 is 11 bits a character."""
+    path = write_config(
+        tmp_path / "c.yaml",
+        "tcp/127.0.0.1:7447",
+        {"hall": {**vigor_line("simulator", TWO_WORDS), "baudrate": 9600, "format": "8E1"}},
+    )
+    [line] = forecasts(load(path))
+    assert line.cycle == pytest.approx(0.005 + READ_D1_D2 * 11 / 9600 + 0.005)
+
+
+def test_a_disabled_device_costs_nothing(tmp_path: Path) -> None:
+    line = reckoned(tmp_path, TWO_WORDS, enabled=False)
+    assert (line.blocks, line.load, line.cycle, line.worst_write) == ((), 0, 0, 0)
+
+
+def test_a_line_that_is_exactly_full_waits_for_ever_but_is_not_overloaded(tmp_path: Path) -> None:
+    path = write_config(
+        tmp_path / "c.yaml", "tcp/127.0.0.1:7447", {"hall": vigor_line("simulator", TWO_WORDS)}
+    )
+    config = load(path)
+    [section] = config.lines
+    device = device_of(section.devices[0], section)
+    [block] = device.blocks
+    device.blocks = (replace(block, every=device.seconds(block.cost)),)
+    line = forecast("hall", [device], section.wire)
+    assert line.load == pytest.approx(1)
+    assert not math.isinf(line.blocks[0].worst_age)

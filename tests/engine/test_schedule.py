@@ -1,0 +1,510 @@
+"""Each sentence of the class docstring is a test; whatever the order of calls, no poll is lost."""
+
+from typing import Any
+
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
+
+from gateway.engine.device import Device, Standing
+from gateway.engine.jobs import PAUSE_FIRST, PAUSE_LONGEST, Idle, Poll, Probe
+from gateway.engine.requests import WAITING_ORDERS, Write
+from gateway.engine.schedule import SILENT_SHARE, Schedule
+from gateway.errors import NoReply
+from gateway.planning.bad_addresses import RETRY
+from gateway.protocols.modbus import ModbusRtu
+from gateway.tags import WriteRule
+from tests.sim.plant import WIRE, device, make_tag
+
+
+def up(*numbers: int, every: float = 1.0, station: int = 1) -> Device:
+    """A device that answers, with one block of one word for each number."""
+    found = device(
+        [make_tag(f"D{n}", every=every, write=WriteRule()) for n in numbers], station=station
+    )
+    found.answered()
+    return found
+
+
+def write(device: Device, expires: float = 99.0) -> Write:
+    return Write(device, device.tags[0], [1], 0.0, expires, lambda _: None)
+
+
+def doubt(device: Device) -> None:
+    device.failed(NoReply("silence"), None, 0.0)
+
+
+def served(schedule: Schedule, now: float) -> Poll:
+    job = schedule.next(now)
+    assert isinstance(job, Poll)
+    schedule.polled(job, now)
+    return job
+
+
+def test_writes_go_first() -> None:
+    dev = up(0)
+    schedule = Schedule([dev], 0.0)
+    mine = write(dev)
+    schedule.orders.submit(mine)
+    assert schedule.next(0.0) is mine
+    assert isinstance(schedule.next(0.0), Poll)
+
+
+def test_but_not_twice_in_a_row_while_a_poll_is_due() -> None:
+    dev = up(0, 1000)
+    schedule = Schedule([dev], 0.0)
+    writes = [write(dev) for _ in range(4)]
+    for one in writes:
+        schedule.orders.submit(one)
+    jobs: list[Any] = []
+    for _ in range(6):
+        jobs.append(schedule.next(0.0))
+        if isinstance(jobs[-1], Poll):
+            schedule.polled(jobs[-1], 0.0)
+    assert [job for job in jobs if isinstance(job, Write)] == writes
+    assert [isinstance(job, Poll) for job in jobs] == [False, True, False, True, False, False]
+
+
+def test_a_write_does_not_wait_for_polls_that_are_not_to_be_asked_any_more() -> None:
+    """The second write goes at once when the poll that was due has been replaced meanwhile."""
+    dev = up(0)
+    schedule = Schedule([dev], 0.0)
+    schedule.orders.submit(write(dev))
+    schedule.orders.submit(second := write(dev))
+    assert isinstance(schedule.next(0.0), Write)
+    schedule.plan(dev, 0.0)
+    schedule.polls(dev)[0].live = False
+    assert schedule.next(0.0) is second
+
+
+def test_polls_go_by_earliest_deadline_over_all_devices() -> None:
+    slow, fast = up(0, every=5.0), up(0, every=0.5, station=2)
+    schedule = Schedule([slow, fast], 0.0)
+    assert served(schedule, 0.0).device is fast
+    assert served(schedule, 4.9).device is fast  # due since 0.5, until 1.0
+    assert served(schedule, 4.9).device is slow
+
+
+def test_what_somebody_wants_to_see_goes_before_other_polls() -> None:
+    dev = up(0, 1000, 2000)
+    schedule = Schedule([dev], 0.0)
+    wanted = schedule.polls(dev)[2]
+    schedule.hasten(wanted)
+    schedule.hasten(wanted)
+    assert served(schedule, 0.0) is wanted
+    assert len({served(schedule, 0.0), served(schedule, 0.0)}) == 2
+    assert schedule.next(0.0) == Idle(1.0)
+
+
+def test_but_not_twice_in_a_row_while_one_is_due() -> None:
+    dev = up(0, 1000)
+    schedule = Schedule([dev], 0.0)
+    wanted, other = schedule.polls(dev)
+    asked = []
+    for _ in range(4):
+        schedule.hasten(wanted)
+        asked.append(served(schedule, 0.0))
+    assert asked == [wanted, other, wanted, wanted]
+
+
+def test_a_poll_that_is_wanted_while_it_is_asked_is_asked_once_more() -> None:
+    dev = up(0)
+    schedule = Schedule([dev], 0.0)
+    poll = schedule.next(0.0)
+    assert isinstance(poll, Poll)
+    schedule.hasten(poll)
+    schedule.polled(poll, 0.1)
+    assert served(schedule, 0.1) is poll
+    assert schedule.next(0.1) == Idle(1.1)
+
+
+def test_a_late_poll_is_done_once_not_once_per_missed_period() -> None:
+    dev = up(0)
+    schedule = Schedule([dev], 0.0)
+    served(schedule, 5.3)
+    assert dev.record.overruns == 5
+    assert schedule.next(5.3) == Idle(6.3)
+
+
+def test_a_poll_that_is_a_little_late_keeps_its_phase() -> None:
+    dev = up(0)
+    schedule = Schedule([dev], 0.0)
+    for period in range(10):
+        served(schedule, period + 0.4)
+    assert schedule.next(9.5) == Idle(10.0)
+    assert dev.record.overruns == 0
+
+
+def test_a_device_in_doubt_is_probed_before_anything_else() -> None:
+    dev = up(0)
+    schedule = Schedule([dev], 0.0)
+    doubt(dev)
+    for what in (lambda: None, lambda: schedule.orders.submit(write(dev))):
+        what()
+        job = schedule.next(0.0)
+        assert isinstance(job, Probe)
+        assert job.device is dev
+    dev.answered()
+    assert isinstance(schedule.next(0.0), Write)
+    assert isinstance(schedule.next(0.0), Poll)
+
+
+def test_a_write_does_not_wait_behind_one_for_a_device_that_has_just_failed() -> None:
+    dead, well = up(0), up(0, station=2)
+    schedule = Schedule([dead, well], 0.0)
+    first, second, other = write(dead), write(dead), write(well)
+    for one in (first, second, other):
+        schedule.orders.submit(one)
+    doubt(dead)
+    assert isinstance(schedule.next(0.0), Probe)
+    schedule.failed(2.0, took=2.0)
+    assert schedule.next(2.0) is other
+    assert served(schedule, 2.0).device is well
+    assert isinstance(schedule.next(4.5), Probe)
+
+
+def test_a_bad_poll_is_tried_again_within_a_minute_however_rarely_it_is_asked() -> None:
+    dev = up(0, every=86_400.0)
+    schedule = Schedule([dev], 0.0)
+    job = schedule.next(0.0)
+    assert isinstance(job, Poll)
+    schedule.polled(job, 0.0)  # it was busy, say: nothing is known
+    assert isinstance(schedule.next(PAUSE_LONGEST), Poll)
+
+
+def test_a_refused_address_is_asked_for_rarely_but_then_does_not_wait_as_long_again() -> None:
+    dev = up(0)
+    (poll,) = Schedule([dev], 0.0).polls(dev)
+    assert not dev.refusals.refused(poll.block, 0, "28")
+    assert poll.every == RETRY
+    assert poll.deadline == poll.due + 1.0
+
+
+def test_a_wanted_poll_of_a_device_in_doubt_stays_wanted() -> None:
+    dev = up(0, 1000)
+    schedule = Schedule([dev], 0.0)
+    wanted = schedule.polls(dev)[1]
+    doubt(dev)
+    schedule.hasten(wanted)
+    assert isinstance(schedule.next(0.0), Probe)
+    dev.answered()
+    assert schedule.next(0.0) is wanted
+
+
+def test_a_device_not_heard_yet_is_probed_at_once() -> None:
+    dev = device([make_tag("D0")])
+    schedule = Schedule([dev], 0.0)
+    assert isinstance(schedule.next(0.0), Probe)
+    dev.answered()
+    schedule.woke(dev, 0.1)
+    assert isinstance(schedule.next(0.1), Poll)
+
+
+def test_while_polls_of_others_are_due_such_probes_get_half_of_the_time() -> None:
+    healthy = up(0, every=0.01)
+    strangers = [device([make_tag("D0")], station=n) for n in range(2, 40)]
+    schedule = Schedule([healthy, *strangers], 0.0)
+    now, probing = 0.0, 0.0
+    while now < 30.0:
+        match schedule.next(now):
+            case Probe(found):
+                now += 0.5
+                probing += 0.5
+                doubt(found)
+                schedule.failed(now, 0.5)
+                schedule.silent(found, now, 0.5)
+            case Poll() as poll:
+                now += 0.02
+                schedule.polled(poll, now)
+    assert 0.4 <= probing / now <= 0.55
+
+
+def test_a_device_that_fails_does_not_hold_up_the_others_twice_in_a_row() -> None:
+    bad, healthy = up(0, every=0.1), up(0, every=5.0, station=2)
+    schedule = Schedule([bad, healthy], 0.0)
+    poll = schedule.next(0.0)
+    assert isinstance(poll, Poll)
+    assert poll.device is bad
+    doubt(bad)
+    schedule.failed(1.0, 1.0)
+    schedule.again(poll)
+    assert served(schedule, 1.0).device is healthy
+    assert isinstance(schedule.next(1.0), Probe)
+
+
+def test_a_silent_device_is_left_alone_but_for_probes_at_growing_pauses() -> None:
+    dev = up(0)
+    schedule = Schedule([dev], 0.0)
+    now, pauses = 0.0, []
+    doubt(dev)
+    for _ in range(12):
+        schedule.silent(dev, now, 0.5)
+        job = schedule.next(now)
+        assert isinstance(job, Idle)
+        pauses.append(job.until - now)
+        assert isinstance(schedule.next(job.until - 1e-6), Idle)
+        assert isinstance(schedule.next(job.until), Probe)
+        now = job.until + 0.5
+    for number, pause in enumerate(pauses):
+        assert 0.9 <= pause / min(PAUSE_FIRST * 2**number, PAUSE_LONGEST) <= 1.1
+    assert len(set(pauses[8:])) == 4  # jitter
+    dev.answered()
+    schedule.woke(dev, now)
+    assert isinstance(schedule.next(now), Poll)
+
+
+def test_all_silent_devices_together_get_a_twentieth_while_others_are_served() -> None:
+    healthy = up(0, every=0.01)
+    silent = [up(0, station=n) for n in range(2, 33)]
+    schedule = Schedule([healthy, *silent], 0.0)
+    for dev in silent:
+        doubt(dev)
+        schedule.silent(dev, 0.0, 0.5)
+    now, probing, probed = 10.0, 0.0, set()
+    while now < 1000.0:
+        match schedule.next(now):
+            case Probe(found):
+                now += 0.5
+                probing += 0.5
+                probed.add(found)
+                schedule.silent(found, now, 0.5)
+            case Poll() as poll:
+                now += 0.02
+                schedule.polled(poll, now)
+    assert 0.8 * SILENT_SHARE <= probing / now <= SILENT_SHARE
+    assert probed == set(silent)  # in turn
+
+
+def test_with_nobody_else_to_serve_silent_devices_have_all_the_time() -> None:
+    silent = [up(0, station=n) for n in range(1, 4)]
+    schedule = Schedule(silent, 0.0)
+    for dev in silent:
+        doubt(dev)
+    for dev in silent:
+        schedule.silent(dev, 0.0, 0.5)
+    assert isinstance(schedule.next(1.2), Probe)
+    schedule.silent(silent[0], 1.7, 0.5)
+    assert isinstance(schedule.next(1.7), Probe)
+
+
+def test_a_silent_device_is_reachable_only_when_its_probe_is_allowed() -> None:
+    healthy, silent = up(0), up(0, station=2)
+    schedule = Schedule([healthy, silent], 0.0)
+    doubt(silent)
+    schedule.silent(silent, 0.0, 0.5)
+    assert schedule.reachable(healthy, 0.0)
+    assert not schedule.reachable(silent, 9.4)
+    assert schedule.reachable(silent, 9.5)
+
+
+def test_a_broadcast_device_is_never_asked() -> None:
+    everybody = ModbusRtu(station=0)
+    tags = (make_tag("holding:1", everybody),)
+    dev = Device("all", everybody, WIRE, everybody.timing, tags, 0.5)
+    assert dev.broadcast
+    schedule = Schedule([dev], 0.0)
+    assert schedule.next(0.0) == Idle(float("inf"))
+    doubt(dev)
+    assert not dev.doubtful
+
+
+def test_a_poll_without_answers_is_asked_less_and_less() -> None:
+    dev = up(0)
+    schedule = Schedule([dev], 0.0)
+    now, gaps = 0.0, []
+    for _ in range(9):
+        poll = schedule.next(now)
+        assert isinstance(poll, Poll)
+        schedule.polled(poll, now, answered=False)
+        job = schedule.next(now)
+        assert isinstance(job, Idle)
+        gaps.append(job.until - now)
+        now = job.until
+    assert gaps == sorted(gaps)
+    assert gaps[-1] == PAUSE_LONGEST
+    served(schedule, now)
+    assert schedule.next(now) == Idle(now + 1.0)
+
+
+def test_replaced_polls_are_asked_at_once_and_the_old_one_no_more() -> None:
+    dev = up(0, 1)
+    schedule = Schedule([dev], 0.0)
+    whole = schedule.next(0.0)
+    assert isinstance(whole, Poll)
+    halves = dev.refusals.refused(whole.block, 0, "28")
+    schedule.replace(whole, halves, 0.0)
+    assert {served(schedule, 0.0).block.span for _ in halves} == {b.span for b in halves}
+    assert schedule.next(0.0) == Idle(1.0)
+
+
+def test_a_plan_keeps_what_is_known_of_a_block() -> None:
+    dev = up(0, 1000)
+    schedule = Schedule([dev], 0.0)
+    served(schedule, 0.0).last_good = 0.25
+    schedule.plan(dev, 0.5)
+    first, second = schedule.polls(dev)
+    assert first.last_good == 0.25
+    assert served(schedule, 0.5) is second
+    assert schedule.next(0.5) == Idle(1.0)
+
+
+def test_writes_are_withdrawn_by_device_and_expire() -> None:
+    one, two = up(0), up(0, station=2)
+    schedule = Schedule([one, two], 0.0)
+    writes = [write(one), write(two), write(one, expires=1.0), write(two)]
+    for each in writes:
+        assert schedule.orders.submit(each)
+    assert schedule.orders.expired(0.9) == []
+    assert schedule.orders.expired(1.0) == [writes[2]]
+    assert schedule.orders.withdraw(two) == [writes[1], writes[3]]
+    assert schedule.orders.withdraw() == [writes[0]]
+    assert schedule.orders.withdraw() == []
+
+
+def test_too_many_waiting_writes_are_not_taken() -> None:
+    dev = up(0)
+    schedule = Schedule([dev], 0.0)
+    assert all(schedule.orders.submit(write(dev)) for _ in range(WAITING_ORDERS))
+    assert not schedule.orders.submit(write(dev))
+
+
+class AnyOrder(RuleBasedStateMachine):
+    """What a line may do to its schedule, in any order. The clock only goes on."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.now = 0.0
+        self.devices = [
+            device(
+                [make_tag(f"D{n}", every=e) for n, e in ((0, 0.5), (1, 0.5), (900, 2.0))], station=s
+            )
+            for s in (1, 2, 3)
+        ]
+        self.schedule = Schedule(self.devices, self.now)
+        self.running: Poll | None = None
+        self.written = 0
+        self.submitted = 0
+
+    @rule(seconds=st.sampled_from([0.0, 0.01, 0.3, 1.0, 7.0, 100.0]))
+    def time_passes(self, seconds: float) -> None:
+        self.now += seconds
+
+    def _heard(self, found: Device) -> None:
+        before = found.standing
+        found.answered()
+        if before in (Standing.STARTING, Standing.SILENT):
+            found.refusals.abandon()
+            self.schedule.woke(found, self.now)
+
+    def _not_heard(self, found: Device) -> None:
+        unknown = not found.served
+        doubt(found)
+        self.schedule.failed(self.now, 1.0)
+        if unknown or found.failures > 2:
+            self.schedule.silent(found, self.now, 1.0)
+
+    @rule(answers=st.booleans(), refused=st.booleans(), hastened=st.booleans())
+    def next_job(self, answers: bool, refused: bool, hastened: bool) -> None:
+        match self.schedule.next(self.now):
+            case Probe(found):
+                (self._heard if answers else self._not_heard)(found)
+            case Poll() as poll:
+                assert poll.live
+                assert poll.device.served
+                assert not poll.device.doubtful
+                assert poll.due <= self.now
+                self.running = poll
+                self.now += 0.05
+                if hastened:
+                    self.schedule.hasten(poll)
+                self._end(poll, answers=answers, refused=refused)
+                self.running = None
+            case Write():
+                self.written += 1
+            case Idle(until):
+                assert until > self.now
+                assert not self._due()
+
+    def _end(self, poll: Poll, *, answers: bool, refused: bool) -> None:
+        found, schedule = poll.device, self.schedule
+        if answers and not refused:
+            self._heard(found)
+            schedule.polled(poll, self.now)
+        elif answers:
+            self._heard(found)
+            halves = found.refusals.refused(poll.block, 0, "28")
+            if halves:
+                schedule.replace(poll, halves, self.now)
+            else:
+                schedule.polled(poll, self.now)
+            if found.refusals.settle():
+                found.plan()
+                schedule.plan(found, self.now)
+        else:
+            self._not_heard(found)
+            if found.standing is Standing.SILENT:
+                return
+            if poll.tries < 2:
+                schedule.again(poll)
+            else:
+                schedule.polled(poll, self.now, answered=False)
+
+    @rule(which=st.integers(0, 2), number=st.integers(0, 9))
+    def hasten(self, which: int, number: int) -> None:
+        polls = self.schedule.polls(self.devices[which])
+        self.schedule.hasten(polls[number % len(polls)])
+
+    @rule(which=st.integers(0, 2))
+    def submit(self, which: int) -> None:
+        self.schedule.orders.submit(write(self.devices[which], expires=1e9))
+        self.submitted += 1
+
+    @precondition(lambda self: self.submitted)
+    @rule(which=st.integers(0, 2))
+    def withdraw(self, which: int) -> None:
+        self.submitted -= len(self.schedule.orders.withdraw(self.devices[which]))
+
+    @rule(which=st.integers(0, 2))
+    def plan(self, which: int) -> None:
+        self.devices[which].plan()
+        self.schedule.plan(self.devices[which], self.now)
+
+    @rule()
+    def line_up(self) -> None:
+        for found in self.devices:
+            found.start()
+        self.schedule.opened(self.now)
+
+    def _queues(self, poll: Poll) -> int:
+        schedule = self.schedule
+        heaps = [*schedule._waiting, *schedule._ready]
+        return sum(one is poll and ticket == poll.ticket for _, ticket, one in heaps) + sum(
+            one is poll for one in schedule._urgent
+        )
+
+    def _due(self) -> list[Poll]:
+        return [
+            poll
+            for found in self.devices
+            if found.served
+            for poll in self.schedule.polls(found)
+            if poll.due <= self.now
+        ]
+
+    @invariant()
+    def every_poll_of_a_served_device_is_in_exactly_one_queue(self) -> None:
+        for found in self.devices:
+            covered = {tag for poll in self.schedule.polls(found) for tag in poll.block.tags}
+            assert covered == set(found.tags)
+            for poll in self.schedule.polls(found):
+                assert poll.live
+                if found.served and poll is not self.running:
+                    assert self._queues(poll) == 1, poll
+
+    @invariant()
+    def no_write_is_lost(self) -> None:
+        assert len(self.schedule.orders) == self.submitted - self.written
+
+
+AnyOrder.TestCase.settings = settings(max_examples=60, stateful_step_count=40, deadline=None)
+TestAnyOrder = AnyOrder.TestCase

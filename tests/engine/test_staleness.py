@@ -1,0 +1,92 @@
+"""A value that is not read for too long turns bad, though its device answers."""
+
+import asyncio
+
+from gateway.engine.ages import asked, worst_ages
+from gateway.engine.device import Device
+from gateway.tags import Quality, Reason
+from tests.sim.plant import Plant, device, make_tag, plant, running
+from tests.sim.virtual import on_virtual_time
+
+
+def scattered(count: int, station: int = 1, every: float = 0.5) -> Device:
+    tags = [make_tag(f"D{66 * n}", every=every, device=f"plc{station}") for n in range(count)]
+    return device(tags, station=station, reply_timeout=0.5)
+
+
+def limit(line: Plant) -> float:
+    """By the rule: twice the worst age promised, and what one failure takes."""
+    return 2 * max(worst_ages(asked(line.devices))) + 0.5 + 0.5
+
+
+@on_virtual_time
+async def test_values_turn_overdue_when_the_line_becomes_too_slow_for_them() -> None:
+    """Its own time in an exchange grows from 5 ms to 400, which no time-out notices."""
+    dev = scattered(10)
+    line = plant([dev])
+    async with running(line):
+        await asyncio.sleep(20)
+        assert line.good(dev)
+        line.told.clear()
+        slow_since = asyncio.get_running_loop().time()
+        line.stations[0].late = lambda _: 0.4
+        most = limit(line)
+        await asyncio.sleep(60)
+        found = [(at, s) for at, s in line.told if s.quality is Quality.BAD]
+        assert {s.reason for _, s in found} == {Reason.OVERDUE}
+        assert "not read for" in found[0][1].detail
+        assert found[0][0] - slow_since < most + 0.5
+        assert dev.record.overdue == len(found)
+        # What it takes is measured: then the line is as good as it can be, and known to be.
+        assert line.good(dev)
+        assert found[-1][0] - slow_since < 40
+
+
+@on_virtual_time
+async def test_no_good_value_is_older_than_its_limit() -> None:
+    """Watched from outside: one device is written to all the time, the other becomes slow."""
+    dev, other = scattered(20), scattered(20, station=2)
+    line = plant([dev, other])
+    read_at = dict.fromkeys((*dev.tags, *other.tags), 0.0)
+    async with running(line):
+        await asyncio.sleep(20)
+        most = limit(line)
+        line.stations[0].late = lambda _: 0.3
+        for _ in range(3000):
+            if not line.line._schedule.orders:
+                line.submit(other, other.tags[0], 1)
+            await asyncio.sleep(0.02)
+            most = max(most, limit(line))  # it grows as the slow one is measured
+            read_at |= {sample.tag: at for at, sample in line.told}
+            line.told.clear()
+            now = asyncio.get_running_loop().time()
+            good = [tag for tag in read_at if line.now[tag].quality is Quality.GOOD]
+            assert all(now - read_at[tag] <= most for tag in good)
+    assert dev.record.overdue > 0
+
+
+@on_virtual_time
+async def test_nothing_is_overdue_on_a_line_that_carries_its_load() -> None:
+    dev, other = scattered(8), scattered(8, station=2)
+    line = plant([dev, other])
+    async with running(line):
+        await asyncio.sleep(600)
+    assert dev.record.overdue == other.record.overdue == 0
+    bad = {s.reason for _, s in line.told if s.quality is Quality.BAD}
+    assert bad == set()
+
+
+@on_virtual_time
+async def test_who_is_written_to_all_the_time_is_read_like_the_others() -> None:
+    """The line is asked for twice what it carries, and half of that goes to the writes."""
+    devices = [scattered(20, station=n) for n in (1, 2, 3)]
+    line = plant(devices)
+    async with running(line):
+        await asyncio.sleep(5)
+        for _ in range(3000):
+            if not line.line._schedule.orders:
+                line.submit(devices[0], devices[0].tags[0], 1)
+            await asyncio.sleep(0.02)
+    # What is written is read back each time; of the others none is left behind.
+    reads = [min(poll.reads for poll in line.line.polls(dev)) for dev in devices]
+    assert min(reads) > 0.6 * max(reads)

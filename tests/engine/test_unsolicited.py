@@ -1,0 +1,703 @@
+"""No-protocol devices through a whole line, on virtual time: heard, asked, answered, written."""
+
+import asyncio
+from collections.abc import AsyncIterator, Callable, Sequence
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from structlog.testing import capture_logs
+
+from gateway.app import Gateway, device_of
+from gateway.config import Config, load
+from gateway.engine.device import Device, Standing
+from gateway.engine.unsolicited import ANSWER_WITHIN
+from gateway.errors import GatewayError, LineDown, Refused
+from gateway.line.line import Line
+from gateway.line.writing import Differs
+from gateway.northbound.repeater import Repeater
+from gateway.stations.vigor import VigorStation
+from gateway.tags import Quality, Reason, Sample, Tag, Written, good
+from gateway.transport import Ear, Port
+from gateway.values import Value
+from tests.sim.virtual import VirtualLoop, on_virtual_time
+from tests.vectors import vectors
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+SECOND = 1_000_000_000
+BY_ID = {v.id: v for v in vectors("noproto-vb1com", "noproto-k120s", "vigor")}
+# The A&D EK-L manual's data format, 9-2: header, sign, digits, unit, CR LF.
+STABLE = b"ST,+001234.5  g\r\n"
+MOVING = b"US,-000012.0  g\r\n"
+OVERLOAD = b"OL,+999999.9  g\r\n"
+
+Reply = Callable[[bytes], bytes]
+
+
+def now() -> float:
+    return asyncio.get_running_loop().time()
+
+
+@dataclass
+class Bench:
+    """The far end of the port, byte by byte, and all that the line told."""
+
+    line: Line = field(init=False)
+    replies: Reply = lambda _: b""
+    pause: float = 0.01  # seconds until it replies
+    echo: bool = False
+    sent: list[tuple[float, bytes]] = field(default_factory=list)
+    told: list[tuple[float, Sample]] = field(default_factory=list)
+    lives: list[bool] = field(default_factory=list)
+    ear: Ear | None = None
+
+    # The port
+
+    async def open(self, ear: Ear) -> Port:
+        self.ear = ear
+        return self
+
+    def write(self, data: bytes) -> None:
+        self.sent.append((now(), data))
+        if self.echo:
+            self._later(0.001, data)
+        if reply := self.replies(data):
+            self._later(self.pause, reply)
+
+    async def close(self) -> None:
+        self.ear = None
+
+    def say(self, data: bytes) -> None:
+        assert self.ear is not None
+        self.ear.received(data)
+
+    def _later(self, pause: float, data: bytes) -> None:
+        asyncio.get_running_loop().call_later(pause, self.say, data)
+
+    # Upstairs
+
+    def samples(self, samples: Sequence[Sample]) -> None:
+        self.told += [(now(), sample) for sample in samples]
+
+    def alive(self, device: Device, alive: bool) -> None:
+        self.lives.append(alive)
+
+    # What tests ask
+
+    @property
+    def words(self) -> list[bytes]:
+        return [data for _, data in self.sent]
+
+    def values(self, name: str) -> list[Value | Reason | None]:
+        """All that was told of a tag: its values, or why there was none."""
+        return [s.reason or s.value for _, s in self.told if s.tag.name == name]
+
+    def last(self, name: str) -> Value | Reason | None:
+        return self.values(name)[-1]
+
+    def tag(self, key: str) -> tuple[Device, Tag]:
+        return next((d, t) for d in self.line.devices for t in d.tags if t.name == key)
+
+    async def write_tag(self, name: str, value: Value) -> Written | GatewayError:
+        device, tag = self.tag(name)
+        done: asyncio.Future[Written | GatewayError] = asyncio.get_running_loop().create_future()
+        self.line.submit(device, tag, tag.encode(value), done.set_result)
+        return await done
+
+
+@asynccontextmanager
+async def running(config: Config, number: int = 0, **how: Any) -> AsyncIterator[Bench]:
+    """One line of the file, open and served. It must neither end nor fail."""
+    bench = Bench(**how)
+    line = config.lines[number]
+    devices = [device_of(device, line) for device in line.devices]
+    bench.line = Line(
+        line.name,
+        devices,
+        line.wire,
+        bench.open,
+        bench,
+        lambda: int(now() * SECOND),
+        echo=bench.echo,
+    )
+    task = asyncio.create_task(bench.line.run())
+    await asyncio.sleep(0.1)
+    yield bench
+    assert bench.line.is_open, bench.line.record.trouble
+    assert bench.line.record.opened == 1
+    assert not task.done()
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)
+
+
+def example(name: str) -> Config:
+    return load(EXAMPLES / f"{name}.yaml")
+
+
+# Heard unasked
+
+
+@on_virtual_time
+async def test_a_scale_streams_and_nobody_asks_it_anything() -> None:
+    async with running(example("scale")) as bench:
+        (device,) = bench.line.devices
+        assert bench.lives == []
+        for _ in range(20):
+            bench.say(MOVING)
+            await asyncio.sleep(0.2)
+            bench.say(STABLE)
+            await asyncio.sleep(0.2)
+        assert bench.values("weight")[-2:] == [-12.0, 1234.5]
+        assert bench.last("state") == "ST"
+        assert bench.lives == [True]
+        assert device.standing is Standing.UP
+        assert device.record.heard == 40
+        assert bench.sent == []
+
+
+@on_virtual_time
+async def test_a_scale_that_falls_silent_is_stale_and_not_alive_until_it_speaks() -> None:
+    async with running(example("scale")) as bench:
+        bench.say(STABLE * 2)
+        spoke = now()
+        await asyncio.sleep(10)
+        stale = [(at, s.reason) for at, s in bench.told if s.quality is Quality.BAD]
+        assert [reason for _, reason in stale] == [Reason.NO_REPLY] * 2  # its two tags, once
+        assert stale[0][0] - spoke == pytest.approx(2.0, abs=0.01)
+        assert bench.lives == [True, False]
+        bench.say(MOVING)
+        assert bench.last("weight") == -12.0
+        assert bench.lives == [True, False, True]
+        assert bench.sent == []  # it is never probed
+
+
+@on_virtual_time
+async def test_what_is_not_understood_makes_all_that_is_listened_to_bad_until_the_next_frame() -> (
+    None
+):
+    with capture_logs() as logs:
+        async with running(example("scale")) as bench:
+            (device,) = bench.line.devices
+            bench.say(STABLE * 2)
+            bench.say(OVERLOAD * 3)
+            assert bench.last("weight") is Reason.GARBLED
+            assert bench.last("state") is Reason.GARBLED
+            noted = [entry for entry in logs if entry["event"] == "not understood"]
+            assert [entry["bytes"] for entry in noted] == [OVERLOAD[:-2].hex(" ")]  # once
+            assert "a frame that listen does not know" in device.diagnosis()
+            bench.say(STABLE)
+            assert bench.last("weight") == 1234.5
+            assert device.diagnosis() == ""
+
+
+@on_virtual_time
+async def test_one_field_that_does_not_parse_is_bad_alone_and_its_bytes_are_in_the_log() -> None:
+    with capture_logs() as logs:
+        async with running(example("scale")) as bench:
+            bench.say(STABLE * 2)
+            bench.say(b"US,+1.2.3.4.  g\r\n" * 3)
+            assert bench.last("weight") is Reason.GARBLED
+            assert bench.last("state") == "US"
+            assert bench.line.devices[0].record.failures == {"shape": 3}
+    (noted,) = [entry for entry in logs if entry["event"] == "not understood"]
+    assert noted["bytes"] == b"US,+1.2.3.4.  g".hex(" ")
+
+
+@on_virtual_time
+async def test_two_equal_bar_codes_are_two_events_in_order() -> None:
+    async with running(example("barcode-reader")) as bench:
+        _, tag = bench.tag("barcode")
+        assert tag.event
+        bench.say(b"\x024006381333931\x03\x024006381333931\x03\x024006")
+        bench.say(b"381333948\x03")
+        codes = bench.values("barcode")
+        assert codes == ["4006381333931", "4006381333931", "4006381333948"]
+
+
+@on_virtual_time
+async def test_each_of_two_equal_events_is_news() -> None:
+    config = load(EXAMPLES / "barcode-reader.yaml")
+    news: list[Value | Reason | None] = []
+    bench = Bench()
+    gateway = Gateway(config, lambda: int(now() * SECOND), lambda _: bench.open)
+    gateway.publish = lambda samples: news.extend(s.reason or s.value for s in samples)
+    tasks = [asyncio.create_task(line.run()) for line in gateway.lines]
+    await asyncio.sleep(0.1)
+    bench.say(b"\x02A\x03\x02A\x03")
+    bench.say(b"\x02B\x03\x02A\x03?")
+    bench.say(b"\x02A\x03")
+    assert news == ["A", "A", "B", "A", "A"]
+    bench.say(b"\x02a\x03")  # no such code
+    assert news[5:] == [Reason.GARBLED]
+    for task in tasks:
+        task.cancel()
+    await asyncio.gather(*tasks, return_exceptions=True)
+
+
+async def test_an_event_is_not_published_again_when_the_network_comes_back() -> None:
+    tags = [tag for name in ("barcode-reader", "scale") for tag in example(name).devices[0].tags]
+    repeated: list[Sample] = []
+
+    class Everything:
+        def all(self) -> list[Tag]:
+            return tags
+
+        def sample(self, tag: Tag) -> Sample:
+            return good(tag, 1, 0)
+
+        def told(self, samples: Sequence[Sample]) -> None:
+            pass
+
+    everything: Any = Everything()
+    await Repeater(repeated.extend, everything, everything, everything).publish_all()
+    assert [sample.tag.key for sample in repeated] == ["scale/weight", "scale/state"]
+
+
+@on_virtual_time
+async def test_a_silent_device_costs_nothing() -> None:
+    """Nothing is sent, and the line is not even woken."""
+    async with running(example("barcode-reader")) as bench:
+        rounds = 0
+        looked = bench.line._schedule.next
+
+        def counted(at: float) -> Any:
+            nonlocal rounds
+            rounds += 1
+            return looked(at)
+
+        bench.line._schedule.next = counted  # type: ignore[method-assign,assignment]  # it counts
+        asyncio.get_running_loop().call_later(86400, lambda: None)
+        await asyncio.sleep(86400)
+        assert rounds == 0
+        assert bench.sent == []
+
+
+@on_virtual_time
+async def test_a_frame_that_only_a_silence_ends_is_heard_when_it_has_passed(tmp_path: Path) -> None:
+    path = tmp_path / "plant.yaml"
+    path.write_text(
+        "lines: {hall: {port: COM1, devices: {scale: {protocol: frames, framing: {gap: 50ms},"
+        " listen: {w: {match: 'W(?P<w>[0-9]{1,5})', fields: {w: {type: integer}}}},"
+        " tags: {w: {address: w}}}}}}"
+    )
+    async with running(load(path)) as bench:
+        bench.say(b"W12")
+        await asyncio.sleep(0.04)
+        bench.say(b"34")
+        assert bench.values("w") == []
+        await asyncio.sleep(0.045)
+        assert bench.values("w") == []
+        await asyncio.sleep(0.01)
+        assert bench.values("w") == [1234]
+
+
+# Answered
+
+
+@on_virtual_time
+async def test_the_k120s_weighing_machine_is_answered_every_time() -> None:
+    frame, answer = BY_ID["noproto-k120s-001"].frame, BY_ID["noproto-k120s-002"].frame
+    async with running(example("weighing-machine")) as bench:
+        await asyncio.sleep(1)
+        for _ in range(3):
+            bench.say(frame)
+            await asyncio.sleep(0.1)
+        assert bench.values("weight") == [0x3412] * 3
+        assert bench.words == [answer] * 3
+        bench.say(frame[:3] + frame[4:])  # a byte was lost
+        await asyncio.sleep(1)
+        assert bench.words == [answer] * 3
+        assert bench.last("weight") is Reason.GARBLED
+
+
+@on_virtual_time
+async def test_the_echo_of_an_answer_is_nothing_that_the_device_said() -> None:
+    frame, answer = BY_ID["noproto-k120s-001"].frame, BY_ID["noproto-k120s-002"].frame
+    async with running(example("weighing-machine"), echo=True) as bench:
+        await asyncio.sleep(1)
+        for _ in range(3):
+            bench.say(frame)
+            await asyncio.sleep(0.5)
+        assert bench.words == [answer] * 3
+        assert bench.values("weight") == [0x3412] * 3
+
+
+@on_virtual_time
+async def test_an_answer_that_its_framing_cannot_carry_is_not_sent(tmp_path: Path) -> None:
+    path = tmp_path / "plant.yaml"
+    path.write_text(
+        "lines: {hall: {port: COM1, devices: {plc: {protocol: frames,"
+        " framing: {header: '<STX>', terminator: '<ETX>'}, send_framing: {terminator: '!'},"
+        " listen: {w: {match: '(?P<w>.{1,5})', fields: {w: {type: text}}, answer: 'OK{w}'}},"
+        " tags: {w: {address: w}}}}}}"
+    )
+    async with running(load(path)) as bench:
+        bench.say(b"\x02AB\x03\x02A!B\x03")
+        await asyncio.sleep(1)
+        assert bench.values("w") == ["AB", "A!B"]
+        assert bench.words == [b"OKAB!"]
+
+
+# Asked and written
+
+
+def sums(text: str) -> bytes:
+    """A frame of the inverter, with the sum as its framing has it."""
+    data = text.encode() + b"\x03"
+    return b"\x02" + data + b"%02X" % (sum(data) % 256)
+
+
+class Inverter:
+    def __init__(self) -> None:
+        self.mute = False
+        self.frequency = "049.98"
+        self.set: list[bytes] = []
+
+    def __call__(self, request: bytes) -> bytes:
+        if self.mute:
+            return b""
+        if request == sums("F?"):
+            return sums(f"F={self.frequency}")
+        if request.startswith(b"\x02S="):
+            self.set.append(request[3:9])
+            return sums("ER07" if request[3:9] == b"013.00" else "OK")
+        raise AssertionError(request)
+
+
+@on_virtual_time
+async def test_an_inverter_is_asked_every_half_second() -> None:
+    async with running(example("inverter"), replies=Inverter()) as bench:
+        await asyncio.sleep(10)
+        assert 18 <= len(bench.values("frequency")) <= 22
+        assert set(bench.values("frequency")) == {49.98}
+        assert set(bench.words) == {sums("F?")}
+        assert bench.lives == [True]
+
+
+@on_virtual_time
+async def test_an_inverter_is_told_its_speed() -> None:
+    inverter = Inverter()
+    async with running(example("inverter"), replies=inverter) as bench:
+        await asyncio.sleep(1)
+        done = await bench.write_tag("setpoint", 25)
+        assert isinstance(done, Written)
+        assert (done.value, done.acknowledged) == (25.0, True)
+        refused = await bench.write_tag("setpoint", 13)
+        assert isinstance(refused, Refused)
+        assert refused.code == "07"
+        assert inverter.set == [b"025.00", b"013.00"]
+
+
+@on_virtual_time
+async def test_a_limit_holds_for_what_is_really_sent() -> None:
+    async with running(example("inverter"), replies=Inverter()) as bench:
+        _, tag = bench.tag("setpoint")
+        assert bytes(tag.encode(60)) == b"060.00"
+        assert bytes(tag.encode(24.996)) == b"025.00"
+        assert tag.from_units(tag.encode(24.996)) == 25.0
+        for value in (60.004, 60.01, -0.01, "25", True, 1e300):
+            with pytest.raises(GatewayError):
+                tag.encode(value)
+
+
+@on_virtual_time
+async def test_a_reply_whose_field_does_not_parse_is_garbled_and_the_device_stays_up() -> None:
+    inverter = Inverter()
+    async with running(example("inverter"), replies=inverter) as bench:
+        await asyncio.sleep(1)
+        inverter.frequency = "0.49.9"
+        await asyncio.sleep(2)
+        assert bench.last("frequency") is Reason.GARBLED
+        assert bench.lives == [True]
+        inverter.frequency = "012.50"
+        await asyncio.sleep(1)
+        assert bench.last("frequency") == 12.5
+
+
+@on_virtual_time
+async def test_an_inverter_that_is_switched_off_is_silent_and_is_probed_with_its_question() -> None:
+    inverter = Inverter()
+    async with running(example("inverter"), replies=inverter) as bench:
+        await asyncio.sleep(1)
+        inverter.mute = True
+        await asyncio.sleep(20)
+        assert bench.last("frequency") is Reason.NO_REPLY
+        assert bench.lives == [True, False]
+        inverter.mute = False
+        await asyncio.sleep(61)
+        assert bench.last("frequency") == 49.98
+        assert bench.lives == [True, False, True]
+
+
+@pytest.mark.parametrize("number", [0, 1], ids=["as-text", "converted"])
+@on_virtual_time
+async def test_b_4_5_both_programs_read_d0_and_write_d1_by_configuration_alone(number: int) -> None:
+    station = VigorStation(1)
+    station.memory.write("D", 0, [0x1234])
+
+    def replies(request: bytes) -> bytes:
+        return b"".join(station.hear(request, now()))
+
+    async with running(example("vb-1com"), number, replies=replies) as bench:
+        await asyncio.sleep(2)
+        assert bench.words[0] == BY_ID["vigor-012"].frame
+        assert set(bench.values("d0")) == {0x1234}
+        station.memory.write("D", 0, [0xA325])
+        await asyncio.sleep(1)
+        assert bench.last("d0") == 0xA325 - 0x10000
+        assert isinstance(await bench.write_tag("d1", -2), Written)
+        assert station.memory.read("D", 1) == [0xFFFE]
+        station.holes.add(("D", 1))
+        refused = await bench.write_tag("d1", 5)
+        assert isinstance(refused, Refused)
+        assert refused.code == "28"
+
+
+READ_BACK = """
+lines:
+  hall:
+    port: COM1
+    devices:
+      drive:
+        protocol: frames
+        framing: {gap: 50ms, max_length: 32}
+        ask:
+          speed: {send: "R", match: 'R(?P<speed>[0-9.]{5})', fields: {speed: {type: decimal}}}
+        write: {speed: {send: "W{value}", value: {type: decimal, format: 05.1f}, match: K}}
+        tags:
+          speed: {address: speed, scale: 0.1, every: 1s, write: {max: 99, verify: true}}
+"""
+
+
+@on_virtual_time
+async def test_a_reply_ends_by_a_silence_and_a_write_is_read_back(tmp_path: Path) -> None:
+    path = tmp_path / "plant.yaml"
+    path.write_text(READ_BACK)
+    held, deaf = b"100.0", False
+
+    def replies(request: bytes) -> bytes:
+        nonlocal held
+        if request == b"R":
+            return b"R" + held
+        assert request[:1] == b"W"
+        held = held if deaf else request[1:]
+        return b"K"
+
+    async with running(load(path), replies=replies) as bench:
+        await asyncio.sleep(3)
+        assert set(bench.values("speed")) == {10.0}
+        done = await bench.write_tag("speed", 60)
+        assert isinstance(done, Written)
+        assert (held, done.value, done.verified) == (b"600.0", 60.0, True)
+        deaf = True  # it says yes, and does nothing
+        assert isinstance(await bench.write_tag("speed", 70), Differs)
+        await asyncio.sleep(2)
+        assert bench.last("speed") == 60.0
+
+
+PRINTER = """
+lines:
+  hall:
+    port: COM1
+    devices:
+      printer:
+        protocol: frames
+        framing: {ending: CR}
+        listen: {state: {match: '(?P<state>[A-Z]{1,8})', fields: {state: {type: text}}}}
+        write:
+          loud:  {send: "PRINT {value}", value: {type: text}}
+          proud: {send: "SET {value}", value: {type: integer, format: 03d}, match: OK}
+        tags:
+          state: {address: state}
+          loud:  {address: loud, write: true}
+          proud: {address: proud, write: true}
+"""
+
+
+@on_virtual_time
+async def test_a_device_that_is_never_asked_is_written_to_but_never_probed(tmp_path: Path) -> None:
+    """Whether it lives, only its own words tell; a write that fails is tried, each time anew."""
+    path = tmp_path / "plant.yaml"
+    path.write_text(PRINTER)
+    async with running(load(path)) as bench:
+        (device,) = bench.line.devices
+        done = await bench.write_tag("loud", "HELLO")
+        assert isinstance(done, Written)
+        assert done.acknowledged is False
+        assert bench.lives == []
+        for _ in range(5):
+            assert not isinstance(await bench.write_tag("proud", 7), Written)
+        assert bench.lives == []
+        await asyncio.sleep(100)
+        assert bench.words == [b"PRINT HELLO\r", *[b"SET 007\r"] * 5]
+        bench.replies = lambda _: b"OK\r"
+        assert isinstance(await bench.write_tag("proud", 8), Written)
+        assert bench.lives == [True]
+        assert device.standing is Standing.UP
+        assert bench.values("state") == []
+
+
+ASKED_AND_HEARD = """
+lines:
+  hall:
+    port: COM1
+    devices:
+      scale:
+        protocol: frames
+        framing: {header: "<STX>", terminator: "<ETX>"}
+        listen: {key: {match: 'K(?P<key>[0-9])', fields: {key: {type: integer}}}}
+        ask:
+          weight: {send: W, match: 'W(?P<w>[0-9]{1,5})', fields: {w: {type: integer}}}
+        tags:
+          key:    {address: key, event: true}
+          weight: {address: w, every: 200ms}
+"""
+
+
+@on_virtual_time
+async def test_what_a_device_says_while_it_is_asked_something_else_is_not_lost(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "plant.yaml"
+    path.write_text(ASKED_AND_HEARD)
+    async with running(load(path), replies=lambda _: b"\x02K7\x03\x02W12\x03") as bench:
+        await asyncio.sleep(2)
+        asked = len(bench.sent)
+        assert asked >= 9
+        assert bench.values("weight") == [12] * (asked - 1)  # the first was the probe
+        assert bench.values("key") == [7] * asked
+
+
+SHARED = """
+lines:
+  hall:
+    port: COM1
+    baudrate: 9600
+    format: 8N1
+    devices:
+      mixer:
+        protocol: vigor
+        station: 1
+        tags: {speed: {address: D0, every: 100ms}}
+      reader:
+        protocol: frames
+        framing: {header: "<STX>", terminator: "<ETX>"}
+        listen: {scan: {match: '(?P<code>[0-9]{1,20})', fields: {code: {type: text}}}}
+        tags: {code: {address: code, event: true}}
+"""
+
+
+@on_virtual_time
+async def test_a_reader_and_a_polled_plc_share_a_line(tmp_path: Path) -> None:
+    path = tmp_path / "plant.yaml"
+    path.write_text(SHARED)
+    station = VigorStation(1)
+    station.memory.write("D", 0, [42])
+
+    def replies(request: bytes) -> bytes:
+        return b"".join(station.hear(request, now()))
+
+    async with running(load(path), replies=replies) as bench:
+        said = 0
+        for n in range(100):
+            await asyncio.sleep(0.173)
+            if bench.line._turn is not None and bench.line._turn.sent:
+                continue  # two at once on one wire: nobody could read either
+            said += 1
+            before = len(bench.sent)
+            bench.say(b"\x0240063")
+            await asyncio.sleep(0.03)
+            assert len(bench.sent) == before  # nobody speaks into its frame
+            bench.say(b"%03d\x03" % n)
+        assert said > 50
+        assert len(bench.values("code")) == said
+        assert set(bench.values("speed")) == {42}
+        assert len(bench.values("speed")) > 80
+
+
+@on_virtual_time
+async def test_a_frame_that_never_ends_does_not_keep_the_line_from_others(tmp_path: Path) -> None:
+    path = tmp_path / "plant.yaml"
+    path.write_text(SHARED)
+    station = VigorStation(1)
+
+    def replies(request: bytes) -> bytes:
+        return b"".join(station.hear(request, now()))
+
+    async with running(load(path), replies=replies) as bench:
+        await asyncio.sleep(1)
+        begun, polled = now(), len(bench.sent)
+        for _ in range(300):
+            bench.say(b"\x02")
+            await asyncio.sleep(0.008)
+        waited = bench.sent[polled][0] - begun
+        assert waited < 1.2
+        await asyncio.sleep(1)
+        assert bench.last("speed") == 0
+
+
+@on_virtual_time
+async def test_an_answer_that_comes_too_late_is_not_sent() -> None:
+    frame = BY_ID["noproto-k120s-001"].frame
+    async with running(example("weighing-machine")) as bench:
+        await asyncio.sleep(1)
+        bench.say(frame)
+        assert bench.line._listening.next(now() + ANSWER_WITHIN) is None  # the line was held up
+        await asyncio.sleep(1)
+        assert bench.sent == []
+
+
+@on_virtual_time
+async def test_when_the_port_goes_and_comes_back_listening_begins_anew() -> None:
+    bench = Bench()
+    config = example("scale").lines[0]
+    devices = [device_of(device, config) for device in config.devices]
+    bench.line = Line("l", devices, config.wire, bench.open, bench, lambda: 0)
+    task = asyncio.create_task(bench.line.run())
+    await asyncio.sleep(0.1)
+    bench.say(STABLE + STABLE[:7])
+    bench.line.lost(LineDown("unplugged"))
+    await asyncio.sleep(0.1)
+    assert bench.last("weight") is Reason.LINE_DOWN
+    await asyncio.sleep(1)
+    bench.say(STABLE[7:] + MOVING)
+    assert bench.values("weight")[-1] == -12.0
+    assert 1234.5 not in bench.values("weight")[1:]
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)
+
+
+@pytest.mark.parametrize(
+    "name", ["scale", "barcode-reader", "inverter", "weighing-machine", "vb-1com"]
+)
+@settings(max_examples=30, deadline=None)
+@given(
+    pieces=st.lists(
+        st.tuples(
+            st.one_of(
+                st.binary(max_size=40), st.sampled_from([STABLE, b"\x02123\x03", sums("OK")])
+            ),
+            st.sampled_from([0.0, 0.004, 0.06, 0.5]),
+        ),
+        max_size=25,
+    )
+)
+def test_whatever_is_heard_nothing_is_raised_out_of_the_line(
+    name: str, pieces: list[tuple[bytes, float]]
+) -> None:
+    async def heard() -> None:
+        async with running(example(name)) as bench:
+            for data, pause in pieces:
+                bench.say(data)
+                await asyncio.sleep(pause)
+            await asyncio.sleep(1)
+
+    loop = VirtualLoop()
+    try:
+        loop.run_until_complete(heard())
+    finally:
+        loop.close()

@@ -1,0 +1,301 @@
+"""One wire with Computer Link PLCs of both formats and a Vigor; PLCs that speak out of turn."""
+
+import asyncio
+import random
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from structlog.testing import capture_logs
+
+from gateway.engine.device import Device, Standing
+from gateway.planning.wire_timing import Wire
+from gateway.protocols.computer_link import SILENT_CAUSES, ComputerLink
+from gateway.protocols.vigor import Vigor
+from gateway.stations.vigor import VigorStation
+from gateway.tags import Quality, Reason, WriteRule, Written
+from tests.sim.links import commands, link_device, link_plant, link_station, spelt
+from tests.sim.plant import (
+    SECOND,
+    Bench,
+    Plant,
+    Unruly,
+    clock_word,
+    clockwork,
+    device,
+    make_tag,
+    plant,
+    running,
+)
+from tests.sim.virtual import on_virtual_time, run_virtual
+
+ONE_FORMAT = Wire(19200, 10)  # 7E1, of all of them
+NUMBERS = (0, 300, 600)
+
+
+def now() -> float:
+    return asyncio.get_running_loop().time()
+
+
+def mixed(every: float = 0.3) -> Plant:
+    """A Vigor, a format 1 and a format 4 PLC."""
+    vigor = Vigor(station=1)
+    tags = [
+        make_tag(f"D{n}", vigor, device="vigor", every=every, type="uint16", write=WriteRule())
+        for n in NUMBERS
+    ]
+    times = replace(vigor.timing, reply_timeout=0.3)
+    devices = [Device("vigor", vigor, ONE_FORMAT, times, tuple(tags), 0.3)]
+    stations: list[Any] = [VigorStation(1)]
+    for number, frame_format in ((5, 1), (6, 4)):
+        driver = ComputerLink(station=number, frame_format=frame_format)  # type: ignore[arg-type]
+        addresses = [f"D{n}" for n in NUMBERS]
+        settings: dict[str, Any] = {"type": "uint16", "write": WriteRule(), "every": every}
+        devices.append(link_device(driver, *addresses, wire=ONE_FORMAT, **settings))
+        stations.append(link_station(driver))
+    for station in stations:
+        clockwork(station.memory, NUMBERS)
+    unruly = [Unruly(station, seed, wire=ONE_FORMAT) for seed, station in enumerate(stations)]
+    return Plant(devices, unruly, Bench(), ONE_FORMAT)
+
+
+def wrong(line: Plant) -> list[tuple[float, str, object]]:
+    """Good values that their station cannot have held during the last second."""
+    found = []
+    for at, sample in line.told:
+        n, value = sample.tag.address.number, sample.value
+        if sample.quality is Quality.GOOD and isinstance(value, int):
+            assert sample.time == int(at * SECOND)
+            if (clock_word(at, n) - value) % 65536 > 300:
+                found.append((at, sample.tag.key, value))
+    return found
+
+
+@on_virtual_time
+async def test_three_protocol_variants_on_one_wire_are_all_healthy() -> None:
+    line = mixed()
+    async with running(line):
+        await asyncio.sleep(30)
+        for dev in line.devices:
+            assert line.good(dev), dev.name
+            assert dev.record.failures == {}
+            assert dev.record.unasked == 0
+            assert len(line.reads(dev)) > 80
+        for dev in line.devices:
+            outcome = line.submit(dev, dev.tags[0], 4711)
+            await asyncio.sleep(1)
+            assert isinstance(outcome.once, Written)
+            assert line.now[dev.tags[0]].value == 4711
+    assert [s.memory.read("D", 0)[0] for s in line.stations] == [4711] * 3
+    assert not [w for w in wrong(line) if w[2] != 4711]
+
+
+@pytest.mark.parametrize("dead", [0, 1, 2])
+@on_virtual_time
+async def test_one_that_dies_disturbs_neither_of_the_others(dead: int) -> None:
+    line = mixed()
+    async with running(line):
+        await asyncio.sleep(5)
+        line.stations[dead].mute = True
+        await asyncio.sleep(60)
+        for i, dev in enumerate(line.devices):
+            assert (dev.standing is Standing.SILENT) == (i == dead)
+            assert line.good(dev) == (i != dead)
+        line.stations[dead].mute = False
+        await asyncio.sleep(90)
+        assert all(line.good(dev) for dev in line.devices)
+    assert wrong(line) == []
+
+
+@on_virtual_time
+async def test_late_and_lost_answers_on_a_mixed_wire_never_make_a_wrong_value() -> None:
+    """The one that answers late is resynchronised by a loopback that cannot be mistaken."""
+    line = mixed(every=0.2)
+    for station in line.stations:
+        station.late = lambda c: 0.3 + c.uniform(0.05, 0.5) if c.random() < 0.1 else 0.0
+        station.lose, station.cut = 0.03, 0.03
+    checks = Check(line)
+    async with running(line):
+        await asyncio.sleep(2000)
+    assert checks.wrong == []
+    assert checks.right > 10_000
+    for dev, station in zip(line.devices[1:], line.stations[1:], strict=True):
+        assert dev.record.late > 20
+        assert commands(station).count("TT") > 20
+        said = {data[9:] for _, data in station.heard if data[5:7] == b"TT"}
+        assert len(said) == commands(station).count("TT")  # no two alike
+
+
+class Check:
+    """Every good value is compared with the clock as it was during its exchange."""
+
+    def __init__(self, line: Plant) -> None:
+        self.line, self.right, self.wrong = line, 0, list[Any]()
+        line.line._then.upstairs = self
+
+    def alive(self, device: Device, alive: bool) -> None: ...
+
+    def samples(self, samples: Any) -> None:
+        began = self.line.bench.sent[-1][0] if self.line.bench.sent else 0.0
+        for sample in samples:
+            if sample.quality is Quality.GOOD:
+                age = (clock_word(now(), sample.tag.address.number) - sample.value) % 65536
+                if age <= (now() - began) * 1000 + 1:
+                    self.right += 1
+                else:
+                    self.wrong.append((now(), sample.tag.key, age))
+
+
+# NAK 06 in the middle of a block
+
+
+@on_virtual_time
+async def test_nak_06_to_one_address_in_the_middle_of_a_block() -> None:
+    dev = link_device(ComputerLink(station=5), *[f"D{n}" for n in range(40)])
+    line = link_plant([dev])
+    line.stations[0].inner.holes = {("D", 17)}
+    for n in range(40):
+        line.stations[0].memory.write("D", n, [n])
+    async with running(line):
+        await asyncio.sleep(4)
+        for tag in dev.tags:
+            if tag.text == "D17":
+                assert line.reason(tag) is Reason.REFUSED
+                assert "06" in line.now[tag].detail
+            else:
+                assert line.now[tag].value == tag.address.number
+        assert [block.span.size for block in dev.blocks] == [17, 1, 22]
+        assert dev.record.failures == {}
+
+
+# Blocks that nobody asked for
+
+
+def talkative(*, monitor: bool = False) -> tuple[Plant, Device]:
+    addresses = [f"D{n}" for n in range(0, 3000, 400)]
+    driver = ComputerLink(station=5, monitor=monitor)
+    dev = link_device(driver, *addresses, every=1.0, type="uint16")
+    line = link_plant([dev])
+    clockwork(line.stations[0].memory, [int(text[1:]) for text in addresses])
+    return line, dev
+
+
+def on_demand(line: Plant, data: str = "1E61") -> bytes:
+    return line.stations[0].inner.on_demand(data)  # type: ignore[attr-defined,no-any-return]
+
+
+@pytest.mark.parametrize("monitor", [False, True])
+@on_virtual_time
+async def test_on_demand_blocks_before_replies_are_counted_and_never_taken_for_one(
+    monitor: bool,
+) -> None:
+    """Of exactly the shape of the answer, but for the PC number FE."""
+    line, dev = talkative(monitor=monitor)
+    station = line.stations[0]
+    hear, chance, said = station.inner.hear, random.Random(1), 0
+
+    def chatty(data: bytes, at: float) -> list[bytes]:
+        nonlocal said
+        replies = hear(data, at)
+        if replies and replies[0][:1] == b"\x02" and chance.random() < 0.5:
+            size = len(replies[0]) - 8
+            said += 1
+            return [on_demand(line, "7" * size), *replies]
+        return replies
+
+    station.inner.hear = chatty  # type: ignore[method-assign]
+    checks = Check(line)
+    async with running(line):
+        await asyncio.sleep(60)
+    assert said > 25
+    assert said - dev.record.unasked in (0, 1)  # perhaps one is on its way
+    assert checks.wrong == []
+    assert checks.right > 400
+    assert dev.record.failures == {}
+
+
+@on_virtual_time
+async def test_on_demand_blocks_between_exchanges_are_counted_and_never_taken_for_a_reply() -> None:
+    line, dev = talkative()
+    checks, said = Check(line), 0
+    async with running(line):
+        await asyncio.sleep(2)
+        for _ in range(50):
+            await asyncio.sleep(0.17)
+            while line.line._turn is not None:
+                await asyncio.sleep(0.002)
+            block = on_demand(line)
+            for start in range(0, len(block), 4):
+                line.bench.received(block[start : start + 4])
+            said += 1
+    assert said - dev.record.unasked in (0, 1)  # perhaps one is on its way
+    assert line.line.record.unasked >= said * 12
+    assert checks.wrong == []
+    assert dev.record.failures == {}
+
+
+def test_on_demand_blocks_are_told_in_the_log_but_do_not_fill_it() -> None:
+    async def whole() -> None:
+        line, _ = talkative()
+        async with running(line):
+            await asyncio.sleep(2)
+            for _ in range(100):
+                await asyncio.sleep(0.25)
+                while line.line._turn is not None:
+                    await asyncio.sleep(0.002)
+                line.bench.received(on_demand(line))
+
+    with capture_logs() as logs:
+        run_virtual(whole())
+    told = [entry for entry in logs if entry["event"] == "nobody asked for this"]
+    assert len(told) == 100
+    assert {entry["what"] for entry in told} == {"on-demand data of station 5: 1E61"}
+    at_info = [entry for entry in told if entry["log_level"] == "info"]
+    assert len(at_info) == 3
+    assert at_info[-1]["count"] > at_info[0]["count"] == 1
+
+
+@on_virtual_time
+async def test_an_on_demand_block_instead_of_an_answer_is_no_answer() -> None:
+    line, dev = talkative()
+    station = line.stations[0]
+    async with running(line):
+        await asyncio.sleep(2)
+        hear = station.inner.hear
+        station.inner.hear = lambda data, at: (  # type: ignore[method-assign]
+            [on_demand(line, "7777")] if hear(data, at) else []
+        )
+        await asyncio.sleep(8)
+        assert dev.standing is Standing.SILENT
+        assert 0x7777 not in {sample.value for _, sample in line.told}
+        assert all(line.now[tag].quality is Quality.BAD for tag in dev.tags)
+
+
+# Diagnosis
+
+
+@on_virtual_time
+async def test_a_plc_that_does_not_answer_is_diagnosed_with_the_causes_it_may_have() -> None:
+    dev = link_device(ComputerLink(station=5), "D0")
+    line = link_plant([dev])
+    async with running(line):
+        await asyncio.sleep(2)
+        line.stations[0].mute = True
+        await asyncio.sleep(10)
+        assert dev.standing is Standing.SILENT
+        assert "station number" in dev.diagnosis()
+        assert SILENT_CAUSES in dev.diagnosis()
+        for number in ("6301", "6305", "6306", "D8121"):
+            assert number in dev.diagnosis()
+        assert SILENT_CAUSES in line.now[spelt(dev, "D0")].detail
+
+
+@on_virtual_time
+async def test_other_protocols_are_not_diagnosed_with_them() -> None:
+    dev = device([make_tag("D0")])
+    line = plant([dev])
+    line.stations[0].mute = True
+    async with running(line):
+        await asyncio.sleep(10)
+        assert "No byte came back" in dev.diagnosis()
+        assert "6301" not in dev.diagnosis()

@@ -1,0 +1,374 @@
+"""Wires behind which answers come late and many at once, or which never fall silent."""
+
+import asyncio
+import random
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
+
+import pytest
+
+from gateway.engine.device import Device, Standing
+from gateway.errors import Busy, LineDown
+from gateway.planning.wire_timing import Wire
+from gateway.protocols.checksums import crc16
+from gateway.protocols.computer_link import ComputerLink
+from gateway.protocols.driver import AnyDriver
+from gateway.protocols.modbus import ModbusAscii, ModbusRtu
+from gateway.protocols.vigor import Vigor
+from gateway.simulator.plant import station_for
+from gateway.tags import Quality, Reason, Tag, WriteRule, Written
+from gateway.transport import Ear
+from tests.sim.bench import WIRE, Bench
+from tests.sim.plant import Outcome, Plant, device, make_tag, plant, running
+from tests.sim.virtual import on_virtual_time
+
+GUARD = 0.5
+
+
+@dataclass
+class DeviceServer(Bench):
+    """Requests reach the PLC one after the other, each when the one before has its answer.
+
+    While it is stalled none goes on, and none is lost: so it is with TCP.
+    """
+
+    late: Callable[[random.Random], float] = lambda _: 0.0  # seconds on top, for each answer
+    deaf_to: Callable[[bytes], bool] = lambda _: False  # requests that are lost on the wire
+    latency: float = 0.0  # seconds, of what comes back
+    flows: asyncio.Event = field(default_factory=asyncio.Event)
+    _queue: "asyncio.Queue[bytes]" = field(default_factory=asyncio.Queue)
+    _task: "asyncio.Task[None] | None" = None
+
+    async def open(self, stations: Sequence[Any], wire: Wire, ear: Ear) -> "DeviceServer":
+        self.ear, (self._station,) = ear, stations
+        self.flows.set()
+        self._task = asyncio.create_task(self._serve())
+        return self
+
+    def write(self, data: bytes) -> None:
+        self.sent.append((now(), data))
+        self._queue.put_nowait(data)
+
+    async def close(self) -> None:
+        if self._task is not None:
+            self._task.cancel()
+
+    def received(self, data: bytes) -> None:
+        if self.ear is not None:
+            asyncio.get_running_loop().call_later(self.latency, self.ear.received, data)
+
+    async def _serve(self) -> None:
+        while True:
+            request = await self._queue.get()
+            await self.flows.wait()
+            await asyncio.sleep(len(request) * WIRE.character)
+            if self.echo:
+                self.received(request)
+            await asyncio.sleep(0.005)
+            answers = [] if self.deaf_to(request) else self._station.hear(request, now())
+            for answer in answers:
+                await asyncio.sleep(len(answer) * WIRE.character + self.late(self._random))
+                self.received(answer)
+
+
+def now() -> float:
+    return asyncio.get_running_loop().time()
+
+
+def behind(server: DeviceServer, driver: AnyDriver, *tags: Tag) -> tuple[Plant, Device, Any]:
+    """The line, its device, and the memory of its PLC."""
+    dev = Device("plc", driver, WIRE, driver.timing, tags, GUARD)
+    station = station_for(driver, [])
+    return Plant([dev], [station], server, WIRE), dev, station.memory  # type: ignore[list-item]
+
+
+def told_wrong(line: Plant) -> list[object]:
+    """Where each word holds its own number."""
+    good = (sample for _, sample in line.told if sample.quality is Quality.GOOD)
+    return [(s.tag.text, s.value) for s in good if s.value != s.tag.address.number]
+
+
+@pytest.mark.parametrize(
+    ("retries", "stall"), [(2, 6.0), (2, 12.0), (2, 30.0), (4, 4.0), (6, 5.0), (10, 8.0)]
+)
+@pytest.mark.parametrize("wanted", [True, False])
+@pytest.mark.parametrize("driver", [ModbusRtu(station=1), ModbusAscii(station=1), Vigor(station=1)])
+@on_virtual_time
+async def test_after_a_stall_no_old_answer_is_taken_for_a_new_one(
+    driver: AnyDriver, wanted: bool, retries: int, stall: float
+) -> None:
+    """Nothing is lost: the answers to all that was asked meanwhile come one after the other."""
+    area = "D" if driver.protocol == "vigor" else "holding:"
+    numbers = (100, 1000, 1001, 2000, 2001, 2002, 3000, 3001, 3002, 3003)
+    tags = [make_tag(f"{area}{n}", driver, device="plc", type="uint16") for n in numbers]
+    server = DeviceServer()
+    line, dev, memory = behind(server, driver, *tags)
+    dev.timing = replace(dev.timing, retries=retries)
+    for number in range(4000):
+        memory.write(area.strip(":"), number, [number])
+    async with running(line):
+        for phase in range(10):
+            await asyncio.sleep(20 + phase * 0.11)
+            assert dev.standing is Standing.UP
+            server.flows.clear()
+            end = now() + stall
+            while now() < end:
+                await asyncio.sleep(1.0)
+                if wanted:
+                    line.line.refresh(dev, tags[0])
+            server.flows.set()
+        await asyncio.sleep(20)
+        assert line.good(dev)
+    assert told_wrong(line) == []
+
+
+@on_virtual_time
+async def test_after_a_stall_one_bit_is_written_into_the_word_as_it_is() -> None:
+    driver = ModbusRtu(station=1)
+    bit = make_tag("holding:500.3", driver, device="plc", write=WriteRule(verify=True))
+    words = [
+        make_tag(f"holding:{n}", driver, device="plc", type="uint16") for n in (100, 1000, 1001)
+    ]
+    server = DeviceServer()
+    line, dev, memory = behind(server, driver, *words, bit)
+    memory.write("holding", 500, [0xA5A0])
+    async with running(line):
+        for phase in range(20):
+            await asyncio.sleep(20 + phase * 0.055)
+            server.flows.clear()
+            asyncio.get_running_loop().call_later(8.0, server.flows.set)
+            outcomes = []
+            for value in (True, False) * 12:
+                await asyncio.sleep(1.0)
+                outcomes.append(line.submit(dev, bit, value))
+            await asyncio.sleep(6.0)
+            assert sum(isinstance(outcome.once, Written) for outcome in outcomes) > 4
+            assert memory.read("holding", 500)[0] in (0xA5A0, 0xA5A8)
+
+
+@dataclass
+class Few:
+    """A Modbus RTU slave with these holding registers and no others."""
+
+    held: dict[int, int]
+    inner: Any
+
+    def hear(self, data: bytes, at: float) -> list[bytes]:
+        first, count = int.from_bytes(data[2:4], "big"), int.from_bytes(data[4:6], "big")
+        if all(number in self.held for number in range(first, first + count)):
+            return list(self.inner.hear(data, at))
+        refusal = bytes((data[0], data[1] | 0x80, 2))
+        return [refusal + crc16(refusal)]
+
+
+@pytest.mark.parametrize("longest", [2.0, 3.0])
+@on_virtual_time
+async def test_late_refusals_of_what_a_slave_does_not_have_acknowledge_nothing(
+    longest: float,
+) -> None:
+    """An exception names no question: those to our own probes come late, too."""
+    driver = ModbusRtu(station=1, write_single=False)
+    numbers = (100, 101, 200, 201, 300)
+    rule = WriteRule()
+    tags = [
+        make_tag(f"holding:{n}", driver, device="plc", type="uint16", write=rule) for n in numbers
+    ]
+    server = DeviceServer(
+        late=lambda chance: chance.uniform(0, longest) if chance.random() < 0.3 else 0.0, seed=3
+    )
+    dev = Device("plc", driver, WIRE, driver.timing, tuple(tags), GUARD)
+    inner = station_for(driver, [])
+    held: dict[int, set[int]] = {number: {number} for number in numbers}  # ever
+    for number in numbers:
+        inner.memory.write("holding", number, [number])
+    line = Plant([dev], [Few(dict.fromkeys(numbers, 0), inner)], server, WIRE)  # type: ignore[list-item]
+    false: list[object] = []
+
+    def judged(tag: Tag, value: int, outcome: Any) -> None:
+        there = inner.memory.read("holding", tag.address.number)[0]
+        if isinstance(outcome, Written) and there != value:
+            false.append((tag.text, value, there))
+
+    async with running(line):
+        for count in range(1500):
+            tag, value = tags[count % 5], 1000 + count
+            held[tag.address.number].add(value)
+            line.line.submit(dev, tag, [value], partial(judged, tag, value))
+            await asyncio.sleep(0.7)
+    assert false == []
+    good = [s for _, s in line.told if s.quality is Quality.GOOD]
+    assert len(good) > 300
+    assert all(sample.value in held[sample.tag.address.number] for sample in good)
+
+
+@pytest.mark.parametrize(
+    ("driver", "address"),
+    [
+        (Vigor(station=1), "D100"),
+        (ComputerLink(station=1), "D100"),
+        (ModbusRtu(station=1), "holding:100"),
+        (ModbusAscii(station=1), "holding:100"),
+    ],
+)
+@on_virtual_time
+async def test_a_line_that_is_never_quiet_is_no_reason_to_be_silent(
+    driver: AnyDriver, address: str
+) -> None:
+    """A stuck transceiver or another master: values turn bad, writes are answered."""
+    tag = make_tag(address, driver, device="plc", write=WriteRule())
+    server = DeviceServer()
+    line, dev, _ = behind(server, driver, tag)
+
+    async def babble() -> None:
+        while True:
+            server.received(b"\x00")
+            await asyncio.sleep(0.001)
+
+    async with running(line):
+        await asyncio.sleep(5)
+        assert line.good(dev)
+        noise = asyncio.create_task(babble())
+        await asyncio.sleep(0.01)
+        first = line.submit(dev, tag, 7)
+        began = now()
+        await asyncio.sleep(30)
+        assert isinstance(first.once, Busy)
+        assert "never quiet" in str(first.once)
+        assert line.now[tag].quality is Quality.BAD
+        assert line.turned(tag, Quality.BAD, began) - began < 2 * tag.every + 2.0
+        assert not [data for at, data in server.sent if at > began]
+        assert "baud rate" in dev.diagnosis()
+        noise.cancel()
+        await asyncio.sleep(90)
+        assert line.good(dev)
+        second = line.submit(dev, tag, 8)
+        await asyncio.sleep(1)
+        assert isinstance(second.once, Written)
+
+
+@pytest.mark.parametrize("delay", [0.005, 0.04, 0.08])
+@on_virtual_time
+async def test_the_echo_of_our_own_area_c_acknowledges_no_write(delay: float) -> None:
+    """The file does not say that the adapter echoes; every write is lost on the wire."""
+    driver = ComputerLink(station=5, send_area_c=True)
+    tag = make_tag("D100", driver, device="plc", every=0.1, write=WriteRule())
+    server = DeviceServer(echo=True, latency=delay)
+    line, dev, _ = behind(server, driver, tag)
+    line.line._echo = None  # the file says nothing of it
+    async with running(line):
+        await asyncio.sleep(3)
+        server.deaf_to = lambda request: request[5:7] == b"WW"
+        outcomes = list[Outcome]()
+        for value in range(10):
+            outcomes.append(line.submit(dev, tag, value))
+            await asyncio.sleep(7)
+    assert not any(isinstance(outcome.once, Written) for outcome in outcomes)
+
+
+@on_virtual_time
+async def test_a_write_behind_a_long_wait_is_answered_when_its_time_is_over() -> None:
+    """Not only when the conversation before it ends."""
+    driver = Vigor(station=1)
+    tags = [make_tag(f"D{n}", driver, device="plc", write=WriteRule()) for n in (100, 1000)]
+    server = DeviceServer()
+    slow = replace(driver.timing, reply_timeout=15.0)
+    dev = Device("plc", driver, WIRE, slow, tuple(tags), GUARD)
+    line = Plant([dev], [station_for(driver, [])], server, WIRE)  # type: ignore[list-item]
+    async with running(line):
+        await asyncio.sleep(5)
+        server.flows.clear()
+        await asyncio.sleep(2)  # a poll is on its way now
+        outcome = line.submit(dev, tags[0], 5)
+        await asyncio.sleep(6)
+        assert isinstance(outcome.once, Busy)
+        assert outcome.at - outcome.asked == pytest.approx(5.0, abs=0.01)
+
+
+@on_virtual_time
+async def test_on_a_line_that_is_down_no_device_is_up() -> None:
+    driver = Vigor(station=1)
+    server = DeviceServer()
+    tag = make_tag("D100", driver, device="plc")
+    line, dev, _ = behind(server, driver, tag)
+    async with running(line):
+        await asyncio.sleep(5)
+        assert dev.standing is Standing.UP
+        assert server.ear is not None
+        server.ear.lost(LineDown("pulled out"))
+        await asyncio.sleep(0.01)
+        assert dev.standing is Standing.STARTING
+        assert dev.diagnosis() == "pulled out"
+        assert line.reason(tag) is Reason.LINE_DOWN
+        await asyncio.sleep(5)
+        assert dev.standing is Standing.UP
+        assert dev.diagnosis() == ""
+
+
+@pytest.mark.parametrize("reply_timeout", [0.5, 5.0])
+@on_virtual_time
+async def test_a_port_that_goes_while_the_line_settles_is_noticed_at_once(
+    reply_timeout: float,
+) -> None:
+    driver = ModbusRtu(station=1)
+    tag = make_tag("holding:100", driver, device="plc", every=0.2)
+    server = DeviceServer()
+    line, dev, _ = behind(server, driver, tag)
+    dev.timing = replace(driver.timing, reply_timeout=reply_timeout, retries=10)
+    async with running(line):
+        await asyncio.sleep(5)
+        server.flows.clear()
+        await asyncio.sleep(8 * dev.patience)
+        asked = len(server.sent)
+        server.flows.set()
+        await asyncio.sleep(0.4)
+        assert len(server.sent) <= asked + 1  # it settles
+        assert server.ear is not None
+        gone = now()
+        server.ear.lost(LineDown("pulled out"))
+        await asyncio.sleep(0.01)
+        assert line.lives[-1] == (pytest.approx(gone, abs=0.01), "plc", False)
+
+
+@on_virtual_time
+async def test_one_refused_address_does_not_keep_the_turnaround_from_being_learned() -> None:
+    tags = [make_tag(f"D{66 * n}", device="plc1", every=0.5) for n in range(10)]
+    dev = device(tags, reply_timeout=0.5)
+    line = plant([dev])
+    line.stations[0].inner.holes.add(("D", 66))
+    async with running(line):
+        await asyncio.sleep(20)
+        line.stations[0].late = lambda _: 0.4
+        await asyncio.sleep(120)
+        assert dev.reckoned == pytest.approx(0.405, abs=0.02)
+        known = dev.record.overdue
+        await asyncio.sleep(60)
+        assert dev.record.overdue == known
+
+
+@on_virtual_time
+async def test_writes_refused_together_are_answered_when_their_time_is_over() -> None:
+    """They are put back one by one, after the timer had found nobody waiting."""
+    driver = ComputerLink(station=1)
+    tags = [make_tag(f"D{n}", driver, device="plc", write=WriteRule()) for n in (100, 200, 300)]
+    server = DeviceServer()
+    line, dev, _ = behind(server, driver, *tags)
+    dev.timing = replace(driver.timing, reply_timeout=15.0)
+    refuse = b"\x1501FF06"
+    answer = line.stations[0].hear
+
+    def hear(data: bytes, at: float) -> list[bytes]:
+        return [refuse] if data[5:7] == b"WT" else answer(data, at)
+
+    line.stations[0].hear = hear  # type: ignore[method-assign]
+    async with running(line):
+        await asyncio.sleep(5)
+        line.submit(dev, tags[2], 7)  # arms the timer, and is done
+        await asyncio.sleep(4.98)
+        outcomes = [line.submit(dev, tag, n) for n, tag in enumerate(tags[:2])]
+        server.deaf_to = lambda request: request[5:7] == b"WW"  # one by one they get lost
+        await asyncio.sleep(20.0)
+        late = outcomes[1]
+        assert isinstance(late.once, Busy)
+        assert late.at - late.asked < 6.0

@@ -1,0 +1,97 @@
+"""Where everything lies on Zenoh."""
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gateway.errors import BadValue, ConfigError
+from gateway.northbound.keys import Asked, Family, Keys, asked, max_age
+
+KEYS = Keys("site/plant", "hall-1")
+CHUNK = st.from_regex(r"[\w.\-]{1,12}", fullmatch=True)
+TAG = st.lists(CHUNK, min_size=2, max_size=5).map("/".join)
+
+
+def test_the_keys_of_the_contract() -> None:
+    assert KEYS.value("mixer/alarms/door") == "site/plant/mixer/alarms/door"
+    assert KEYS.set("mixer/recipe") == "site/plant/mixer/recipe/@set"
+    assert KEYS.meta("mixer/recipe") == "site/plant/mixer/recipe/@meta"
+    assert KEYS.block("mixer") == "site/plant/mixer/@block"
+    assert KEYS.device("mixer") == "site/plant/mixer"
+    assert KEYS.own == "site/plant/@gateway/hall-1"
+    assert KEYS.status("lines/hall-1") == "site/plant/@gateway/hall-1/lines/hall-1"
+    assert KEYS.writes == "site/plant/@gateway/hall-1/writes"
+
+
+@pytest.mark.parametrize(
+    ("key", "family", "of"),
+    [
+        ("plant/mixer/speed", Family.VALUE, "plant/mixer/speed"),
+        ("plant/**", Family.VALUE, "plant/**"),
+        ("plant/mixer/recipe/@set", Family.SET, "plant/mixer/recipe"),
+        ("plant/**/@set", Family.SET, "plant/**"),
+        ("**/@meta", Family.META, "**"),
+        ("plant/*/@block", Family.BLOCK, "plant/*"),
+        ("plant/@gateway/*/status", Family.STATUS, "plant/@gateway/*/status"),
+        ("plant/**/@adv/**", Family.LAST, "plant/**"),
+        ("plant/mixer/speed/@adv/**", Family.LAST, "plant/mixer/speed"),
+    ],
+)
+def test_a_key_that_arrives_says_what_is_asked(key: str, family: Family, of: str) -> None:
+    assert asked(key) == Asked(family, of)
+
+
+@pytest.mark.parametrize("key", ["plant/*/speed", "plant/**", "plant/mix$*/speed/@set"])
+def test_a_wildcard_of_any_kind_is_seen(key: str) -> None:
+    assert asked(key).is_wild
+    assert not asked("plant/mixer/speed").is_wild
+
+
+@given(TAG)
+@settings(max_examples=50)
+def test_every_tag_comes_back_from_each_of_its_keys(tag: str) -> None:
+    assert KEYS.tag(KEYS.value(tag)) == tag
+    for key, family in (
+        (KEYS.value(tag), Family.VALUE),
+        (KEYS.set(tag), Family.SET),
+        (KEYS.meta(tag), Family.META),
+    ):
+        assert asked(key).family is family
+        assert KEYS.tag(asked(key).of) == tag
+
+
+@given(st.text(alphabet="ab/@*$set_metablockgwy", max_size=40))
+@settings(max_examples=200)
+def test_any_key_at_all_asks_for_something(key: str) -> None:
+    assert len(asked(key).of) <= len(key)
+
+
+def test_a_key_outside_the_prefix_is_no_tag() -> None:
+    assert KEYS.tag("site/plantation/mixer/speed") is None
+    assert KEYS.tag("site/plant") is None
+
+
+@pytest.mark.parametrize("prefix", ["", "/plant", "plant/", "a//b", "@plant", "pl*nt", "a b", "a#"])
+def test_a_prefix_that_is_no_key_is_refused_with_the_reason(prefix: str) -> None:
+    with pytest.raises(ConfigError, match="letters, digits"):
+        Keys(prefix, "demo")
+
+
+def test_a_gateways_name_is_one_chunk() -> None:
+    with pytest.raises(ConfigError, match="the gateway's name 'a/b'"):
+        Keys("plant", "a/b")
+    assert Keys("工場/площадка", "größe-1").own == "工場/площадка/@gateway/größe-1"
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"),
+    [("0s", 0.0), ("0", 0.0), ("500ms", 0.5), ("2s", 2.0), ("1.5s", 1.5), ("15min", 900.0)],
+)
+def test_an_age_is_written_like_every_duration(text: str, seconds: float) -> None:
+    assert max_age(text) == seconds
+
+
+@pytest.mark.parametrize("text", ["", "s", "-1s", "1 s", "nan", "inf", "1e3s", "9" * 400, "1s\n"])
+def test_an_age_that_is_no_duration_is_refused(text: str) -> None:
+    with pytest.raises(BadValue, match="no duration"):
+        max_age(text)

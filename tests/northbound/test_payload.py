@@ -1,0 +1,212 @@
+"""What travels on Zenoh, byte for byte."""
+
+import json
+import math
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gateway.errors import (
+    BadValue,
+    Busy,
+    Garbled,
+    GatewayError,
+    LineDown,
+    NoReply,
+    Refused,
+    Unclear,
+)
+from gateway.northbound import payload
+from gateway.northbound.payload import Failure, Problem, WriteOutcome
+from gateway.protocols.driver import Address, Span, Unit
+from gateway.tags import Deadband, Reason, Tag, WriteRule, Written, bad, good
+from gateway.values import Layout, Value, parse_type
+
+NOON = 1_795_176_000_123_456_789  # 2026-11-20T12:00:00.123456789Z
+
+
+def tag(name: str = "speed", kind: str = "int16", **settings: Any) -> Tag:
+    return Tag(
+        device="mixer",
+        name=name,
+        text="D100",
+        address=Address("D", 100),
+        span=Span("D", 100, 1),
+        unit_kind=Unit.WORD,
+        layout=Layout(parse_type(kind)),
+        **settings,
+    )
+
+
+def test_a_good_value_as_the_contract_prints_it() -> None:
+    assert payload.value(good(tag(), 12.5, NOON)) == (
+        b'{"value":12.5,"quality":"good","time":"2026-11-20T12:00:00.123456Z"}'
+    )
+
+
+@pytest.mark.parametrize("reason", list(Reason))
+def test_a_bad_value_is_null_and_says_why(reason: Reason) -> None:
+    document = json.loads(payload.value(bad(tag(), reason, NOON, "the station is silent")))
+    assert document == {
+        "value": None,
+        "quality": "bad",
+        "reason": reason.value,
+        "time": "2026-11-20T12:00:00.123456Z",
+        "detail": "the station is silent",
+    }
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_what_json_cannot_write_is_never_a_good_null(value: float) -> None:
+    document = json.loads(payload.value(good(tag(), value, NOON)))
+    assert (document["quality"], document["reason"]) == ("bad", "not-a-number")
+
+
+@given(
+    st.booleans()
+    | st.integers(-(2**63), 2**64 - 1)
+    | st.floats(allow_nan=False, allow_infinity=False)
+    | st.text(st.characters(max_codepoint=255))
+)
+@settings(max_examples=150)
+def test_every_value_arrives_as_it_was(value: Value) -> None:
+    document = json.loads(payload.value(good(tag(), value, NOON)))
+    assert document["value"] == value
+    assert type(document["value"]) is type(value)
+    assert document["quality"] == "good"
+
+
+@given(st.integers(0, 4_000_000_000 * 10**9))
+@settings(max_examples=50)
+def test_time_is_utc_with_six_digits(time: int) -> None:
+    text = payload.rfc3339(time)
+    assert len(text) == len("2026-11-20T12:00:00.123456Z")
+    assert text.endswith(f".{time // 1000 % 10**6:06}Z")
+
+
+def test_a_block_holds_every_tag_by_name() -> None:
+    samples = [good(tag("speed"), 12, NOON), bad(tag("alarms/door"), Reason.NO_REPLY, NOON)]
+    document = json.loads(payload.block(samples))
+    assert document["speed"]["value"] == 12
+    assert document["alarms/door"]["reason"] == "no-reply"
+
+
+def test_meta_says_type_address_interval_and_limits() -> None:
+    rule = WriteRule(min=1, max=40, verify=True)
+    of = tag(kind="float32", unit="rpm", write=rule, deadband=Deadband(0.5), every=0.5)
+    document = json.loads(payload.meta(of))
+    assert document["type"] == "float32"
+    assert document["address"] == "D100"
+    assert document["unit"] == "rpm"
+    assert document["every"] == 0.5
+    assert document["write"] == {"min": 1, "max": 40, "verify": True}
+    assert document["deadband"] == {"amount": 0.5, "percent": False}
+    assert json.loads(payload.meta(tag()))["write"] is None
+
+
+@pytest.mark.parametrize(
+    ("sent", "value"),
+    [
+        (b"true", True),
+        (b"12.5", 12.5),
+        (b"12", 12),
+        (b'"AB"', "AB"),
+        (b'{"value": 12.5}', 12.5),
+        (b' {"value": false} ', False),
+        (b"18446744073709551615", 2**64 - 1),
+        (b"-9223372036854775809", -(2**63) - 1),  # exactly, so that it can be refused
+    ],
+)
+def test_a_write_is_a_scalar_or_an_object_with_the_value(sent: bytes, value: Value) -> None:
+    found = payload.wanted(sent)
+    assert found == value
+    assert type(found) is type(value)
+
+
+@pytest.mark.parametrize(
+    "sent",
+    [
+        b"",
+        b" \n",
+        b"null",
+        b"[1]",
+        b"{}",
+        b'{"value": null}',
+        b'{"value": {"value": 1}}',
+        b'{"value": 1, "value": 2}',
+        b'{"value": 1, "quality": "good"}',
+        b'{"valu": 1}',
+        b"NaN",
+        b"-Infinity",
+        b"1e400",
+        b"9" * 5000,
+        b"12.5 13",
+        b"0x10",
+        b"tru",
+        b'"AB',
+        b'"\\ud800"',
+        b"\xff\xfe1\x00",
+        b"\xef\xbb\xbf1",
+        b"[" * 60_000,
+        b'{"value":' * 7000,
+        b'"' + b"A" * 65_536 + b'"',
+    ],
+)
+def test_whatever_else_is_sent_is_a_bad_value(sent: bytes) -> None:
+    with pytest.raises(BadValue):
+        payload.wanted(sent)
+
+
+@given(st.binary(max_size=64))
+@settings(max_examples=300)
+def test_any_bytes_are_a_value_or_a_bad_value(sent: bytes) -> None:
+    try:
+        found = payload.wanted(sent)
+    except BadValue:
+        return
+    assert isinstance(found, (bool, int, float, str))
+
+
+@pytest.mark.parametrize(
+    ("error", "word", "code"),
+    [
+        (BadValue("too large"), "bad-value", None),
+        (Refused("no such area", code="28"), "refused", "28"),
+        (NoReply("silence"), "unclear", None),
+        (Garbled("noise"), "unclear", None),
+        (Unclear("who knows"), "unclear", None),
+        (LineDown("no port"), "line-down", None),
+        (Busy("later"), "busy", None),
+        (GatewayError("something new"), "unclear", None),
+    ],
+)
+def test_every_error_has_its_word(error: GatewayError, word: str, code: str | None) -> None:
+    document = json.loads(payload.outcome(payload.failure(error)))
+    assert document == {"error": word, "code": code, "reason": str(error)}
+
+
+def test_the_answer_to_a_write() -> None:
+    document = json.loads(payload.outcome(Written(12.5, NOON, 0.0310001, verified=True)))
+    assert document == {
+        "value": 12.5,
+        "time": "2026-11-20T12:00:00.123456Z",
+        "verified": True,
+        "acknowledged": True,
+        "took": 0.031,
+    }
+
+
+def test_an_answer_is_short_and_utf8_whatever_was_sent() -> None:
+    endless = Failure(Problem.BAD_VALUE, "\ud800" + "x" * 60_000)
+    assert len(payload.outcome(endless)) < 500
+
+
+@pytest.mark.parametrize("asked", [None, True, 12, 12.5, "AB", 10**400, -(10**30), "x" * 60_000])
+def test_the_audit_line_is_written_for_every_value_asked(asked: Value | None) -> None:
+    done = WriteOutcome("plant/mixer/recipe", asked, Failure(Problem.BUSY, "later"), NOON, 0.01)
+    document = json.loads(payload.write_outcome(done))
+    assert document["outcome"] == "busy"
+    assert document["key"] == "plant/mixer/recipe"
+    assert len(str(document["value"])) < 400

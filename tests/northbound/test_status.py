@@ -1,0 +1,94 @@
+"""What the status documents say of lines and devices."""
+
+import asyncio
+import json
+from pathlib import Path
+from typing import Any
+
+from gateway.app import Gateway
+from gateway.config import load
+from gateway.engine.device import Device
+from gateway.errors import NoReply
+from gateway.line.line import Line
+from gateway.northbound import payload
+from gateway.northbound.status import device_document
+from tests.e2e.processes import vigor_line, write_config
+
+TAGS = {"speed": {"address": "D10"}, "door": {"address": "M12"}}
+
+
+def made(folder: Path, **device: Any) -> Gateway:
+    line = vigor_line("simulator", TAGS, **device)
+    return Gateway(load(write_config(folder / "c.yaml", "tcp/127.0.0.1:7447", {"hall": line})))
+
+
+def only(gateway: Gateway) -> tuple[Line, Device]:
+    [line] = gateway.lines
+    [device] = line.devices
+    return line, device
+
+
+async def served(gateway: Gateway, until: str) -> None:
+    """Runs the one line until the device stands so."""
+    line, device = only(gateway)
+    task = asyncio.create_task(line.run())
+    async with asyncio.timeout(10):
+        while device.standing.value != until:
+            await asyncio.sleep(0)
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)
+
+
+async def test_before_anything_was_said(tmp_path: Path) -> None:
+    documents = made(tmp_path).status()
+    assert set(documents) == {"status", "lines/hall", "devices/mixer"}
+    status = documents["status"]
+    assert (status["name"], status["tags"]) == ("demo", 2)
+    assert (status["lines"], status["devices"]) == ({"hall": False}, {"mixer": "starting"})
+    device = documents["devices/mixer"]
+    assert (device["protocol"], device["station"]) == ("vigor", 1)
+    assert (device["exchanges"], device["turnaround"], device["diagnosis"]) == (0, None, "")
+    line = documents["lines/hall"]
+    assert (line["open"], line["opened"], line["baudrate"]) == (False, 0, 19200)
+
+
+async def test_what_was_said_is_counted(tmp_path: Path) -> None:
+    gateway = made(tmp_path)
+    await served(gateway, "up")
+    document = gateway.status()["devices/mixer"]
+    assert document["standing"] == "up"
+    assert isinstance(document["exchanges"], int)
+    assert document["exchanges"] >= 1
+    assert document["failures"] == {}
+
+
+async def test_a_device_in_trouble_says_what_to_look_for(tmp_path: Path) -> None:
+    _, device = only(made(tmp_path))
+    device.failed(NoReply("no reply"), None, 0.0)
+    document = device_document(device, [])
+    assert document["failures"] == {"silence": 1}
+    assert "check power, wiring" in str(document["diagnosis"])
+
+
+async def test_a_disabled_device_has_no_document_of_its_own(tmp_path: Path) -> None:
+    documents = made(tmp_path, enabled=False).status()
+    assert set(documents) == {"status", "lines/hall"}
+    assert documents["status"]["devices"] == {}
+
+
+async def test_every_document_is_json(tmp_path: Path) -> None:
+    gateway = made(tmp_path)
+    await served(gateway, "up")
+    for document in gateway.status().values():
+        assert json.loads(payload.document(document)).keys() == document.keys()
+
+
+async def test_a_line_tells_what_was_promised(tmp_path: Path) -> None:
+    gateway = made(tmp_path)
+    line, device = only(gateway)
+    expected = gateway.status()["lines/hall"]["expected"]
+    load = sum(device.seconds(block.cost) / block.every for block in device.blocks)
+    assert isinstance(expected, dict)
+    assert expected["load"] == round(load, 4)
+    assert expected["requests_per_second"] == 10  # two blocks, five times a second
+    assert line.wire.baudrate == 19200

@@ -1,0 +1,154 @@
+"""Whatever set of addresses a device refuses, halving finds it and the rest is merged again."""
+
+import math
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gateway.engine.device import Device
+from gateway.planning.bad_addresses import RETRY
+from gateway.planning.planner import Block
+from gateway.protocols.driver import Span
+from tests.sim.plant import device, make_tag
+
+
+class Asker:
+    """Does with a device's blocks what the line does, and counts."""
+
+    def __init__(self, device: Device, missing: set[int]) -> None:
+        self.device = device
+        self.missing = missing
+        self.exchanges = 0
+
+    def there(self, block: Block) -> bool:
+        start, size = block.span.start, block.span.size
+        return not any(start <= n < start + size for n in self.missing)
+
+    def ask(self, block: Block) -> bool:
+        """True when the device was planned anew."""
+        refusals = self.device.refusals
+        self.exchanges += 1
+        if self.there(block):
+            again = refusals.read(block)
+            if again:
+                refusals.abandon()
+            if again or refusals.settle():
+                self.device.plan()
+                return True
+            return False
+        halves = refusals.refused(block, 7, "28")
+        if any(self.ask(half) for half in halves):
+            return True
+        if not halves and refusals.settle():
+            self.device.plan()
+            return True
+        return False
+
+    def settle(self) -> None:
+        """Rounds over all blocks until one goes by in which nothing new is learnt."""
+        for _ in range(200):
+            blocks = self.device.blocks
+            for block in blocks:
+                if block.span not in self.device.refusals.bad and self.ask(block):
+                    break
+            else:
+                if not self.device.refusals.searching:
+                    return
+        raise AssertionError("the search does not end")
+
+
+def words(*numbers: int) -> Device:
+    return device([make_tag(f"D{n}") for n in numbers])
+
+
+def bad_numbers(found: Device) -> set[int]:
+    return {span.start for span in found.refusals.bad}
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.sets(st.integers(0, 63), min_size=1), st.sets(st.integers(0, 63), max_size=6))
+def test_any_set_of_refused_addresses_is_found(numbers: set[int], missing: set[int]) -> None:
+    """Those of tags are named; holes in the gaps are planned around; all else is read."""
+    found = words(*sorted(numbers))
+    asker = Asker(found, missing)
+    asker.settle()
+    assert bad_numbers(found) == numbers & missing
+    for block in found.blocks:
+        assert asker.there(block) or block.span in found.refusals.bad
+    assert {tag for b in found.blocks for tag in b.tags} == set(found.tags)
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.sets(st.integers(0, 63), max_size=5))
+def test_neighbours_of_the_culprits_stay_merged(missing: set[int]) -> None:
+    """With every address in use: one block for each run between two culprits, no more."""
+    found = words(*range(64))
+    Asker(found, missing).settle()
+    runs = "".join(" " if n in missing else "x" for n in range(64)).split()
+    good = [block for block in found.blocks if block.span not in found.refusals.bad]
+    assert [block.span.size for block in good] == [len(run) for run in runs]
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.sets(st.integers(0, 63), min_size=1, max_size=6))
+def test_the_search_takes_about_two_log_n_exchanges_for_each_culprit(missing: set[int]) -> None:
+    found = words(*range(64))
+    asker = Asker(found, missing)
+    (whole,) = found.blocks
+    asker.ask(whole)
+    assert asker.exchanges <= 1 + 2 * len(missing) * math.ceil(math.log2(64))
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    st.sets(st.integers(0, 40), min_size=1, max_size=6),
+    st.lists(st.integers(0, 40), min_size=1, max_size=6),
+)
+def test_an_address_that_comes_back_is_merged_again(missing: set[int], returns: list[int]) -> None:
+    found = words(*range(41))
+    asker = Asker(found, missing)
+    asker.settle()
+    for number in returns:
+        asker.missing.discard(number)
+        for block in found.blocks:
+            if block.span in found.refusals.bad and asker.ask(block):
+                break
+        asker.settle()
+        assert bad_numbers(found) == asker.missing
+        assert not found.refusals.searching
+    asker.missing.clear()
+    for _ in range(41):
+        asker.settle()
+        for block in found.blocks:
+            if block.span in found.refusals.bad and asker.ask(block):
+                break
+    assert [block.span.size for block in found.blocks] == [41]
+
+
+def test_a_culprit_that_rides_in_a_faster_block_is_fenced_off() -> None:
+    """Its boundaries lie in a gap of the faster tags: they must be kept there too."""
+    fast = [make_tag(f"D{n}", every=0.1) for n in (0, 1, 8, 9)]
+    found = device([*fast, make_tag("D5", every=5.0)])
+    assert [block.span for block in found.blocks] == [Span("D", 0, 10)]
+    asker = Asker(found, {5})
+    asker.settle()
+    assert bad_numbers(found) == {5}
+    assert sorted(block.span.start for block in found.blocks) == [0, 5, 8]
+
+
+def test_the_range_is_remembered_with_its_time_code_and_tags() -> None:
+    found = words(3)
+    (block,) = found.blocks
+    assert found.refusals.refused(block, 77, "28") == ()
+    (bad,) = found.refusals.bad.values()
+    assert (bad.span, bad.since, bad.code, bad.tags) == (block.span, 77, "28", block.tags)
+    assert found.refusals.refused(block, 99, "28") == ()
+    assert found.refusals.bad[block.span].since == 77
+
+
+def test_a_refused_address_is_asked_rarely() -> None:
+    found = words(3)
+    (block,) = found.blocks
+    assert found.interval(block) == 1.0
+    found.refusals.refused(block, 0, "28")
+    assert found.interval(block) == RETRY

@@ -1,0 +1,329 @@
+"""Lists registered in the PLC: chosen where cheaper, registered anew after any trouble."""
+
+import asyncio
+import random
+from typing import Any
+
+import pytest
+
+from gateway.engine.device import Device
+from gateway.planning.monitor_lists import with_list
+from gateway.planning.planner import Block
+from gateway.protocols.computer_link import ComputerLink, Nak
+from gateway.protocols.vigor import Vigor
+from gateway.stations.computer_link.devices import Cells, Kind
+from gateway.tags import Quality, Reason, Sample
+from tests.sim.links import commands, link_device, link_plant, spelt
+from tests.sim.plant import Plant, clock_word, clockwork, running
+from tests.sim.virtual import on_virtual_time
+
+SCATTERED = [f"D{n}" for n in range(0, 3000, 400)]
+POINTS = [f"M{n}" for n in range(0, 1000, 100)]
+
+
+def now() -> float:
+    return asyncio.get_running_loop().time()
+
+
+def one(*addresses: str, every: float = 0.5, **settings: Any) -> tuple[Plant, Device]:
+    driver = ComputerLink(station=5, monitor=settings.pop("monitor", True))
+    dev = link_device(driver, *addresses, every=every, **settings)
+    return link_plant([dev]), dev
+
+
+def listed(dev: Device) -> list[Block]:
+    return [block for block in dev.blocks if block.listed]
+
+
+# Chosen
+
+
+@pytest.mark.parametrize("addresses", [SCATTERED, POINTS], ids=["words", "points"])
+def test_scattered_addresses_are_read_by_a_list(addresses: list[str]) -> None:
+    _, dev = one(*addresses)
+    [block] = dev.blocks
+    assert len(block.listed) == len(addresses)
+    assert {tag.text for tag in block.tags} == set(addresses)
+
+
+@pytest.mark.parametrize(
+    ("addresses", "settings"),
+    [
+        ([f"D{n}" for n in range(40)], {}),  # neighbours
+        (["D0"], {}),  # one: a list saves no exchange
+        (["C200", "C240"], {}),  # 32 bits: MN cannot
+        (SCATTERED, {"monitor": False}),
+    ],
+    ids=["neighbours", "a single one", "32 bits", "not wanted"],
+)
+def test_no_list_where_it_is_not_cheaper_or_not_wanted(
+    addresses: list[str], settings: dict[str, Any]
+) -> None:
+    _, dev = one(*addresses, **settings)
+    assert listed(dev) == []
+
+
+def test_a_list_is_never_dearer_and_every_tag_is_read_once() -> None:
+    chance = random.Random(7)
+    chosen = 0
+    for _ in range(60):
+        numbers = chance.sample(range(3999), chance.randint(1, 30))
+        texts = [chance.choice(["D", "D", "M", "S", "TN"]) + f"{n % 250}" for n in numbers]
+        addresses = list(dict.fromkeys(texts))
+        _, with_lists = one(*addresses)
+        _, without = one(*addresses, monitor=False)
+        assert with_lists.load <= without.load * (1 + 1e-9)
+        read = [tag.text for block in with_lists.blocks for tag in block.tags]
+        assert sorted(read) == sorted(addresses)
+        chosen += bool(listed(with_lists))
+        for block in listed(with_lists):
+            assert len(block.listed) <= 10
+    assert chosen > 20
+
+
+def test_refused_addresses_are_in_no_list() -> None:
+    _, dev = one(*SCATTERED)
+    dev.lists = False
+    dev.plan()
+    bad = next(block for block in dev.blocks if block.tags[0].text == "D800")
+    dev.refusals.refused(bad, 0, "06")
+    dev.lists = True
+    dev.plan()
+    [block] = listed(dev)
+    assert {tag.text for tag in block.tags} == set(SCATTERED) - {"D800"}
+    assert bad.span in {other.span for other in dev.blocks if not other.listed}
+
+
+def test_a_driver_without_lists_keeps_its_plan() -> None:
+    _, dev = one(*SCATTERED, monitor=False)
+    assert with_list(dev.blocks, Vigor(station=1), dev.seconds) == dev.blocks
+
+
+# Registered, read, and registered again
+
+
+@on_virtual_time
+async def test_a_list_is_registered_once_and_then_read() -> None:
+    line, dev = one(*SCATTERED, *POINTS[:3])
+    station = line.stations[0]
+    for n, text in enumerate(SCATTERED):
+        station.memory.write("D", int(text[1:]), [100 + n])
+    station.memory.write("M", 100, [1])
+    async with running(line):
+        await asyncio.sleep(10)
+        assert line.good(dev)
+        values = {tag.text: line.now[tag].value for tag in dev.tags}
+        assert values == {text: 100 + n for n, text in enumerate(SCATTERED)} | {
+            "M0": False,
+            "M100": True,
+            "M200": False,
+        }
+        sent = commands(station)
+        assert sent.count("WM") == 1
+        assert sent.count("MN") >= 18
+
+
+async def _lost(line: Plant) -> None:
+    line.stations[0].inner.forget_monitor()  # type: ignore[attr-defined]
+
+
+async def _power_cycle(line: Plant) -> None:
+    line.stations[0].mute = True
+    line.stations[0].inner.power_cycle()  # type: ignore[attr-defined]
+    await asyncio.sleep(0.7)
+    line.stations[0].mute = False
+
+
+async def _timed_out(line: Plant) -> None:
+    station = line.stations[0]
+    station.late = lambda _: 0.4
+    while not line.devices[0].failures:
+        await asyncio.sleep(0.01)
+    station.late = lambda _: 0.0
+
+
+async def _line_lost(line: Plant) -> None:
+    """Another computer used the port meanwhile, and left a list of the same length."""
+    line.bench.vanish()
+    _other_list(line)
+    await asyncio.sleep(1)
+    line.bench.come_back()
+
+
+async def _somebody_else_spoke(line: Plant) -> None:
+    """Another computer on the wire registered a list of the same length, and was heard."""
+    while line.line._turn is not None:
+        await asyncio.sleep(0.001)
+    _other_list(line)
+    line.bench.received(b"\x0505FFWM0")
+
+
+def _other_list(line: Plant) -> None:
+    station = line.stations[0].inner
+    station._words = [Cells("D", 3900 + i, 1, Kind.WORDS) for i in range(len(SCATTERED))]  # type: ignore[attr-defined]
+
+
+TROUBLES = [_lost, _power_cycle, _timed_out, _line_lost, _somebody_else_spoke]
+
+
+@pytest.mark.parametrize("trouble", TROUBLES, ids=lambda trouble: trouble.__name__[1:])
+@on_virtual_time
+async def test_after_any_trouble_the_list_is_registered_again(trouble: Any) -> None:
+    line, dev = one(*SCATTERED)
+    station = line.stations[0]
+    clockwork(station.memory, [int(text[1:]) for text in SCATTERED])
+    station.memory.write("D", 3900, [7777] * len(SCATTERED))
+    async with running(line):
+        await asyncio.sleep(5)
+        assert commands(station).count("WM") == 1
+        since = now()
+        await trouble(line)
+        await asyncio.sleep(10)
+        assert line.good(dev)
+        assert dev.lists
+        assert listed(dev)
+        again = commands(station, since)
+        assert again.count("WM") == 1
+        assert again[-1] == "MN"
+        told = [sample for at, sample in line.told if at >= since]
+        assert 7777 not in {sample.value for sample in told}
+        assert not [s for s in told if s.reason is Reason.REFUSED]
+
+
+@on_virtual_time
+async def test_a_registration_that_is_not_acknowledged_is_not_believed() -> None:
+    """Two lists of one length: the PLC still holds the other."""
+    line, dev = one(*SCATTERED)
+    station = line.stations[0]
+    clockwork(station.memory, [int(text[1:]) for text in SCATTERED])
+    station.memory.write("D", 3900, [7777] * len(SCATTERED))
+    _other_list(line)
+    original = station.inner._answer
+    deaf = 2
+
+    def sometimes(text: str, at: float) -> Any:
+        nonlocal deaf
+        if text[4:6] == "WM" and deaf:
+            deaf -= 1
+            return None
+        return original(text, at)
+
+    station.inner._answer = sometimes  # type: ignore[method-assign,assignment]
+    async with running(line):
+        await asyncio.sleep(20)
+        assert line.good(dev)
+        assert commands(station).count("WM") == 3
+        assert 7777 not in {sample.value for _, sample in line.told}
+
+
+# Falling back
+
+
+@on_virtual_time
+async def test_an_address_that_is_not_there_is_found_and_the_others_are_listed_again() -> None:
+    line, dev = one(*SCATTERED)
+    station = line.stations[0]
+    station.inner.holes = {("D", 800)}
+    start = now()
+    async with running(line):
+        await asyncio.sleep(10)
+        for tag in dev.tags:
+            if tag.text == "D800":
+                assert line.reason(tag) is Reason.REFUSED
+            else:
+                assert line.turned(tag, Quality.GOOD, start) - start < 3
+                assert line.now[tag].quality is Quality.GOOD
+        [block] = listed(dev)
+        assert spelt(dev, "D800") not in block.tags
+        assert set(commands(station, now() - 3)) == {"MN"}
+        station.inner.holes = set()
+        await asyncio.sleep(310)
+        assert line.good(dev)
+        assert len(listed(dev)[0].tags) == len(SCATTERED)
+
+
+@on_virtual_time
+async def test_a_plc_without_these_commands_is_read_without_lists() -> None:
+    line, dev = one(*SCATTERED)
+    station = line.stations[0]
+    original = station.inner._answer
+    station.inner._answer = (
+        lambda text, at: (  # type: ignore[method-assign]
+            Nak(5, "03") if text[4:6] == "WM" else original(text, at)
+        )
+    )
+    async with running(line):
+        await asyncio.sleep(10)
+        assert line.good(dev)
+        assert listed(dev) == []
+        assert commands(station).count("WM") == 2
+        assert set(commands(station, now() - 3)) == {"WR"}
+
+
+@on_virtual_time
+async def test_falling_back_keeps_the_age_of_what_was_read() -> None:
+    """When the device fails before the new requests were asked once, old values still turn bad."""
+    line, dev = one(*SCATTERED, every=2.0, reply_timeout=1.0, guard=1.0, retries=20)
+    async with running(line):
+        await asyncio.sleep(5)
+        assert line.good(dev)
+        line.line._then._replan(dev)
+        dev.lists = False
+        line.line._then._replan(dev)
+        line.stations[0].mute = True
+        await asyncio.sleep(8)
+        assert {line.now[tag].quality for tag in dev.tags} == {Quality.BAD}
+
+
+# All of it at once
+
+
+class Witness:
+    """Checks every good value against the clock during the exchange that fetched it."""
+
+    def __init__(self, plant: Plant) -> None:
+        self.plant = plant
+        self.right = 0
+        self.wrong: list[tuple[float, str, int]] = []
+        plant.line._then.upstairs = self
+
+    def alive(self, device: Device, alive: bool) -> None: ...
+
+    def samples(self, samples: Any) -> None:
+        sample: Sample
+        began = self.plant.bench.sent[-1][0] if self.plant.bench.sent else 0.0
+        for sample in samples:
+            if sample.quality is not Quality.GOOD:
+                continue
+            n, value = sample.tag.address.number, sample.value
+            assert isinstance(value, int)
+            age = (clock_word(now(), n) - value) % 65536
+            if age <= (now() - began) * 1000 + 1:
+                self.right += 1
+            else:
+                self.wrong.append((now(), sample.tag.key, age))
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+@on_virtual_time
+async def test_whatever_happens_to_the_list_no_wrong_value_is_shown_as_good(seed: int) -> None:
+    line, dev = one(*SCATTERED, every=0.2, type="uint16", guard=0.3)
+    station = line.stations[0]
+    clockwork(station.memory, [int(text[1:]) for text in SCATTERED])
+    station.memory.write("D", 3900, [7777] * len(SCATTERED))
+    station.late = lambda chance: 0.3 + chance.uniform(0.05, 0.6) if chance.random() < 0.1 else 0.0
+    station.lose = 0.05
+    chance, witness = random.Random(seed), Witness(line)
+    async with running(line):
+        for _ in range(150):
+            await asyncio.sleep(chance.uniform(0.1, 6))
+            await chance.choice([_lost, _power_cycle, _line_lost, _somebody_else_spoke])(line)
+        station.late, station.lose = (lambda _: 0.0), 0.0
+        await asyncio.sleep(60)
+        before = witness.right
+        await asyncio.sleep(60)
+        assert witness.right - before > 200
+    assert witness.wrong == []
+    assert witness.right > 2000
+    assert commands(station).count("WM") > 100
+    assert dev.record.late > 10
