@@ -26,7 +26,7 @@ from gateway.engine.device import Device
 from gateway.engine.forecast import forecast
 from gateway.errors import GatewayError
 from gateway.line.line import Line
-from gateway.planning.wire_timing import Wire, character_bits
+from gateway.planning.wire_timing import WireTiming, character_bits
 from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.driver import AnyDriver
 from gateway.protocols.modbus import ModbusRtu
@@ -35,7 +35,7 @@ from gateway.stations.computer_link import ComputerLinkStation
 from gateway.stations.modbus import ModbusStation
 from gateway.stations.station import Station
 from gateway.stations.vigor import VigorStation
-from gateway.tags import Sample, Tag, Written
+from gateway.tags import Sample, Tag, WriteResult
 from gateway.transport import SerialPath, SerialSettings, open_port
 
 TURNAROUND = 0.005
@@ -102,8 +102,8 @@ async def writing(line: Line, device: Device, tag: Tag, took: list[float]) -> No
         number += 1
         told = asyncio.Event()
 
-        def done(outcome: Written | GatewayError, told: asyncio.Event = told) -> None:
-            if isinstance(outcome, Written):
+        def done(outcome: WriteResult | GatewayError, told: asyncio.Event = told) -> None:
+            if isinstance(outcome, WriteResult):
                 took.append(outcome.took)
             told.set()
 
@@ -122,7 +122,7 @@ async def measure(name: str, baud: int, seconds: float, *, writes: bool = False)
     assert child.stdin is not None
     assert child.stdout is not None
     path = child.stdout.readline().strip()
-    driver, wire = setting.driver(), Wire(baud, setting.bits)
+    driver, wire = setting.driver(), WireTiming(baud, setting.bits)
     device = Device(
         "plc", driver, wire, driver.timing, tags(setting.area), 0.5, turnaround=TURNAROUND
     )

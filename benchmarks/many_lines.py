@@ -19,17 +19,17 @@ import structlog
 
 from gateway.engine.device import Device
 from gateway.line.line import Line
-from gateway.planning.wire_timing import Wire
+from gateway.planning.wire_timing import WireTiming
 from gateway.protocols.vigor import Vigor
 from gateway.simulator.port import open_simulator
 from gateway.stations.vigor import VigorStation
 from gateway.tags import Sample
 from gateway.tags.mirror import Mirror
-from gateway.transport import Ear, Port
+from gateway.transport import Port, Receiver
 from tests.sim.plant import make_tag
 from tests.sim.virtual import run_virtual
 
-WIRE = Wire(115200, 10)
+WIRE = WireTiming(115200, 10)
 TAGS = 50
 
 
@@ -63,7 +63,7 @@ def devices(line: int, stations: int) -> list[Device]:
     return found
 
 
-def opener(stations: Sequence[VigorStation]) -> Callable[[Ear], Awaitable[Port]]:
+def opener(stations: Sequence[VigorStation]) -> Callable[[Receiver], Awaitable[Port]]:
     return lambda ear: open_simulator(stations, WIRE, ear)
 
 

@@ -38,7 +38,7 @@ from gateway.northbound import Mode, Northbound, ZenohSettings
 from gateway.northbound.session import configure
 from gateway.protocols.driver import Address, Span, Unit
 from gateway.service import COLLECT, SWITCH
-from gateway.tags import Sample, Tag, WriteRule, Written, good
+from gateway.tags import Sample, Tag, WriteResult, WriteRule, good
 from gateway.tags.mirror import Mirror
 from gateway.values import Layout, Value, parse_type
 from tests.zenoh_peer import free_endpoint
@@ -73,9 +73,9 @@ class Plant:
     def sample(self, tag: Tag) -> Sample:
         return self.mirror[tag]
 
-    async def write(self, tag: Tag, value: Value) -> Written:
+    async def write(self, tag: Tag, value: Value) -> WriteResult:
         tag.encode(value)
-        return Written(value, time.time_ns(), took=0.0)
+        return WriteResult(value, time.time_ns(), took=0.0)
 
     def told(self, samples: Sequence[Sample]) -> None:
         self.mirror.told(samples)

@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from gateway.planning.planner import plan
-from gateway.planning.wire_timing import Wire
+from gateway.planning.wire_timing import WireTiming
 from gateway.protocols.driver import Address, Cost, Span, Unit
 from gateway.protocols.modbus import ModbusRtu
 from gateway.tags import Tag
@@ -44,7 +44,7 @@ def tags() -> list[Tag]:
     ]
 
 
-def seconds(wire: Wire, size: int) -> float:
+def seconds(wire: WireTiming, size: int) -> float:
     cost = DRIVER.cost(Span("holding", 0, size))
     assert cost is not None
     return wire.exchange(cost, DRIVER.timing, TURNAROUND)
@@ -62,7 +62,7 @@ def fixed_gap(gap: int) -> list[int]:
     return [*sizes, last - start + 1]
 
 
-def optimum(wire: Wire) -> float:
+def optimum(wire: WireTiming) -> float:
     """The least time by plain dynamic programming, written again here to check the planner."""
     row = addresses()
     best = [0.0]
@@ -77,7 +77,7 @@ def optimum(wire: Wire) -> float:
     return best[-1]
 
 
-def ours(wire: Wire) -> list[int]:
+def ours(wire: WireTiming) -> list[int]:
     def price(cost: Cost) -> float:
         return wire.exchange(cost, DRIVER.timing, TURNAROUND)
 
@@ -87,7 +87,7 @@ def ours(wire: Wire) -> list[int]:
 def rows() -> Iterable[str]:
     yield "| way to merge | " + " | ".join(f"{baud} baud" for baud in BAUDS) + " |"
     yield "|---|" + "---|" * len(BAUDS)
-    wires = [Wire(baud, 11) for baud in BAUDS]
+    wires = [WireTiming(baud, 11) for baud in BAUDS]
     ways = [
         ("one request per tag", [[1] * len(addresses())] * len(BAUDS)),
         *((f"fixed gap {gap}", [fixed_gap(gap)] * len(BAUDS)) for gap in (0, 1, 10, 50)),

@@ -14,13 +14,13 @@ from functools import partial
 
 from benchmarks.words import words
 from gateway.planning.planner import Seconds, plan
-from gateway.planning.wire_timing import Wire
+from gateway.planning.wire_timing import WireTiming
 from gateway.protocols.modbus import ModbusRtu
 from gateway.tags import Tag
 
 DRIVER = ModbusRtu(station=1)
-SECONDS = partial(Wire(19200, 11).exchange, timing=DRIVER.timing, turnaround=0.010)
-NETWORK = partial(Wire(10_000_000, 10).exchange, timing=DRIVER.timing, turnaround=0.005)
+SECONDS = partial(WireTiming(19200, 11).exchange, timing=DRIVER.timing, turnaround=0.010)
+NETWORK = partial(WireTiming(10_000_000, 10).exchange, timing=DRIVER.timing, turnaround=0.005)
 INTERVALS = {1: [1.0], 2: [1.0, 10.0], 3: [0.5, 1.0, 5.0], 5: [0.2, 0.5, 1.0, 5.0, 60.0]}
 
 

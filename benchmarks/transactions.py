@@ -30,13 +30,13 @@ from pymodbus.client import AsyncModbusSerialClient, AsyncModbusTcpClient
 from benchmarks.words import words
 from gateway.engine.device import Device
 from gateway.line.line import Line
-from gateway.planning.wire_timing import NETWORK_BAUD, Wire
+from gateway.planning.wire_timing import NETWORK_BAUD, WireTiming
 from gateway.protocols.driver import AnyDriver
 from gateway.protocols.modbus import ModbusRtu, ModbusTcp
 from gateway.protocols.vigor import Vigor
 from gateway.tags import Sample, Tag
 from gateway.tags.mirror import Mirror
-from gateway.transport import Ear, Port, SerialPath, SerialSettings, TcpAddress, open_port
+from gateway.transport import Port, Receiver, SerialPath, SerialSettings, TcpAddress, open_port
 from gateway.transport.loop import new_event_loop
 
 INTEROP = Path(__file__).parent.parent / "tests" / "interop"
@@ -45,10 +45,10 @@ VIGOR_STATION = """
 import asyncio, sys
 from gateway.stations.vigor import VigorStation
 from gateway.simulator.serve import serve_on_pty, serve_on_tcp
-from gateway.planning.wire_timing import Wire
+from gateway.planning.wire_timing import WireTiming
 
 async def main():
-    wire = Wire(115200, 10)
+    wire = WireTiming(115200, 10)
     stations = [VigorStation(1)]
     if sys.argv[1] == "pty":
         served = await serve_on_pty(stations, wire, turnaround=0, paced=False)
@@ -87,11 +87,15 @@ def tags(area: str, each: int) -> tuple[Tag, ...]:
 
 
 async def ours(
-    driver: AnyDriver, area: str, each: int, where: Callable[[Ear], Awaitable[Port]], count: int
+    driver: AnyDriver,
+    area: str,
+    each: int,
+    where: Callable[[Receiver], Awaitable[Port]],
+    count: int,
 ) -> float:
     """Seconds of processor time per exchange. No silence is kept: it would only add sleep."""
     timing = replace(driver.timing, silence=0.0, silence_chars=0.0)
-    wire = Wire(NETWORK_BAUD, 10)
+    wire = WireTiming(NETWORK_BAUD, 10)
     chosen = tags(area, each)
     device = Device("plc", driver, wire, timing, chosen, 0.5, turnaround=1.0)
     assert len(device.blocks) == 1, device.blocks
@@ -179,11 +183,11 @@ def run_fast(coroutine: Coroutine[Any, Any, float]) -> float:
         return runner.run(coroutine)
 
 
-def tcp_opener(port: int) -> Callable[[Ear], Awaitable[Port]]:
+def tcp_opener(port: int) -> Callable[[Receiver], Awaitable[Port]]:
     return lambda ear: open_port(TcpAddress("127.0.0.1", port), SerialSettings(), ear)
 
 
-def serial_opener(path: str) -> Callable[[Ear], Awaitable[Port]]:
+def serial_opener(path: str) -> Callable[[Receiver], Awaitable[Port]]:
     return lambda ear: open_port(SerialPath(path), SerialSettings(115200, "8N1"), ear)
 
 
@@ -202,10 +206,10 @@ def repeated(runs: Runs, count: int, rounds: int) -> dict[str, float]:
 def beside(
     driver: AnyDriver,
     area: str,
-    opener: Callable[[Ear], Awaitable[Port]],
+    opener: Callable[[Receiver], Awaitable[Port]],
     client: Callable[[], AsyncModbusTcpClient | AsyncModbusSerialClient] | None = None,
     in_c: Callable[[int], float] | None = None,
-    changing: Callable[[Ear], Awaitable[Port]] | None = None,
+    changing: Callable[[Receiver], Awaitable[Port]] | None = None,
 ) -> Runs:
     """Ours, and who else can ask that slave; once more on uvloop where it is installed.
 
@@ -219,7 +223,7 @@ def beside(
 
         def read(
             step: int,
-            opener: Callable[[Ear], Awaitable[Port]],
+            opener: Callable[[Receiver], Awaitable[Port]],
             on: Callable[[Coroutine[Any, Any, float]], float] = on,
         ) -> Callable[[int], float]:
             return lambda count: on(ours(driver, area, step, opener, count))

@@ -12,16 +12,16 @@ from gateway.config.commands import check_command, every_command, speaker
 from gateway.engine.device import Device, DeviceSettings
 from gateway.engine.forecast import LineForecast, forecast
 from gateway.engine.jobs import Poll
-from gateway.engine.requests import Obeyed
+from gateway.engine.requests import CommandResult
 from gateway.errors import Busy, GatewayError, Offline
 from gateway.line.line import Line
 from gateway.northbound.payload import rfc3339
 from gateway.northbound.status import Document, device_document, line_document
 from gateway.simulator.plant import station_for
 from gateway.simulator.port import open_simulator
-from gateway.tags import Quality, Reason, Sample, Tag, Written, bad
+from gateway.tags import Quality, Reason, Sample, Tag, WriteResult, bad
 from gateway.tags.mirror import Mirror
-from gateway.transport import Ear, Port, SimulatorAddress, open_port
+from gateway.transport import Port, Receiver, SimulatorAddress, open_port
 from gateway.values import Value
 
 T = TypeVar("T")
@@ -42,7 +42,7 @@ def device_of(config: DeviceSettings, line: LineConfig) -> Device:
     )
 
 
-def opener(line: LineConfig) -> Callable[[Ear], Awaitable[Port]]:
+def opener(line: LineConfig) -> Callable[[Receiver], Awaitable[Port]]:
     """What opens the line's port: the real one, or its devices simulated in memory."""
     if isinstance(line.port, SimulatorAddress):
         stations = [station_for(device.driver, device.tags) for device in line.devices]
@@ -76,7 +76,7 @@ class Gateway:
         self,
         config: Config,
         wall: Callable[[], int] = time.time_ns,
-        open_line: Callable[[LineConfig], Callable[[Ear], Awaitable[Port]]] = opener,
+        open_line: Callable[[LineConfig], Callable[[Receiver], Awaitable[Port]]] = opener,
     ) -> None:
         """`wall`: nanoseconds since 1970. `open_line`: what opens a line's port."""
         self.config = config
@@ -149,13 +149,13 @@ class Gateway:
         if news := self.mirror.told(samples):
             self.publish(news)  # as any other: what is published is kept in history too
 
-    async def write(self, tag: Tag, value: Value) -> Written:
+    async def write(self, tag: Tag, value: Value) -> WriteResult:
         """Returns when the device has acknowledged. Raises `GatewayError`, `BadValue` first."""
         if tag.device not in self._places:
             raise Offline(f"device {tag.device} is disabled; nothing was sent")
         units = tag.encode(value)
         line, device = self._places[tag.device]
-        outcome: asyncio.Future[Written] = asyncio.get_running_loop().create_future()
+        outcome: asyncio.Future[WriteResult] = asyncio.get_running_loop().create_future()
         line.submit(device, tag, units, partial(_end, outcome))
         return await outcome
 
@@ -165,7 +165,7 @@ class Gateway:
     def speaker(self, line: str) -> str:
         return speaker(self.config, line)
 
-    async def control(self, device: str, command: str, argument: str = "") -> Obeyed:
+    async def control(self, device: str, command: str, argument: str = "") -> CommandResult:
         """Have a device run, stop ...: what it said. Raises `GatewayError`, `BadValue` first."""
         check_command(self.config, device, command)
         line, told = self._places[device]
@@ -174,7 +174,7 @@ class Gateway:
         outcome: asyncio.Future[str] = loop.create_future()
         line.command(told, command, argument, partial(_end, outcome))
         answer = await outcome
-        return Obeyed(answer, self._wall(), loop.time() - started)
+        return CommandResult(answer, self._wall(), loop.time() - started)
 
     def is_fresh(self, tag: Tag, max_age: float) -> bool:
         """Whether it was read less than `max_age` seconds ago, or cannot be read now.

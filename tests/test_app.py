@@ -16,7 +16,7 @@ from gateway.errors import BadValue, LineDown, Offline
 from gateway.northbound import Mode, zenoh_settings
 from gateway.stations.vigor import VigorStation
 from gateway.tags import Quality, Reason, Sample, Tag, good
-from gateway.transport import Ear
+from gateway.transport import Receiver
 from tests.e2e.processes import vigor_line, write_config
 from tests.sim.bench import WIRE, Bench, Unruly
 from tests.sim.virtual import on_virtual_time
@@ -252,13 +252,13 @@ async def test_what_comes_unasked_is_answered_as_it_is_known_at_once(tmp_path: P
     }
     lines = {"door": {"port": "COM1", "devices": {"reader": reader}}}
     path = write_config(tmp_path / "c.yaml", "tcp/127.0.0.1:7447", lines)
-    ears: list[Ear] = []
+    ears: list[Receiver] = []
 
     class Mute:
         async def close(self) -> None:
             pass
 
-    async def opened(ear: Ear) -> Any:
+    async def opened(ear: Receiver) -> Any:
         ears.append(ear)
         return Mute()
 

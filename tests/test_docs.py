@@ -37,7 +37,7 @@ from gateway.northbound import StandbySettings, payload
 from gateway.northbound.duty import Duty
 from gateway.northbound.keys import Keys
 from gateway.northbound.payload import Problem
-from gateway.tags import Reason, Written, bad, good
+from gateway.tags import Reason, WriteResult, bad, good
 from tests.e2e.processes import ROOT, Program, plc_gateway, started, until
 from tests.zenoh_peer import free_endpoint
 
@@ -570,7 +570,7 @@ def test_every_error_word_and_every_reason_is_explained() -> None:
 
 
 def test_the_answer_to_a_write_has_the_fields_of_the_page() -> None:
-    answer = json.loads(payload.outcome(Written(7, 0, 0.1)))
+    answer = json.loads(payload.outcome(WriteResult(7, 0, 0.1)))
     assert set(names("zenoh.md", "A write", "in the answer")) == set(answer)
 
 

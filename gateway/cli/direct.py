@@ -12,12 +12,12 @@ from gateway.app import device_of, opener
 from gateway.config import Config, LineConfig
 from gateway.config.commands import check_command, line_of
 from gateway.engine.device import Device, DeviceSettings
-from gateway.engine.requests import Obeyed
+from gateway.engine.requests import CommandResult
 from gateway.engine.unsolicited import listened
 from gateway.errors import BadValue, GatewayError, LineDown
 from gateway.line.line import Line
 from gateway.northbound import payload
-from gateway.tags import Reason, Sample, Tag, Written, bad
+from gateway.tags import Reason, Sample, Tag, WriteResult, bad
 from gateway.values import Value
 
 LISTEN_FOR = 5.0  # seconds, for what comes unasked
@@ -80,7 +80,7 @@ async def _listen(once: _Once, unasked: AbstractSet[Tag]) -> None:
             await once.all_heard.wait()
 
 
-async def write(config: Config, tag: Tag, value: Value) -> Written:
+async def write(config: Config, tag: Tag, value: Value) -> WriteResult:
     """Raises `GatewayError` when it was not done, or nobody knows; `BadValue` before anything."""
     units = tag.encode(value)
     (line_config,) = (line for line in config.lines if tag in line.tags)
@@ -93,7 +93,7 @@ async def write(config: Config, tag: Tag, value: Value) -> Written:
     task = asyncio.create_task(line.run())
     while not line.is_open and not once.heard:
         await asyncio.sleep(0.01)
-    outcome: asyncio.Future[Written | GatewayError] = asyncio.get_running_loop().create_future()
+    outcome: asyncio.Future[WriteResult | GatewayError] = asyncio.get_running_loop().create_future()
     line.submit(device, tag, units, outcome.set_result)
     result = await outcome
     await _end(task)
@@ -102,7 +102,7 @@ async def write(config: Config, tag: Tag, value: Value) -> Written:
     return result
 
 
-async def control(config: Config, device: str, command: str, argument: str) -> Obeyed:
+async def control(config: Config, device: str, command: str, argument: str) -> CommandResult:
     """Raises `GatewayError`; `BadValue` before anything is sent."""
     check_command(config, device, command)
     line_config = line_of(config, device)
@@ -120,7 +120,7 @@ async def control(config: Config, device: str, command: str, argument: str) -> O
     await _end(task)
     if isinstance(result, GatewayError):
         raise result
-    return Obeyed(result, time.time_ns(), loop.time() - started)
+    return CommandResult(result, time.time_ns(), loop.time() - started)
 
 
 def told(config: Config, tag: Tag, value: Value) -> dict[str, object]:

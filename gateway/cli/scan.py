@@ -11,14 +11,14 @@ from gateway.errors import ConfigError, Garbled, LineDown, Refused, Unclear
 from gateway.line.clock import Clock
 from gateway.line.transaction import Turn
 from gateway.line.wire_log import Recorder
-from gateway.planning.wire_timing import Wire, character_bits
+from gateway.planning.wire_timing import WireTiming, character_bits
 from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.driver import AnyDriver
 from gateway.protocols.modbus import ModbusAscii, ModbusRtu, ModbusTcp
 from gateway.protocols.vigor import Vigor
 from gateway.transport import (
-    Ear,
     Port,
+    Receiver,
     SerialSettings,
     SimulatorAddress,
     TcpAddress,
@@ -38,7 +38,7 @@ FORMATS = {
 FROM_ZERO = ("vigor", "computer-link")
 # After bytes that made no sense: seconds without one before the next question, and at most.
 QUIET, LONGEST_NOISE = 0.02, 0.5
-Open = Callable[[SerialSettings | None, Ear], Awaitable[Port]]
+Open = Callable[[SerialSettings | None, Receiver], Awaitable[Port]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,7 +120,7 @@ def planned(
     if isinstance(where, TcpAddress):
         serial = [None]
 
-    async def open_it(settings: SerialSettings | None, ear: Ear) -> Port:
+    async def open_it(settings: SerialSettings | None, ear: Receiver) -> Port:
         return await open_port(where, settings or SerialSettings(), ear)
 
     return Plan(open_it, protocol, numbers, serial, written.duration(timeout))
@@ -163,14 +163,14 @@ def spoken(settings: SerialSettings | None) -> str:
 
 
 class _Wire:
-    """The port as it is opened once. The `Ear` of whatever question is open."""
+    """The port as it is opened once. The `Receiver` of whatever question is open."""
 
     def __init__(self, plan: Plan, serial: SerialSettings | None, report: Report) -> None:
         self._plan = plan
         self._serial = serial
         self._report = report
         behind = serial or SerialSettings()  # there may be a slow wire behind a network
-        self._wire = Wire(behind.baudrate, character_bits(behind.format))
+        self._wire = WireTiming(behind.baudrate, character_bits(behind.format))
         self._clock = Clock(now=asyncio.get_running_loop().time)
         self._turn: Turn | None = None
         self._lost: LineDown | None = None

@@ -17,7 +17,7 @@ from gateway.config import Config
 from gateway.engine.forecast import LineForecast
 from gateway.northbound.payload import rfc3339
 from gateway.planning.planner import spell
-from gateway.planning.wire_timing import NETWORK_BAUD, Wire
+from gateway.planning.wire_timing import NETWORK_BAUD, WireTiming
 from gateway.tags import Quality, Sample, Tag, WriteRule
 from gateway.values import Kind
 
@@ -167,7 +167,7 @@ def _counted(number: int, what: str) -> str:
     return f"{number} {what}" if number == 1 else f"{number} {what}s"
 
 
-def _speed(wire: Wire) -> str:
+def _speed(wire: WireTiming) -> str:
     return "over the network" if wire.baudrate == NETWORK_BAUD else f"at {wire.baudrate} baud"
 
 

@@ -6,7 +6,7 @@ from gateway.config.customs import custom
 from gateway.config.messages import Mistakes, Path
 from gateway.config.model import LineSection
 from gateway.engine.device import DeviceSettings
-from gateway.planning.wire_timing import NETWORK_BAUD, Wire, character_bits
+from gateway.planning.wire_timing import NETWORK_BAUD, WireTiming, character_bits
 from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.frames import FrameDriver
 from gateway.transport.port import SerialSettings, SimulatorAddress, TcpAddress
@@ -87,13 +87,13 @@ def _check_network(
 
 def line_wire(
     line: LineSection, devices: Sequence[DeviceSettings], path: Path, mistakes: Mistakes
-) -> tuple[SerialSettings, Wire]:
+) -> tuple[SerialSettings, WireTiming]:
     """Speed and format, as written or as all protocols of the line are used to."""
     customs = {device.driver.protocol: custom(device.driver) for device in devices}
     rates = {name: habit.baudrate for name, habit in customs.items()}
     formats = {name: habit.format for name, habit in customs.items()}
     if line.baudrate is None and set(rates.values()) == {None}:
-        return SerialSettings(), Wire(NETWORK_BAUD, 10)
+        return SerialSettings(), WireTiming(NETWORK_BAUD, 10)
     for setting, given, usual in (
         ("baudrate", line.baudrate, rates),
         ("format", line.format, formats),
@@ -105,4 +105,4 @@ def line_wire(
             )
     baudrate = line.baudrate or next(filter(None, rates.values()), 9600)
     serial = SerialSettings(baudrate, line.format or next(iter(formats.values()), "8N1"))
-    return serial, Wire(serial.baudrate, character_bits(serial.format))
+    return serial, WireTiming(serial.baudrate, character_bits(serial.format))

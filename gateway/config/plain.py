@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gateway.engine.device import DeviceSettings
-from gateway.planning.wire_timing import Wire
+from gateway.planning.wire_timing import WireTiming
 from gateway.tags import Tag
 from gateway.transport.port import PortAddress, SerialSettings, SimulatorAddress
 
@@ -58,7 +58,7 @@ class LineConfig:
     name: str
     port: PortAddress
     serial: SerialSettings
-    wire: Wire
+    wire: WireTiming
     echo: bool | None  # whether the port hears what it says; None: not said
     devices: tuple[DeviceSettings, ...]
 

@@ -10,7 +10,7 @@ from gateway.errors import DeviceError, Evidence, Garbled, GatewayError, LineDow
 from gateway.planning.bad_addresses import RETRY, Refusals
 from gateway.planning.monitor_lists import with_list
 from gateway.planning.planner import Block, plan
-from gateway.planning.wire_timing import Wire
+from gateway.planning.wire_timing import WireTiming
 from gateway.protocols.driver import AnyDriver, Cost, Overhearing, Span, Timing, Windowed
 from gateway.tags import Reason, Tag
 
@@ -92,7 +92,7 @@ class Device:
 
     name: str
     driver: AnyDriver
-    wire: Wire
+    wire: WireTiming
     timing: Timing
     tags: tuple[Tag, ...]
     late_guard: float

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from gateway.engine.ages import asked, load_of, worst_ages
 from gateway.engine.device import Device
 from gateway.planning.planner import Block, plan
-from gateway.planning.wire_timing import Wire
+from gateway.planning.wire_timing import WireTiming
 from gateway.protocols.frames.driver import LISTENED
 from gateway.tags import Tag
 
@@ -27,7 +27,7 @@ class LineForecast:
     """One line while all its stations answer. Times in seconds."""
 
     name: str
-    wire: Wire
+    wire: WireTiming
     blocks: tuple[BlockForecast, ...]
     load: float  # 1.0: all the time the wire has
     requests: float  # per second
@@ -54,7 +54,7 @@ class LineForecast:
         )
 
 
-def forecast(name: str, devices: Sequence[Device], wire: Wire) -> LineForecast:
+def forecast(name: str, devices: Sequence[Device], wire: WireTiming) -> LineForecast:
     """Reckon a line from its plan."""
     blocks = asked(devices)
     load = load_of(blocks)

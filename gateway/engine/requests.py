@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 from gateway.engine.device import Device
 from gateway.errors import GatewayError
-from gateway.tags import Tag, Written
+from gateway.tags import Tag, WriteResult
 
-Done = Callable[[Written | GatewayError], None]
+Done = Callable[[WriteResult | GatewayError], None]
 Told = Callable[[str | GatewayError], None]
 
 
@@ -38,7 +38,7 @@ class Write:
         return self.tag.write is not None and self.tag.write.latest
 
 
-class Obeyed(NamedTuple):
+class CommandResult(NamedTuple):
     """What a device said to a command; `time` in ns since 1970, `took` in seconds."""
 
     answer: str

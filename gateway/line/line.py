@@ -21,10 +21,10 @@ from gateway.line.polling import Poller
 from gateway.line.transaction import Turn
 from gateway.line.wire_log import Recorder
 from gateway.line.writing import Writer, together
-from gateway.planning.wire_timing import Wire
+from gateway.planning.wire_timing import WireTiming
 from gateway.protocols.driver import Span
 from gateway.tags import Tag
-from gateway.transport import Ear, Port
+from gateway.transport import Port, Receiver
 
 log = structlog.get_logger("gateway.line")
 REOPEN_FIRST, REOPEN_LONGEST = 0.2, 10.0
@@ -41,8 +41,8 @@ class Line:
         self,
         name: str,
         devices: Sequence[Device],
-        wire: Wire,
-        open_port: Callable[[Ear], Awaitable[Port]],
+        wire: WireTiming,
+        open_port: Callable[[Receiver], Awaitable[Port]],
         upstairs: Upstairs,
         wall: Callable[[], int],
         *,

@@ -9,7 +9,7 @@ from gateway.errors import DeviceError, Evidence, Garbled, LineDown, NoReply
 from gateway.line.clock import NEVER, Clock
 from gateway.line.echo import Adapter
 from gateway.line.wire_log import Recorder
-from gateway.planning.wire_timing import Wire
+from gateway.planning.wire_timing import WireTiming
 from gateway.protocols.driver import Codec, EndedByGap
 from gateway.transport import Port
 
@@ -39,7 +39,7 @@ class Turn:
 
     port: Port
     new_codec: Callable[[], Codec[Any]]
-    wire: Wire
+    wire: WireTiming
     silence: float
     reply_timeout: float
     clock: Clock

@@ -12,7 +12,7 @@ from gateway.engine.results import Consequences
 from gateway.errors import BadValue, Busy, GatewayError, LineDown, Refused, Unclear
 from gateway.line.transaction import Turn
 from gateway.protocols.driver import AnyDriver, Controllable, ScatteredWriter, Span, Talk
-from gateway.tags import Written
+from gateway.tags import WriteResult
 from gateway.values import Value
 
 Wall = Callable[[], int]
@@ -23,7 +23,7 @@ class Differs(Unclear):
     """The write was acknowledged, but reading back does not show it."""
 
 
-async def carry_out(talk: Talk[Any], write: Write, wall: Wall) -> Written:
+async def carry_out(talk: Talk[Any], write: Write, wall: Wall) -> WriteResult:
     """The whole of one write on one turn. A bit of a word is changed in the word as it is.
 
     Raises `Differs` where `verify` is asked for and the device does not hold the value.
@@ -47,7 +47,7 @@ async def carry_out(talk: Talk[Any], write: Write, wall: Wall) -> Written:
     return written(write, wall, verified=True)
 
 
-async def look_again(talk: Talk[Any], write: Write, wall: Wall) -> Written | None:
+async def look_again(talk: Talk[Any], write: Write, wall: Wall) -> WriteResult | None:
     """After a write that ended unclear: what its rule allows. None when that settles nothing.
 
     `verify` reads back what the device holds. `repeat` writes once more.
@@ -96,10 +96,10 @@ def holds(write: Write, units: Sequence[int]) -> bool:
 
 def written(
     write: Write, wall: Wall, *, verified: bool = False, acknowledged: bool = True
-) -> Written:
+) -> WriteResult:
     value: Value | None = write.tag.from_units(write.units)
     took = asyncio.get_running_loop().time() - write.submitted
-    return Written(False if value is None else value, wall(), took, verified, acknowledged)
+    return WriteResult(False if value is None else value, wall(), took, verified, acknowledged)
 
 
 class Wire(Protocol):
@@ -126,7 +126,7 @@ class Writer:
     async def write(self, write: Write, others: Sequence[Write] = ()) -> None:
         """One write; `others` go out in the same exchange, and each alone if that is refused."""
         group = [write, *others]
-        outcomes: dict[Write, Written | GatewayError] = {}
+        outcomes: dict[Write, WriteResult | GatewayError] = {}
         try:
             if others:
                 group = await self._all_at_once(group, outcomes)
@@ -177,7 +177,7 @@ class Writer:
             return answer
 
     async def _all_at_once(
-        self, group: list[Write], outcomes: dict[Write, Written | GatewayError]
+        self, group: list[Write], outcomes: dict[Write, WriteResult | GatewayError]
     ) -> list[Write]:
         """Those whose outcome is known: none when the device refused the whole."""
         device = group[0].device
@@ -201,7 +201,7 @@ class Writer:
             outcomes.update((one, written(one, self.wall)) for one in group)
             return group
 
-    async def _one(self, write: Write) -> Written | GatewayError:
+    async def _one(self, write: Write) -> WriteResult | GatewayError:
         """Never simply sent again: what may follow an unclear end is the tag's own rule."""
         device, span = write.device, write.tag.span
         with self.wire.turn_with(device) as turn:
@@ -230,7 +230,7 @@ class Writer:
                 await self.wire.unclear(device, turn, error, span)
         return unclear
 
-    def _tell(self, write: Write, outcome: Written | GatewayError) -> None:
+    def _tell(self, write: Write, outcome: WriteResult | GatewayError) -> None:
         record = write.device.record
         record.writes += 1
         took = asyncio.get_running_loop().time() - write.submitted
@@ -243,7 +243,7 @@ class Writer:
         device.record.refusals[error.code] += 1
         return error
 
-    def _noted(self, device: Device, done: Written) -> Written:
+    def _noted(self, device: Device, done: WriteResult) -> WriteResult:
         if done.acknowledged:
             self.then.answered(device)
         else:  # a broadcast: stations need time to take it in

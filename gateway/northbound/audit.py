@@ -10,11 +10,11 @@ from collections.abc import Callable
 
 import structlog
 
-from gateway.engine.requests import Obeyed
+from gateway.engine.requests import CommandResult
 from gateway.northbound import payload
 from gateway.northbound.limiter import Limiter
 from gateway.northbound.payload import Failure, Problem, WriteOutcome
-from gateway.tags import Written
+from gateway.tags import WriteResult
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 
@@ -73,9 +73,9 @@ def _log(outcome: WriteOutcome) -> None:
         "by": outcome.by,
     }
     match outcome.result:
-        case Written(verified=verified):
+        case WriteResult(verified=verified):
             log.info("written", verified=verified, **shown)
-        case Obeyed(answer):
+        case CommandResult(answer):
             log.info("command obeyed", answer=answer, **shown)
         case Failure(problem, reason, code):
             log.warning(

@@ -13,7 +13,7 @@ import orjson
 import zenoh
 
 from gateway.config.commands import TO_ALL, NotControlled
-from gateway.engine.requests import Obeyed
+from gateway.engine.requests import CommandResult
 from gateway.errors import BadValue, GatewayError
 from gateway.northbound import forms, payload
 from gateway.northbound.keys import Keys
@@ -33,7 +33,7 @@ class Commanded(Protocol):
     def speaker(self, line: str) -> str:
         """The device in whose name all stations of a line are told. Raises `BadValue`."""
 
-    async def control(self, device: str, command: str, argument: str) -> Obeyed:
+    async def control(self, device: str, command: str, argument: str) -> CommandResult:
         """Returns what the device said. Raises `GatewayError`; `BadValue` before anything."""
 
 
@@ -64,11 +64,11 @@ class Controls:
             for command in sorted(commands)
         ]
 
-    async def obey(self, key: str, data: bytes | None, asker: Asker) -> Obeyed | Failure:
+    async def obey(self, key: str, data: bytes | None, asker: Asker) -> CommandResult | Failure:
         """`key` as it came, wildcards and all; `data` is the argument as text."""
         by, argument = asker.session, ""
         started = time.monotonic()
-        result: Obeyed | Failure = Failure(Problem.UNCLEAR, "the gateway is ending")
+        result: CommandResult | Failure = Failure(Problem.UNCLEAR, "the gateway is ending")
         try:
             if self._writers is not None:
                 by = self._writers.owner(asker.token)
@@ -91,10 +91,10 @@ class Controls:
             self._told(WriteOutcome(key, value, result, time.time_ns(), took, by, command=True))
         return result
 
-    def reply(self, result: Obeyed | Failure, query: zenoh.Query) -> None:
+    def reply(self, result: CommandResult | Failure, query: zenoh.Query) -> None:
         """On an answering thread."""
         match result:
-            case Obeyed(answer, at, took):
+            case CommandResult(answer, at, took):
                 told = {"answer": answer, "time": payload.rfc3339(at), "took": round(took, 6)}
                 forms.reply_json(query, str(query.key_expr), orjson.dumps(told), self._stamp())
             case Failure():

@@ -17,9 +17,9 @@ from typing import Never
 
 import orjson
 
-from gateway.engine.requests import Obeyed
+from gateway.engine.requests import CommandResult
 from gateway.errors import BadValue, Busy, GatewayError, LineDown, Offline, Refused
-from gateway.tags import Quality, Reason, Sample, Tag, Written
+from gateway.tags import Quality, Reason, Sample, Tag, WriteResult
 from gateway.values import Value
 
 LONGEST_WRITE = 64 * 1024  # bytes: a tag holds 250 characters at most, the rest is room
@@ -62,7 +62,7 @@ class WriteOutcome:
 
     key: str
     value: Value | None
-    result: Written | Obeyed | Failure
+    result: WriteResult | CommandResult | Failure
     time: int
     took: float
     by: str | None = None
@@ -142,7 +142,7 @@ def meta(tag: Tag) -> bytes:
     return orjson.dumps(fields)
 
 
-def outcome(result: Written | Failure) -> bytes:
+def outcome(result: WriteResult | Failure) -> bytes:
     """The answer to one write, or the error of any query."""
     return orjson.dumps(_result(result))
 
@@ -158,9 +158,9 @@ def write_outcome(done: WriteOutcome) -> bytes:
         "by": done.by,
     }
     match done.result:
-        case Written(verified=verified):
+        case WriteResult(verified=verified):
             line |= {"outcome": "written", "verified": verified}
-        case Obeyed(answer):
+        case CommandResult(answer):
             line |= {"outcome": "obeyed", "answer": short(answer)}
         case Failure(problem, reason, code):
             line |= {"outcome": problem.value, "code": code, "reason": short(reason)}
@@ -198,9 +198,9 @@ def _sample(sample: Sample) -> dict[str, Value | None]:
     return told
 
 
-def _result(result: Written | Failure) -> dict[str, Value | None]:
+def _result(result: WriteResult | Failure) -> dict[str, Value | None]:
     match result:
-        case Written(known, time, took, verified, acknowledged):
+        case WriteResult(known, time, took, verified, acknowledged):
             return {
                 "value": known,
                 "time": rfc3339(time),

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Literal, Protocol
 
-from gateway.tags import Sample, Tag, Written
+from gateway.tags import Sample, Tag, WriteResult
 from gateway.values import Value
 
 
@@ -39,7 +39,7 @@ class Plant(Protocol):
     def told(self, samples: Sequence[Sample]) -> None:
         """They are about to be published again: what is worth telling is reckoned from them."""
 
-    async def write(self, tag: Tag, value: Value) -> Written:
+    async def write(self, tag: Tag, value: Value) -> WriteResult:
         """Returns when the device has acknowledged. Raises `GatewayError`; `Busy` and `BadValue`
         only when nothing was sent. Cancelled when nobody waits any more."""
 

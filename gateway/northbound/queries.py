@@ -15,7 +15,7 @@ from functools import partial
 import structlog
 import zenoh
 
-from gateway.engine.requests import Obeyed
+from gateway.engine.requests import CommandResult
 from gateway.errors import BadValue, Busy
 from gateway.northbound.controls import Controls
 from gateway.northbound.directory import Directory
@@ -24,7 +24,7 @@ from gateway.northbound.payload import Failure, Problem
 from gateway.northbound.plant import Plant
 from gateway.northbound.replies import Replies
 from gateway.northbound.writes import ANSWER_WITHIN, Writes, asker
-from gateway.tags import Tag, Written
+from gateway.tags import Tag, WriteResult
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 
@@ -126,7 +126,7 @@ class Queries:
 
     async def _set(self, query: zenoh.Query) -> None:
         key, data = str(query.key_expr), query.payload
-        result: Written | Failure = Failure(Problem.UNCLEAR, "the gateway is ending")
+        result: WriteResult | Failure = Failure(Problem.UNCLEAR, "the gateway is ending")
         try:
             result = await self._writes.write(
                 key, None if data is None else data.to_bytes(), asker(query)
@@ -136,7 +136,7 @@ class Queries:
 
     async def _command(self, query: zenoh.Query, controls: Controls) -> None:
         key, data = str(query.key_expr), query.payload
-        result: Obeyed | Failure = Failure(Problem.UNCLEAR, "the gateway is ending")
+        result: CommandResult | Failure = Failure(Problem.UNCLEAR, "the gateway is ending")
         try:
             result = await controls.obey(
                 key, None if data is None else data.to_bytes(), asker(query)

@@ -10,7 +10,7 @@ from gateway.northbound.directory import Directory
 from gateway.northbound.keys import Asked, Family, Keys
 from gateway.northbound.payload import Failure, Problem
 from gateway.northbound.plant import History, Plant
-from gateway.tags import Tag, Written
+from gateway.tags import Tag, WriteResult
 
 _NOT_ALL = "the gateway is ending: this is not all"
 _NO_HISTORY = Failure(Problem.NO_HISTORY, "no history is kept here: ask without _time")
@@ -122,7 +122,7 @@ class Replies:
             if query.key_expr.intersects(key):
                 self._reply(query, key, document, self._stamp())
 
-    def outcome(self, result: Written | Failure, query: zenoh.Query) -> None:
+    def outcome(self, result: WriteResult | Failure, query: zenoh.Query) -> None:
         data = payload.outcome(result)
         if isinstance(result, Failure):
             query.reply_err(data, encoding=zenoh.Encoding.APPLICATION_JSON)

@@ -19,7 +19,7 @@ from gateway.northbound.keys import Keys, asked
 from gateway.northbound.payload import Failure, Problem, WriteOutcome
 from gateway.northbound.plant import Plant
 from gateway.northbound.writers import LONGEST_TOKEN, Asker, NotAllowed, Writers
-from gateway.tags import Tag, Written
+from gateway.tags import Tag, WriteResult
 from gateway.values import Value
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
@@ -47,12 +47,14 @@ class Writes:
         self._writers = writers
         self._waiting = 0
 
-    async def write(self, key: str, data: bytes | None, asker: Asker) -> Written | Failure:
+    async def write(self, key: str, data: bytes | None, asker: Asker) -> WriteResult | Failure:
         """`key` is the `@set` key as it came, wildcards and all; `data` its payload."""
         by = asker.session
         started = time.monotonic()
         value: Value | None = None
-        result: Written | Failure = Failure(Problem.UNCLEAR, "the gateway ended before the write")
+        result: WriteResult | Failure = Failure(
+            Problem.UNCLEAR, "the gateway ended before the write"
+        )
         self._waiting += 1
         try:
             if self._writers is not None:
@@ -77,7 +79,7 @@ class Writes:
             self._wrote(WriteOutcome(asked(key).of, value, result, time.time_ns(), took, by))
         return result
 
-    async def _hand_down(self, tag: Tag, value: Value) -> Written:
+    async def _hand_down(self, tag: Tag, value: Value) -> WriteResult:
         if self._waiting > AT_ONCE:
             raise Busy(f"{AT_ONCE} writes are waiting already")
         async with asyncio.timeout(ANSWER_WITHIN):

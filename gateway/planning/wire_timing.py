@@ -9,7 +9,7 @@ NETWORK_BAUD = 100_000_000
 
 
 @dataclass(frozen=True, slots=True)
-class Wire:
+class WireTiming:
     """The speed of a line. Times are seconds."""
 
     baudrate: int = 9600

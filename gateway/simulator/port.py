@@ -5,9 +5,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from gateway.errors import LineDown
-from gateway.planning.wire_timing import Wire
+from gateway.planning.wire_timing import WireTiming
 from gateway.stations.station import Station
-from gateway.transport.port import Ear, Port
+from gateway.transport.port import Port, Receiver
 
 # Two characters that overlap by less than this part of one leave each other whole: a UART looks at
 # the middle of its bits, and a timer is never exact.
@@ -17,8 +17,8 @@ FIFO = 16  # characters that a UART gathers before it tells
 
 async def open_simulator(
     stations: Sequence[Station],
-    wire: Wire,
-    ear: Ear,
+    wire: WireTiming,
+    ear: Receiver,
     *,
     turnaround: float = 0.005,
     paced: bool = True,
@@ -82,7 +82,7 @@ class HalfDuplex:
     def __init__(
         self,
         stations: Sequence[Station],
-        wire: Wire,
+        wire: WireTiming,
         deliver: Callable[[bytes], None],
         turnaround: float = 0.005,
         *,

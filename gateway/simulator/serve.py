@@ -8,7 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Protocol, cast
 
-from gateway.planning.wire_timing import Wire
+from gateway.planning.wire_timing import WireTiming
 from gateway.simulator.port import HalfDuplex
 from gateway.stations.station import Station
 from gateway.transport.trouble import line_down
@@ -28,7 +28,7 @@ class Served(Protocol):
 
 async def serve_on_pty(
     stations: Sequence[Station],
-    wire: Wire,
+    wire: WireTiming,
     link: str | None = None,
     *,
     turnaround: float = 0.005,
@@ -59,7 +59,7 @@ class _Pty:
         master: int,
         slave: int,
         stations: Sequence[Station],
-        wire: Wire,
+        wire: WireTiming,
         turnaround: float,
         *,
         paced: bool,
@@ -107,7 +107,7 @@ class _Pty:
 
 async def serve_on_tcp(
     stations: Sequence[Station],
-    wire: Wire,
+    wire: WireTiming,
     host: str,
     port: int,
     *,
@@ -129,7 +129,7 @@ async def serve_on_tcp(
 
 class _Tcp:
     def __init__(
-        self, stations: Sequence[Station], wire: Wire, turnaround: float, *, paced: bool
+        self, stations: Sequence[Station], wire: WireTiming, turnaround: float, *, paced: bool
     ) -> None:
         self.address = ""
         self._connections: set[_Connection] = set()

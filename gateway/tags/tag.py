@@ -283,7 +283,7 @@ def bad(tag: Tag, reason: Reason, time: int, detail: str = "") -> Sample:
     return Sample(tag, None, Quality.BAD, time, reason, detail)
 
 
-class Written(NamedTuple):
+class WriteResult(NamedTuple):
     """A write that was done: what the device now holds, as far as it told us."""
 
     value: Value

@@ -1,9 +1,9 @@
 """The one place that touches a port: `open_port` for serial ports, TCP and RFC 2217."""
 
 from gateway.transport.port import (
-    Ear,
     Port,
     PortAddress,
+    Receiver,
     Rfc2217Address,
     SerialPath,
     SerialSettings,
@@ -17,7 +17,7 @@ from gateway.transport.tcp import open_tcp
 
 
 async def open_port(
-    where: PortAddress, settings: SerialSettings, ear: Ear, *, timeout: float = 5.0
+    where: PortAddress, settings: SerialSettings, ear: Receiver, *, timeout: float = 5.0
 ) -> Port:
     """Open the port; from now on `ear` hears it. `timeout` is in seconds.
 
@@ -36,7 +36,7 @@ async def open_port(
 
 
 __all__ = [
-    "Ear",
+    "Receiver",
     "Port",
     "PortAddress",
     "Rfc2217Address",

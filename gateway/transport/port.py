@@ -7,7 +7,7 @@ from typing import Protocol
 from gateway.errors import ConfigError
 
 
-class Ear(Protocol):
+class Receiver(Protocol):
     """Who hears a port. Called from the event loop."""
 
     def received(self, data: bytes) -> None: ...
@@ -17,7 +17,7 @@ class Ear(Protocol):
 
 
 class Port(Protocol):
-    """An open port. Bytes that arrive go to the `Ear` it was opened with."""
+    """An open port. Bytes that arrive go to the `Receiver` it was opened with."""
 
     def write(self, data: bytes) -> None:
         """Hand the bytes to the system; returns at once. Raises `LineDown`."""

@@ -7,7 +7,7 @@ from contextlib import suppress
 import structlog
 
 from gateway.errors import LineDown
-from gateway.transport.port import Ear, Port, Rfc2217Address, SerialSettings, TcpAddress
+from gateway.transport.port import Port, Receiver, Rfc2217Address, SerialSettings, TcpAddress
 from gateway.transport.stream import StreamPort
 from gateway.transport.tcp import open_tcp
 from gateway.transport.telnet import (
@@ -33,7 +33,7 @@ _log = structlog.get_logger(__name__)
 
 
 async def open_rfc2217(
-    where: Rfc2217Address, settings: SerialSettings, ear: Ear, *, timeout: float = 5.0
+    where: Rfc2217Address, settings: SerialSettings, ear: Receiver, *, timeout: float = 5.0
 ) -> Port:
     """Connect, agree on COM-PORT-OPTION, and ask for baud rate and format. Raises `LineDown`.
 
@@ -55,9 +55,9 @@ async def open_rfc2217(
 
 
 class Rfc2217Port:
-    """The `Port` to its owner, and the `Ear` of the TCP connection beneath."""
+    """The `Port` to its owner, and the `Receiver` of the TCP connection beneath."""
 
-    def __init__(self, ear: Ear) -> None:
+    def __init__(self, ear: Receiver) -> None:
         self._ear = ear
         self._telnet = Telnet()
         self._tcp: StreamPort | None = None

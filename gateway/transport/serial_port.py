@@ -9,7 +9,7 @@ from pathlib import Path
 import serialx
 
 from gateway.errors import LineDown
-from gateway.transport.port import Ear, Port, SerialPath, SerialSettings
+from gateway.transport.port import Port, Receiver, SerialPath, SerialSettings
 from gateway.transport.stream import StreamPort
 from gateway.transport.trouble import line_down
 
@@ -28,7 +28,7 @@ _PTYS = range(136, 144)  # Linux' major device numbers of pseudo terminals
 
 
 async def open_serial(
-    where: SerialPath, settings: SerialSettings, ear: Ear, *, timeout: float = 5.0
+    where: SerialPath, settings: SerialSettings, ear: Receiver, *, timeout: float = 5.0
 ) -> Port:
     """Open and lock a serial port of this computer. Raises `LineDown`.
 

@@ -5,7 +5,7 @@ from contextlib import suppress
 from typing import cast
 
 from gateway.errors import LineDown
-from gateway.transport.port import Ear
+from gateway.transport.port import Receiver
 from gateway.transport.trouble import line_down
 
 # More than this waiting to be sent means that nobody takes it: what waits are old requests, which
@@ -21,11 +21,11 @@ LONGEST_CLOSE = 1.0  # seconds
 class StreamPort(asyncio.Protocol):
     """A `Port` that is also the protocol object of its own asyncio transport.
 
-    `Ear.lost` is called only between `ready` and `close`: whoever opens the port hears of
+    `Receiver.lost` is called only between `ready` and `close`: whoever opens the port hears of
     an earlier end by the exception of `ready`.
     """
 
-    def __init__(self, name: str, ear: Ear) -> None:
+    def __init__(self, name: str, ear: Receiver) -> None:
         self.name = name
         self._ear = ear
         self._live = False

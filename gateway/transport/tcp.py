@@ -4,7 +4,7 @@ import asyncio
 import socket
 
 from gateway.errors import LineDown
-from gateway.transport.port import Ear, TcpAddress
+from gateway.transport.port import Receiver, TcpAddress
 from gateway.transport.stream import StreamPort
 from gateway.transport.trouble import line_down
 
@@ -20,7 +20,7 @@ _WATCH = {
 }
 
 
-async def open_tcp(where: TcpAddress, ear: Ear, *, timeout: float = 5.0) -> StreamPort:
+async def open_tcp(where: TcpAddress, ear: Receiver, *, timeout: float = 5.0) -> StreamPort:
     """Connect. Raises `LineDown`."""
     name = f"{where.host}:{where.port}"
     port = StreamPort(name, ear)

@@ -13,7 +13,7 @@ from gateway.stations.computer_link import ComputerLinkStation
 from gateway.stations.modbus import ModbusStation
 from gateway.stations.station import Station
 from gateway.stations.vigor import VigorStation
-from gateway.transport import Ear, Port, SerialSettings
+from gateway.transport import Port, Receiver, SerialSettings
 from tests.sim.virtual import on_virtual_time
 
 RIGHT = SerialSettings(19200, "7E1")
@@ -32,7 +32,7 @@ class OldLine:
         self.closed = 0
         self._nonsense = nonsense
 
-    async def open(self, settings: SerialSettings | None, ear: Ear) -> Port:
+    async def open(self, settings: SerialSettings | None, ear: Receiver) -> Port:
         self._settings, self._ear = settings, ear
         return self
 

@@ -13,7 +13,7 @@ from structlog.testing import capture_logs
 from gateway.app import Gateway
 from gateway.config import load
 from gateway.config.commands import NotControlled, check_command, speaker
-from gateway.engine.requests import Obeyed
+from gateway.engine.requests import CommandResult
 from gateway.errors import BadValue, ConfigError, LineDown
 from gateway.northbound import payload
 from gateway.northbound.audit import Audit
@@ -115,13 +115,13 @@ def test_keys_of_commands(key: str, family: Family) -> None:
     assert asked(key).family is family
 
 
-# Obeyed, refused, told
+# Carried out, refused, told
 
 
 class Below:
     """A plant that obeys, or fails as it is told."""
 
-    def __init__(self, outcome: Obeyed | Exception) -> None:
+    def __init__(self, outcome: CommandResult | Exception) -> None:
         self.outcome = outcome
         self.told: list[tuple[str, str, str]] = []
 
@@ -133,7 +133,7 @@ class Below:
             raise BadValue(f"there is no line {line}")
         return "oven"
 
-    async def control(self, device: str, command: str, argument: str) -> Obeyed:
+    async def control(self, device: str, command: str, argument: str) -> CommandResult:
         self.told.append((device, command, argument))
         if isinstance(self.outcome, Exception):
             raise self.outcome
@@ -153,7 +153,7 @@ def obey(below: Below, key: str, data: bytes | None = None) -> tuple[Any, list[A
 
 
 def test_a_command_is_handed_down_and_told_as_a_write_is() -> None:
-    below = Below(Obeyed("acknowledged", 1, 0.1))
+    below = Below(CommandResult("acknowledged", 1, 0.1))
     result, [line, told] = obey(below, "plant/oven/@stop")
     assert result == below.outcome
     assert (told["key"], told["value"], told["by"]) == ("plant/oven/@stop", None, "client")
@@ -180,7 +180,7 @@ def test_a_command_is_handed_down_and_told_as_a_write_is() -> None:
 def test_what_is_no_command_is_refused_and_told(
     key: str, data: bytes | None, problem: Problem
 ) -> None:
-    below = Below(Obeyed("acknowledged", 1, 0.1))
+    below = Below(CommandResult("acknowledged", 1, 0.1))
     result, [line, told] = obey(below, key, data)
     assert isinstance(result, Failure)
     assert result.problem is problem

@@ -13,11 +13,11 @@ lines on its standard input and answers each with `ok …`:
 import asyncio
 import sys
 
-from gateway.planning.wire_timing import Wire, character_bits
+from gateway.planning.wire_timing import WireTiming, character_bits
 from gateway.simulator.serve import Served, serve_on_pty, serve_on_tcp
 from gateway.stations.vigor import VigorStation
 
-WIRE = Wire(19200, character_bits("7E1"))
+WIRE = WireTiming(19200, character_bits("7E1"))
 
 
 class Plant:

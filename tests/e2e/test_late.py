@@ -5,16 +5,16 @@ import random
 from dataclasses import dataclass
 from typing import Any
 
-from gateway.planning.wire_timing import Wire
+from gateway.planning.wire_timing import WireTiming
 from gateway.protocols.driver import Timing
 from gateway.protocols.modbus import ModbusAscii, ModbusRtu
 from gateway.simulator.serve import serve_on_pty
 from gateway.stations.modbus import ModbusStation
-from gateway.transport import Ear, SerialPath, SerialSettings, open_port
+from gateway.transport import Receiver, SerialPath, SerialSettings, open_port
 from tests.line.test_line import Device, Witness
 from tests.sim.plant import Bench, Plant, Unruly, clock_word, make_tag, running
 
-WIRE = Wire(115200, 10)
+WIRE = WireTiming(115200, 10)
 TIMEOUT, SECONDS = 0.05, 6.0
 
 
@@ -24,7 +24,7 @@ class PtyBench(Bench):
 
     path: str = ""
 
-    async def open(self, stations: Any, wire: Wire, ear: Ear) -> "PtyBench":
+    async def open(self, stations: Any, wire: WireTiming, ear: Receiver) -> "PtyBench":
         self.ear = ear
         self.inner = await open_port(SerialPath(self.path), SerialSettings(115200, "8N1"), self)
         return self

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from gateway.engine.device import Device
 from gateway.errors import BadValue, Busy, GatewayError, LineDown, Offline, Refused, Unclear
 from gateway.protocols.computer_link import ComputerLink
-from gateway.tags import WriteRule, Written
+from gateway.tags import WriteResult, WriteRule
 from tests.sim.links import commands, link_device, link_plant, spelt
 from tests.sim.plant import Outcome, Plant, device, plant, running, words
 from tests.sim.virtual import on_virtual_time, run_virtual
@@ -37,7 +37,7 @@ def submit_all(line: Plant, dev: Device, values: dict[str, Any]) -> dict[str, Ou
 def written(outcomes: dict[str, Outcome]) -> dict[str, Any]:
     found = {}
     for text, outcome in outcomes.items():
-        assert isinstance(outcome.once, Written), (text, outcome.once)
+        assert isinstance(outcome.once, WriteResult), (text, outcome.once)
         found[text] = outcome.once.value
     return found
 
@@ -107,7 +107,7 @@ async def test_a_driver_without_such_a_command_writes_one_after_the_other() -> N
         await asyncio.sleep(1)
         outcomes = [line.submit(dev, tag, n) for n, tag in enumerate(dev.tags)]
         await asyncio.sleep(1)
-        assert all(isinstance(outcome.once, Written) for outcome in outcomes)
+        assert all(isinstance(outcome.once, WriteResult) for outcome in outcomes)
     assert len(line.writes_sent()) == 5
 
 
@@ -196,8 +196,8 @@ async def test_after_a_refused_group_no_late_answer_counts_for_the_next_write(ob
         await asyncio.sleep(5)
         assert isinstance(outcomes["M0"].once, Unclear)
         assert isinstance(outcomes["M21"].once, Refused)
-        assert isinstance(outcomes["M42"].once, Written)
-        assert isinstance(outcomes["M63"].once, Written)
+        assert isinstance(outcomes["M42"].once, WriteResult)
+        assert isinstance(outcomes["M63"].once, WriteResult)
         sent = [c for c in commands(station, asked) if c != "BR"]
         assert sent[:2] == ["BT", "BW"]
         assert sent[2] == "TT"
@@ -258,7 +258,7 @@ def test_a_device_is_told_everything_in_the_order_it_was_asked_for(
             if text in holes:
                 assert isinstance(outcome.once, Refused)
             else:
-                assert isinstance(outcome.once, Written)
+                assert isinstance(outcome.once, WriteResult)
                 assert outcome.once.value == value
 
     run_virtual(whole())
@@ -277,8 +277,8 @@ async def test_of_several_waiting_values_only_the_latest_is_sent() -> None:
         for outcome in (first, second):
             assert isinstance(outcome.once, Busy)
             assert "newer value" in str(outcome.once)
-        assert isinstance(third.once, Written)
-        assert isinstance(other.once, Written)
+        assert isinstance(third.once, WriteResult)
+        assert isinstance(other.once, WriteResult)
         assert commands(line.stations[0], asked)[0] == "WT"
         assert line.stations[0].memory.read("D", 5) == [3]
 
@@ -290,7 +290,7 @@ async def test_without_latest_every_value_is_sent() -> None:
         await asyncio.sleep(3)
         outcomes = [line.submit(dev, dev.tags[0], n) for n in (1, 2, 3)]
         await asyncio.sleep(2)
-        assert [o.once.value for o in outcomes if isinstance(o.once, Written)] == [1, 2, 3]
+        assert [o.once.value for o in outcomes if isinstance(o.once, WriteResult)] == [1, 2, 3]
         assert "WT" not in commands(line.stations[0])  # the same register twice: not in one
 
 

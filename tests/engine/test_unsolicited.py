@@ -21,8 +21,8 @@ from gateway.line.line import Line
 from gateway.line.writing import Differs
 from gateway.northbound.repeater import Repeater
 from gateway.stations.vigor import VigorStation
-from gateway.tags import Quality, Reason, Sample, Tag, Written, good
-from gateway.transport import Ear, Port
+from gateway.tags import Quality, Reason, Sample, Tag, WriteResult, good
+from gateway.transport import Port, Receiver
 from gateway.values import Value
 from tests.sim.virtual import VirtualLoop, on_virtual_time
 from tests.vectors import vectors
@@ -53,11 +53,11 @@ class Bench:
     sent: list[tuple[float, bytes]] = field(default_factory=list)
     told: list[tuple[float, Sample]] = field(default_factory=list)
     lives: list[bool] = field(default_factory=list)
-    ear: Ear | None = None
+    ear: Receiver | None = None
 
     # The port
 
-    async def open(self, ear: Ear) -> Port:
+    async def open(self, ear: Receiver) -> Port:
         self.ear = ear
         return self
 
@@ -102,9 +102,11 @@ class Bench:
     def tag(self, key: str) -> tuple[Device, Tag]:
         return next((d, t) for d in self.line.devices for t in d.tags if t.name == key)
 
-    async def write_tag(self, name: str, value: Value) -> Written | GatewayError:
+    async def write_tag(self, name: str, value: Value) -> WriteResult | GatewayError:
         device, tag = self.tag(name)
-        done: asyncio.Future[Written | GatewayError] = asyncio.get_running_loop().create_future()
+        done: asyncio.Future[WriteResult | GatewayError] = (
+            asyncio.get_running_loop().create_future()
+        )
         self.line.submit(device, tag, tag.encode(value), done.set_result)
         return await done
 
@@ -384,7 +386,7 @@ async def test_an_inverter_is_told_its_speed() -> None:
     async with running(example("inverter"), replies=inverter) as bench:
         await asyncio.sleep(1)
         done = await bench.write_tag("setpoint", 25)
-        assert isinstance(done, Written)
+        assert isinstance(done, WriteResult)
         assert (done.value, done.acknowledged) == (25.0, True)
         refused = await bench.write_tag("setpoint", 13)
         assert isinstance(refused, Refused)
@@ -449,7 +451,7 @@ async def test_b_4_5_both_programs_read_d0_and_write_d1_by_configuration_alone(n
         station.memory.write("D", 0, [0xA325])
         await asyncio.sleep(1)
         assert bench.last("d0") == 0xA325 - 0x10000
-        assert isinstance(await bench.write_tag("d1", -2), Written)
+        assert isinstance(await bench.write_tag("d1", -2), WriteResult)
         assert station.memory.read("D", 1) == [0xFFFE]
         station.holes.add(("D", 1))
         refused = await bench.write_tag("d1", 5)
@@ -491,7 +493,7 @@ async def test_a_reply_ends_by_a_silence_and_a_write_is_read_back(tmp_path: Path
         await asyncio.sleep(3)
         assert set(bench.values("speed")) == {10.0}
         done = await bench.write_tag("speed", 60)
-        assert isinstance(done, Written)
+        assert isinstance(done, WriteResult)
         assert (held, done.value, done.verified) == (b"600.0", 60.0, True)
         deaf = True  # it says yes, and does nothing
         assert isinstance(await bench.write_tag("speed", 70), Differs)
@@ -526,16 +528,16 @@ async def test_a_device_that_is_never_asked_is_written_to_but_never_probed(tmp_p
     async with running(load(path)) as bench:
         (device,) = bench.line.devices
         done = await bench.write_tag("loud", "HELLO")
-        assert isinstance(done, Written)
+        assert isinstance(done, WriteResult)
         assert done.acknowledged is False
         assert bench.lives == []
         for _ in range(5):
-            assert not isinstance(await bench.write_tag("proud", 7), Written)
+            assert not isinstance(await bench.write_tag("proud", 7), WriteResult)
         assert bench.lives == []
         await asyncio.sleep(100)
         assert bench.words == [b"PRINT HELLO\r", *[b"SET 007\r"] * 5]
         bench.replies = lambda _: b"OK\r"
-        assert isinstance(await bench.write_tag("proud", 8), Written)
+        assert isinstance(await bench.write_tag("proud", 8), WriteResult)
         assert bench.lives == [True]
         assert device.standing is Standing.UP
         assert bench.values("state") == []

@@ -11,12 +11,12 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
-from gateway.engine.requests import Obeyed
+from gateway.engine.requests import CommandResult
 from gateway.history import Historian
 from gateway.northbound import Mode, Northbound, ZenohSettings, payload
 from gateway.northbound.payload import Failure, Problem, WriteOutcome
 from gateway.northbound.plant import History
-from gateway.tags import Reason, Sample, Tag, Written, bad, good
+from gateway.tags import Reason, Sample, Tag, WriteResult, bad, good
 from tests.e2e.processes import Program
 from tests.history_writer import WEEK, until
 from tests.northbound.test_northbound import PlainDevice, PlainPlant, tag
@@ -177,9 +177,9 @@ async def test_what_became_of_writes_and_commands_is_asked_back_by_time(tmp_path
     endpoint = free_endpoint()
     writes = "plant/@gateway/demo/writes"
     done = [
-        WriteOutcome("plant/mixer/speed", 7, Written(7, PAST, 0.1), PAST, 0.1, "alice"),
+        WriteOutcome("plant/mixer/speed", 7, WriteResult(7, PAST, 0.1), PAST, 0.1, "alice"),
         WriteOutcome(
-            "plant/mixer/@stop", None, Obeyed("ok", PAST, 0.2), PAST + 1, 0.2, command=True
+            "plant/mixer/@stop", None, CommandResult("ok", PAST, 0.2), PAST + 1, 0.2, command=True
         ),
         WriteOutcome("plant/mixer/speed", 8, Failure(Problem.UNCLEAR, "?"), PAST + SECOND, 8.0),
     ]

@@ -22,7 +22,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.engine.requests import Obeyed
+from gateway.engine.requests import CommandResult
 from gateway.errors import BadValue, Busy
 from gateway.history import Historian, TimeRange, lock, time_range
 from gateway.history.file import HistoryFile
@@ -32,7 +32,7 @@ from gateway.history.recent import MOST_RUNS, Identity
 from gateway.history.rows import from_row, to_row
 from gateway.history.timerange import EARLIEST, LATEST
 from gateway.northbound.payload import Failure, Problem, WriteOutcome
-from gateway.tags import Quality, Reason, Sample, Tag, Written, bad, good
+from gateway.tags import Quality, Reason, Sample, Tag, WriteResult, bad, good
 from gateway.values import Value
 from tests.history_writer import NOBODY, TAGS, WEEK, tag, until
 
@@ -454,7 +454,7 @@ def test_what_is_older_than_keep_goes(tmp_path: Path) -> None:
         tmp_path / "h.db", keep=1.0, max_size=1_000_000, wall=lambda: clock[0]
     ) as historian:
         historian.record(numbered(1500))
-        historian.record_write(WriteOutcome("k", 1, Written(1, NOON, 0.1), NOON, 0.1))
+        historian.record_write(WriteOutcome("k", 1, WriteResult(1, NOON, 0.1), NOON, 0.1))
         until(historian, waiting=0, writes_stored=1)
         assert values(historian) == list(range(1500))
         for _ in range(1000):
@@ -488,7 +488,7 @@ def test_what_the_disk_cannot_take_in_time_is_dropped_oldest_first_and_counted(
     lost = (50_000 // 3906 + 1 - MOST_RUNS) * 3906
     assert historian.document()["lost"] == lost
     for n in range(MOST_WAITING + 7):
-        historian.record_write(WriteOutcome("k", n, Written(n, NOON, 0.1), NOON + n, 0.1))
+        historian.record_write(WriteOutcome("k", n, WriteResult(n, NOON, 0.1), NOON + n, 0.1))
     historian.start()
     document = until(historian, state="ok", waiting=0)
     assert document["lost"] == lost
@@ -498,12 +498,14 @@ def test_what_the_disk_cannot_take_in_time_is_dropped_oldest_first_and_counted(
 
 
 def test_every_write_is_kept_with_its_outcome(tmp_path: Path) -> None:
-    done = Written(12.5, NOON, 0.031, verified=True)
+    done = WriteResult(12.5, NOON, 0.031, verified=True)
     outcomes = [
         WriteOutcome("plant/mixer/speed", 12.5, done, NOON + 2, 0.031, by="abc"),
         WriteOutcome("plant/mixer/run", True, Failure(Problem.REFUSED, "no", "28"), NOON + 1, 0.1),
         WriteOutcome("plant/mixer/x", None, Failure(Problem.UNCLEAR, "\ud800"), NOON + 2, 8.0),
-        WriteOutcome("plant/mixer/@stop", None, Obeyed("ok", 1, 0.1), NOON + 3, 0.1, command=True),
+        WriteOutcome(
+            "plant/mixer/@stop", None, CommandResult("ok", 1, 0.1), NOON + 3, 0.1, command=True
+        ),
     ]
     with history(tmp_path / "h.db") as historian:
         for outcome in outcomes:
@@ -529,7 +531,7 @@ def test_every_write_is_kept_with_its_outcome(tmp_path: Path) -> None:
 
 def write(number: int) -> WriteOutcome:
     time = NOON + number * SECOND
-    return WriteOutcome("plant/mixer/speed", number, Written(number, time, 0.1), time, 0.1)
+    return WriteOutcome("plant/mixer/speed", number, WriteResult(number, time, 0.1), time, 0.1)
 
 
 def written(historian: Historian, asked: str = EVERYTHING) -> list[int]:

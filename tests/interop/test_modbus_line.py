@@ -12,10 +12,10 @@ from typing import Any
 import pytest
 
 from gateway.engine.device import Device
-from gateway.planning.wire_timing import NETWORK_BAUD, Wire
+from gateway.planning.wire_timing import NETWORK_BAUD, WireTiming
 from gateway.protocols.modbus import ModbusAscii, ModbusRtu, ModbusTcp
-from gateway.tags import Quality, Reason, WriteRule, Written
-from gateway.transport import Ear, SerialPath, SerialSettings, TcpAddress, open_port
+from gateway.tags import Quality, Reason, WriteResult, WriteRule
+from gateway.transport import Receiver, SerialPath, SerialSettings, TcpAddress, open_port
 from tests.e2e.processes import plc_gateway, write_config
 from tests.interop.peers import HERE, free_port, pty_pair, running
 from tests.sim.plant import Bench, Outcome, Plant, make_tag
@@ -24,8 +24,8 @@ from tests.zenoh_peer import free_endpoint
 
 Where = SerialPath | TcpAddress
 Peer = Callable[[pytest.FixtureRequest, Path], AbstractAsyncContextManager[Where]]
-SERIAL = Wire(19200, 10)
-NETWORK = Wire(NETWORK_BAUD, 10)
+SERIAL = WireTiming(19200, 10)
+NETWORK = WireTiming(NETWORK_BAUD, 10)
 
 
 @dataclass
@@ -34,7 +34,7 @@ class RealPort(Bench):
 
     where: Where = SerialPath("")  # noqa: RUF009 - immutable
 
-    async def open(self, stations: Any, wire: Wire, ear: Ear) -> "RealPort":
+    async def open(self, stations: Any, wire: WireTiming, ear: Receiver) -> "RealPort":
         self.ear = ear
         self.inner = await open_port(self.where, SerialSettings(19200, "8N1"), self)
         return self
@@ -98,7 +98,7 @@ PEERS = {
 }
 
 
-def device_of(driver: Any, wire: Wire) -> Device:
+def device_of(driver: Any, wire: WireTiming) -> Device:
     """Holding n holds n, input n 1000 + n, every third bit is on; 10000 of each."""
     texts = [f"holding:{n}" for n in (*range(100, 164), 500, 1000, 1500, 2000, 9999, 10000)]
     texts += [f"input:{n}" for n in range(5, 8)]
@@ -151,7 +151,7 @@ async def test_a_whole_line_with(name: str, request: pytest.FixtureRequest, tmp_
                 outcome = Outcome(0.0)
                 line.line.submit(device, tag, tag.encode(value), outcome)
                 await until(lambda outcome=outcome: bool(outcome.said))
-                assert isinstance(outcome.once, Written)
+                assert isinstance(outcome.once, WriteResult)
                 assert outcome.once.verified
                 await until(lambda tag=tag, value=value: line.now[tag].value == value)
         assert device.record.failures == {}

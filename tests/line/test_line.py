@@ -11,9 +11,9 @@ from structlog.testing import capture_logs
 from gateway.engine.device import Device, Standing
 from gateway.errors import Busy, Evidence, GatewayError, LineDown, Offline, Refused, Unclear
 from gateway.line.line import PATIENCE, REOPEN_LONGEST
-from gateway.planning.wire_timing import Wire
+from gateway.planning.wire_timing import WireTiming
 from gateway.protocols.vigor import Vigor
-from gateway.tags import Quality, Reason, Tag, WriteRule, Written
+from gateway.tags import Quality, Reason, Tag, WriteResult, WriteRule
 from tests.sim.plant import (
     WIRE,
     Plant,
@@ -159,7 +159,7 @@ async def test_late_acknowledgements_never_prove_another_write(late_acks: float)
             station.inner.hear = hear  # type: ignore[method-assign]
             held = station.memory.read("D", tag.address.number)[0]
             match outcome.once:
-                case Written():
+                case WriteResult():
                     assert held == value
                     said.append(value)
                 case Offline() | Busy():
@@ -355,8 +355,8 @@ async def test_under_full_load_a_write_waits_for_one_exchange_or_two() -> None:
             first, second = (at for at, _ in line.writes_sent(asked))
             assert first - asked <= longest + 0.005 + 1e-6
             assert second - first <= 2 * longest + 0.1
-            assert isinstance(alone.once, Written)
-            assert isinstance(close.once, Written)
+            assert isinstance(alone.once, WriteResult)
+            assert isinstance(close.once, WriteResult)
             assert alone.at < close.at
 
 
@@ -437,12 +437,12 @@ async def test_a_cancelled_line_answers_every_write_once(moment: float) -> None:
         task.cancel()
         await asyncio.sleep(0.001)
         for outcome in outcomes:
-            assert isinstance(outcome.once, Written | GatewayError)
+            assert isinstance(outcome.once, WriteResult | GatewayError)
     sent = len(line.writes_sent())
-    done = [o for o in outcomes if isinstance(o.once, Written)]
+    done = [o for o in outcomes if isinstance(o.once, WriteResult)]
     unclear = [o for o in outcomes if isinstance(o.once, Unclear)]
     assert len(done) + len(unclear) in (sent, sent + 1)  # the silence before it may have run
-    assert all(isinstance(o.once, LineDown | Offline | Written | Unclear) for o in outcomes)
+    assert all(isinstance(o.once, LineDown | Offline | WriteResult | Unclear) for o in outcomes)
 
 
 @on_virtual_time
@@ -745,7 +745,7 @@ async def test_what_the_adapter_adds_before_the_echo_does_no_harm() -> None:
 
 @on_virtual_time
 async def test_above_19200_baud_the_clock_is_watched() -> None:
-    wire = Wire(115200, 10)
+    wire = WireTiming(115200, 10)
     dev = device(words(0, 20, every=0.02), wire=wire)
     line = plant([dev], wire=wire)
     async with running(line):

@@ -9,11 +9,11 @@ import pytest
 from structlog.testing import capture_logs
 
 from gateway.engine.device import Device, Standing
-from gateway.planning.wire_timing import Wire
+from gateway.planning.wire_timing import WireTiming
 from gateway.protocols.computer_link import SILENT_CAUSES, ComputerLink
 from gateway.protocols.vigor import Vigor
 from gateway.stations.vigor import VigorStation
-from gateway.tags import Quality, Reason, WriteRule, Written
+from gateway.tags import Quality, Reason, WriteResult, WriteRule
 from tests.sim.links import commands, link_device, link_plant, link_station, spelt
 from tests.sim.plant import (
     SECOND,
@@ -29,7 +29,7 @@ from tests.sim.plant import (
 )
 from tests.sim.virtual import on_virtual_time, run_virtual
 
-ONE_FORMAT = Wire(19200, 10)  # 7E1, of all of them
+ONE_FORMAT = WireTiming(19200, 10)  # 7E1, of all of them
 NUMBERS = (0, 300, 600)
 
 
@@ -84,7 +84,7 @@ async def test_three_protocol_variants_on_one_wire_are_all_healthy() -> None:
         for dev in line.devices:
             outcome = line.submit(dev, dev.tags[0], 4711)
             await asyncio.sleep(1)
-            assert isinstance(outcome.once, Written)
+            assert isinstance(outcome.once, WriteResult)
             assert line.now[dev.tags[0]].value == 4711
     assert [s.memory.read("D", 0)[0] for s in line.stations] == [4711] * 3
     assert not [w for w in wrong(line) if w[2] != 4711]

@@ -13,18 +13,18 @@ from structlog.testing import capture_logs
 
 from gateway.engine.device import Device, Standing
 from gateway.errors import Evidence, LineDown, Unclear
-from gateway.planning.wire_timing import NETWORK_BAUD, Wire
+from gateway.planning.wire_timing import NETWORK_BAUD, WireTiming
 from gateway.protocols.driver import AnyDriver
 from gateway.protocols.modbus import Frame, MbapCodec, ModbusAscii, ModbusRtu, ModbusTcp, RtuEar
 from gateway.stations.modbus import ModbusStation
-from gateway.tags import Quality, Reason, Tag, WriteRule, Written
-from gateway.transport import Ear
+from gateway.tags import Quality, Reason, Tag, WriteResult, WriteRule
+from gateway.transport import Receiver
 from tests.line.test_line import Witness
 from tests.sim.plant import WIRE, Bench, Plant, Unruly, clock_word, make_tag, running
 from tests.sim.virtual import on_virtual_time
 from tests.vectors import vectors
 
-NETWORK = Wire(NETWORK_BAUD, 10)
+NETWORK = WireTiming(NETWORK_BAUD, 10)
 Driver = ModbusRtu | ModbusAscii | ModbusTcp
 
 
@@ -33,7 +33,12 @@ def now() -> float:
 
 
 def slave(
-    driver: Driver, tags: Sequence[Tag], *, wire: Wire = WIRE, guard: float = 0.3, **timing: Any
+    driver: Driver,
+    tags: Sequence[Tag],
+    *,
+    wire: WireTiming = WIRE,
+    guard: float = 0.3,
+    **timing: Any,
 ) -> Device:
     times = replace(driver.timing, **timing)
     return Device(f"slave{driver.station}", driver, wire, times, tuple(tags), guard)
@@ -58,7 +63,7 @@ def station_of(driver: Driver, **settings: Any) -> ModbusStation:
 def plant(
     devices: Sequence[Device],
     *,
-    wire: Wire = WIRE,
+    wire: WireTiming = WIRE,
     seed: int = 0,
     bench: Bench | None = None,
     **station: Any,
@@ -154,7 +159,7 @@ async def test_a_broadcast_is_written_and_nothing_is_waited_for_but_the_turnarou
             sent, asked = len(line.bench.sent), now()
             outcome = line.submit(devices[2], tag, value)
             await asyncio.sleep(1)
-            assert isinstance(outcome.once, Written)
+            assert isinstance(outcome.once, WriteResult)
             assert (outcome.once.acknowledged, outcome.once.verified) == (False, False)
             assert outcome.at - asked < 0.1  # reply_timeout is 0.5 s
             at = next(i for i, (_, data) in enumerate(line.bench.sent[sent:]) if is_to_all(data))
@@ -269,7 +274,7 @@ async def test_function_06_answered_with_address_0_is_done_for_vigor_alone(
         await asyncio.sleep(1)
         outcome = line.submit(dev, tag, 4711)
         await asyncio.sleep(3)
-        assert isinstance(outcome.once, Written if done else Unclear)
+        assert isinstance(outcome.once, WriteResult if done else Unclear)
         assert memory.read(area, 300) == [4711]
 
 
@@ -300,7 +305,7 @@ async def test_three_dialects_share_one_rtu_line_and_ex485lnk_has_its_silence() 
             first = device.tags[0]
             outcome = line.submit(device, first, 321)
             await asyncio.sleep(0.5)
-            assert isinstance(outcome.once, Written)
+            assert isinstance(outcome.once, WriteResult)
             assert line.now[first].value == 321
         await asyncio.sleep(25)
     assert all(line.good(device) and not device.record.failures for device in devices)
@@ -333,7 +338,7 @@ async def test_on_an_echoing_line_a_silent_slave_does_not_acknowledge_by_its_ech
         for tag, value in ((tags[0], 1234), (tags[1], True)):
             done = line.submit(dev, tag, value)
             await asyncio.sleep(0.5)
-            assert isinstance(done.once, Written)
+            assert isinstance(done.once, WriteResult)
         assert not dev.record.failures
         for tag, value in ((tags[0], 4321), (tags[1], False)):
             line.stations[0].mute = True
@@ -370,7 +375,7 @@ async def test_an_echo_the_file_does_not_speak_of_is_no_acknowledgement(driver: 
         for tag, value in zip(tags, (1234, True), strict=True):
             done = line.submit(dev, tag, value)
             await asyncio.sleep(0.9)
-            assert isinstance(done.once, Written)
+            assert isinstance(done.once, WriteResult)
             assert line.now[tag].value == value
         for tag, value in zip(tags, (4321, False), strict=True):
             line.stations[0].mute = True
@@ -411,7 +416,7 @@ async def test_where_nothing_echoes_a_write_takes_one_exchange() -> None:
             for tag, value in zip(tags, (1234, True), strict=True):
                 done = line.submit(dev, tag, value)
                 await asyncio.sleep(0.5)
-                assert isinstance(done.once, Written)
+                assert isinstance(done.once, WriteResult)
             assert not dev.record.failures
     assert not [entry for entry in logs if "echo" in entry["event"]]
 
@@ -447,7 +452,7 @@ class Network(Bench):
     open_most: int = 0
     codec: MbapCodec = field(default_factory=MbapCodec)
 
-    async def open(self, stations: Sequence[Any], wire: Wire, ear: Ear) -> "Network":
+    async def open(self, stations: Sequence[Any], wire: WireTiming, ear: Receiver) -> "Network":
         self.opened.append(now())
         self.ear, self.codec, self.open_now = ear, MbapCodec(), 0
         self.station = stations[0]
@@ -469,7 +474,7 @@ class Network(Bench):
                 ear = self.ear
                 asyncio.get_running_loop().call_later(wait, self._answer, number, question, ear)
 
-    def _answer(self, number: int, question: bytes, ear: Ear | None) -> None:
+    def _answer(self, number: int, question: bytes, ear: Receiver | None) -> None:
         if ear is None or ear is not self.ear:
             return
         (reply,) = self.station.hear(question, now())

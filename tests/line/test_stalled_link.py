@@ -11,15 +11,15 @@ import pytest
 
 from gateway.engine.device import Device, Standing
 from gateway.errors import Busy, LineDown
-from gateway.planning.wire_timing import Wire
+from gateway.planning.wire_timing import WireTiming
 from gateway.protocols.checksums import crc16
 from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.driver import AnyDriver
 from gateway.protocols.modbus import ModbusAscii, ModbusRtu
 from gateway.protocols.vigor import Vigor
 from gateway.simulator.plant import station_for
-from gateway.tags import Quality, Reason, Tag, WriteRule, Written
-from gateway.transport import Ear
+from gateway.tags import Quality, Reason, Tag, WriteResult, WriteRule
+from gateway.transport import Receiver
 from tests.sim.bench import WIRE, Bench
 from tests.sim.plant import Outcome, Plant, device, make_tag, plant, running
 from tests.sim.virtual import on_virtual_time
@@ -41,7 +41,9 @@ class DeviceServer(Bench):
     _queue: "asyncio.Queue[bytes]" = field(default_factory=asyncio.Queue)
     _task: "asyncio.Task[None] | None" = None
 
-    async def open(self, stations: Sequence[Any], wire: Wire, ear: Ear) -> "DeviceServer":
+    async def open(
+        self, stations: Sequence[Any], wire: WireTiming, ear: Receiver
+    ) -> "DeviceServer":
         self.ear, (self._station,) = ear, stations
         self.flows.set()
         self._task = asyncio.create_task(self._serve())
@@ -144,7 +146,7 @@ async def test_after_a_stall_one_bit_is_written_into_the_word_as_it_is() -> None
                 await asyncio.sleep(1.0)
                 outcomes.append(line.submit(dev, bit, value))
             await asyncio.sleep(6.0)
-            assert sum(isinstance(outcome.once, Written) for outcome in outcomes) > 4
+            assert sum(isinstance(outcome.once, WriteResult) for outcome in outcomes) > 4
             assert memory.read("holding", 500)[0] in (0xA5A0, 0xA5A8)
 
 
@@ -188,7 +190,7 @@ async def test_late_refusals_of_what_a_slave_does_not_have_acknowledge_nothing(
 
     def judged(tag: Tag, value: int, outcome: Any) -> None:
         there = inner.memory.read("holding", tag.address.number)[0]
-        if isinstance(outcome, Written) and there != value:
+        if isinstance(outcome, WriteResult) and there != value:
             false.append((tag.text, value, there))
 
     async with running(line):
@@ -245,7 +247,7 @@ async def test_a_line_that_is_never_quiet_is_no_reason_to_be_silent(
         assert line.good(dev)
         second = line.submit(dev, tag, 8)
         await asyncio.sleep(1)
-        assert isinstance(second.once, Written)
+        assert isinstance(second.once, WriteResult)
 
 
 @pytest.mark.parametrize("delay", [0.005, 0.04, 0.08])
@@ -264,7 +266,7 @@ async def test_the_echo_of_our_own_area_c_acknowledges_no_write(delay: float) ->
         for value in range(10):
             outcomes.append(line.submit(dev, tag, value))
             await asyncio.sleep(7)
-    assert not any(isinstance(outcome.once, Written) for outcome in outcomes)
+    assert not any(isinstance(outcome.once, WriteResult) for outcome in outcomes)
 
 
 @on_virtual_time

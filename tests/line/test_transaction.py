@@ -10,7 +10,7 @@ from gateway.errors import Evidence, Garbled, LineDown, NoReply, Refused
 from gateway.line.clock import Clock
 from gateway.line.transaction import Turn
 from gateway.line.wire_log import Recorder
-from gateway.planning.wire_timing import Wire
+from gateway.planning.wire_timing import WireTiming
 from gateway.protocols.driver import Span
 from gateway.protocols.modbus import ModbusRtu
 from gateway.protocols.vigor import Vigor
@@ -18,7 +18,7 @@ from gateway.stations.modbus import ModbusStation
 from gateway.stations.vigor import VigorStation
 from tests.sim.virtual import on_virtual_time
 
-WIRE = Wire(9600, 10)
+WIRE = WireTiming(9600, 10)
 SPAN = Span("D", 0, 2)
 
 

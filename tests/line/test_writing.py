@@ -7,7 +7,7 @@ import pytest
 from gateway.engine.device import Device
 from gateway.errors import Refused, Unclear
 from gateway.line.writing import Differs
-from gateway.tags import Tag, WriteRule, Written
+from gateway.tags import Tag, WriteResult, WriteRule
 from tests.sim.plant import Outcome, Plant, device, make_tag, plant, running
 from tests.sim.virtual import on_virtual_time
 
@@ -48,7 +48,7 @@ async def test_an_acknowledged_write_is_done() -> None:
     async with running(line):
         await asyncio.sleep(1)
         done = (await write(line)).once
-    assert isinstance(done, Written)
+    assert isinstance(done, WriteResult)
     assert (done.value, done.verified, done.acknowledged) == (5, False, True)
     assert 0 < done.took < 0.2
     assert dev.record.writes == 1
@@ -76,7 +76,7 @@ async def test_verify_reads_back_what_became_of_it(obeys: bool) -> None:
         done = (await write(line)).once
     assert len(line.writes_sent()) == 1
     if obeys:
-        assert isinstance(done, Written)
+        assert isinstance(done, WriteResult)
         assert done.verified
     else:
         assert isinstance(done, Unclear)
@@ -88,7 +88,7 @@ async def test_repeat_sends_once_more() -> None:
     async with running(line):
         await asyncio.sleep(1)
         deafen(line, b"61")
-        assert isinstance((await write(line)).once, Written)
+        assert isinstance((await write(line)).once, WriteResult)
         deafen(line, b"61", times=9)
         assert isinstance((await write(line, 6)).once, Unclear)
     assert len(line.writes_sent()) == 2 + 2
@@ -101,12 +101,12 @@ async def test_verify_and_repeat_send_again_only_what_was_not_done() -> None:
         await asyncio.sleep(1)
         deafen(line, b"61", obeys=True)
         done = (await write(line)).once
-        assert isinstance(done, Written)
+        assert isinstance(done, WriteResult)
         assert done.verified
         assert len(line.writes_sent()) == 1
         deafen(line, b"61")
         done = (await write(line, 6)).once
-        assert isinstance(done, Written)
+        assert isinstance(done, WriteResult)
         assert done.verified
         assert len(line.writes_sent()) == 3
 
@@ -220,6 +220,6 @@ async def test_a_bit_area_is_written_bit_by_bit() -> None:
         await asyncio.sleep(1)
         outcome = line.submit(line.devices[0], tag, True)
         await asyncio.sleep(1)
-        assert isinstance(outcome.once, Written)
+        assert isinstance(outcome.once, WriteResult)
         assert outcome.once.verified
     assert line.stations[0].memory.read("M", 8, 8) == [0, 0, 0, 0, 1, 0, 0, 0]

@@ -36,7 +36,7 @@ from gateway.northbound.repeater import Repeater
 from gateway.northbound.session import configure
 from gateway.northbound.writes import AT_ONCE
 from gateway.protocols.driver import Address, Span, Unit
-from gateway.tags import Form, Reason, Sample, Tag, WriteRule, Written, bad, good
+from gateway.tags import Form, Reason, Sample, Tag, WriteResult, WriteRule, bad, good
 from gateway.values import Layout, Value, parse_type
 from tests.zenoh_peer import ZenohPeer, free_endpoint
 
@@ -92,13 +92,13 @@ class PlainPlant:
     def sample(self, tag: Tag) -> Sample:
         return self.samples[tag.key]
 
-    async def write(self, tag: Tag, value: Value) -> Written:
+    async def write(self, tag: Tag, value: Value) -> WriteResult:
         tag.encode(value)
         await self.gate.wait()
         if value in self.endings:
             raise self.endings[value]
         self.written.append((tag.key, value))
-        return Written(value, time.time_ns(), verified=True, took=0.031)
+        return WriteResult(value, time.time_ns(), verified=True, took=0.031)
 
     def told(self, samples: Sequence[Sample]) -> None:
         self.repeated += samples

@@ -21,7 +21,7 @@ from gateway.errors import (
 from gateway.northbound import payload
 from gateway.northbound.payload import Failure, Problem, WriteOutcome
 from gateway.protocols.driver import Address, Span, Unit
-from gateway.tags import Deadband, Reason, Tag, WriteRule, Written, bad, good
+from gateway.tags import Deadband, Reason, Tag, WriteResult, WriteRule, bad, good
 from gateway.values import Layout, Value, parse_type
 
 NOON = 1_795_176_000_123_456_789  # 2026-11-20T12:00:00.123456789Z
@@ -188,7 +188,7 @@ def test_every_error_has_its_word(error: GatewayError, word: str, code: str | No
 
 
 def test_the_answer_to_a_write() -> None:
-    document = json.loads(payload.outcome(Written(12.5, NOON, 0.0310001, verified=True)))
+    document = json.loads(payload.outcome(WriteResult(12.5, NOON, 0.0310001, verified=True)))
     assert document == {
         "value": 12.5,
         "time": "2026-11-20T12:00:00.123456Z",

@@ -19,7 +19,7 @@ import zenoh
 
 from gateway.cli.client.connection import PASSWORD_VARIABLE, USER_VARIABLE
 from gateway.config.plain import TlsConfig
-from gateway.engine.requests import Obeyed
+from gateway.engine.requests import CommandResult
 from gateway.errors import ConfigError
 from gateway.northbound import Northbound, ZenohSettings, secrets
 from gateway.northbound.audit import BURST, Audit
@@ -27,7 +27,7 @@ from gateway.northbound.limiter import Limiter
 from gateway.northbound.payload import Failure, Problem, WriteOutcome
 from gateway.northbound.session import configure
 from gateway.northbound.writers import NotAllowed, Writers
-from gateway.tags import Written
+from gateway.tags import WriteResult
 from tests.config.test_commands import Below
 from tests.conftest import needs
 from tests.e2e.processes import PATIENCE, Done, Program, started, vigor_line, write_config
@@ -84,7 +84,7 @@ async def running(northbound: Northbound) -> AsyncIterator[None]:
         await asyncio.wait([serves], timeout=5)
 
 
-COMMANDED = Below(Obeyed("acknowledged", 1, 0.1))
+COMMANDED = Below(CommandResult("acknowledged", 1, 0.1))
 
 
 @asynccontextmanager
@@ -455,7 +455,9 @@ async def test_with_writers_only_a_token_writes_and_its_owner_is_named(tmp_path:
         assert {line["outcome"] for line in lines[:12]} == {"not-allowed"}
         assert [(line["value"], line["by"]) for line in lines[12:]] == [(8, "alice"), (9, "alice")]
         assert plant.written == [("mixer/recipe", 8), ("mixer/recipe", 9)]
-        assert [(done.by, type(done.result)) for done in recorded[12:]] == [("alice", Written)] * 2
+        assert [(done.by, type(done.result)) for done in recorded[12:]] == [
+            ("alice", WriteResult)
+        ] * 2
         assert len(recorded) == 14
 
 
@@ -512,7 +514,7 @@ def test_the_one_liner_of_the_page_makes_a_line_and_its_token(tmp_path: Path) ->
 # -- the audit under a flood -------------------------------------------------------------------
 
 
-def outcome(result: Written | Failure, number: int = 0) -> WriteOutcome:
+def outcome(result: WriteResult | Failure, number: int = 0) -> WriteOutcome:
     return WriteOutcome("plant/mixer/recipe", number, result, number, 0.0, None)
 
 
@@ -524,7 +526,7 @@ def test_a_flood_of_refusals_is_counted_and_what_was_written_is_told_meanwhile()
         for number in range(10_000):
             audit(outcome(Failure(Problem.UNKNOWN_TAG, "no"), number))
         for ending in (
-            Written(1, 0, took=0.1),
+            WriteResult(1, 0, took=0.1),
             Failure(Problem.UNCLEAR, "?"),
             Failure(Problem.REFUSED, "no", "28"),
         ):
@@ -532,7 +534,7 @@ def test_a_flood_of_refusals_is_counted_and_what_was_written_is_told_meanwhile()
         audit.tell_rest()
         audit.tell_rest()
     assert len(told) == len(kept) == BURST + 3
-    assert [type(done.result) for done in kept[BURST:]] == [Written, Failure, Failure]
+    assert [type(done.result) for done in kept[BURST:]] == [WriteResult, Failure, Failure]
     assert audit.untold == 10_000 - BURST
     assert len(lines) == BURST + 3 + 1
     assert lines[-1]["count"] == 10_000 - BURST

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from benchmarks import peers_requests
 from gateway.errors import ConfigError
 from gateway.planning.planner import Block, Cuts, plan
-from gateway.planning.wire_timing import Wire
+from gateway.planning.wire_timing import WireTiming
 from gateway.protocols.driver import Cost, Span
 from gateway.protocols.modbus import ModbusRtu
 from gateway.protocols.vigor import Vigor
@@ -23,7 +23,7 @@ DRIVER = Vigor()
 
 
 def at(baud: int, turnaround: float = 0.01) -> partial[float]:
-    return partial(Wire(baud, 10).exchange, timing=DRIVER.timing, turnaround=turnaround)
+    return partial(WireTiming(baud, 10).exchange, timing=DRIVER.timing, turnaround=turnaround)
 
 
 def spans(blocks: Sequence[Block]) -> list[tuple[int, int]]:
@@ -204,7 +204,7 @@ def test_a_tag_that_no_request_can_carry_is_an_error() -> None:
 def test_ten_times_the_tags_take_about_ten_times_as_long() -> None:
     """By the processor's clock; the least of some, for the machine may have other work."""
     modbus = ModbusRtu(station=1)
-    seconds = partial(Wire(19200, 10).exchange, timing=modbus.timing, turnaround=0.01)
+    seconds = partial(WireTiming(19200, 10).exchange, timing=modbus.timing, turnaround=0.01)
 
     def took(count: int) -> float:
         tags = [make_tag(f"holding:{3 * n}", modbus, name=str(n)) for n in range(count)]
@@ -221,7 +221,7 @@ def test_ten_times_the_tags_take_about_ten_times_as_long() -> None:
 
 @pytest.mark.parametrize("baud", [9600, 19200, 38400, 115200])
 def test_the_two_hundred_register_set_is_planned_at_the_optimum(baud: int) -> None:
-    wire = Wire(baud, 11)
+    wire = WireTiming(baud, 11)
     found = peers_requests.ours(wire)
     spent = sum(peers_requests.seconds(wire, size) for size in found)
     assert spent == pytest.approx(peers_requests.optimum(wire), rel=1e-9)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from gateway.planning.wire_timing import Wire, character_bits
+from gateway.planning.wire_timing import WireTiming, character_bits
 from gateway.protocols.driver import Cost, Timing
 
 
@@ -20,18 +20,20 @@ def test_a_character_has_a_start_bit_data_parity_and_stop_bits(
 def test_the_longest_vigor_frames_take_141_and_139_ms_at_19200(
     characters: int, milliseconds: float
 ) -> None:
-    assert Wire(19200, 10).character * characters * 1000 == pytest.approx(milliseconds, abs=0.1)
+    assert WireTiming(19200, 10).character * characters * 1000 == pytest.approx(
+        milliseconds, abs=0.1
+    )
 
 
 def test_rtu_keeps_three_and_a_half_characters_of_silence_or_what_was_set() -> None:
     rtu = Timing(silence=0.00175, silence_chars=3.5)
-    assert Wire(9600, 11).silence(rtu) == pytest.approx(3.5 * 11 / 9600)
-    assert Wire(115200, 11).silence(rtu) == 0.00175
-    assert Wire(9600, 11).silence(Timing(silence=0.01, silence_chars=3.5)) == 0.01
+    assert WireTiming(9600, 11).silence(rtu) == pytest.approx(3.5 * 11 / 9600)
+    assert WireTiming(115200, 11).silence(rtu) == 0.00175
+    assert WireTiming(9600, 11).silence(Timing(silence=0.01, silence_chars=3.5)) == 0.01
 
 
 def test_an_exchange_is_silence_request_turnaround_and_reply() -> None:
-    wire, timing = Wire(9600, 10), Timing(turnaround=0.02, silence=0.005)
+    wire, timing = WireTiming(9600, 10), Timing(turnaround=0.02, silence=0.005)
     cost = Cost(14, 12)
     assert wire.exchange(cost, timing) == pytest.approx(0.005 + 26 / 960 + 0.02)
     assert wire.exchange(cost, timing, 0.1) == pytest.approx(0.005 + 26 / 960 + 0.1)

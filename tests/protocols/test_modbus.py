@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gateway.errors import BadValue, ConfigError, DeviceError, NoReply, Refusal, Refused
-from gateway.planning.wire_timing import Wire
+from gateway.planning.wire_timing import WireTiming
 from gateway.protocols.driver import Address, Cost, Driver, Span
 from gateway.protocols.modbus import Frame, ModbusAscii, ModbusRtu, ModbusTcp
 from gateway.stations.modbus import ModbusStation
@@ -143,15 +143,15 @@ def test_settings_out_of_range_are_refused(
 
 def test_rtu_keeps_3_5_characters_of_silence_and_1_75_ms_above_19200_baud() -> None:
     timing = ModbusRtu(station=1).timing
-    assert Wire(9600, 11).silence(timing) == pytest.approx(3.5 * 11 / 9600)
-    assert Wire(19200, 11).silence(timing) == pytest.approx(3.5 * 11 / 19200)
-    assert Wire(38400, 11).silence(timing) == pytest.approx(0.00175)
+    assert WireTiming(9600, 11).silence(timing) == pytest.approx(3.5 * 11 / 9600)
+    assert WireTiming(19200, 11).silence(timing) == pytest.approx(3.5 * 11 / 19200)
+    assert WireTiming(38400, 11).silence(timing) == pytest.approx(0.00175)
 
 
 def test_ex485lnk_keeps_10_ms_of_silence_or_3_5_characters() -> None:
     timing = ModbusRtu(station=1, addressing="ex485lnk").timing
-    assert Wire(9600, 11).silence(timing) == pytest.approx(0.010)
-    assert Wire(1200, 11).silence(timing) == pytest.approx(3.5 * 11 / 1200)
+    assert WireTiming(9600, 11).silence(timing) == pytest.approx(0.010)
+    assert WireTiming(1200, 11).silence(timing) == pytest.approx(3.5 * 11 / 1200)
 
 
 # ---- limits and costs ------------------------------------------------------------------

@@ -7,13 +7,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from gateway.errors import LineDown
-from gateway.planning.wire_timing import Wire
+from gateway.planning.wire_timing import WireTiming
 from gateway.simulator.port import open_simulator
 from gateway.stations.station import Memory
 from gateway.stations.vigor import VigorStation
-from gateway.transport import Ear, Port
+from gateway.transport import Port, Receiver
 
-WIRE = Wire(19200, 10)
+WIRE = WireTiming(19200, 10)
 TURNAROUND = 0.005
 
 
@@ -27,7 +27,7 @@ class Unruly:
     delay: float = 0.0  # what the simulated wire adds to the turnaround
     lose: float = 0.0  # share of replies that are lost
     cut: float = 0.0  # share of replies that break off
-    wire: Wire = WIRE
+    wire: WireTiming = WIRE
     heard: list[tuple[float, bytes]] = field(default_factory=list)  # its requests
     lost: int = 0
 
@@ -76,13 +76,13 @@ class Bench:
     opened: list[float] = field(default_factory=list)  # every try
     sent: list[tuple[float, bytes]] = field(default_factory=list)
     damaged: int = 0
-    ear: Ear | None = None
+    ear: Receiver | None = None
     inner: Port | None = None
 
     def __post_init__(self) -> None:
         self._random = random.Random(self.seed)
 
-    async def open(self, stations: Sequence[Any], wire: Wire, ear: Ear) -> "Bench":
+    async def open(self, stations: Sequence[Any], wire: WireTiming, ear: Receiver) -> "Bench":
         self.opened.append(_now())
         if self.gone:
             raise LineDown(self.gone)

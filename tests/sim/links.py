@@ -5,7 +5,7 @@ from dataclasses import replace
 from typing import Any
 
 from gateway.engine.device import Device
-from gateway.planning.wire_timing import Wire
+from gateway.planning.wire_timing import WireTiming
 from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.driver import AnyDriver
 from gateway.stations.computer_link import ComputerLinkStation
@@ -33,7 +33,7 @@ def link_station(driver: AnyDriver) -> ComputerLinkStation:
     )
 
 
-def link_plant(devices: Sequence[Device], wire: Wire = WIRE, seed: int = 0) -> Plant:
+def link_plant(devices: Sequence[Device], wire: WireTiming = WIRE, seed: int = 0) -> Plant:
     stations = [
         Unruly(link_station(device.driver), seed * 1000 + i, wire=wire)  # type: ignore[arg-type]
         for i, device in enumerate(devices)

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 from gateway.errors import LineDown
-from gateway.transport import Ear
+from gateway.transport import Receiver
 from tests.sim.stations import Troubled
 from tests.sim.wire import Noise, Watch
 
@@ -30,14 +30,14 @@ class SimNet:
     closed: int = 0
 
     def __post_init__(self) -> None:
-        self._ear: Ear | None = None
+        self._ear: Receiver | None = None
         self._generation = 0
         self._hanging = False
         self._stuck: list[Callable[[], None]] = []
 
     # The port
 
-    async def open(self, ear: Ear) -> "SimNet":
+    async def open(self, ear: Receiver) -> "SimNet":
         if self.gone or self._hanging:
             raise LineDown(self.gone or "no answer within 5 s")
         self._ear = ear

@@ -11,7 +11,7 @@ from gateway.errors import BadValue, Busy, GatewayError, LineDown, Offline, Refu
 from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.computer_link.refusals import model_name
 from gateway.protocols.frames.driver import LISTENED
-from gateway.tags import Quality, Tag, Written
+from gateway.tags import Quality, Tag, WriteResult
 from gateway.values import Kind, Value
 from tests.sim.bus import Bus, summed
 from tests.sim.judge import Judge
@@ -104,10 +104,10 @@ class Person:
         obeyed = _times(station, tag) - known
         most = 2 if tag.write is not None and tag.write.repeat else 1
         match outcome:
-            case Written(acknowledged=False):
+            case WriteResult(acknowledged=False):
                 await self._must_arrive(tag, value, station, since)
                 return
-            case Written():
+            case WriteResult():
                 true = holds and (obeyed > 0 or held == value)
             case Refused() | BadValue():
                 true = obeyed == 0
@@ -118,7 +118,7 @@ class Person:
         true = true and obeyed <= most
         if true:
             return
-        done = isinstance(outcome, Written)
+        done = isinstance(outcome, WriteResult)
         if bus.hurt_at >= since:
             self.blind("blind writes")
         elif obeyed and (holds or not done) and self.deaf(tag.device, since, ("stall",)):
@@ -133,7 +133,7 @@ class Person:
                 f"obeyed {obeyed} times, holds {holds}"
             )
 
-    async def _outcome(self, tag: Tag, value: Value) -> Written | GatewayError:
+    async def _outcome(self, tag: Tag, value: Value) -> WriteResult | GatewayError:
         try:
             return await self.judge.gateway.write(tag, value)
         except GatewayError as error:
@@ -155,9 +155,9 @@ class Person:
         sent = bus.writes[self.number] - frames
         bus.note("told all", tag.key, value, type(outcome).__name__, sent)
         judge.story.counts[f"broadcast {type(outcome).__name__}"] += 1
-        if isinstance(outcome, Written) and outcome.acknowledged:
+        if isinstance(outcome, WriteResult) and outcome.acknowledged:
             judge.broke(f"{tag.key}: nobody acknowledges, but it is said to be done")
-        if not isinstance(outcome, Written):
+        if not isinstance(outcome, WriteResult):
             return
         await asyncio.sleep(SOON)
         for name, station in bus.stations.items():

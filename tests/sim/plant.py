@@ -12,12 +12,12 @@ from typing import Any
 from gateway.engine.device import Device
 from gateway.errors import GatewayError
 from gateway.line.line import Line
-from gateway.planning.wire_timing import Wire
+from gateway.planning.wire_timing import WireTiming
 from gateway.protocols.driver import AnyDriver, Span, Timing, Unit
 from gateway.protocols.vigor import Vigor
 from gateway.stations.station import Memory
 from gateway.stations.vigor import VigorStation
-from gateway.tags import Quality, Reason, Sample, Tag, Written
+from gateway.tags import Quality, Reason, Sample, Tag, WriteResult
 from gateway.values import Layout, Value, parse_type
 from tests.sim.bench import WIRE, Bench, Unruly
 
@@ -73,7 +73,7 @@ class Plant:
     devices: list[Device]
     stations: list[Unruly]
     bench: Bench
-    wire: Wire = WIRE
+    wire: WireTiming = WIRE
     told: list[tuple[float, Sample]] = field(default_factory=list)
     lives: list[tuple[float, str, bool]] = field(default_factory=list)
     now: dict[Tag, Sample] = field(default_factory=dict)
@@ -138,15 +138,15 @@ class Outcome:
     """What became of a write, and whether it was said once."""
 
     asked: float
-    said: list[Written | GatewayError] = field(default_factory=list)
+    said: list[WriteResult | GatewayError] = field(default_factory=list)
     at: float = 0.0
 
-    def __call__(self, outcome: Written | GatewayError) -> None:
+    def __call__(self, outcome: WriteResult | GatewayError) -> None:
         self.said.append(outcome)
         self.at = _now()
 
     @property
-    def once(self) -> Written | GatewayError:
+    def once(self) -> WriteResult | GatewayError:
         assert len(self.said) == 1, self.said
         return self.said[0]
 
@@ -157,7 +157,7 @@ def device(
     station: int = 1,
     name: str = "",
     guard: float = 0.5,
-    wire: Wire = WIRE,
+    wire: WireTiming = WIRE,
     **timing: Any,
 ) -> Device:
     driver = Vigor(station=station)
@@ -165,7 +165,9 @@ def device(
     return Device(name or f"plc{station}", driver, wire, times, tuple(tags), guard)
 
 
-def plant(devices: Sequence[Device], *, wire: Wire = WIRE, seed: int = 0, **bench: Any) -> Plant:
+def plant(
+    devices: Sequence[Device], *, wire: WireTiming = WIRE, seed: int = 0, **bench: Any
+) -> Plant:
     """A station for every device; its knobs and the bench's can be turned at any time."""
     stations = [
         Unruly(VigorStation(d.driver.station), seed * 1000 + i, wire=wire)

@@ -25,7 +25,7 @@ from typing import Any
 from gateway.engine.device import Device
 from gateway.errors import DeviceError, NoReply
 from gateway.line.reading import read_block
-from gateway.planning.wire_timing import Wire
+from gateway.planning.wire_timing import WireTiming
 from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.driver import Address, AnyDriver, Span
 from gateway.protocols.modbus import ModbusAscii, ModbusRtu
@@ -105,7 +105,7 @@ class Bench:
         addresses = [Address(area, start + n) for n in range(size)]
         tags = [make_tag(case.driver.spell(address), case.driver) for address in addresses]
         self.device = Device(
-            "plc", case.driver, Wire(19200, 10), case.driver.timing, tuple(tags), 0.0
+            "plc", case.driver, WireTiming(19200, 10), case.driver.timing, tuple(tags), 0.0
         )
         [self.block] = self.device.blocks
         assert self.block.span == case.span

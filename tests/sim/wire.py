@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from gateway.errors import LineDown
-from gateway.planning.wire_timing import Wire
-from gateway.transport import Ear
+from gateway.planning.wire_timing import WireTiming
+from gateway.transport import Receiver
 
 SERVER_WAITS = 0.25  # seconds between two requests that it has kept
 
@@ -76,7 +76,7 @@ class _Sending:
 class SimWire:
     """One line: the opener of its port, and its stations."""
 
-    wire: Wire
+    wire: WireTiming
     shape: Format
     stations: Sequence[Speaker]
     chance: random.Random
@@ -92,7 +92,7 @@ class SimWire:
     addressed: Callable[[bytes], Sequence[Speaker]] | None = None  # whom a whole request is for
 
     def __post_init__(self) -> None:
-        self._ear: Ear | None = None
+        self._ear: Receiver | None = None
         self._generation = 0
         self._sendings: list[_Sending] = []
         self._ours_until = 0.0
@@ -101,7 +101,7 @@ class SimWire:
 
     # The port
 
-    async def open(self, ear: Ear) -> "SimWire":
+    async def open(self, ear: Receiver) -> "SimWire":
         if self.gone:
             raise LineDown(self.gone)
         self._ear = ear

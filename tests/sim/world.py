@@ -22,7 +22,7 @@ from gateway.engine.device import DeviceSettings
 from gateway.protocols.frames import FrameDriver
 from gateway.protocols.frames.driver import LISTENED
 from gateway.tags import Sample
-from gateway.transport import Ear, TcpAddress
+from gateway.transport import Receiver, TcpAddress
 from tests.sim.bus import Bus
 from tests.sim.draw import Drawn, draw
 from tests.sim.expect import Expectations
@@ -93,7 +93,7 @@ class World:
 
     # Building
 
-    def _opener(self, config: LineConfig) -> Callable[[Ear], Any]:
+    def _opener(self, config: LineConfig) -> Callable[[Receiver], Any]:
         chance = random.Random(f"wire {self.story.seed} {config.name}")
         stations = {
             device.name: self._station(device, config, chance)

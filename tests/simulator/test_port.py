@@ -8,14 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gateway.errors import LineDown
-from gateway.planning.wire_timing import Wire
+from gateway.planning.wire_timing import WireTiming
 from gateway.simulator.port import FIFO, open_simulator
 from gateway.transport import Port, SerialSettings, SimulatorAddress, open_port
 from tests.transport.ends import Heard, Says, counted
 from tests.vectors import vectors
 
 REQUEST, REPLY = (vector.frame for vector in vectors("vigor")[:2])
-WIRE = Wire(19200, 10)
+WIRE = WireTiming(19200, 10)
 C = WIRE.character
 
 

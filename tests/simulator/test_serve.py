@@ -7,14 +7,14 @@ from pathlib import Path
 import pytest
 
 from gateway.errors import LineDown
-from gateway.planning.wire_timing import NETWORK_BAUD, Wire
+from gateway.planning.wire_timing import NETWORK_BAUD, WireTiming
 from gateway.simulator.serve import serve_on_pty, serve_on_tcp
 from gateway.transport import Port, SerialSettings, open_port, parse_port
 from tests.transport.ends import PATIENCE, Heard, Says, listening
 from tests.vectors import vectors
 
 REQUEST, REPLY = (vector.frame for vector in vectors("vigor")[:2])
-WIRE = Wire(19200, 10)
+WIRE = WireTiming(19200, 10)
 SEVEN_EVEN = SerialSettings(19200, "7E1")
 
 
@@ -55,7 +55,7 @@ async def test_a_pty_nobody_reads_does_not_stop_the_wire() -> None:
     loop, troubles = asyncio.get_running_loop(), []
     loop.set_exception_handler(lambda _, context: troubles.append(context))
     station = Says(bytes(3000))
-    served = await serve_on_pty([station], Wire(NETWORK_BAUD), None, turnaround=0.0)
+    served = await serve_on_pty([station], WireTiming(NETWORK_BAUD), None, turnaround=0.0)
     user = os.open(served.address, os.O_RDWR | os.O_NOCTTY)
     async with asyncio.timeout(PATIENCE):
         for asked in range(20):
@@ -124,7 +124,7 @@ class Echo(Says):
 
 
 async def test_network_stations_answer_each_connection_alone() -> None:
-    served = await serve_on_tcp([Echo()], Wire(NETWORK_BAUD), "127.0.0.1", 0, paced=False)
+    served = await serve_on_tcp([Echo()], WireTiming(NETWORK_BAUD), "127.0.0.1", 0, paced=False)
     ears = Heard(), Heard()
     ports = [await reach(served.address, ear) for ear in ears]
     for who, question in ((0, b"a"), (1, b"b"), (0, b"c")):

@@ -17,7 +17,7 @@ PATIENCE = 5.0  # seconds; never waited for when all is well
 
 
 class Heard:
-    """An `Ear` that remembers; `until` waits for what it should hear."""
+    """An `Receiver` that remembers; `until` waits for what it should hear."""
 
     def __init__(self, now: Callable[[], float] | None = None) -> None:
         self.data = b""

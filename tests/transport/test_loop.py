@@ -11,7 +11,7 @@ import pytest
 from gateway.line.clock import Clock
 from gateway.line.transaction import Turn
 from gateway.line.wire_log import Recorder
-from gateway.planning.wire_timing import Wire
+from gateway.planning.wire_timing import WireTiming
 from gateway.protocols.driver import Span
 from gateway.protocols.modbus import ModbusRtu
 from gateway.transport import SerialPath, SerialSettings, loop, open_port
@@ -61,7 +61,7 @@ def test_where_it_is_missing_asyncio_is_taken(monkeypatch: pytest.MonkeyPatch) -
 @pytest.mark.usefixtures("uvloop")
 def test_the_silence_before_a_request_is_kept_though_its_timers_fire_early() -> None:
     """They count whole milliseconds: 1.75 ms of RTU silence would be cut to 1 or less."""
-    silence, wire = 0.00175, Wire(115200, 10)
+    silence, wire = 0.00175, WireTiming(115200, 10)
     kept: list[float] = []
 
     class Noting:
