@@ -18,7 +18,7 @@ import typer.main
 import yaml
 import zenoh
 
-from gateway.cli.main import main as cli
+from gateway.cli import main as cli
 from gateway.config import (
     Config,
     ConfigErrors,

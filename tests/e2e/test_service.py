@@ -34,7 +34,7 @@ from tests.zenoh_peer import ZenohPeer, free_endpoint
 
 TAGS = {f"d{n}": {"address": f"D{n}"} for n in range(700, 708)}
 # The command itself; only that the state is written at once when there is news.
-SOON = "import gateway.service as s; s.KEEP_EVERY = 0.05; from gateway.cli import main; main()"
+SOON = "import gateway.service as s; s.KEEP_EVERY = 0.05; from gateway.cli.main import main; main()"
 # The command itself, with a history that fails as soon as there is something to store.
 BROKEN = """
 from gateway.history.file import HistoryFile
