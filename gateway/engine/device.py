@@ -11,7 +11,7 @@ from gateway.planning.bad_addresses import RETRY, Refusals
 from gateway.planning.monitor_lists import with_list
 from gateway.planning.planner import Block, plan
 from gateway.planning.wire_timing import WireTiming
-from gateway.protocols.driver import AnyDriver, Cost, Overhearing, Span, Timing, Windowed
+from gateway.protocols.driver import AnyDriver, Cost, NoReplyCauses, Span, Timing, Windowed
 from gateway.tags import Reason, Tag
 
 LEARN_EVERY = 50  # exchanges between two looks at the measured turnaround
@@ -284,7 +284,8 @@ class Device:
             case Garbled() as error:
                 return f"{_ADVICE.get(error.evidence, 'not understood')} ({error})"
             case NoReply():
-                causes = self.driver.silent_causes if isinstance(self.driver, Overhearing) else ""
+                driver = self.driver
+                causes = driver.no_reply_causes if isinstance(driver, NoReplyCauses) else ""
                 return f"{_SILENCE} {causes}".strip()
             case error:
                 return str(error)
