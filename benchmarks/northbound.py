@@ -79,7 +79,7 @@ class Plant:
         return WriteResult(value, time.time_ns(), took=0.0)
 
     def told(self, samples: Sequence[Sample]) -> None:
-        self.mirror.told(samples)
+        self.mirror.mark_published(samples)
 
     def is_fresh(self, tag: Tag, max_age: float) -> bool:
         return False

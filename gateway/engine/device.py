@@ -7,8 +7,8 @@ from enum import StrEnum
 from typing import Literal
 
 from gateway.errors import DeviceError, Evidence, Garbled, GatewayError, LineDown, NoReply
-from gateway.planning.bad_addresses import RETRY, Refusals
-from gateway.planning.monitor_lists import with_list
+from gateway.planning.bad_addresses import RETRY, BadAddresses
+from gateway.planning.monitor_lists import with_monitor_list
 from gateway.planning.planner import Block, plan
 from gateway.planning.wire_timing import WireTiming
 from gateway.protocols.driver import AnyDriver, Cost, NoReplyCauses, Span, Timing, Windowed
@@ -113,7 +113,7 @@ class Device:
     trouble: GatewayError | None = None
     record: Record = field(default_factory=Record)
     _use: tuple[float, float] = (0.0, 0.0)  # seconds of the wire, and when that was reckoned
-    refusals: Refusals = field(init=False)
+    refusals: BadAddresses = field(init=False)
     reckoned: float | None = field(init=False)  # the turnaround planned with; None: the usual
     _learn_at: int = LEARN_EVERY
     _tried: float = 0.0  # the turnaround that the last plan was tried with
@@ -121,7 +121,7 @@ class Device:
     window: int = field(init=False)  # questions that may be open at once
 
     def __post_init__(self) -> None:
-        self.refusals = Refusals(self.driver.cost)
+        self.refusals = BadAddresses(self.driver.cost)
         self.reckoned = self.turnaround
         areas = self.driver.areas
         used = [areas[tag.span.area] for tag in self.tags] or areas.values()
@@ -142,7 +142,7 @@ class Device:
 
     def seconds(self, cost: Cost) -> float:
         """One exchange on this line with this station."""
-        return self.wire.exchange(cost, self.timing, self.reckoned)
+        return self.wire.transaction(cost, self.timing, self.reckoned)
 
     @property
     def load(self) -> float:
@@ -154,7 +154,7 @@ class Device:
         """Decide anew what to ask, around what the device has refused."""
         blocks = plan(self.tags, self.driver, self.seconds, self.refusals.cuts)
         if self.lists:
-            blocks = with_list(blocks, self.driver, self.seconds, self.refusals.bad.keys())
+            blocks = with_monitor_list(blocks, self.driver, self.seconds, self.refusals.bad.keys())
         self.blocks = blocks
 
     def learn(self) -> bool:

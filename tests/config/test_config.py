@@ -559,7 +559,7 @@ TAGS = [
     bad(
         "unknown type",
         tags("a: {address: D1, type: int, write: {max: 70000}}"),
-        f"8: {M}.tags.a.type: 'int' is no type: use {TYPES} or string[n]",
+        f"8: {M}.tags.a.type: 'int' is not a type: use {TYPES} or string[n]",
     ),
     bad(
         "string too long",
