@@ -99,7 +99,7 @@ BUSY = '{"error": "busy", "code": null, "reason": "it could not be read"}'
 GOOD = '{"value": 6, "quality": "good", "time": ""}'
 BAD = '{"value": null, "quality": "bad", "reason": "no-reply", "time": ""}'
 MUTE = ""
-NOBODY_KNOWS = "nobody knows, and the PLC could not be read"
+UNKNOWN = "unknown, and the PLC could not be read"
 # In the place of a gateway: answers so, or (mute) lets the asker wait until he gives up.
 STAND_IN = """
 import json, sys, zenoh
@@ -127,15 +127,15 @@ with zenoh.open(config) as session:
     [
         ((DONE, MUTE), "done: 7"),
         ((REFUSED, GOOD), "not done: refused, no such address"),
-        ((UNCLEAR, GOOD), "nobody knows; the PLC now holds 6"),
-        ((UNCLEAR, BAD), NOBODY_KNOWS),
-        ((UNCLEAR, BUSY), NOBODY_KNOWS),
-        ((MUTE, GOOD), "nobody knows; the PLC now holds 6"),
-        ((MUTE, MUTE), NOBODY_KNOWS),
-        ((), NOBODY_KNOWS),
+        ((UNCLEAR, GOOD), "unknown; the PLC now holds 6"),
+        ((UNCLEAR, BAD), UNKNOWN),
+        ((UNCLEAR, BUSY), UNKNOWN),
+        ((MUTE, GOOD), "unknown; the PLC now holds 6"),
+        ((MUTE, MUTE), UNKNOWN),
+        ((), UNKNOWN),
     ],
 )
-def test_a_write_is_done_or_not_done_or_nobody_knows(
+def test_a_write_is_done_or_not_done_or_unknown(
     answers: tuple[str, ...], said: str, tmp_path: Path
 ) -> None:
     endpoint = free_endpoint()
@@ -157,7 +157,7 @@ def test_a_write_is_done_or_not_done_or_nobody_knows(
             assert program.lines == [said] * 3
 
 
-def test_with_the_doors_closed_a_viewer_reads_and_does_not_write(end: Story) -> None:
+def test_a_viewer_of_the_secured_gateway_reads_and_does_not_write(end: Story) -> None:
     program, shown = PROGRAMS[-1]
     command = [sys.executable, "-c", program.text]
 
