@@ -25,7 +25,7 @@ async def test_a_late_reply_to_another_request_is_not_accepted() -> None:
     read = await driver.read(Script(driver, *bits), Span("M", 8, 16))
     assert list(read) == [int(bit) for bit in f"{0x93A7:016b}"[::-1]]
     with pytest.raises(Refused) as refused:
-        await driver.read(Script(driver, *bad_address), Span("D", 9000, 1))
+        await driver.read(Script(driver, *bad_address), Span("D9", 9000, 1))
     assert refused.value.code == "28"
 
 
