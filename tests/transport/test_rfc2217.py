@@ -276,8 +276,8 @@ async def test_a_server_that_sets_something_else_is_logged(
         with capture_logs() as logs:
             port = await open_port(where, SEVEN_EVEN, Heard())
         await port.close()
-    row = next(row for row in logs if row["event"] == "setting not taken")
-    assert (row["setting"], row["asked"], row["is_now"]) == ("data_bits", 7, 8)
+    row = next(row for row in logs if row["event"] == "setting refused")
+    assert (row["setting"], row["requested"], row["actual"]) == ("data_bits", 7, 8)
 
 
 async def test_a_server_that_goes_with_its_last_answer_is_line_down() -> None:
@@ -299,7 +299,7 @@ async def test_a_server_that_goes_with_its_last_answer_is_line_down() -> None:
     port: Any = rfc2217.Rfc2217Port(ear)
     with pytest.raises(LineDown, match="gone"):
         await port.set_up(Gone(), SEVEN_EVEN, 1.0)
-    assert not port.live
+    assert not port.is_open
     assert ear.losses == []
 
 

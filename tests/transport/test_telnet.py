@@ -8,10 +8,10 @@ from gateway.transport.telnet import (
     COM_PORT,
     Acknowledged,
     Agreed,
-    Answer,
     Consent,
     Event,
     Received,
+    Send,
     Setting,
     Telnet,
 )
@@ -79,7 +79,7 @@ def test_any_bytes_at_all_never_raise(stream: list[bytes]) -> None:
     telnet = begun()
     for part in stream:
         for event in telnet.feed(part):
-            assert isinstance(event, Received | Answer | Agreed | Acknowledged)
+            assert isinstance(event, Received | Send | Agreed | Acknowledged)
 
 
 @given(pieces_of_telnet, st.binary(max_size=20).filter(lambda data: IAC not in data))
@@ -100,7 +100,7 @@ def test_two_of_our_kind_do_not_answer_each_other_for_ever(opening: list[bytes])
     on_the_way = b"".join(bytes((IAC,)) + verb for verb in opening)
     for turn in range(6):
         events = ends[turn % 2].feed(on_the_way)
-        on_the_way = b"".join(event.data for event in events if isinstance(event, Answer))
+        on_the_way = b"".join(event.data for event in events if isinstance(event, Send))
     assert on_the_way == b""
 
 
@@ -134,9 +134,9 @@ def test_com_port_agreed_and_refused() -> None:
 
 def test_echo_is_declined_and_com_port_of_theirs_is_taken() -> None:
     telnet = begun()
-    assert telnet.feed(bytes((IAC, WILL, ECHO))) == [Answer(bytes((IAC, DONT, ECHO)))]
+    assert telnet.feed(bytes((IAC, WILL, ECHO))) == [Send(bytes((IAC, DONT, ECHO)))]
     assert telnet.feed(bytes((IAC, WILL, COM_PORT))) == [
-        Answer(bytes((IAC, DO, COM_PORT))),
+        Send(bytes((IAC, DO, COM_PORT))),
         Agreed(COM_PORT, ours=False, yes=True),
     ]
 
