@@ -126,7 +126,7 @@ async def says(program: Program, words: str, after: int = 0) -> int:
 
 
 @pytest.mark.parametrize("watched", ["a", "b"])
-async def test_watch_goes_on_with_whichever_gateway_of_the_group_serves(
+async def test_watch_continues_with_the_active_gateway_of_the_group(
     tmp_path: Path, watched: str
 ) -> None:
     """By the file of either of them; and when nobody is left all is bad at once."""
