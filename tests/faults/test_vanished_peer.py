@@ -21,7 +21,7 @@ from tests.zenoh_peer import ZenohPeer, free_endpoint
 
 # The command itself; only how long a dead peer may go unnoticed is shorter.
 SHORT = "{'TCP_KEEPIDLE': 1, 'TCP_KEEPINTVL': 1, 'TCP_KEEPCNT': 1, 'TCP_USER_TIMEOUT': 3000}"
-RUN = f"import gateway.transport.tcp as t; t._WATCH = {SHORT}; from gateway.cli.main import main; main()"
+RUN = f"import gateway.transport.tcp as t; t._WATCH = {SHORT}; from gateway.cli import main; main.main()"
 PORT = 4001
 SPEED = "plant/mixer/speed"
 
