@@ -34,7 +34,8 @@ from typing import Literal, NamedTuple
 import structlog
 import zenoh
 
-from gateway.northbound import Mode, Northbound, ZenohSettings
+from gateway.config import ZenohConfig, ZenohMode
+from gateway.northbound import Northbound
 from gateway.northbound.session import configure
 from gateway.protocols.driver import Address, Span, Unit
 from gateway.service import COLLECT, SWITCH
@@ -78,7 +79,7 @@ class Plant:
         return WriteResult(value, time.time_ns(), took=0.0)
 
     def told(self, samples: Sequence[Sample]) -> None:
-        self.mirror.told(samples)
+        self.mirror.mark_published(samples)
 
     def is_fresh(self, tag: Tag, max_age: float) -> bool:
         return False
@@ -151,7 +152,7 @@ def count(endpoint: str) -> None:
         nonlocal arrived
         arrived += heard.payload.to_bytes().count(b'"quality"')
 
-    with zenoh.open(configure(ZenohSettings(mode=Mode.CLIENT, connect=(endpoint,)))) as session:
+    with zenoh.open(configure(ZenohConfig(mode=ZenohMode.CLIENT, connect=(endpoint,)))) as session:
         subscriber = session.declare_subscriber("plant/**", heard)
         blocks = session.declare_subscriber("plant/*/@block", block)
         print("ready", flush=True)
@@ -174,7 +175,7 @@ def flood(endpoint: str, seconds: float) -> None:
     ]  # fmt: skip
     sent = rounds = 0
     end = time.monotonic() + seconds
-    with zenoh.open(configure(ZenohSettings(mode=Mode.CLIENT, connect=(endpoint,)))) as session:
+    with zenoh.open(configure(ZenohConfig(mode=ZenohMode.CLIENT, connect=(endpoint,)))) as session:
         ignore = zenoh.handlers.Callback(lambda _: None, indirect=False)
         while time.monotonic() < end:
             for payload in junk:
@@ -202,7 +203,7 @@ def ask(endpoint: str, seconds: float) -> None:
         first = heard[0] if heard else None
         ended["silent" if first is None else "answered" if first.ok else "an error"] += 1
 
-    with zenoh.open(configure(ZenohSettings(mode=Mode.CLIENT, connect=(endpoint,)))) as session:
+    with zenoh.open(configure(ZenohConfig(mode=ZenohMode.CLIENT, connect=(endpoint,)))) as session:
         asked, until = 0, time.monotonic() + seconds
         while time.monotonic() < until:
             for key, payload in keys:
@@ -302,7 +303,7 @@ def bare(tags: int, devices: int, seconds: float, *, like_ours: bool) -> Rate:
     data = b'{"value":123456,"quality":"good","time":"2026-11-20T12:00:00.123456Z"}'
     json_encoding, drop = zenoh.Encoding.APPLICATION_JSON, zenoh.CongestionControl.DROP
     with (
-        zenoh.open(configure(ZenohSettings(listen=(endpoint,)))) as session,
+        zenoh.open(configure(ZenohConfig(listen=(endpoint,)))) as session,
         other("count", endpoint) as process,
     ):
         put, stamp, kept = session.put, session.new_timestamp, []
@@ -339,7 +340,7 @@ async def gateway(tags: int, devices: int, seconds: float, for_flood: float) -> 
     made = plant(tags, devices)
     with_tags = memory()
     began = time.perf_counter()
-    northbound = Northbound(ZenohSettings(listen=(endpoint,)), "demo", made)
+    northbound = Northbound(ZenohConfig(listen=(endpoint,)), "demo", made)
     serves = asyncio.create_task(northbound.run())
     await northbound.opened.wait()
     print(f"on Zenoh with {tags:,} tags on {devices} devices after "
@@ -363,7 +364,7 @@ async def gateway(tags: int, devices: int, seconds: float, for_flood: float) -> 
 async def gateway_of_blocks(tags: int, devices: int, seconds: float) -> Rate:
     """Each device has one scan in a round; the next round begins when all were put."""
     endpoint, made = free_endpoint(), plant(tags, devices, "only")
-    northbound = Northbound(ZenohSettings(listen=(endpoint,)), "demo", made)
+    northbound = Northbound(ZenohConfig(listen=(endpoint,)), "demo", made)
     serves = asyncio.create_task(northbound.run())
     await northbound.opened.wait()
     try:

@@ -47,7 +47,7 @@ def tags() -> list[Tag]:
 def seconds(wire: WireTiming, size: int) -> float:
     cost = DRIVER.cost(Span("holding", 0, size))
     assert cost is not None
-    return wire.exchange(cost, DRIVER.timing, TURNAROUND)
+    return wire.transaction(cost, DRIVER.timing, TURNAROUND)
 
 
 def fixed_gap(gap: int) -> list[int]:
@@ -79,7 +79,7 @@ def optimum(wire: WireTiming) -> float:
 
 def ours(wire: WireTiming) -> list[int]:
     def price(cost: Cost) -> float:
-        return wire.exchange(cost, DRIVER.timing, TURNAROUND)
+        return wire.transaction(cost, DRIVER.timing, TURNAROUND)
 
     return [block.span.size for block in plan(tags(), DRIVER, price)]
 

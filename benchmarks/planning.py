@@ -19,8 +19,8 @@ from gateway.protocols.modbus import ModbusRtu
 from gateway.tags import Tag
 
 DRIVER = ModbusRtu(station=1)
-SECONDS = partial(WireTiming(19200, 11).exchange, timing=DRIVER.timing, turnaround=0.010)
-NETWORK = partial(WireTiming(10_000_000, 10).exchange, timing=DRIVER.timing, turnaround=0.005)
+SECONDS = partial(WireTiming(19200, 11).transaction, timing=DRIVER.timing, turnaround=0.010)
+NETWORK = partial(WireTiming(10_000_000, 10).transaction, timing=DRIVER.timing, turnaround=0.005)
 INTERVALS = {1: [1.0], 2: [1.0, 10.0], 3: [0.5, 1.0, 5.0], 5: [0.2, 0.5, 1.0, 5.0, 60.0]}
 
 

@@ -146,7 +146,7 @@ class Gateway:
         return self.mirror[tag]
 
     def told(self, samples: Sequence[Sample]) -> None:
-        if news := self.mirror.told(samples):
+        if news := self.mirror.mark_published(samples):
             self.publish(news)  # as any other: what is published is kept in history too
 
     async def write(self, tag: Tag, value: Value) -> WriteResult:

@@ -1,62 +1,62 @@
-"""Everything that can go wrong, named after what the caller should do next.
+"""The gateway's exceptions, named by what the caller does next.
 
 GatewayError
 ├── ConfigError          fix the file; nothing has been sent
 ├── BadValue             refuse the write; nothing has been sent
-├── Busy                 ask again later; nothing has been sent
-├── Offline              the device does not answer; nothing has been sent
+├── Busy                 try again later; nothing has been sent
+├── Offline              the device is offline; nothing has been sent
 ├── LineDown             reopen the port; pending writes fail at once
-└── DeviceError          one device, one conversation
-    ├── Refused          it answered "no", with its code: report it, do not repeat
-    └── Unclear          it may or may not have been done: repeat reads
+└── DeviceError          one device, one transaction
+    ├── Refused          the device sent an error reply with its code: report it, do not repeat
+    └── Unclear          the device may or may not have done it: repeat reads
         ├── NoReply      silence until the time-out
-        └── Garbled      bytes that are no frame; kept for the log
+        └── Garbled      bytes that are no frame or no reply; kept for the log
 """
 
 from enum import StrEnum
 
 
 class GatewayError(Exception):
-    """Whatever the gateway itself raises."""
+    """The base of all exceptions the gateway raises."""
 
 
 class ConfigError(GatewayError, ValueError):
-    """The configuration is wrong; also a ValueError, so that pydantic says where."""
+    """A mistake in the configuration. Also a ValueError, so that pydantic reports its place."""
 
 
 class BadValue(GatewayError, ValueError):
-    """The value cannot be written to this tag; nothing has been sent."""
+    """A value that cannot be written to its tag; nothing has been sent."""
 
 
 class Busy(GatewayError):
-    """The write could not be sent in time; nothing has been sent."""
+    """A request that could not be sent in time; nothing has been sent."""
 
 
 class Offline(GatewayError):
-    """The device is silent, so the write was not sent at all."""
+    """A write to an offline device; nothing has been sent."""
 
 
 class LineDown(GatewayError):
-    """The port is not there, or went away."""
+    """A port that cannot be opened or was lost."""
 
 
 class DeviceError(GatewayError):
-    """A conversation with one device did not end well."""
+    """A transaction with one device that failed."""
 
 
 class Refusal(StrEnum):
-    """What a refusal asks of us, whatever the maker's code for it is."""
+    """The kind of an error reply, whatever the maker's code: it decides the next step."""
 
-    ADDRESS = "address"  # this address never: split the block, remember the culprit
-    DAMAGED = "damaged"  # our frame did not arrive whole, nothing was done: reads are asked again
-    BUSY = "busy"  # later: leave the device alone for a while
+    ADDRESS = "address"  # the address does not exist: halve the block, remember the address
+    DAMAGED = "damaged"  # our request arrived damaged and did nothing: repeat reads
+    BUSY = "busy"  # the device is busy: pause, then repeat
     OTHER = "other"  # report it
 
 
 class Refused(DeviceError):
-    """The device answered "no".
+    """An error reply.
 
-    `code` is the maker's own code as its manual prints it ("28", "06", "02").
+    `code` is the maker's code as the manual prints it ("28", "06", "02").
     """
 
     def __init__(self, message: str, *, code: str, refusal: Refusal = Refusal.OTHER) -> None:
@@ -66,20 +66,20 @@ class Refused(DeviceError):
 
 
 class Unclear(DeviceError):
-    """Nobody can say whether it was done."""
+    """A transaction without a clear result: the device may or may not have done it."""
 
 
 class Evidence(StrEnum):
-    """What was heard instead of a good reply: the raw material of a diagnosis."""
+    """The bytes received instead of a good reply, by kind: the input of the diagnosis."""
 
     SILENCE = "silence"  # no byte at all
     ECHO = "echo"  # only our own request
     NOISE = "noise"  # bytes that are no frame: baud rate, parity, format, noise
-    CHECKSUM = "checksum"  # a frame whose sum is wrong
+    CHECKSUM = "checksum"  # a frame with a wrong checksum
     STATION = "station"  # a good frame from another station
-    SHAPE = "shape"  # a good frame that answers some other question
-    TRUNCATED = "truncated"  # a frame that began and did not end
-    SLOW = "slow"  # the right answer, after the time-out
+    SHAPE = "shape"  # a good frame that answers another request
+    TRUNCATED = "truncated"  # a frame without its end
+    SLOW = "slow"  # the right reply, after the time-out
 
 
 class NoReply(Unclear):
@@ -89,9 +89,9 @@ class NoReply(Unclear):
 
 
 class Garbled(Unclear):
-    """Bytes that are no frame, or no answer to what was asked.
+    """Bytes that are no frame, or a frame that is no reply to the request.
 
-    `data` holds the first bytes for the log, `evidence` says what was wrong with them.
+    `data` holds the first bytes for the log, `evidence` the kind of fault.
     """
 
     def __init__(
@@ -103,4 +103,4 @@ class Garbled(Unclear):
 
 
 class Unsteady(Garbled):
-    """Two good answers that ought to be the same are not."""
+    """Two good replies that differ although they must be equal."""

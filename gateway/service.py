@@ -15,7 +15,7 @@ from gateway.app import Gateway
 from gateway.config import Config
 from gateway.history import Historian
 from gateway.history.state_file import Notebook
-from gateway.northbound import Northbound, StandbySettings, zenoh_settings
+from gateway.northbound import Northbound, StandbySettings
 from gateway.tags import Sample
 
 log = structlog.get_logger("gateway")
@@ -99,7 +99,7 @@ async def _first(*tasks: asyncio.Task[Any]) -> None:
 def _northbound(config: Config, gateway: Gateway, history: Historian | None) -> Northbound:
     group = config.standby
     return Northbound(
-        zenoh_settings(config.zenoh),
+        config.zenoh,
         config.name,
         gateway,
         history=history,

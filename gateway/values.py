@@ -1,7 +1,7 @@
-"""Raw words and bits <-> the values people read: types, word and byte order, BCD, strings.
+"""Conversion between words and values: types, word and byte order, BCD, strings.
 
-Words are unsigned 16-bit integers in the order of their addresses. Every conversion is
-compiled once, at configuration time, into a plain function.
+Words are unsigned 16-bit integers in the order of their addresses. Each conversion is built
+once, with the configuration, as a plain function.
 """
 
 import math
@@ -35,7 +35,7 @@ class Kind(StrEnum):
 
 
 class Order(StrEnum):
-    """Which half comes first: of the words of a number, or of the bytes of a word."""
+    """The order of the words of a number, or of the bytes of a word."""
 
     LOW_FIRST = "low_first"
     HIGH_FIRST = "high_first"
@@ -73,14 +73,14 @@ LONGEST_STRING = 250
 
 @dataclass(frozen=True, slots=True)
 class ValueType:
-    """A tag's type as the file writes it; `length` is the characters of a string."""
+    """A tag's type as the file writes it; `length` counts the characters of a string."""
 
     kind: Kind
     length: int = 0
 
     @property
     def words(self) -> int:
-        """The 16-bit words it takes."""
+        """The number of 16-bit words of a value."""
         return (self.length + 1) // 2 if self.kind is Kind.STRING else _WORDS[self.kind]
 
     @property
@@ -95,7 +95,7 @@ _STRING = re.compile(r"string\[([0-9]{1,4})\]\Z")
 
 
 def parse_type(text: str) -> ValueType:
-    """`int16`, `float32`, `string[16]` ... Raises `ConfigError`."""
+    """Returns the type for `int16`, `float32`, `string[16]` ... Raises `ConfigError`."""
     if match := _STRING.match(text):
         length = int(match[1])
         if not 1 <= length <= LONGEST_STRING:
@@ -103,16 +103,15 @@ def parse_type(text: str) -> ValueType:
         return ValueType(Kind.STRING, length)
     known = [kind.value for kind in Kind if kind is not Kind.STRING]
     if text not in known:
-        raise ConfigError(f"{text!r} is no type: use {', '.join(known)} or string[n]")
+        raise ConfigError(f"{text!r} is not a type: use {', '.join(known)} or string[n]")
     return ValueType(Kind(text))
 
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """How a value lies in its words.
+    """The position of a value's words and bytes.
 
-    `byte_order` says which byte of each word comes first. For a number it is usually
-    `high_first`; `low_first` swaps the bytes of every word.
+    `byte_order` `low_first` swaps the two bytes of every word.
     """
 
     type: ValueType
@@ -121,9 +120,9 @@ class Layout:
 
 
 def from_words(layout: Layout) -> FromWords:
-    """The function that turns `layout.type.words` words into the value.
+    """Returns the function that turns `layout.type.words` words into the value.
 
-    It returns None for words that are no such value: a float that is NaN or infinite, BCD
+    That function returns None for words without a value: a float that is NaN or infinite, BCD
     with a digit above 9.
     """
     kind = layout.type.kind
@@ -153,7 +152,7 @@ def from_words(layout: Layout) -> FromWords:
 
 
 def to_words(layout: Layout) -> ToWords:
-    """The inverse of `from_words`; the function raises `BadValue` for what does not fit."""
+    """Returns the inverse of `from_words`. It raises `BadValue` for a value that does not fit."""
     kind = layout.type.kind
     if kind is Kind.STRING:
         return lambda value: _string_words(value, layout)
@@ -177,13 +176,13 @@ def to_words(layout: Layout) -> ToWords:
 
 
 def _ordered(words: Words, layout: Layout) -> list[int]:
-    """Words by address <-> words with the most significant first; its own inverse."""
+    """Turns words by address into words with the most significant first, and back."""
     row = [swapped(word) for word in words] if layout.byte_order is Order.LOW_FIRST else list(words)
     return row[::-1] if layout.word_order is Order.LOW_FIRST else row
 
 
 def swapped(word: int) -> int:
-    """The word with its two bytes exchanged."""
+    """Returns the word with its two bytes swapped."""
     return (word >> 8) | (word & 0xFF) << 8
 
 
@@ -196,7 +195,7 @@ def _finite(value: float) -> float | None:
 
 
 def shortest(value: float) -> float | None:
-    """The decimal a person would write for a 32-bit float: 0.1, not 0.10000000149011612."""
+    """Returns the shortest decimal of a 32-bit float: 0.1, not 0.10000000149011612."""
     if not math.isfinite(value):
         return None
     if value.is_integer():
@@ -215,7 +214,7 @@ def _text(octets: bytes) -> str:
 
 def _string_words(value: Value, layout: Layout) -> list[int]:
     if not isinstance(value, str):
-        raise BadValue(f"{value!r} is no text")
+        raise BadValue(f"{value!r} is not text")
     length = layout.type.length
     try:
         octets = value.encode("latin-1")
@@ -237,24 +236,24 @@ def _boolean(value: Value) -> bool:
 
 
 def whole(value: Value) -> int:
-    """The value as an integer. Raises `BadValue` for what is none."""
+    """Returns the value as an integer. Raises `BadValue` for other values."""
     if isinstance(value, (bool, str)):
-        raise BadValue(f"{value!r} is no number")
+        raise BadValue(f"{value!r} is not a number")
     if isinstance(value, float) and not value.is_integer():
-        raise BadValue(f"{value} is no whole number")
+        raise BadValue(f"{value} is not a whole number")
     return int(value)
 
 
 def real(value: Value) -> float:
-    """The value as a finite float. Raises `BadValue` for what is none."""
+    """Returns the value as a finite float. Raises `BadValue` for other values."""
     if isinstance(value, (bool, str)):
-        raise BadValue(f"{value!r} is no number")
+        raise BadValue(f"{value!r} is not a number")
     try:
         number = float(value)
     except OverflowError:
         number = math.inf
     if not math.isfinite(number):
-        raise BadValue(f"{value} is no finite number")
+        raise BadValue(f"{value} is not a finite number")
     return number
 
 

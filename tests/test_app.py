@@ -11,9 +11,8 @@ from typing import Any
 import pytest
 
 from gateway.app import FRESH_WITHIN, Gateway, forecasts
-from gateway.config import load
+from gateway.config import ZenohMode, load
 from gateway.errors import BadValue, LineDown, Offline
-from gateway.northbound import Mode, zenoh_settings
 from gateway.stations.vigor import VigorStation
 from gateway.tags import Quality, Reason, Sample, Tag, good
 from gateway.transport import Receiver
@@ -295,8 +294,8 @@ def test_what_moved_within_its_deadband_and_is_published_again_is_news_to_all(
 
 def test_zenoh_gets_the_files_settings(tmp_path: Path) -> None:
     watched = made(tmp_path)
-    settings = zenoh_settings(watched.gateway.config.zenoh)
-    assert (settings.prefix, settings.mode) == ("plant", Mode.PEER)
+    settings = watched.gateway.config.zenoh
+    assert (settings.prefix, settings.mode) == ("plant", ZenohMode.PEER)
     assert settings.listen == ("tcp/127.0.0.1:7447",)
 
 

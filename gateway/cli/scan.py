@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from itertools import product
 from typing import Literal
 
-from gateway.config import written
+from gateway.config import parsers
 from gateway.errors import ConfigError, Garbled, LineDown, Refused, Unclear
 from gateway.line.clock import Clock
 from gateway.line.transaction import Turn
@@ -111,7 +111,7 @@ def planned(
     if protocol == "modbus-tcp" and not isinstance(where, TcpAddress):
         raise ConfigError("modbus-tcp is spoken at tcp://host:port")
     serial: list[SerialSettings | None] = [
-        SerialSettings(written.baudrate(baud), written.serial_format(form))
+        SerialSettings(parsers.baudrate(baud), parsers.serial_format(form))
         for form, baud in product(
             formats.split(",") if formats else FORMATS[protocol],
             [_number(baud, "9600,19200") for baud in bauds.split(",")] if bauds else BAUDS,
@@ -123,7 +123,7 @@ def planned(
     async def open_it(settings: SerialSettings | None, ear: Receiver) -> Port:
         return await open_port(where, settings or SerialSettings(), ear)
 
-    return Plan(open_it, protocol, numbers, serial, written.duration(timeout))
+    return Plan(open_it, protocol, numbers, serial, parsers.duration(timeout))
 
 
 def _numbers(text: str) -> Iterator[int]:

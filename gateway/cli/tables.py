@@ -16,7 +16,7 @@ from gateway.cli.scan import Report, spoken
 from gateway.config import Config
 from gateway.engine.forecast import LineForecast
 from gateway.northbound.payload import rfc3339
-from gateway.planning.planner import spell
+from gateway.planning.planner import describe
 from gateway.planning.wire_timing import NETWORK_BAUD, WireTiming
 from gateway.tags import Quality, Sample, Tag, WriteRule
 from gateway.values import Kind
@@ -179,7 +179,7 @@ def _blocks(line: LineForecast) -> Table:
         block = row.block
         table.add_row(
             f"  {row.device.name}",
-            spell(block),
+            describe(block),
             str(len(block.tags)),
             seconds(block.every),
             f"{block.cost.request} + {block.cost.reply}",

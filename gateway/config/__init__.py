@@ -7,12 +7,14 @@ from pathlib import Path
 
 from gateway.config.build import Builder
 from gateway.config.messages import ConfigErrors
-from gateway.config.plain import (
+from gateway.config.records import (
     Config,
     HistoryConfig,
     LineConfig,
+    TlsConfig,
     WebConfig,
     ZenohConfig,
+    ZenohMode,
 )
 from gateway.config.schema import schema
 from gateway.config.yaml_file import read_yaml
@@ -22,8 +24,10 @@ __all__ = [
     "ConfigErrors",
     "HistoryConfig",
     "LineConfig",
+    "TlsConfig",
     "WebConfig",
     "ZenohConfig",
+    "ZenohMode",
     "load",
     "schema",
 ]

@@ -6,7 +6,7 @@ from os.path import realpath
 from pathlib import Path as FilePath
 from typing import Any
 
-from gateway.config import written
+from gateway.config import parsers
 from gateway.config.field_rules import field_tag
 from gateway.config.line_rules import check_line, line_wire
 from gateway.config.messages import Mistakes, Path, meant, shown
@@ -17,13 +17,14 @@ from gateway.config.model import (
     TagDefaults,
     TagSection,
 )
-from gateway.config.plain import (
+from gateway.config.records import (
     Config,
     HistoryConfig,
     LineConfig,
     TlsConfig,
     WebConfig,
     ZenohConfig,
+    ZenohMode,
 )
 from gateway.config.tag_rules import TagSource, build_tag, inherit
 from gateway.config.validate import (
@@ -203,7 +204,7 @@ class Builder:
 
     def _name(self, text: str, path: Path, *, tag: bool = False) -> str:
         try:
-            return written.tag_name(text) if tag else written.name(text)
+            return parsers.tag_name(text) if tag else parsers.name(text)
         except ConfigError as error:
             self.mistakes.add(path, str(error))
             return text
@@ -243,7 +244,7 @@ class Builder:
         tls = found.tls
         return ZenohConfig(
             prefix=found.prefix,
-            mode=found.mode,
+            mode=ZenohMode(found.mode),
             listen=tuple(found.listen),
             connect=tuple(found.connect),
             config_file=self._file(found.config_file, (*own, "config_file")),

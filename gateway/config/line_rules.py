@@ -9,6 +9,7 @@ from gateway.engine.device import DeviceSettings
 from gateway.planning.wire_timing import NETWORK_BAUD, WireTiming, character_bits
 from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.frames import FrameDriver
+from gateway.protocols.unsolicited import Unsolicited
 from gateway.transport.port import SerialSettings, SimulatorAddress, TcpAddress
 
 
@@ -54,7 +55,7 @@ def _check_listening(devices: Sequence[DeviceSettings], path: Path, mistakes: Mi
     speakers = [
         device.name
         for device in devices
-        if isinstance(device.driver, FrameDriver) and device.driver.listens
+        if isinstance(device.driver, Unsolicited) and device.driver.sends_unsolicited
     ]
     for name in speakers[1:]:
         mistakes.add(

@@ -19,8 +19,8 @@ from pydantic import (
 )
 from pydantic import Tag as Choice
 
-from gateway.config import written
-from gateway.config.settings import (
+from gateway.config import parsers
+from gateway.config.setting_types import (
     DEADBAND_SCHEMA,
     FORMAT_SCHEMA,
     SCALE_SCHEMA,
@@ -141,7 +141,7 @@ class HistorySection(Section):
     """Older samples are deleted."""
     max_size: Annotated[
         int,
-        PlainValidator(written.size),
+        PlainValidator(parsers.size),
         WithJsonSchema({"type": "string", "pattern": r"^[0-9]+(\.[0-9]+)? ?([kKMGT]B)$"}),
     ] = 10**9
     """The oldest samples are deleted when the file grows beyond it."""
@@ -183,12 +183,12 @@ class TagDefaults(Section):
     """Tag settings for a whole file, line or device."""
 
     type: Annotated[
-        ValueType | None, PlainValidator(written.value_type), WithJsonSchema(TYPE_SCHEMA)
+        ValueType | None, PlainValidator(parsers.value_type), WithJsonSchema(TYPE_SCHEMA)
     ] = None
     """What the words mean; left out: bool for a bit, a whole number otherwise."""
     every: Interval = 1.0
     """How often the tag is read."""
-    scale: Annotated[Finite, AfterValidator(written.scale), WithJsonSchema(SCALE_SCHEMA)] = 1.0
+    scale: Annotated[Finite, AfterValidator(parsers.scale), WithJsonSchema(SCALE_SCHEMA)] = 1.0
     """value = raw x scale + offset"""
     offset: Finite = 0.0
     """value = raw x scale + offset"""
@@ -197,7 +197,7 @@ class TagDefaults(Section):
     description: Text = ""
     """What it is, for people."""
     deadband: Annotated[
-        Deadband | None, PlainValidator(written.deadband), WithJsonSchema(DEADBAND_SCHEMA)
+        Deadband | None, PlainValidator(parsers.deadband), WithJsonSchema(DEADBAND_SCHEMA)
     ] = None
     """A smaller change is not published: 0.5 (in the tag's unit) or 2%."""
     word_order: OrderName = Order.LOW_FIRST
@@ -206,7 +206,7 @@ class TagDefaults(Section):
     """Which byte of each word comes first."""
     publish: Annotated[
         Publish,
-        PlainValidator(written.publish),
+        PlainValidator(parsers.publish),
         WithJsonSchema({"type": "string", "enum": ["change", "always"]}),
     ] = Publish.CHANGE
     """Publish when the value changes, or every value that is read."""
@@ -216,7 +216,7 @@ class TagDefaults(Section):
     """Keep the values on disk."""
     payload: Annotated[
         Form,
-        PlainValidator(written.form),
+        PlainValidator(parsers.form),
         WithJsonSchema({"type": "string", "enum": ["json", "raw"]}),
     ] = Form.JSON
     """json: value, quality and time; raw: the bare value as text."""
@@ -253,7 +253,7 @@ class DeviceSection(Section):
     """How long a late reply is waited for before anyone speaks again."""
     blocks: Annotated[
         bool | Literal["only"],
-        PlainValidator(written.blocks),
+        PlainValidator(parsers.blocks),
         WithJsonSchema({"enum": [True, False, "only"]}),
     ] = False
     """One put per scan with all changed tags, at <device>/@block: also, or only that."""
@@ -274,7 +274,7 @@ class LineSection(Section):
     baudrate: Baudrate = None
     """Of the wire, also of the one behind a device server; the protocol's custom if left out."""
     format: Annotated[
-        str | None, PlainValidator(written.serial_format), WithJsonSchema(FORMAT_SCHEMA)
+        str | None, PlainValidator(parsers.serial_format), WithJsonSchema(FORMAT_SCHEMA)
     ] = None
     """Data bits, parity, stop bits: 7E1, 8N1; the protocol's custom if left out."""
     echo: bool | None = None

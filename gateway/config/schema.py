@@ -6,6 +6,7 @@ from typing import Any, get_args, get_type_hints
 
 from pydantic import TypeAdapter
 
+from gateway.config.driver_settings import is_duration
 from gateway.config.model import (
     DeviceSection,
     FileSection,
@@ -14,15 +15,14 @@ from gateway.config.model import (
     TagDefaults,
     TagSection,
 )
-from gateway.config.nested import is_duration
-from gateway.config.settings import (
+from gateway.config.parsers import BYTES, SECONDS
+from gateway.config.setting_types import (
     DURATION_SCHEMA,
     INTERVAL_SCHEMA,
     NAME_PATTERN,
     TAG_NAME_PATTERN,
 )
 from gateway.config.validate import DRIVERS
-from gateway.config.written import BYTES, SECONDS
 from gateway.errors import ConfigError
 
 _TIMES = (DURATION_SCHEMA["pattern"], INTERVAL_SCHEMA["pattern"])

@@ -8,9 +8,9 @@ from typing import Any, TypeVar, get_args, get_type_hints
 from pydantic import TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
 
+from gateway.config.driver_settings import plain_settings
 from gateway.config.messages import Mistakes, Path, meant, one_of, shown
 from gateway.config.model import Section
-from gateway.config.nested import plain_settings
 from gateway.protocols import Frames, PlcDriver
 from gateway.protocols.driver import AnyDriver
 from gateway.protocols.frames import FrameDriver

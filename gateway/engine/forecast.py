@@ -8,7 +8,7 @@ from gateway.engine.ages import asked, load_of, worst_ages
 from gateway.engine.device import Device
 from gateway.planning.planner import Block, plan
 from gateway.planning.wire_timing import WireTiming
-from gateway.protocols.frames.driver import LISTENED
+from gateway.protocols.unsolicited import Unsolicited
 from gateway.tags import Tag
 
 
@@ -62,9 +62,7 @@ def forecast(name: str, devices: Sequence[Device], wire: WireTiming) -> LineFore
     write = max((_longest_write(device) for device in devices), default=0.0)
     silence = max((device.patience for device in devices), default=0.0)
     cycle = sum(one.seconds for one in blocks)
-    unasked = [
-        (device, sum(tag.span.area == LISTENED for tag in device.tags)) for device in devices
-    ]
+    unasked = [(device, _unsolicited(device)) for device in devices]
     return LineForecast(
         name=name,
         wire=wire,
@@ -80,6 +78,14 @@ def forecast(name: str, devices: Sequence[Device], wire: WireTiming) -> LineFore
         shortest=sum(_round(device) for device in devices) if load > 1 else cycle,
         unasked=tuple((device, tags) for device, tags in unasked if tags),
     )
+
+
+def _unsolicited(device: Device) -> int:
+    """The number of its tags that cannot be polled."""
+    driver = device.driver
+    if not isinstance(driver, Unsolicited):
+        return 0
+    return sum(driver.unsolicited_only(tag.span) for tag in device.tags)
 
 
 def _round(device: Device) -> float:

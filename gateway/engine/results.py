@@ -22,7 +22,7 @@ from gateway.errors import (
     Unclear,
     Unsteady,
 )
-from gateway.planning.planner import spell
+from gateway.planning.planner import describe
 from gateway.protocols.driver import Span
 from gateway.tags import Reason, Sample, Tag, bad
 from gateway.tags.unchanged import Unchanged
@@ -63,7 +63,7 @@ class Consequences:
         refusals = device.refusals
         if refusals.searching or refusals.bad:
             if refusals.read(block):
-                log.info("address is there now", device=device.name, block=spell(poll.block))
+                log.info("address is there now", device=device.name, block=describe(poll.block))
                 self._replan(device)
             self._settle(device)
         if not refusals.searching and device.learn():
@@ -78,7 +78,7 @@ class Consequences:
             poll.told = told = poll.block.decode(units, time)
         elif not isinstance(told, Unchanged):
             poll.told = told = Unchanged(told, time)
-        elif told.over:
+        elif told.superseded:
             poll.told = told = poll.block.decode(units, time)
         else:
             told.time = time
@@ -193,7 +193,7 @@ class Consequences:
                 self.schedule.replace(poll, halves, _now())
                 return
             log.warning(
-                "address refused", device=device.name, block=spell(poll.block), why=str(error)
+                "address refused", device=device.name, block=describe(poll.block), why=str(error)
             )
         poll.forget(_now())
         self.bad(block.tags, Reason.REFUSED, str(error))

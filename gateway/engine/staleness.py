@@ -10,7 +10,7 @@ from gateway.engine.ages import asked_of, worst_ages
 from gateway.engine.device import Device, Standing
 from gateway.engine.jobs import Poll
 from gateway.engine.schedule import Schedule
-from gateway.planning.planner import spell
+from gateway.planning.planner import describe
 from gateway.tags import Reason, Tag
 
 log = structlog.get_logger("gateway.line")
@@ -85,5 +85,5 @@ class Overdue:
         self.bad(poll.block.tags, Reason.OVERDUE, f"not read for {age:.1f} s: {WHY}")
         if now - self._told.get(device, float("-inf")) >= TELL_EVERY:
             self._told[device] = now
-            block = spell(poll.block)
+            block = describe(poll.block)
             log.warning("overdue", device=device.name, block=block, age=round(age, 1), why=WHY)

@@ -9,7 +9,7 @@ import structlog
 
 from gateway.engine.device import Device
 from gateway.errors import Garbled
-from gateway.protocols.driver import Codec, Overhearing
+from gateway.protocols.driver import Codec, StrayFrames
 
 log = structlog.get_logger("gateway.line")
 TELL_EVERY = 10.0  # seconds for each device; what comes between is told to debuggers only
@@ -37,8 +37,9 @@ class Overheard:
         self._last = now
         for device in self.devices:
             device.registered = ()
-            if isinstance(device.driver, Overhearing):
-                frames = [f for f in self._feed(device, data) if f.station == device.driver.station]
+            if isinstance(device.driver, StrayFrames):
+                heard = self._feed(device, data)
+                frames = [frame for frame in heard if device.driver.from_this_station(frame)]
                 device.record.unasked += len(frames)
                 self.frames(device, frames)
 
@@ -46,13 +47,15 @@ class Overheard:
         """Whole ones that answered nothing, already counted."""
         for frame in frames:
             device.registered = ()
-            if isinstance(device.driver, Overhearing) and (said := device.driver.unasked(frame)):
+            if not isinstance(device.driver, StrayFrames):
+                continue
+            if said := device.driver.describe_stray(frame):
                 self._tell(device, said)
 
     def _feed(self, device: Device, data: bytes) -> list[Any]:
         codec = self._codecs.setdefault(device, device.driver.codec())
         try:
-            return [frame for frame in codec.feed(data) if hasattr(frame, "station")]
+            return codec.feed(data)
         except Garbled:
             del self._codecs[device]
             return []

@@ -5,9 +5,10 @@ A line that has no such device never comes here but for one look at an empty tab
 
 import asyncio
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from typing import Any
 
 import structlog
 
@@ -17,9 +18,13 @@ from gateway.engine.results import Consequences
 from gateway.errors import BadValue, Garbled
 from gateway.line.transaction import Turn
 from gateway.protocols.driver import Talk
-from gateway.protocols.frames import FrameDriver, Heard, Listener, Stale
-from gateway.protocols.frames.driver import LISTENED
-from gateway.protocols.frames.listener import Said
+from gateway.protocols.unsolicited import (
+    Stale,
+    Unsolicited,
+    UnsolicitedEvent,
+    UnsolicitedFrame,
+    UnsolicitedListener,
+)
 from gateway.tags import Reason, Sample, Tag, bad, of_field
 
 log = structlog.get_logger("gateway.line")
@@ -33,10 +38,10 @@ class Answer:
     """What a device waits for that spoke unasked. `until`: by the loop's clock."""
 
     device: Device
-    frame: bytes
+    frame: Any
     until: float
 
-    async def give(self, talk: Talk[bytes]) -> None:
+    async def give(self, talk: Talk[Any]) -> None:
         try:
             await talk.tell(self.frame)
         except Garbled as error:
@@ -48,25 +53,25 @@ class _Speaker:
     """A device that speaks unasked, and the tags that it speaks of."""
 
     device: Device
-    driver: FrameDriver
-    listener: Listener
+    listener: UnsolicitedListener
+    unsolicited: Collection[str]
     tags: dict[str, list[Tag]] = field(default_factory=dict)  # by field
     understood: bool = True  # the last it said
     unread: set[str] = field(default_factory=set)  # fields that the last frame with them spoilt
 
     def __post_init__(self) -> None:
-        listened = self.driver.settings.listened
         for tag in self.device.tags:
-            name = self.driver.spell(tag.address)
-            if name in listened:
+            name = self.device.driver.spell(tag.address)
+            if name in self.unsolicited:
                 self.tags.setdefault(name, []).append(tag)
 
 
 def listened(device: Device) -> list[Tag]:
     """Its tags whose values come unasked and in no other way."""
-    if not isinstance(device.driver, FrameDriver):
+    driver = device.driver
+    if not isinstance(driver, Unsolicited):
         return []
-    return [tag for tag in device.tags if tag.span.area == LISTENED]
+    return [tag for tag in device.tags if driver.unsolicited_only(tag.span)]
 
 
 class Listening:
@@ -85,9 +90,9 @@ class Listening:
         self._answers.clear()
         self._echo, self._held_since = b"", None
         self._speakers = [
-            _Speaker(device, device.driver, Listener(device.driver.settings, now))
+            _Speaker(device, device.driver.listener(now), device.driver.unsolicited)
             for device in self._devices
-            if isinstance(device.driver, FrameDriver) and device.driver.listens
+            if isinstance(device.driver, Unsolicited) and device.driver.sends_unsolicited
         ]
 
     def received(self, data: bytes, now: float) -> None:
@@ -97,23 +102,23 @@ class Listening:
         for speaker in self._speakers:
             self._take(speaker, speaker.listener.received(data, now), now)
 
-    def beside(self, device: Device) -> Callable[[bytes], None] | None:
+    def beside(self, device: Device) -> Callable[[Any], None] | None:
         """For what it says in a conversation with it, and is no answer."""
         for speaker in self._speakers:
             if speaker.device is device:
                 return partial(self._beside, speaker)
         return None
 
-    def _beside(self, speaker: _Speaker, frame: bytes) -> None:
+    def _beside(self, speaker: _Speaker, frame: Any) -> None:
         now = _now()
-        self._take(speaker, speaker.listener.overheard([frame], now), now)
+        self._take(speaker, speaker.listener.unmatched(frame, now), now)
 
     def ended(self, device: Device, turn: Turn) -> None:
         """A conversation is over: what was half heard before it is void."""
         self._echo = turn.unreturned
         for speaker in self._speakers:
             if turn.heard or (turn.sent and speaker.device is not device):
-                speaker.listener.disturbed(_now())
+                speaker.listener.restart(_now())
 
     @property
     def due(self) -> float:
@@ -157,17 +162,17 @@ class Listening:
         self._echo = b""
         return data
 
-    def _take(self, speaker: _Speaker, said: Iterable[Said], now: float) -> None:
+    def _take(self, speaker: _Speaker, said: Iterable[UnsolicitedEvent], now: float) -> None:
         for one in said:
             match one:
-                case Heard():
+                case UnsolicitedFrame():
                     self._heard(speaker, one, now)
                 case Garbled():
                     self._garbled(speaker, one)
                 case Stale(fields):
                     self._stale(speaker, fields)
 
-    def _heard(self, speaker: _Speaker, heard: Heard, now: float) -> None:
+    def _heard(self, speaker: _Speaker, heard: UnsolicitedFrame, now: float) -> None:
         device, time = speaker.device, self._then.wall()
         device.record.heard += 1
         speaker.understood = True
@@ -181,10 +186,10 @@ class Listening:
             for tag in speaker.tags.get(name, ())
         ]
         self._tell(samples)
-        if heard.answer is not None:
-            self._answer(speaker, heard.answer, now)
+        if heard.reply is not None:
+            self._answer(speaker, heard.reply, now)
 
-    def _look_over(self, speaker: _Speaker, heard: Heard) -> None:
+    def _look_over(self, speaker: _Speaker, heard: UnsolicitedFrame) -> None:
         """Count the fields that could not be read; told are those that could before."""
         for name, value in heard.values.items():
             if not isinstance(value, Garbled):
@@ -208,18 +213,18 @@ class Listening:
     def _stale(self, speaker: _Speaker, fields: Iterable[str]) -> None:
         device = speaker.device
         self._bad(speaker, fields, Reason.NO_REPLY, "not heard for longer than its stale_after")
-        if device.broadcast and speaker.listener.silent and device.served:
+        if device.broadcast and speaker.listener.all_stale and device.served:
             device.start()
             self._then.upstairs.alive(device, False)
             log.warning("device silent", device=device.name)
 
-    def _answer(self, speaker: _Speaker, data: bytes, now: float) -> None:
+    def _answer(self, speaker: _Speaker, frame: Any, now: float) -> None:
         try:
-            speaker.driver.codec().encode(data)
+            speaker.device.driver.codec().encode(frame)
         except BadValue as error:
             log.warning("not answered", device=speaker.device.name, why=str(error))
         else:
-            self._answers.append(Answer(speaker.device, data, now + ANSWER_WITHIN))
+            self._answers.append(Answer(speaker.device, frame, now + ANSWER_WITHIN))
 
     def _bad(self, speaker: _Speaker, fields: Iterable[str], reason: Reason, detail: str) -> None:
         time = self._then.wall()

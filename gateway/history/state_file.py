@@ -15,7 +15,7 @@ import orjson
 import structlog
 
 from gateway.engine.device import Device
-from gateway.planning.bad_addresses import Learned
+from gateway.planning.bad_addresses import KnownBad
 from gateway.protocols.driver import Span
 
 log = structlog.get_logger("gateway")
@@ -40,7 +40,7 @@ class Notebook:
         known = self._read()
         for device in devices:
             if (learned := known.get(device.name)) is not None:
-                device.refusals.recall(learned, device.tags)
+                device.refusals.restore(learned, device.tags)
                 device.plan()
 
     def page(self, devices: Iterable[Device]) -> bytes:
@@ -48,7 +48,7 @@ class Notebook:
         return orjson.dumps(
             {
                 "form": FORM,
-                "devices": {d.name: _written(d.refusals.learned()) for d in devices},
+                "devices": {d.name: _written(d.refusals.known()) for d in devices},
             },
             option=orjson.OPT_INDENT_2 | orjson.OPT_SORT_KEYS,
         )
@@ -100,7 +100,7 @@ class Notebook:
 
     # -- when it is read --
 
-    def _read(self) -> Mapping[str, Learned]:
+    def _read(self) -> Mapping[str, KnownBad]:
         try:
             data = self._path.read_bytes()
         except FileNotFoundError:
@@ -124,13 +124,13 @@ class Notebook:
             log.warning("spoilt, moved aside", file=str(self._path), to=str(aside), why=why)
 
 
-def _pages(document: Mapping[str, Any]) -> dict[str, Learned]:
+def _pages(document: Mapping[str, Any]) -> dict[str, KnownBad]:
     if document["form"] != FORM:
         raise ValueError(f"form {document['form']} is not {FORM}")
     return {name: _learned(page) for name, page in document["devices"].items()}
 
 
-def _written(learned: Learned) -> dict[str, object]:
+def _written(learned: KnownBad) -> dict[str, object]:
     return {
         "refused": [
             {"area": area, "start": start, "size": size, "since": since, "code": code}
@@ -140,7 +140,7 @@ def _written(learned: Learned) -> dict[str, object]:
     }
 
 
-def _learned(page: Mapping[str, list[Mapping[str, object]]]) -> Learned:
+def _learned(page: Mapping[str, list[Mapping[str, object]]]) -> KnownBad:
     """Raises ValueError, TypeError, KeyError for what is no page of ours."""
     refused = tuple(
         (
@@ -151,7 +151,7 @@ def _learned(page: Mapping[str, list[Mapping[str, object]]]) -> Learned:
         for row in page["refused"]
     )
     cuts = tuple((str(area), int(number)) for area, number in page["cuts"])
-    return Learned(refused, cuts)
+    return KnownBad(refused, cuts)
 
 
 def _time(text: str) -> int:

@@ -1,6 +1,6 @@
 """The Zenoh side of the gateway: one session, one publishing thread, bounded queues.
 
-`Northbound` is made with `ZenohSettings` and the `Plant` it speaks for, and `run`s until it is
+`Northbound` is made with `ZenohConfig` and the `Plant` it speaks for, and `run`s until it is
 cancelled. Nothing it does holds the event loop, and nothing below it knows Zenoh.
 """
 
@@ -8,16 +8,12 @@ from gateway.northbound.check import check
 from gateway.northbound.duty import StandbySettings
 from gateway.northbound.northbound import Northbound
 from gateway.northbound.plant import Device, History, Plant
-from gateway.northbound.session import Mode, ZenohSettings, zenoh_settings
 
 __all__ = [
     "Device",
     "History",
-    "Mode",
     "Northbound",
     "Plant",
     "StandbySettings",
-    "ZenohSettings",
     "check",
-    "zenoh_settings",
 ]

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 
 import zenoh
 
-from gateway.config.plain import TlsConfig
+from gateway.config import TlsConfig
 from gateway.errors import ConfigError
 
 

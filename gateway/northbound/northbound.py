@@ -11,6 +11,7 @@ from typing import TypeVar
 import structlog
 import zenoh
 
+from gateway.config import ZenohConfig, ZenohMode
 from gateway.errors import GatewayError
 from gateway.northbound import payload, secrets
 from gateway.northbound.audit import Audit
@@ -29,8 +30,6 @@ from gateway.northbound.replies import Replies
 from gateway.northbound.scans import Scans
 from gateway.northbound.session import (
     CLOSE_WITHIN,
-    Mode,
-    ZenohSettings,
     configure,
     off_loop,
     opened,
@@ -59,7 +58,7 @@ class Northbound:
 
     def __init__(
         self,
-        settings: ZenohSettings,
+        settings: ZenohConfig,
         name: str,
         plant: Plant,
         *,
@@ -78,7 +77,7 @@ class Northbound:
         self.sole = asyncio.Event()  # set when files and lines may be touched, see `run`
         self.opened = asyncio.Event()  # everything is declared, all current values are queued
         self._config = configure(settings)
-        self._retry = settings.mode is Mode.CLIENT
+        self._retry = settings.mode is ZenohMode.CLIENT
         if self._retry:
             self.sole.set()  # it listens to nobody, and may wait for its router for ever
         self._writers = None if writers is None else Writers(writers)

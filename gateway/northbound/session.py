@@ -6,16 +6,13 @@ import json
 import threading
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
-from enum import StrEnum
 from pathlib import Path
 from typing import TypeVar
 
 import structlog
 import zenoh
 
-from gateway.config import written
-from gateway.config.plain import TlsConfig, ZenohConfig
+from gateway.config import TlsConfig, ZenohConfig, ZenohMode, parsers
 from gateway.errors import ConfigError, GatewayError
 from gateway.northbound import certificates, secrets
 
@@ -24,48 +21,6 @@ log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 T = TypeVar("T")
 CLOSE_WITHIN = 2.0  # seconds
 _SHORTEST_RETRY, _LONGEST_RETRY = 0.5, 5.0  # seconds between two attempts of a client
-
-
-class Mode(StrEnum):
-    PEER = "peer"
-    CLIENT = "client"
-    ROUTER = "router"
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ZenohSettings:
-    """`zenoh:` of the configuration file.
-
-    `config_file` is a Zenoh JSON5 file for everything else. `mode` here always counts; `listen`
-    and `connect` here replace the file's unless they are empty, as do the others where given.
-    `user` and its password are how we are known elsewhere; `users_file` is Zenoh's dictionary of
-    those who may connect to us, a line `user:password` each.
-    """
-
-    prefix: str = "plant"
-    mode: Mode = Mode.PEER
-    listen: tuple[str, ...] = ()
-    connect: tuple[str, ...] = ()
-    config_file: Path | None = None
-    tls: TlsConfig | None = None
-    user: str | None = None
-    password_file: Path | None = None
-    users_file: Path | None = None
-
-
-def zenoh_settings(zenoh: ZenohConfig) -> ZenohSettings:
-    """What the configuration file says."""
-    return ZenohSettings(
-        prefix=zenoh.prefix,
-        mode=Mode(zenoh.mode),
-        listen=zenoh.listen,
-        connect=zenoh.connect,
-        config_file=zenoh.config_file,
-        tls=zenoh.tls,
-        user=zenoh.user,
-        password_file=zenoh.password_file,
-        users_file=zenoh.users_file,
-    )
 
 
 # What a gateway needs other than Zenoh's own defaults. A value that the user's file sets wins.
@@ -87,16 +42,16 @@ _GATEWAY: dict[str, object] = {
 _LONGEST_MESSAGE = {"transport/link/rx/max_message_size": 256 * 1024}
 
 
-def configure(settings: ZenohSettings) -> zenoh.Config:
+def configure(settings: ZenohConfig) -> zenoh.Config:
     """The session's configuration. Raises `ConfigError` for a bad file or endpoint."""
     config = zenoh.Config() if settings.config_file is None else _from_file(settings.config_file)
     untouched = zenoh.Config()
-    wanted = _GATEWAY if settings.mode is Mode.ROUTER else _GATEWAY | _LONGEST_MESSAGE
+    wanted = _GATEWAY if settings.mode is ZenohMode.ROUTER else _GATEWAY | _LONGEST_MESSAGE
     for path, setting in wanted.items():
         if config.get_json(path) == untouched.get_json(path):
             config.insert_json5(path, json.dumps(setting))
     config.insert_json5("mode", json.dumps(settings.mode.value))
-    if settings.mode is Mode.CLIENT:
+    if settings.mode is ZenohMode.CLIENT:
         # It would wait for ever in a thread that nobody can stop: `opened` tries again instead.
         config.insert_json5("connect/timeout_ms", "1000")
     for path, value in (_tls(settings.tls) | _users(settings)).items():
@@ -107,7 +62,7 @@ def configure(settings: ZenohSettings) -> zenoh.Config:
         if endpoints:
             config.insert_json5(f"{side}/endpoints", json.dumps(endpoints))
     certificates.check_shown(config, settings.listen)
-    if settings.mode is Mode.CLIENT and json.loads(config.get_json("connect/endpoints")) == []:
+    if settings.mode is ZenohMode.CLIENT and json.loads(config.get_json("connect/endpoints")) == []:
         raise ConfigError("zenoh mode client: say in `connect` which router it is a client of")
     return config
 
@@ -157,7 +112,7 @@ def _tls(tls: TlsConfig | None) -> dict[str, object]:
     return {f"transport/link/tls/{name}": value for name, value in found.items()}
 
 
-def _users(settings: ZenohSettings) -> dict[str, object]:
+def _users(settings: ZenohConfig) -> dict[str, object]:
     found: dict[str, object] = {}
     if settings.users_file is not None:
         secrets.check_users(settings.users_file)
@@ -176,7 +131,7 @@ def _users(settings: ZenohSettings) -> dict[str, object]:
 
 def _check(side: str, endpoint: str) -> None:
     try:
-        written.check_address(endpoint)
+        parsers.check_address(endpoint)
     except ConfigError as error:
         raise ConfigError(f"zenoh {side} {error}") from None
 

@@ -8,7 +8,7 @@ from gateway.engine.jobs import Poll
 from gateway.line.line import Line
 from gateway.northbound.payload import rfc3339
 from gateway.planning.bad_addresses import BadRange
-from gateway.planning.planner import spell
+from gateway.planning.planner import describe
 
 MOST_REQUESTS = 200
 Document = Mapping[str, object]
@@ -44,7 +44,7 @@ def device_document(device: Device, polls: Sequence[Poll]) -> Document:
 def _request(poll: Poll) -> Document:
     """One block: how often it is wanted and how often it came."""
     return {
-        "tags": spell(poll.block),
+        "tags": describe(poll.block),
         "every": poll.block.every,
         "measured_every": round(poll.mean_gap, 4) if poll.mean_gap else None,
         "worst_age": round(poll.worst_gap, 4) if poll.worst_gap else None,

@@ -1,8 +1,8 @@
-"""Finding the address a device refuses by halving its block, and remembering it.
+"""Finds the addresses a device refuses by halving their block, and remembers them.
 
-A device answers a request that touches one address it does not have with a refusal of the
-whole. The block is cut in two, and the refused half again, until the culprit stands alone;
-then everything else is planned together again around it.
+A device refuses a whole request when one of its addresses does not exist. The block is halved,
+then the refused half, until the bad address stands alone. Then the planner covers all other
+addresses again, with cuts around the bad ones.
 """
 
 from collections.abc import Callable, Iterable
@@ -13,7 +13,7 @@ from gateway.planning.planner import Block, Cuts, items_of
 from gateway.protocols.driver import Cost, Span
 from gateway.tags import Tag
 
-RETRY = 300.0  # seconds between two tries of an address that was refused
+RETRY = 300.0  # seconds between two tries of a bad address
 CostOf = Callable[[Span], Cost | None]
 
 
@@ -27,16 +27,16 @@ class BadRange:
     tags: tuple[Tag, ...]
 
 
-class Learned(NamedTuple):
-    """What is worth knowing after a restart."""
+class KnownBad(NamedTuple):
+    """Bad addresses and cuts, as the state file keeps them across a restart."""
 
-    refused: tuple[tuple[Span, int, str], ...]  # the addresses, since when, the maker's code
+    refused: tuple[tuple[Span, int, str], ...]  # span, since (ns since 1970), the maker's code
     cuts: tuple[tuple[str, int], ...]
 
 
 @dataclass(slots=True)
 class _Node:
-    """A block under suspicion, or one half of one."""
+    """A refused block, or one half of a refused block."""
 
     span: Span
     good: bool | None = None
@@ -46,12 +46,12 @@ class _Node:
         return all(half.settled() for half in self.halves) if self.halves else self.good is not None
 
     def cuts(self) -> set[tuple[str, int]]:
-        """The boundaries that the finished search has shown to be needed."""
+        """The boundaries that the completed search requires."""
         if not self.halves:
             if self.good:
                 return set()
             return _bounds(self.span)
-        if all(half.good for half in self.halves):  # each is there, but not both in one request
+        if all(half.good for half in self.halves):  # the device refuses only both in one request
             return {(self.span.area, self.halves[1].span.start)}
         return set().union(*(half.cuts() for half in self.halves))
 
@@ -67,8 +67,12 @@ def _bounds(span: Span) -> set[tuple[str, int]]:
 
 
 @dataclass(slots=True)
-class Refusals:
-    """What one device refuses. Feed it each refused and each good block."""
+class BadAddresses:
+    """The bad addresses of one device. The caller reports each block the device refuses or reads.
+
+    `bad` holds the ranges found so far. While `searching`, halves of refused blocks are still
+    to be read.
+    """
 
     cost: CostOf
     bad: dict[Span, BadRange] = field(default_factory=dict)
@@ -78,7 +82,7 @@ class Refusals:
 
     @property
     def cuts(self) -> Cuts:
-        """Boundaries the planner must keep."""
+        """Boundaries that no planned block may cross."""
         return frozenset(self._cuts)
 
     @property
@@ -86,7 +90,7 @@ class Refusals:
         return bool(self._roots)
 
     def refused(self, block: Block, now: int, code: str) -> tuple[Block, ...]:
-        """What to ask instead of `block`: its two halves, or nothing where it is the culprit."""
+        """Returns the two halves to read instead of `block`; empty when it is the bad address."""
         node = self._leaves.pop(block.span, None)
         if block.span in self.bad:
             if node is not None:
@@ -102,7 +106,10 @@ class Refusals:
         return halves
 
     def read(self, block: Block) -> bool:
-        """The block was read well. True when an address refused before is there now."""
+        """Records a good read.
+
+        Returns True when the block was bad before: then the device is to be planned again.
+        """
         node = self._leaves.pop(block.span, None)
         if node is not None:
             node.good = True
@@ -114,7 +121,10 @@ class Refusals:
         return True
 
     def settle(self) -> bool:
-        """True when all searches have just ended: plan the device anew."""
+        """Adopts the cuts once all searches are complete.
+
+        Returns True then: the device is to be planned again.
+        """
         if not self._roots or not all(root.settled() for root in self._roots):
             return False
         for root in self._roots:
@@ -123,25 +133,25 @@ class Refusals:
         return True
 
     def abandon(self) -> None:
-        """The blocks are about to be other ones: what is still searched for will be again."""
+        """Drops the searches: the device gets other blocks, and a bad address is found again."""
         self._roots.clear()
         self._leaves.clear()
 
-    def learned(self) -> Learned:
+    def known(self) -> KnownBad:
         refused = tuple((bad.span, bad.since, bad.code) for bad in self.bad.values())
-        return Learned(tuple(sorted(refused)), tuple(sorted(self._cuts)))
+        return KnownBad(tuple(sorted(refused)), tuple(sorted(self._cuts)))
 
-    def recall(self, learned: Learned, tags: Iterable[Tag]) -> None:
-        """Begin with what an earlier run found, as far as there are still tags for it."""
-        self._cuts |= set(learned.cuts)
-        by_area = {span.area for span, _, _ in learned.refused}
-        known = [tag for tag in tags if tag.span.area in by_area]
-        for span, since, code in learned.refused:
-            there = tuple(tag for tag in known if _within(tag.span, span))
-            if [(i.start, i.end) for i in items_of(there)] == [
+    def restore(self, known: KnownBad, tags: Iterable[Tag]) -> None:
+        """Takes over the result of an earlier run. Skips ranges that the tags no longer fill."""
+        self._cuts |= set(known.cuts)
+        areas = {span.area for span, _, _ in known.refused}
+        candidates = [tag for tag in tags if tag.span.area in areas]
+        for span, since, code in known.refused:
+            inside = tuple(tag for tag in candidates if _within(tag.span, span))
+            if [(i.start, i.end) for i in items_of(inside)] == [
                 (span.start, span.start + span.size)
             ]:
-                self.bad[span] = BadRange(span, since, code, there)
+                self.bad[span] = BadRange(span, since, code, inside)
                 self._cuts |= _bounds(span)
 
     def _halves(self, block: Block, node: _Node) -> tuple[Block, ...]:

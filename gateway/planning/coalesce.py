@@ -1,31 +1,30 @@
-"""The cheapest set of requests that reads everything as often as it is wanted, found exactly.
+"""Covers items by the requests with the least wire time per second: an exact search.
 
-What is to be read lies in a row by address, and each item has its interval. A request covers a
-run of items at one interval; an item may be in a request that is asked more often than it
-needs, and requests of different intervals may reach over one another. Looked for is the set with
-the least wire time per second.
+The items lie in a row by address; each has an interval. A request reads a run of neighbouring
+items at one interval. An item may join a request that is sent more often than the item needs, and
+requests of different intervals may overlap.
 
-The row is walked from left to right. A state says, for each interval, where its request that
-reaches over the current item began, if there is one. Of all states only those are kept that
-could still win: whoever is dearer than the cheapest by as much as it costs to begin its
-open requests afresh will never be cheaper; nor will one that is no cheaper and has less room
-left in its open requests. On a wire fewer than a hundred are left. Where characters cost next
-to nothing, as on a network, and intervals are many, only the cheapest `MOST` are followed: then
-what is found may not be the least, though none was seen that was dearer.
+The search walks the row from left to right. A state holds, for each interval, the item where its
+open request began, if one is open. Two rules drop states that cannot become the best: a state
+that costs more than the cheapest one plus new requests in place of its open ones; and a state
+that costs no less than another one and has less room left in its open requests. On a serial wire
+fewer than a hundred states remain. On a network, where characters cost almost nothing, many
+intervals leave more: there the search follows only the cheapest `MOST`. Its result may then cost
+more than the least; no such case has been seen.
 """
 
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
-# Seconds of one exchange over items first..last, None where one request cannot hold them.
+# Seconds of one transaction over items first..last; None where one request cannot hold them.
 SecondsOf = Callable[[int, int], float | None]
 CLOSED = -1
-MOST = 200  # states that are followed
+MOST = 200  # states kept at each item
 _TINY = 1e-12
 
 
 class Request(NamedTuple):
-    """Items `first` .. `last` asked for together every `every` seconds."""
+    """Items `first` to `last`, read together every `every` seconds."""
 
     first: int
     last: int
@@ -33,31 +32,31 @@ class Request(NamedTuple):
 
 
 class _Closed(NamedTuple):
-    """Requests that have ended, newest first."""
+    """A linked list of the closed requests, newest first."""
 
     request: Request
     before: "_Closed | None"
 
 
-_Starts = tuple[int, ...]  # by interval, fastest first: where the open request began, or CLOSED
-# One way to have covered the items so far: its wire time per second, as if the open requests
-# were closed here; the open requests; the closed ones.
+_Starts = tuple[int, ...]  # for each interval, fastest first: first item of its open request
+# A cover of the items so far: its wire time per second, as if the open requests ended here; the
+# open requests; the closed requests.
 _State = tuple[float, _Starts, _Closed | None]
 
 
-def cover(
+def coalesce(
     intervals: Sequence[float],
     seconds: SecondsOf,
     splits: frozenset[int] = frozenset(),
     *,
     even: bool = False,
 ) -> list[Request]:
-    """The requests of least wire time for items with these intervals (seconds), by address.
+    """Returns the requests of least wire time for items with these intervals (seconds), by address.
 
-    No request reaches over the border before an item in `splits`. Raises `ValueError` when a
-    single item fits no request. `seconds` must not fall when a request grows. `even` promises
-    that one more item costs a request the same wherever it began (registers do, bits that are
-    packed from their first one do not); it makes long rows much faster.
+    No request crosses the border before an item in `splits`. `seconds` must not fall when a request
+    grows. `even` promises that one more item adds the same to a request wherever that request
+    began: true for registers, not for bits, which are packed from the first one. It makes long
+    rows much faster. Raises `ValueError` with the index of an item that fits no request.
     """
     rates = sorted(set(intervals))
     rank = {every: rate for rate, every in enumerate(rates)}
@@ -83,42 +82,42 @@ def cover(
 def _growth(
     item: int, states: Sequence[_State], seconds: SecondsOf, *, split: bool, even: bool
 ) -> dict[int, float | None]:
-    """What `item` adds to each open request, by where that began; None where it does not fit."""
-    begun = sorted({start for _, starts, _ in states for start in starts if start != CLOSED})
+    """Returns the seconds `item` adds to an open request, by its first item; None: does not fit."""
+    begins = sorted({start for _, starts, _ in states for start in starts if start != CLOSED})
     if split:
-        return dict.fromkeys(begun)
+        return dict.fromkeys(begins)
     growth: dict[int, float | None] = {}
-    for place, start in enumerate(begun):
+    for place, start in enumerate(begins):
         whole = seconds(start, item)
         if whole is None:
             growth[start] = None
             continue
         more = whole - (seconds(start, item - 1) or 0.0)
-        if even:  # those that began later are shorter still
-            growth.update(dict.fromkeys(begun[place:], more))
+        if even:  # requests that began later are shorter, so the item fits them too
+            growth.update(dict.fromkeys(begins[place:], more))
             break
         growth[start] = more
     return growth
 
 
 class _Step(NamedTuple):
-    """What may be done at one item."""
+    """The choices at one item."""
 
     item: int
-    rate: int  # which of the intervals the item wants
+    rate: int  # index of the item's own interval
     rates: Sequence[float]
-    fresh: Sequence[float]  # by interval: what a new request for the item alone costs
+    fresh: Sequence[float]  # by interval: the cost of a new request for the item alone
     growth: dict[int, float | None]
 
     def after(self, state: _State) -> Iterator[_State]:
-        """Every state that `state` can become: each open request goes on or ends, others begin.
+        """Yields every next state: each open request continues or ends, and others may begin.
 
-        Of the open requests only the fastest served the item before, so it alone may end without
-        need: the others would have ended sooner.
+        Only the fastest open request may end although it could continue: it alone read the item
+        before. The others were of no use there and would have ended earlier.
         """
         total, starts, done = state
         fastest: int | None = None
-        spared: float | None = None
+        saved: float | None = None
         for rate, start in enumerate(starts):
             if start == CLOSED:
                 continue
@@ -129,10 +128,10 @@ class _Step(NamedTuple):
                 more /= self.rates[rate]
                 total += more
             if fastest is None:
-                fastest, spared = rate, more
-        yield from self._serve(total, starts, done)
-        if fastest is not None and spared is not None:
-            yield from self._serve(total - spared, *self._end(starts, done, fastest))
+                fastest, saved = rate, more
+        yield from self._read_item(total, starts, done)
+        if fastest is not None and saved is not None:
+            yield from self._read_item(total - saved, *self._end(starts, done, fastest))
 
     def _end(
         self, starts: _Starts, done: _Closed | None, rate: int
@@ -140,8 +139,8 @@ class _Step(NamedTuple):
         request = Request(starts[rate], self.item - 1, self.rates[rate])
         return (*starts[:rate], CLOSED, *starts[rate + 1 :]), _Closed(request, done)
 
-    def _serve(self, total: float, starts: _Starts, done: _Closed | None) -> Iterator[_State]:
-        """A request begins only where nothing else serves."""
+    def _read_item(self, total: float, starts: _Starts, done: _Closed | None) -> Iterator[_State]:
+        """Yields the states that read the item. A request begins only if no open one reads it."""
         if max(starts[: self.rate + 1]) != CLOSED:
             yield total, starts, done
             return
@@ -155,8 +154,11 @@ def _total(state: _State) -> float:
 
 
 def _contenders(states: list[_State], fresh: Sequence[float]) -> list[_State]:
-    """Those that could still win. From the cheapest one can go on as any other would by
-    beginning its open requests afresh, for at most one exchange of a single item each."""
+    """Drops states that cannot become the best.
+
+    The cheapest state can continue like any other one after it begins that one's open requests
+    again, each at the cost of one transaction over a single item at most.
+    """
     best = min(map(_total, states))
 
     def could_win(state: _State) -> bool:
@@ -168,10 +170,10 @@ def _contenders(states: list[_State], fresh: Sequence[float]) -> list[_State]:
 
 
 def _undominated(states: list[_State], fresh: Sequence[float]) -> list[_State]:
-    """Without those that another can match by beginning afresh only where it has less room.
+    """Drops states that a cheaper one can replace by new requests only where it has less room.
 
-    Written out flat, without strict (all three have one place an interval): most of the time that
-    a plan takes is spent here, and strict alone would add a third to all of it.
+    Planning spends most of its time here, hence the flat loops. `strict` would add a third to the
+    whole; the three sequences have one entry for each interval.
     """
     kept: list[_State] = []
     for state in sorted(states, key=_total):
@@ -184,7 +186,7 @@ def _undominated(states: list[_State], fresh: Sequence[float]) -> list[_State]:
                     if left < 0:
                         break
             else:
-                break  # matched
+                break  # a cheaper state replaces this one
         else:
             kept.append(state)
             if len(kept) == MOST:

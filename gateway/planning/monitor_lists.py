@@ -1,6 +1,6 @@
-"""Scattered addresses read through a list that the PLC remembers, where that is cheaper.
+"""Reads scattered addresses through a list registered in the PLC, where that costs less.
 
-A PLC keeps one list: the one is chosen that saves the most wire time.
+A PLC keeps one list, so the planner chooses the list that saves the most wire time.
 """
 
 from collections.abc import Collection, Sequence
@@ -9,12 +9,12 @@ from gateway.planning.planner import Block, Seconds
 from gateway.protocols.driver import AnyDriver, Monitor, Span, Unit
 
 
-def with_list(
+def with_monitor_list(
     blocks: Sequence[Block], driver: AnyDriver, seconds: Seconds, refused: Collection[Span] = ()
 ) -> tuple[Block, ...]:
-    """The plan, with the blocks that a list reads cheaper put together in one.
+    """Returns the plan with the blocks that a list reads at lower cost joined into one block.
 
-    Blocks that are `refused` stay apart: one of their addresses would have the list refused.
+    Blocks in `refused` stay apart: one bad address would make the PLC refuse the whole list.
     """
     if not isinstance(driver, Monitor):
         return tuple(blocks)
@@ -28,7 +28,7 @@ def with_list(
                 and block.span not in refused
                 and (driver.areas[block.span.area].unit is Unit.BIT) is bits
             ]
-            found = _listed(alike, driver, seconds)
+            found = _best_list(alike, driver, seconds)
             if found is not None and (best is None or found[0] > best[0]):
                 best = found
     if best is None:
@@ -37,23 +37,23 @@ def with_list(
     return (*(other for other in blocks if other not in replaced), block)
 
 
-def _listed(
+def _best_list(
     blocks: Sequence[Block], driver: Monitor[object], seconds: Seconds
 ) -> tuple[float, Block, list[Block]] | None:
-    """What a list saves per second, the block that reads it, and those it stands for."""
-    taken: list[Block] = []
+    """Returns the seconds saved per second, the list's block and the blocks it replaces."""
+    replaced: list[Block] = []
     spans: tuple[Span, ...] = ()
     for block in sorted(blocks, key=lambda block: (len(block.tags), block.span)):
         more = (*spans, *dict.fromkeys(tag.span for tag in block.tags))
         if driver.monitor_cost(more) is not None:
-            taken.append(block)
+            replaced.append(block)
             spans = more
-    cost = driver.monitor_cost(spans) if len(taken) > 1 else None
+    cost = driver.monitor_cost(spans) if len(replaced) > 1 else None
     if cost is None:
         return None
-    every = taken[0].every
-    saved = (sum(seconds(block.cost) for block in taken) - seconds(cost)) / every
+    every = replaced[0].every
+    saved = (sum(seconds(block.cost) for block in replaced) - seconds(cost)) / every
     if saved <= 0:
         return None
-    tags = tuple(tag for block in taken for tag in block.tags)
-    return saved, Block(spans[0], every, tags, cost, listed=spans), taken
+    tags = tuple(tag for block in replaced for tag in block.tags)
+    return saved, Block(spans[0], every, tags, cost, listed=spans), replaced

@@ -1,9 +1,9 @@
-"""Tags -> blocks: what to ask a device so that the wire is busy the shortest time.
+"""Turns tags into blocks, the requests that read them at the least wire time.
 
-Tags of one area share blocks. Which, and how often each block is asked, is found exactly
-(`cover`) from the driver's own character costs, the line's speed, the silence before a request
-and the station's turnaround; no fixed gap is right at every baud rate. A slower tag rides in a
-faster block where that costs less than asking for it apart.
+Tags of one area share blocks. `coalesce` finds the blocks and their intervals exactly, from the
+driver's character costs, the line's speed, the silence before a request and the station's
+turnaround; no fixed gap is right at every baud rate. A slower tag joins a faster block where that
+costs less than a request of its own.
 """
 
 from bisect import bisect_left
@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 
 from gateway.errors import ConfigError
-from gateway.planning.coalesce import Request, cover
+from gateway.planning.coalesce import Request, coalesce
 from gateway.protocols.driver import AnyDriver, Cost, Span, Unit
 from gateway.tags import Publish, Quality, Reason, Sample, Tag, bad, of_field
 from gateway.values import Value
@@ -28,7 +28,7 @@ Cuts = frozenset[tuple[str, int]]  # (area, n): no block may hold both n - 1 and
 class Block:
     """One request and the tags it feeds.
 
-    `listed`: the spans of a list registered in the PLC, where the block is read by one.
+    `listed`: the spans of the monitor list that reads the block, if there is one.
     """
 
     span: Span
@@ -37,8 +37,10 @@ class Block:
     cost: Cost
     listed: tuple[Span, ...] = ()
     parts: tuple[tuple[Tag, Decode, slice], ...] = field(init=False, repr=False)
-    of_fields: bool = field(init=False, repr=False)  # of a frame: values, not words
-    eager: bool = field(init=False, repr=False)  # to be told of though nothing changed
+    of_fields: bool = field(
+        init=False, repr=False
+    )  # frames protocol: the units are values, not words
+    eager: bool = field(init=False, repr=False)  # decode every read, although nothing changed
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "parts", tuple(self._parts()))
@@ -47,7 +49,7 @@ class Block:
         object.__setattr__(self, "eager", eager or self.of_fields)
 
     def _parts(self) -> Iterator[tuple[Tag, Decode, slice]]:
-        """Each tag with its decoder and where its units stand among those that are read."""
+        """Yields each tag with its decoder and the position of its units in the reply."""
         begins, place = {}, 0
         for span in self.listed:
             begins[span] = place
@@ -57,10 +59,10 @@ class Block:
             yield tag, tag.decode, slice(begin, begin + tag.span.size)
 
     def decode(self, units: Sequence[int], time: int) -> list[Sample]:
-        """The samples of all tags; `time` is when the reply arrived (ns since 1970)."""
+        """Returns a sample for each tag; `time` is the arrival of the reply (ns since 1970)."""
         if self.of_fields:
             return [of_field(tag, units[part.start], time) for tag, _, part in self.parts]
-        good, new = Quality.GOOD, tuple.__new__  # half of what the constructor takes: it is much
+        good, new = Quality.GOOD, tuple.__new__  # twice as fast as the constructor
         return [
             bad(tag, Reason.NOT_A_NUMBER, time)
             if (value := decode(units[part])) is None
@@ -71,21 +73,22 @@ class Block:
 
 @dataclass(slots=True)
 class Item:
-    """Tags that any block takes all or none of: equal or overlapping spans."""
+    """Tags with equal or overlapping spans: a block reads all of them or none."""
 
     start: int
     end: int  # exclusive
-    every: float  # as often as the most impatient of them wants it
+    every: float  # the shortest interval of the tags
     tags: list[Tag]
 
 
 def plan(
     tags: Iterable[Tag], driver: AnyDriver, seconds: Seconds, cuts: Cuts = frozenset()
 ) -> tuple[Block, ...]:
-    """Cover every readable tag of one device at the least wire time.
+    """Returns the blocks that read every readable tag of one device at the least wire time.
 
-    `seconds` says how long an exchange of a given cost takes on this line with this station.
-    The result is in the order of areas and addresses and depends on nothing but the arguments.
+    `seconds` gives the duration of a transaction of a given cost on this line with this station.
+    The blocks are in the order of areas and addresses; equal arguments give equal blocks. Raises
+    `ConfigError` for a tag that does not fit one request.
     """
     areas: dict[str, list[Tag]] = defaultdict(list)
     for tag in tags:
@@ -106,28 +109,29 @@ def _plan_area(
         i + 1 for i, (a, b) in enumerate(pairwise(items)) if _between(a.end, b.start, fences)
     )
 
-    def exchange(first: int, last: int) -> float | None:
+    def transaction(first: int, last: int) -> float | None:
         start = items[first].start
         cost = driver.cost(Span(area, start, items[last].end - start))
         return None if cost is None else seconds(cost)
 
-    # In very long rows of packed bits a request may cost a character more than the least.
+    # Bits are packed and so not even. For a very long row speed counts more: there a request may
+    # cost one character more than the least.
     even = driver.areas[area].unit is not Unit.BIT or len(items) > LONG_ROW
     try:
-        requests = cover([item.every for item in items], exchange, splits, even=even)
+        requests = coalesce([item.every for item in items], transaction, splits, even=even)
     except ValueError as error:
-        culprit = items[error.args[0]].tags[0].text
-        raise ConfigError(f"{culprit} cannot be read in one request") from None
+        address = items[error.args[0]].tags[0].text
+        raise ConfigError(f"{address} cannot be read in one request") from None
     return list(_blocks(area, items, requests, driver))
 
 
 def _blocks(
     area: str, items: Sequence[Item], requests: Sequence[Request], driver: AnyDriver
 ) -> Iterator[Block]:
-    """A tag goes with the fastest request that reaches over it: that one is fresher."""
+    """Yields a block for each request. A tag joins the fastest request over it: the freshest."""
     members: dict[Request, list[Tag]] = {request: [] for request in requests}
     waiting = deque(requests)
-    over: list[Request] = []  # those that reach over the item
+    over: list[Request] = []  # requests over the current item
     for number, item in enumerate(items):
         over = [request for request in over if request.last >= number]
         while waiting and waiting[0].first == number:
@@ -142,13 +146,13 @@ def _blocks(
 
 
 def _between(end: int, start: int, fences: Sequence[int]) -> bool:
-    """Whether a cut lies between an item that ends at `end` and the next one at `start`."""
+    """Returns True when a cut lies between an item that ends at `end` and the next at `start`."""
     place = bisect_left(fences, end)
     return place < len(fences) and fences[place] <= start
 
 
 def items_of(tags: Iterable[Tag]) -> list[Item]:
-    """Tags by address; those that overlap (bits of one word, two views of one value) as one."""
+    """Sorts tags by address. Joins overlapping tags: bits of one word, two views of one value."""
     items: list[Item] = []
     for tag in sorted(tags, key=lambda tag: (tag.span.start, tag.span.size, tag.name)):
         end = tag.span.start + tag.span.size
@@ -161,8 +165,8 @@ def items_of(tags: Iterable[Tag]) -> list[Item]:
     return items
 
 
-def spell(block: Block) -> str:
-    """`D7.3..D10`: the first and the last address of a block as the file writes them."""
+def describe(block: Block) -> str:
+    """Returns the first and last address of a block as the file writes them: `D7.3..D10`."""
     first = min(block.tags, key=lambda tag: tag.span)
     last = max(block.tags, key=lambda tag: (tag.span.area, tag.span.start + tag.span.size))
     return first.text if first is last else f"{first.text}..{last.text}"

@@ -203,15 +203,23 @@ class Windowed(Protocol):
 
 
 @runtime_checkable
-class Overhearing(Protocol):
-    """A driver whose device may speak without being asked, or keep silent for known reasons."""
+class NoReplyCauses(Protocol):
+    """A driver that knows why its device may not reply at all."""
 
     @property
-    def silent_causes(self) -> str:
-        """Why it may not answer at all, in a sentence or two for people."""
+    def no_reply_causes(self) -> str:
+        """The causes, in a sentence or two for people."""
 
-    def unasked(self, frame: Any) -> str | None:
-        """What to say of a frame that answers no question; None for nothing."""
+
+@runtime_checkable
+class StrayFrames(Protocol):
+    """A driver that can explain stray frames: frames that are no reply to any request."""
+
+    def from_this_station(self, frame: Any) -> bool:
+        """True when the device itself sent the frame."""
+
+    def describe_stray(self, frame: Any) -> str | None:
+        """A phrase for the log; None for a frame that needs no explanation."""
 
 
 @runtime_checkable

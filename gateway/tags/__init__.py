@@ -1,20 +1,7 @@
-"""Tags, their samples, and the last sample of every tag."""
+"""Tags, their samples, and the latest sample of every tag."""
 
-from gateway.tags.tag import (
-    Deadband,
-    Form,
-    Publish,
-    Quality,
-    Reason,
-    Sample,
-    Shape,
-    Tag,
-    WriteResult,
-    WriteRule,
-    bad,
-    good,
-    of_field,
-)
+from gateway.tags.sample import Quality, Reason, Sample, WriteResult, bad, good, of_field
+from gateway.tags.tag import Deadband, Form, Publish, Shape, Tag, WriteRule
 
 __all__ = [
     "Deadband",
@@ -25,8 +12,8 @@ __all__ = [
     "Sample",
     "Shape",
     "Tag",
-    "WriteRule",
     "WriteResult",
+    "WriteRule",
     "bad",
     "good",
     "of_field",

@@ -1,4 +1,4 @@
-"""The last sample of every tag, and which samples are worth publishing."""
+"""The latest sample of every tag, and the choice of samples to publish."""
 
 from collections.abc import Iterable
 
@@ -7,106 +7,111 @@ from gateway.tags.unchanged import Unchanged
 
 
 class Mirror:
-    """What is known of every tag now, and what the network was last told.
+    """The latest and the last published sample of every tag.
 
     A sample is published when its quality or reason changed, when its value changed by at
     least the tag's deadband since the last published one, when the tag is published always,
-    or when its heartbeat has run out.
+    or when its heartbeat interval has passed.
     """
 
     def __init__(self, tags: Iterable[Tag], now: int) -> None:
         """`now`: nanoseconds since 1970."""
         self._current = {tag: bad(tag, Reason.STARTING, now) for tag in tags}
         self._published: dict[Tag, Sample] = {}
-        # Those read again and again since, as they are: each with what knows its time now. Both in
-        # one look-up, so that a thread that looks never takes the one for another's.
+        # Tags of repeated equal reads. Sample and `Unchanged` are in one entry: another thread gets
+        # both by one look-up and never combines a value with the time of another.
         self._unchanged: dict[Tag, tuple[Sample, Unchanged]] = {}
 
     def __getitem__(self, tag: Tag) -> Sample:
-        known = self._unchanged.get(tag)
-        if known is None:
+        entry = self._unchanged.get(tag)
+        if entry is None:
             return self._current[tag]
-        sample, unchanged = known
-        return unchanged.now(sample)
+        sample, unchanged = entry
+        return unchanged.restamped(sample)
 
     def samples(self) -> Iterable[Sample]:
         return map(self.__getitem__, self._current)
 
     def update(self, samples: Iterable[Sample]) -> list[Sample]:
-        """Take the samples in; those worth publishing come back, in their order."""
-        if type(samples) is Unchanged and self._goes_on(samples):
+        """Stores the samples. Returns those to publish, in their order."""
+        if type(samples) is Unchanged and self._adopt(samples):
             return []
         current, published, good = self._current, self._published, Quality.GOOD
         unchanged = self._unchanged
-        news = []
+        to_publish = []
         for sample in samples:
             tag, value, quality, _, _, _ = sample
-            if quality is not good and _same_trouble(current[tag], sample):
-                continue  # it became bad then, not now
-            current[tag] = sample  # first: a thread may look, and must find the one or the other
+            if quality is not good and _same_failure(current[tag], sample):
+                continue  # keeps the time when it became bad
+            # Before the entry of `unchanged` goes: other threads must find one or the other.
+            current[tag] = sample
             if tag in unchanged:
-                unchanged.pop(tag)[1].over = True
-            told = published.get(tag)
-            if told is not None and quality is told.quality is good:
-                if told.value == value:
+                unchanged.pop(tag)[1].superseded = True
+            last = published.get(tag)
+            if last is not None and quality is last.quality is good:
+                if last.value == value:
                     if tag.heartbeat is None and tag.publish is not Publish.ALWAYS:
-                        continue  # as the last one: most samples end here
+                        continue  # most samples end here
                 elif tag.deadband is None:
                     published[tag] = sample
-                    news.append(sample)
+                    to_publish.append(sample)
                     continue
-            if _worth_telling(told, sample):
+            if _is_due(last, sample):
                 published[tag] = sample
-                news.append(sample)
-        return news
+                to_publish.append(sample)
+        return to_publish
 
-    def told(self, samples: Iterable[Sample]) -> list[Sample]:
-        """They are published once more, changed or not: a change counts from them. Those come
-        back that are news, their value having moved by less than the deadband."""
+    def mark_published(self, samples: Iterable[Sample]) -> list[Sample]:
+        """Records samples that are published again: deadband and heartbeat count from them.
+
+        Returns those whose value differs from the last published one by less than the deadband.
+        """
         published = self._published
-        news = []
+        changed = []
         for sample in samples:
-            before = published.get(sample.tag)
+            last = published.get(sample.tag)
             published[sample.tag] = sample
-            if before is not None and before.value != sample.value:
-                news.append(sample)
-        return news
+            if last is not None and last.value != sample.value:
+                changed.append(sample)
+        return changed
 
-    def _goes_on(self, unchanged: Unchanged) -> bool:
-        """Whether these are what is known, so that nothing but their time is new."""
-        if unchanged.over:
+    def _adopt(self, unchanged: Unchanged) -> bool:
+        """Returns True when the values are the current ones, so that only the time is new."""
+        if unchanged.superseded:
             return False
-        known = self._unchanged.get(unchanged.samples[0].tag)
-        if known is None or known[1] is not unchanged:
-            if not all(self._is_known(sample) for sample in unchanged.samples):
-                unchanged.over = True
+        entry = self._unchanged.get(unchanged.samples[0].tag)
+        if entry is None or entry[1] is not unchanged:
+            if not all(self._is_current(sample) for sample in unchanged.samples):
+                unchanged.superseded = True
                 return False
             tags = [sample.tag for sample in unchanged.samples]
             self._unchanged |= {tag: (self._current[tag], unchanged) for tag in tags}
         return True
 
-    def _is_known(self, sample: Sample) -> bool:
-        known = self._current[sample.tag]
-        return known is sample or (known.quality is Quality.BAD and _same_trouble(known, sample))
+    def _is_current(self, sample: Sample) -> bool:
+        current = self._current[sample.tag]
+        return current is sample or (
+            current.quality is Quality.BAD and _same_failure(current, sample)
+        )
 
 
-def _same_trouble(known: Sample, sample: Sample) -> bool:
-    return known.quality is Quality.BAD and known.reason is sample.reason
+def _same_failure(current: Sample, sample: Sample) -> bool:
+    return current.quality is Quality.BAD and current.reason is sample.reason
 
 
-def _worth_telling(told: Sample | None, sample: Sample) -> bool:
-    if told is None or told.quality is not sample.quality or told.reason is not sample.reason:
+def _is_due(last: Sample | None, sample: Sample) -> bool:
+    if last is None or last.quality is not sample.quality or last.reason is not sample.reason:
         return True
     tag = sample.tag
     if tag.publish is Publish.ALWAYS:
         return True
-    if tag.heartbeat is not None and not 0 <= sample.time - told.time < tag.heartbeat * 1e9:
-        return True  # or the clock was set back: nobody knows how long ago that was
-    return _changed(tag, told, sample)
+    if tag.heartbeat is not None and not 0 <= sample.time - last.time < tag.heartbeat * 1e9:
+        return True  # also after the clock was set back: the interval is then unknown
+    return _changed(tag, last, sample)
 
 
-def _changed(tag: Tag, told: Sample, sample: Sample) -> bool:
-    old, new = told.value, sample.value
+def _changed(tag: Tag, last: Sample, sample: Sample) -> bool:
+    old, new = last.value, sample.value
     if tag.deadband is None or old is None or new is None:
         return old != new
     if isinstance(old, (bool, str)) or isinstance(new, (bool, str)):

@@ -1,4 +1,4 @@
-"""Samples that were read once more with the same values: nothing is made but their new time."""
+"""Samples of a repeated read with equal values: only their time changes."""
 
 from collections.abc import Sequence
 from typing import overload
@@ -7,21 +7,22 @@ from gateway.tags import Quality, Sample
 
 
 class Unchanged(Sequence[Sample]):
-    """The samples of a block as they were told, at the `time` of its last reading.
+    """The samples of a block whose units are the same at every read.
 
-    One reading after another only moves `time` (nanoseconds since 1970), until something else is
-    told of one of the tags: then it is `over`. A sample of that time is made for who looks at it.
+    `time` (nanoseconds since 1970) is the latest read; each read moves it and creates no samples.
+    Access to an element creates a sample with that time. `superseded` becomes True when another
+    sample of one of the tags arrives; the object is not used after that.
     """
 
-    __slots__ = ("over", "samples", "time")
+    __slots__ = ("samples", "superseded", "time")
 
     def __init__(self, samples: Sequence[Sample], time: int) -> None:
         self.samples = samples
         self.time = time
-        self.over = False
+        self.superseded = False
 
-    def now(self, sample: Sample) -> Sample:
-        """That one of them, at its time now. A bad one became bad then, not now."""
+    def restamped(self, sample: Sample) -> Sample:
+        """Returns the sample with the latest time. A bad one keeps the time it became bad."""
         return sample._replace(time=self.time) if sample.quality is Quality.GOOD else sample
 
     def __len__(self) -> int:
@@ -33,5 +34,5 @@ class Unchanged(Sequence[Sample]):
     def __getitem__(self, index: slice) -> list[Sample]: ...
     def __getitem__(self, index: int | slice) -> Sample | list[Sample]:
         if isinstance(index, slice):
-            return [self.now(sample) for sample in self.samples[index]]
-        return self.now(self.samples[index])
+            return [self.restamped(sample) for sample in self.samples[index]]
+        return self.restamped(self.samples[index])

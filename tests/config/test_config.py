@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.config import Config, ConfigErrors, load, schema, written
+from gateway.config import Config, ConfigErrors, load, parsers, schema
 from gateway.config.model import (
     HistorySection,
     Section,
@@ -559,7 +559,7 @@ TAGS = [
     bad(
         "unknown type",
         tags("a: {address: D1, type: int, write: {max: 70000}}"),
-        f"8: {M}.tags.a.type: 'int' is no type: use {TYPES} or string[n]",
+        f"8: {M}.tags.a.type: 'int' is not a type: use {TYPES} or string[n]",
     ),
     bad(
         "string too long",
@@ -1001,7 +1001,7 @@ def test_loading_leaves_the_garbage_collector_as_it_was(file: Callable[[str], Co
      ("1.1s", 1.1), ("0.5 ms", 0.0005), ("100ms", 0.1), ("0s", 0.0)],
 )  # fmt: skip
 def test_durations(text: str, seconds: float) -> None:
-    assert written.duration(text) == seconds
+    assert parsers.duration(text) == seconds
 
 
 @pytest.mark.parametrize(
@@ -1009,17 +1009,17 @@ def test_durations(text: str, seconds: float) -> None:
 )
 def test_what_is_no_duration(value: object) -> None:
     with pytest.raises(ConfigError):
-        written.duration(value)
+        parsers.duration(value)
 
 
 def test_sizes() -> None:
-    assert [written.size(text) for text in ("1MB", "1.5GB", "2 TB")] == [
+    assert [parsers.size(text) for text in ("1MB", "1.5GB", "2 TB")] == [
         10**6,
         1_500_000_000,
         2 * 10**12,
     ]
     with pytest.raises(ConfigError, match="too little"):
-        written.size("10kB")
+        parsers.size("10kB")
 
 
 @given(st.recursive(

@@ -10,7 +10,7 @@ from contextlib import AsyncExitStack, closing
 from pathlib import Path
 from typing import Any
 
-from gateway.northbound import Mode
+from gateway.config import ZenohMode
 from gateway.northbound.payload import rfc3339
 from tests.e2e.processes import ROOT, Program, started, station, until, vigor_line, write_config
 from tests.zenoh_peer import ZenohPeer, free_endpoint
@@ -63,7 +63,7 @@ async def test_history_survives_router_and_gateway_killed_under_load(tmp_path: P
     async with AsyncExitStack() as stack:
         plc = stack.enter_context(station("pty", tty))
         plc.tell("count 1 D 10")
-        router = await stack.enter_async_context(ZenohPeer(Mode.ROUTER, listen=[endpoint]))
+        router = await stack.enter_async_context(ZenohPeer(ZenohMode.ROUTER, listen=[endpoint]))
         first = stack.enter_context(await asyncio.to_thread(started, config))
         consumer = Consumer(stack.enter_context(_catch_up(endpoint)))
         await consumer.goes_on(200)
@@ -75,7 +75,7 @@ async def test_history_survives_router_and_gateway_killed_under_load(tmp_path: P
         await asyncio.to_thread(
             until, lambda: len(kept(history)) > there + 500, "history goes on by itself"
         )
-        await stack.enter_async_context(ZenohPeer(Mode.ROUTER, listen=[endpoint]))
+        await stack.enter_async_context(ZenohPeer(ZenohMode.ROUTER, listen=[endpoint]))
         await consumer.goes_on(700)
 
         # The gateway, in the middle of writes.

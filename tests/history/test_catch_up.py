@@ -11,9 +11,10 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
+from gateway.config import ZenohConfig, ZenohMode
 from gateway.engine.requests import CommandResult
 from gateway.history import Historian
-from gateway.northbound import Mode, Northbound, ZenohSettings, payload
+from gateway.northbound import Northbound, payload
 from gateway.northbound.payload import Failure, Problem, WriteOutcome
 from gateway.northbound.plant import History
 from gateway.tags import Reason, Sample, Tag, WriteResult, bad, good
@@ -52,8 +53,8 @@ async def recording(path: Path) -> AsyncIterator[Historian]:
 async def serving(
     below: PlainPlant, historian: History, endpoint: str, *, listen: bool = False
 ) -> AsyncIterator[Northbound]:
-    settings = ZenohSettings(
-        mode=Mode.PEER,
+    settings = ZenohConfig(
+        mode=ZenohMode.PEER,
         listen=(endpoint,) if listen else (),
         connect=() if listen else (endpoint,),
     )
@@ -310,7 +311,7 @@ async def test_ctrl_c_ends_the_consumer_without_a_word(tmp_path: Path) -> None:
         assert not waiting.has_said("Traceback")
     async with (
         polling(tmp_path / "h.db") as poll,
-        ZenohPeer(Mode.ROUTER, listen=[endpoint]),
+        ZenohPeer(ZenohMode.ROUTER, listen=[endpoint]),
         poll.on_air(endpoint),
     ):
         with Program(*command, "--since", MIDNIGHT) as consumer:
@@ -324,13 +325,13 @@ async def test_a_consumer_loses_nothing_when_its_router_is_killed(tmp_path: Path
     async with polling_and_consuming(tmp_path / "h.db", endpoint) as (poll, consumer):
         async with poll.on_air(endpoint):
             for _ in range(3):
-                async with ZenohPeer(Mode.ROUTER, listen=[endpoint]) as router:
+                async with ZenohPeer(ZenohMode.ROUTER, listen=[endpoint]) as router:
                     await consumer.knows(poll.told + 50)
                     await router.kill()
                 missed = poll.told + 50
                 while poll.told < missed:
                     await asyncio.sleep(0.01)
-            async with ZenohPeer(Mode.ROUTER, listen=[endpoint]):
+            async with ZenohPeer(ZenohMode.ROUTER, listen=[endpoint]):
                 await consumer.knows(poll.told + 50)
         nothing_lost_and_nothing_twice(consumer.lines)
 
@@ -338,7 +339,7 @@ async def test_a_consumer_loses_nothing_when_its_router_is_killed(tmp_path: Path
 async def test_a_consumer_loses_nothing_when_the_gateway_is_away(tmp_path: Path) -> None:
     endpoint = free_endpoint()
     async with (
-        ZenohPeer(Mode.ROUTER, listen=[endpoint]),
+        ZenohPeer(ZenohMode.ROUTER, listen=[endpoint]),
         polling_and_consuming(tmp_path / "h.db", endpoint) as (poll, consumer),
     ):
         for _ in range(2):
@@ -351,7 +352,7 @@ async def test_a_consumer_that_is_killed_goes_on_from_the_last_it_knew(tmp_path:
     endpoint = free_endpoint()
     known: list[str] = []
     async with (
-        ZenohPeer(Mode.ROUTER, listen=[endpoint]),
+        ZenohPeer(ZenohMode.ROUTER, listen=[endpoint]),
         polling(tmp_path / "h.db") as poll,
         poll.on_air(endpoint),
     ):

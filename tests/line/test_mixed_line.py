@@ -10,7 +10,7 @@ from structlog.testing import capture_logs
 
 from gateway.engine.device import Device, Standing
 from gateway.planning.wire_timing import WireTiming
-from gateway.protocols.computer_link import SILENT_CAUSES, ComputerLink
+from gateway.protocols.computer_link import NO_REPLY_CAUSES, ComputerLink
 from gateway.protocols.vigor import Vigor
 from gateway.stations.vigor import VigorStation
 from gateway.tags import Quality, Reason, WriteResult, WriteRule
@@ -284,10 +284,10 @@ async def test_a_plc_that_does_not_answer_is_diagnosed_with_the_causes_it_may_ha
         await asyncio.sleep(10)
         assert dev.standing is Standing.SILENT
         assert "station number" in dev.diagnosis()
-        assert SILENT_CAUSES in dev.diagnosis()
+        assert NO_REPLY_CAUSES in dev.diagnosis()
         for number in ("6301", "6305", "6306", "D8121"):
             assert number in dev.diagnosis()
-        assert SILENT_CAUSES in line.now[spelt(dev, "D0")].detail
+        assert NO_REPLY_CAUSES in line.now[spelt(dev, "D0")].detail
 
 
 @on_virtual_time

@@ -14,7 +14,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from benchmarks.northbound import Lag, memory
-from gateway.northbound import ZenohSettings
+from gateway.config import ZenohConfig
 from tests.northbound.test_northbound import PlainDevice, PlainPlant, serving, tag
 from tests.zenoh_peer import ZenohPeer, free_endpoint
 
@@ -39,7 +39,7 @@ async def test_a_flood_of_everything_costs_little_memory_and_no_poll() -> None:
     endpoint = free_endpoint()
     served = plant()
     async with (
-        serving(served, ZenohSettings(listen=(endpoint,))) as northbound,
+        serving(served, ZenohConfig(listen=(endpoint,))) as northbound,
         ZenohPeer("client", connect=[endpoint]) as client,
     ):
         await client.get("plant/**")

@@ -17,6 +17,7 @@ from typing import Any, Literal
 
 import pytest
 
+from gateway.config import ZenohConfig, ZenohMode
 from gateway.errors import (
     BadValue,
     Busy,
@@ -26,7 +27,7 @@ from gateway.errors import (
     NoReply,
     Refused,
 )
-from gateway.northbound import Mode, Northbound, ZenohSettings, payload
+from gateway.northbound import Northbound, payload
 from gateway.northbound.directory import Directory
 from gateway.northbound.inbox import LIMIT, Inbox
 from gateway.northbound.keys import Keys
@@ -139,7 +140,7 @@ def mixer(*, blocks: bool | Literal["only"] = False) -> PlainPlant:
 
 
 @asynccontextmanager
-async def serving(plant: PlainPlant, settings: ZenohSettings) -> AsyncIterator[Northbound]:
+async def serving(plant: PlainPlant, settings: ZenohConfig) -> AsyncIterator[Northbound]:
     northbound = Northbound(settings, "demo", plant, status_every=0.5)
     serves = asyncio.create_task(northbound.run())
     opens = asyncio.create_task(northbound.opened.wait())
@@ -162,7 +163,7 @@ async def together(
     """A gateway that listens, and a client in another process."""
     endpoint = free_endpoint()
     async with (
-        serving(plant, ZenohSettings(listen=(endpoint,))) as northbound,
+        serving(plant, ZenohConfig(listen=(endpoint,))) as northbound,
         ZenohPeer("client", connect=[endpoint]) as client,
     ):
         yield northbound, client
@@ -709,7 +710,7 @@ async def test_a_write_that_is_not_acknowledged_when_the_gateway_ends_is_unclear
     plant.gate.clear()
     endpoint = free_endpoint()
     async with ZenohPeer("peer", connect=[endpoint]) as client:
-        async with serving(plant, ZenohSettings(listen=(endpoint,))) as northbound:
+        async with serving(plant, ZenohConfig(listen=(endpoint,))) as northbound:
             live = await client.liveliness("plant/@gateway/*")
             await live.next(lambda token: token.kind == "PUT")
             asking = asyncio.create_task(client.get("plant/mixer/recipe/@set", b"7"))
@@ -727,14 +728,14 @@ async def until(true: Any) -> None:
 # -- the network comes and goes ----------------------------------------------------------------
 
 
-@pytest.mark.parametrize("mode", [Mode.PEER, Mode.CLIENT])
+@pytest.mark.parametrize("mode", [ZenohMode.PEER, ZenohMode.CLIENT])
 async def test_after_a_router_was_killed_and_returned_everything_is_published_again(
-    mode: Mode,
+    mode: ZenohMode,
 ) -> None:
     plant = mixer()
     endpoint = free_endpoint()
     # No router yet: the gateway starts all the same.
-    northbound = Northbound(ZenohSettings(mode=mode, connect=(endpoint,)), "demo", plant)
+    northbound = Northbound(ZenohConfig(mode=mode, connect=(endpoint,)), "demo", plant)
     serves = asyncio.create_task(northbound.run())
     northbound.publish([plant.now("mixer/speed", 1)])
     try:
@@ -857,7 +858,7 @@ def test_the_users_zenoh_file_lies_under_the_settings(tmp_path: Path) -> None:
           transport: {link: {tx: {lease: 5000}}},
         }"""
     )
-    config = configure(ZenohSettings(listen=("tcp/127.0.0.1:7447",), config_file=file))
+    config = configure(ZenohConfig(listen=("tcp/127.0.0.1:7447",), config_file=file))
     seen = {
         path: json.loads(config.get_json(path))
         for path in (
@@ -878,7 +879,7 @@ def test_the_users_zenoh_file_lies_under_the_settings(tmp_path: Path) -> None:
 
 
 def test_nothing_listens_unless_it_is_said_where() -> None:
-    assert json.loads(configure(ZenohSettings()).get_json("listen/endpoints")) == []
+    assert json.loads(configure(ZenohConfig()).get_json("listen/endpoints")) == []
 
 
 @pytest.mark.parametrize(
@@ -888,14 +889,14 @@ def test_nothing_listens_unless_it_is_said_where() -> None:
         ({"connect": ("tcp/router",)}, "write it as tcp/host:port"),
         ({"connect": ("tcp/router:99999",)}, "write it as tcp/host:port"),
         ({"connect": ("serial/x:1",)}, "serial is none of tcp"),
-        ({"mode": Mode.CLIENT}, "which router"),
+        ({"mode": ZenohMode.CLIENT}, "which router"),
         ({"prefix": "plant/**"}, "the prefix 'plant/\\*\\*'"),
         ({"config_file": Path("/nowhere/zenoh.json5")}, "No such file"),
     ],
 )
 def test_a_mistake_in_the_settings_is_one_sentence(settings: Any, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
-        Northbound(ZenohSettings(**settings), "demo", mixer_outside())
+        Northbound(ZenohConfig(**settings), "demo", mixer_outside())
 
 
 @pytest.mark.parametrize("text", ["{mode: ", "{nonsense: 1}", '{mode: "pear"}'])
@@ -903,7 +904,7 @@ def test_a_zenoh_file_that_is_none_is_a_configuration_error(tmp_path: Path, text
     file = tmp_path / "zenoh.json5"
     file.write_text(text)
     with pytest.raises(ConfigError, match=r"config_file .*zenoh\.json5"):
-        configure(ZenohSettings(config_file=file))
+        configure(ZenohConfig(config_file=file))
 
 
 def mixer_outside() -> Any:
@@ -912,9 +913,9 @@ def mixer_outside() -> Any:
 
 async def test_a_port_in_use_is_one_sentence_and_ends_the_run() -> None:
     endpoint = free_endpoint()
-    async with serving(mixer(), ZenohSettings(listen=(endpoint,))):
+    async with serving(mixer(), ZenohConfig(listen=(endpoint,))):
         with pytest.raises(GatewayError, match=r"Zenoh cannot be opened: .*"):
-            await Northbound(ZenohSettings(listen=(endpoint,)), "second", mixer()).run()
+            await Northbound(ZenohConfig(listen=(endpoint,)), "second", mixer()).run()
 
 
 async def test_an_inbox_that_is_full_refuses_and_loses_nothing_it_took() -> None:
@@ -933,7 +934,7 @@ async def test_an_inbox_that_is_full_refuses_and_loses_nothing_it_took() -> None
 
 
 async def serve(endpoint: str, fails: str) -> None:
-    async with serving(mixer(), ZenohSettings(connect=(endpoint,))):
+    async with serving(mixer(), ZenohConfig(connect=(endpoint,))):
         print("serving", flush=True)
         if fails == "loop":
             await asyncio.sleep(0.2)

@@ -18,10 +18,10 @@ import structlog
 import zenoh
 
 from gateway.cli.client.connection import PASSWORD_VARIABLE, USER_VARIABLE
-from gateway.config.plain import TlsConfig
+from gateway.config import TlsConfig, ZenohConfig
 from gateway.engine.requests import CommandResult
 from gateway.errors import ConfigError
-from gateway.northbound import Northbound, ZenohSettings, secrets
+from gateway.northbound import Northbound, secrets
 from gateway.northbound.audit import BURST, Audit
 from gateway.northbound.limiter import Limiter
 from gateway.northbound.payload import Failure, Problem, WriteOutcome
@@ -95,7 +95,7 @@ async def behind_a_router(plant: PlainPlant, folder: Path) -> AsyncIterator[tupl
         "transport/auth/usrpwd/dictionary_file": str(users(folder)),
     }
     password = secret(folder / "password.txt", PASSWORDS["gateway"] + "\n")
-    settings = ZenohSettings(connect=(endpoint,), user="gateway", password_file=password)
+    settings = ZenohConfig(connect=(endpoint,), user="gateway", password_file=password)
     async with ZenohPeer("router", listen=[endpoint], config=config):
         northbound = Northbound(settings, "demo", plant, commanded=COMMANDED)
         async with running(northbound):
@@ -108,7 +108,7 @@ async def by_itself(plant: PlainPlant, folder: Path) -> AsyncIterator[tuple[Any,
     endpoint = free_endpoint()
     file = folder / "access.json5"
     file.write_text(GATEWAY_RULES)
-    settings = ZenohSettings(listen=(endpoint,), config_file=file, users_file=users(folder))
+    settings = ZenohConfig(listen=(endpoint,), config_file=file, users_file=users(folder))
     northbound = Northbound(settings, "demo", plant, commanded=COMMANDED)
     async with running(northbound):
         yield northbound, endpoint
@@ -243,7 +243,7 @@ async def test_mutual_tls_lets_in_whom_the_authority_signed(tmp_path: Path) -> N
         f"{link}/connect_certificate": str(own_certificate),
         f"{link}/connect_private_key": str(own_key),
     }
-    async with running(Northbound(ZenohSettings(listen=(endpoint,), tls=tls), "demo", plant)):
+    async with running(Northbound(ZenohConfig(listen=(endpoint,), tls=tls), "demo", plant)):
         async with ZenohPeer("client", connect=[endpoint], config=known) as client:
             [reply] = await client.get(RECIPE, b"7")
             assert reply.ok
@@ -434,7 +434,7 @@ async def test_with_writers_only_a_token_writes_and_its_owner_is_named(tmp_path:
     endpoint = free_endpoint()
     recorded: list[WriteOutcome] = []
     northbound = Northbound(
-        ZenohSettings(listen=(endpoint,)),
+        ZenohConfig(listen=(endpoint,)),
         "demo",
         plant,
         writers=file,
@@ -556,9 +556,9 @@ def test_a_secret_that_everybody_can_read_is_refused(tmp_path: Path, setting: st
     file = tmp_path / "secret"
     file.write_text('{transport: {auth: {usrpwd: {user: "a", password: "hunter2-x"}}}}')
     if setting == "key":
-        settings = ZenohSettings(tls=TlsConfig(certificate=tmp_path / "c.pem", key=file))
+        settings = ZenohConfig(tls=TlsConfig(certificate=tmp_path / "c.pem", key=file))
     else:
-        settings = ZenohSettings(**{setting: file, "user": "gateway"})  # type: ignore[arg-type]  # by name
+        settings = ZenohConfig(**{setting: file, "user": "gateway"})  # type: ignore[arg-type]  # by name
     file.chmod(0o644)
     with pytest.raises(ConfigError, match="is open to everybody on this machine: run chmod") as one:
         configure(settings)
@@ -580,7 +580,7 @@ def test_a_users_file_that_says_not_who_may_connect_is_refused(
     tmp_path: Path, text: str, says: str
 ) -> None:
     with pytest.raises(ConfigError, match=says) as raised:
-        configure(ZenohSettings(users_file=secret(tmp_path / "users.txt", text)))
+        configure(ZenohConfig(users_file=secret(tmp_path / "users.txt", text)))
     assert "secret-x" not in str(raised.value)
 
 
@@ -596,7 +596,7 @@ def test_what_is_no_certificate_or_key_is_named(tmp_path: Path) -> None:
         (TlsConfig(certificate=certificate, key=other_key), f"not that of {certificate}"),
     ):
         with pytest.raises(ConfigError) as raised:
-            configure(ZenohSettings(tls=tls))
+            configure(ZenohConfig(tls=tls))
         assert says in str(raised.value)
 
 
@@ -604,7 +604,7 @@ def test_the_password_comes_from_the_file_or_the_environment(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def used(**settings: Any) -> object:
-        config = configure(ZenohSettings(user="gateway", **settings))
+        config = configure(ZenohConfig(user="gateway", **settings))
         return json.loads(config.get_json("transport/auth/usrpwd/password"))
 
     monkeypatch.delenv(secrets.PASSWORD_VARIABLE, raising=False)
@@ -629,7 +629,7 @@ def test_nothing_is_quoted_from_a_zenoh_file_that_may_hold_a_password(
     tmp_path: Path, text: str
 ) -> None:
     with pytest.raises(ConfigError, match="it may hold a password") as raised:
-        configure(ZenohSettings(config_file=secret(tmp_path / "zenoh.json5", text)))
+        configure(ZenohConfig(config_file=secret(tmp_path / "zenoh.json5", text)))
     assert "hunter2-x" not in str(raised.value)
 
 
@@ -741,7 +741,7 @@ class ZenohRefused:
 def test_what_others_can_reach_unprotected_is_told(
     listen: str, setup: dict[str, Any], says: list[str]
 ) -> None:
-    config = configure(ZenohSettings())
+    config = configure(ZenohConfig())
     for path, value in {"listen/endpoints": [listen], **setup}.items():
         config.insert_json5(path, json.dumps(value))
     told = secrets.exposures(config)

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gateway.planning.coalesce import Request, SecondsOf, cover
+from gateway.planning.coalesce import Request, SecondsOf, coalesce
 
 Row = list[tuple[int, int]]  # first unit, units
 
@@ -94,7 +94,7 @@ def test_no_cover_is_cheaper(
     pick = st.sampled_from([1.0, 2.0, 10.0]) if len(row) < 5 else st.sampled_from([1.0, 3.0])
     intervals = [data.draw(pick) for _ in row]
     seconds = wire(row, overhead, 1.0, limit, grain)
-    found = cover(intervals, seconds, even=grain == 1)
+    found = coalesce(intervals, seconds, even=grain == 1)
     check_served(found, intervals)
     assert spent(found, seconds) == pytest.approx(brute_force(intervals, seconds), rel=1e-9)
 
@@ -108,31 +108,31 @@ def test_the_short_cut_for_even_costs_loses_nothing(steps: list[tuple[int, float
         at += gap + 1
     intervals = [every for _, every in steps]
     seconds = wire(row, 3, 1, 7)
-    quick, slow = cover(intervals, seconds, even=True), cover(intervals, seconds)
+    quick, slow = coalesce(intervals, seconds, even=True), coalesce(intervals, seconds)
     assert spent(quick, seconds) == pytest.approx(spent(slow, seconds))
 
 
 def test_a_slower_item_rides_in_a_faster_request() -> None:
     row = [(0, 1), (1, 1), (2, 1)]
-    found = cover([1.0, 10.0, 1.0], wire(row, 10, 1, 64))
+    found = coalesce([1.0, 10.0, 1.0], wire(row, 10, 1, 64))
     assert found == [Request(0, 2, 1.0)]
 
 
 def test_a_slower_request_reaches_over_a_faster_one() -> None:
     row = [(0, 20), (20, 1), (21, 20)]
-    found = cover([100.0, 0.1, 100.0], wire(row, 10, 1, 64))
+    found = coalesce([100.0, 0.1, 100.0], wire(row, 10, 1, 64))
     assert sorted(found) == [Request(0, 2, 100.0), Request(1, 1, 0.1)]
 
 
 def test_no_request_crosses_a_split() -> None:
     row = [(n, 1) for n in range(6)]
-    found = cover([1.0] * 6, wire(row, 10, 1, 64), frozenset({2, 5}))
+    found = coalesce([1.0] * 6, wire(row, 10, 1, 64), frozenset({2, 5}))
     assert found == [Request(0, 1, 1.0), Request(2, 4, 1.0), Request(5, 5, 1.0)]
 
 
 def test_an_item_that_fits_no_request_is_named() -> None:
     with pytest.raises(ValueError, match="1"):
-        cover([1.0, 1.0], wire([(0, 1), (1, 9)], 1, 1, 4))
+        coalesce([1.0, 1.0], wire([(0, 1), (1, 9)], 1, 1, 4))
 
 
 def test_the_work_grows_with_the_number_of_items_not_with_its_square() -> None:
@@ -145,7 +145,7 @@ def test_the_work_grows_with_the_number_of_items_not_with_its_square() -> None:
             at += row[-1][1]
         intervals = [rng.choice([0.5, 1.0, 5.0]) for _ in range(n)]
         begun = time.process_time()
-        cover(intervals, wire(row, 12, 1, 64), even=True)
+        coalesce(intervals, wire(row, 12, 1, 64), even=True)
         return time.process_time() - begun
 
     work(200)  # warm
@@ -161,8 +161,8 @@ def test_where_characters_cost_next_to_nothing_the_cheapest_ways_are_enough(
     row = [(unit, 1) for unit in sorted(chance.sample(range(300), 200))]
     intervals = [chance.choice((0.1, 0.5, 1.0, 2.0, 10.0, 60.0)) for _ in row]
     seconds = wire(row, 0.006, 2e-6, 125)
-    found = cover(intervals, seconds, even=True)
+    found = coalesce(intervals, seconds, even=True)
     check_served(found, intervals)
     monkeypatch.setattr("gateway.planning.coalesce.MOST", 10**9)
-    least = cover(intervals, seconds, even=True)
+    least = coalesce(intervals, seconds, even=True)
     assert spent(found, seconds) == pytest.approx(spent(least, seconds))

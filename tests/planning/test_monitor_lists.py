@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from gateway.engine.device import Device
-from gateway.planning.monitor_lists import with_list
+from gateway.planning.monitor_lists import with_monitor_list
 from gateway.planning.planner import Block
 from gateway.protocols.computer_link import ComputerLink, Nak
 from gateway.protocols.vigor import Vigor
@@ -96,7 +96,7 @@ def test_refused_addresses_are_in_no_list() -> None:
 
 def test_a_driver_without_lists_keeps_its_plan() -> None:
     _, dev = one(*SCATTERED, monitor=False)
-    assert with_list(dev.blocks, Vigor(station=1), dev.seconds) == dev.blocks
+    assert with_monitor_list(dev.blocks, Vigor(station=1), dev.seconds) == dev.blocks
 
 
 # Registered, read, and registered again

@@ -23,7 +23,7 @@ DRIVER = Vigor()
 
 
 def at(baud: int, turnaround: float = 0.01) -> partial[float]:
-    return partial(WireTiming(baud, 10).exchange, timing=DRIVER.timing, turnaround=turnaround)
+    return partial(WireTiming(baud, 10).transaction, timing=DRIVER.timing, turnaround=turnaround)
 
 
 def spans(blocks: Sequence[Block]) -> list[tuple[int, int]]:
@@ -204,7 +204,7 @@ def test_a_tag_that_no_request_can_carry_is_an_error() -> None:
 def test_ten_times_the_tags_take_about_ten_times_as_long() -> None:
     """By the processor's clock; the least of some, for the machine may have other work."""
     modbus = ModbusRtu(station=1)
-    seconds = partial(WireTiming(19200, 10).exchange, timing=modbus.timing, turnaround=0.01)
+    seconds = partial(WireTiming(19200, 10).transaction, timing=modbus.timing, turnaround=0.01)
 
     def took(count: int) -> float:
         tags = [make_tag(f"holding:{3 * n}", modbus, name=str(n)) for n in range(count)]

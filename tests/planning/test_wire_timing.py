@@ -35,6 +35,6 @@ def test_rtu_keeps_three_and_a_half_characters_of_silence_or_what_was_set() -> N
 def test_an_exchange_is_silence_request_turnaround_and_reply() -> None:
     wire, timing = WireTiming(9600, 10), Timing(turnaround=0.02, silence=0.005)
     cost = Cost(14, 12)
-    assert wire.exchange(cost, timing) == pytest.approx(0.005 + 26 / 960 + 0.02)
-    assert wire.exchange(cost, timing, 0.1) == pytest.approx(0.005 + 26 / 960 + 0.1)
-    assert wire.exchange(cost, timing, 0.0) == pytest.approx(0.005 + 26 / 960)
+    assert wire.transaction(cost, timing) == pytest.approx(0.005 + 26 / 960 + 0.02)
+    assert wire.transaction(cost, timing, 0.1) == pytest.approx(0.005 + 26 / 960 + 0.1)
+    assert wire.transaction(cost, timing, 0.0) == pytest.approx(0.005 + 26 / 960)

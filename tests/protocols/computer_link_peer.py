@@ -198,7 +198,7 @@ class Peer:
         return self.ack()
 
 
-class Wire:
+class PeerTalk:
     """A `Talk` over bytes: what the driver says goes to `hear`, what comes back to its codec."""
 
     may_echo = False

@@ -10,7 +10,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from gateway.config import load
 from gateway.errors import BadValue, ConfigError, DeviceError, Garbled, NoReply, Refusal, Refused
-from gateway.protocols.computer_link import SILENT_CAUSES, ComputerLink, Enquiry, Frame, Text
+from gateway.protocols.computer_link import NO_REPLY_CAUSES, ComputerLink, Enquiry, Frame, Text
 from gateway.protocols.driver import (
     Address,
     Controllable,
@@ -508,14 +508,14 @@ async def test_a_write_is_done_by_its_own_stations_ack_alone() -> None:
 
 def test_a_block_nobody_asked_for_can_be_told_for_the_log() -> None:
     driver = ComputerLink(station=5)
-    assert driver.unasked(Text(5, "0007", "FE")) == "on-demand data of station 5: 0007"
-    assert driver.unasked(Enquiry(5, "BR", "M001001")) == "echo of BR M001001"
-    assert driver.unasked(Text(5, "0007")) is None
+    assert driver.describe_stray(Text(5, "0007", "FE")) == "on-demand data of station 5: 0007"
+    assert driver.describe_stray(Enquiry(5, "BR", "M001001")) == "echo of BR M001001"
+    assert driver.describe_stray(Text(5, "0007")) is None
 
 
 def test_the_causes_of_silence_name_the_plcs_own_codes() -> None:
     for code in ("6301", "6305", "6306", "D8120", "D8121", "D8129", "D8063"):
-        assert code in SILENT_CAUSES
+        assert code in NO_REPLY_CAUSES
 
 
 async def test_resync_takes_only_the_answer_to_its_own_salt() -> None:

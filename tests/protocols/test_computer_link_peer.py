@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from gateway.errors import Refused
 from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.driver import Cost, Span, Unit
-from tests.protocols.computer_link_peer import Peer, Wire
+from tests.protocols.computer_link_peer import Peer, PeerTalk
 
 PROCEDURES = [(1, True), (1, False), (4, True), (4, False)]
 LETTERS = {"M8": "M", "D8": "D", "T": "TN", "C": "CN", "C32": "CN"}
@@ -78,7 +78,7 @@ async def test_a_read_gives_the_devices_and_costs_what_was_said(
     peer = peer_of(driver)
     units = values(data.draw, driver, span)
     peer.devices = dict(zip(names(peer, span), units, strict=True))
-    wire = Wire(driver, peer.hear, pieces)
+    wire = PeerTalk(driver, peer.hear, pieces)
     cost = driver.cost(span)
     if cost is None:
         with pytest.raises(ValueError, match="does not fit"):
@@ -97,7 +97,7 @@ async def test_a_write_changes_its_devices_and_no_other_and_costs_what_was_said(
     span = data.draw(spans(driver, 170))
     peer = peer_of(driver)
     units = values(data.draw, driver, span)
-    wire = Wire(driver, peer.hear)
+    wire = PeerTalk(driver, peer.hear)
     cost = driver.write_cost(span)
     if cost is None:
         with pytest.raises(ValueError, match="does not fit"):
@@ -115,7 +115,7 @@ async def test_a_scattered_write_changes_its_devices_and_no_other(
 ) -> None:
     parts = [(span, values(data.draw, driver, span)) for span in data.draw(neighbours(driver))]
     peer = peer_of(driver)
-    wire = Wire(driver, peer.hear)
+    wire = PeerTalk(driver, peer.hear)
     cost = driver.scattered_write_cost([span for span, _ in parts])
     if cost is None:
         return
@@ -142,11 +142,11 @@ async def test_registered_devices_are_read_in_their_order(
     cost = driver.monitor_cost(asked)
     if cost is None:
         return
-    wire = Wire(driver, peer.hear)
+    wire = PeerTalk(driver, peer.hear)
     with pytest.raises(Refused):  # nothing is registered yet
         await driver.read_registered(wire, asked)
     await driver.register(wire, asked)
-    wire = Wire(driver, peer.hear)
+    wire = PeerTalk(driver, peer.hear)
     read = await driver.read_registered(wire, asked)
     assert [list(units) for units in read] == [
         [peer.devices[name] for name in names(peer, span)] for span in asked
@@ -261,7 +261,7 @@ def test_a_span_outside_the_device_cannot_be_asked_for(span: Span) -> None:
 async def test_every_control_is_understood(procedure: tuple[int, bool]) -> None:
     driver = ComputerLink(station=5, frame_format=procedure[0], sum_check=procedure[1])
     peer = peer_of(driver)
-    wire = Wire(driver, peer.hear)
+    wire = PeerTalk(driver, peer.hear)
     assert await driver.control(wire, "run", "") == "acknowledged"
     assert await driver.control(wire, "stop", "") == "acknowledged"
     assert await driver.control(wire, "model", "") == "9D (FX2N)"
@@ -269,5 +269,5 @@ async def test_every_control_is_understood(procedure: tuple[int, bool]) -> None:
     assert await driver.control(wire, "loopback", text) == text
     await driver.resync(wire, None, 70000)
     heard: list[bytes] = []
-    await driver.control(Wire(driver, lambda data: heard.append(data) or b""), "global", "on")
+    await driver.control(PeerTalk(driver, lambda data: heard.append(data) or b""), "global", "on")
     assert heard == [peer.enq("FFFFGW01")]

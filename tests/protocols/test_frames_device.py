@@ -7,7 +7,8 @@ import pytest
 from pydantic import ValidationError
 
 from gateway.errors import BadValue, ConfigError, Garbled, NoReply, Refused, Unclear
-from gateway.protocols.frames import Ask, Field, Frames, Framing, Heard, Listen, Write
+from gateway.protocols.frames import Ask, Field, Frames, Framing, Listen, Write
+from gateway.protocols.unsolicited import UnsolicitedFrame
 from gateway.stations.vigor import VigorStation
 from tests.doubles import Script
 from tests.protocols.frames_examples import device, documented, load
@@ -124,8 +125,8 @@ def test_the_k120s_weighing_machine_is_answered_ack_station_ok_eot() -> None:
     heard = one.hear(frame)
     assert heard is not None
     assert heard.values == {"station": "0", "weight": 0x3412}
-    assert heard.answer is not None
-    assert one.codec().encode(heard.answer) == BY_ID["noproto-k120s-002"].frame
+    assert heard.reply is not None
+    assert one.codec().encode(heard.reply) == BY_ID["noproto-k120s-002"].frame
 
 
 def test_a_weighing_frame_of_another_shape_is_not_answered() -> None:
@@ -147,10 +148,10 @@ def test_a_frame_with_a_field_that_cannot_be_read_is_not_answered() -> None:
             )
         },
     )
-    assert one.hear(b"W1.5") == Heard("weight", {"weight": 1.5, "first": "W"}, b"OK")
+    assert one.hear(b"W1.5") == UnsolicitedFrame("weight", {"weight": 1.5, "first": "W"}, b"OK")
     heard = one.hear(b"W1.x")
     assert heard is not None
-    assert heard.answer is None
+    assert heard.reply is None
     assert heard.values["first"] == "W"  # one bad field does not take the others with it
     assert isinstance(heard.values["weight"], Garbled)
     assert heard.values["weight"].data == b"W1.x"
@@ -168,7 +169,7 @@ def test_a_scale_by_pattern_or_by_columns(name: str) -> None:
     heard = one.hear(stable)
     assert heard is not None
     assert (heard.values["weight"], heard.values["state"]) == (1234.5, "ST")
-    assert heard.answer is None
+    assert heard.reply is None
     assert one.hear(overload) is None
 
 
@@ -176,7 +177,7 @@ def test_a_barcode_between_start_and_end_code() -> None:
     one = device("reader")
     frames = one.codec().feed(b"\x02400638133393-1\x03" * 2)
     assert [one.hear(frame) for frame in frames] == [
-        Heard("scan", {"barcode": "400638133393-1"})
+        UnsolicitedFrame("scan", {"barcode": "400638133393-1"})
     ] * 2
 
 

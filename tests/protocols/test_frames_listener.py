@@ -4,7 +4,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gateway.errors import Garbled
-from gateway.protocols.frames import Field, Frames, Framing, Heard, Listen, Listener, Said, Stale
+from gateway.protocols.frames import Field, Frames, Framing, Listen, Listener
+from gateway.protocols.unsolicited import Stale, UnsolicitedEvent, UnsolicitedFrame
 from tests.protocols.frames_examples import device
 from tests.protocols.test_frames_device import OVERLOAD, STABLE
 from tests.vectors import vectors
@@ -12,15 +13,15 @@ from tests.vectors import vectors
 K120S = {v.id: v.frame for v in vectors("noproto-k120s")}
 
 
-def weights(said: list[Said]) -> list[object]:
-    return [item.values["weight"] for item in said if isinstance(item, Heard)]
+def weights(said: list[UnsolicitedEvent]) -> list[object]:
+    return [item.values["weight"] for item in said if isinstance(item, UnsolicitedFrame)]
 
 
 def test_frames_are_heard_in_order_however_they_are_cut() -> None:
     listener = Listener(device("reader"), now=0.0)
     stream = b"".join(b"\x02CODE-%d\x03" % number for number in (1, 1, 2))
     said = [item for octet in stream for item in listener.received(bytes([octet]), now=5.0)]
-    assert [item.values for item in said if isinstance(item, Heard)] == [
+    assert [item.values for item in said if isinstance(item, UnsolicitedFrame)] == [
         {"barcode": "CODE-1"},
         {"barcode": "CODE-1"},
         {"barcode": "CODE-2"},
@@ -65,7 +66,10 @@ def test_a_frame_that_is_known_and_means_nothing_is_no_damage() -> None:
         },
     )
     said = Listener(one, now=0.0).received(STABLE + OVERLOAD, now=1.0)
-    assert said == [Heard("weight", {"weight": 1234.5}), Heard("overload", {})]
+    assert said == [
+        UnsolicitedFrame("weight", {"weight": 1234.5}),
+        UnsolicitedFrame("overload", {}),
+    ]
 
 
 def test_a_streaming_scale_that_falls_silent_is_stale_once() -> None:
@@ -123,7 +127,7 @@ def test_a_gap_ends_a_frame_that_nothing_else_ends() -> None:
     assert listener.received(b"C", now=1.03) == []
     assert listener.due == 1.03 + 0.05
     assert listener.tick(now=1.07) == []
-    assert listener.tick(now=1.08) == [Heard("any", {"text": "ABC"})]
+    assert listener.tick(now=1.08) == [UnsolicitedFrame("any", {"text": "ABC"})]
     assert listener.due is None
 
 
@@ -134,7 +138,7 @@ def test_a_gap_counts_by_the_bytes_when_the_line_was_late() -> None:
     )
     listener = Listener(one, now=0.0)
     listener.received(b"AB", now=1.0)
-    assert listener.received(b"CD", now=1.2) == [Heard("any", {"text": "AB"})]
+    assert listener.received(b"CD", now=1.2) == [UnsolicitedFrame("any", {"text": "AB"})]
 
 
 def test_half_a_frame_is_void_after_a_long_pause_even_without_a_gap() -> None:
@@ -148,16 +152,16 @@ def test_half_a_frame_is_void_after_a_long_pause_even_without_a_gap() -> None:
 def test_after_others_spoke_only_a_frame_that_began_afterwards_is_taken() -> None:
     listener = Listener(device("scale"), now=0.0)
     listener.received(STABLE[:5], now=1.0)
-    listener.disturbed(now=1.1)
+    listener.restart(now=1.1)
     assert weights(listener.received(STABLE[5:] + STABLE, now=1.11)) == [1234.5]
 
 
 def test_the_k120s_weighing_machine_gets_its_answer() -> None:
     one = device("weighing")
     (heard,) = Listener(one, now=0.0).received(K120S["noproto-k120s-001"], now=1.0)
-    assert isinstance(heard, Heard)
-    assert heard.answer is not None
-    assert one.codec().encode(heard.answer) == K120S["noproto-k120s-002"]
+    assert isinstance(heard, UnsolicitedFrame)
+    assert heard.reply is not None
+    assert one.codec().encode(heard.reply) == K120S["noproto-k120s-002"]
 
 
 steps = st.lists(
@@ -178,5 +182,5 @@ def test_whatever_comes_and_whenever_a_listener_tells_and_never_fails(
     for data, pause in steps:
         now += pause
         said = listener.received(data, now) + listener.tick(now)
-        assert all(isinstance(item, Heard | Garbled | Stale) for item in said)
+        assert all(isinstance(item, UnsolicitedFrame | Garbled | Stale) for item in said)
         assert listener.due is None or listener.due > now

@@ -221,14 +221,14 @@ MUTANTS = (
     Mutant(
         "what was told in between does not end what goes on unchanged",
         "tags/mirror.py",
-        "                unchanged.pop(tag)[1].over = True\n",
+        "                unchanged.pop(tag)[1].superseded = True\n",
         "                pass\n",
         "tests/tags/test_unchanged.py",
     ),
     Mutant(
         "what goes on unchanged is not compared with what is known",
         "tags/mirror.py",
-        "            if not all(self._is_known(sample) for sample in unchanged.samples):\n",
+        "            if not all(self._is_current(sample) for sample in unchanged.samples):\n",
         "            if False:\n",
         "tests/tags/test_unchanged.py",
     ),

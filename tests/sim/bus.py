@@ -148,7 +148,7 @@ class Bus:
     def collides(self) -> bool:
         """Somebody on it speaks when he likes, though he or others are asked."""
         drivers = [device.driver for device in self.line.devices]
-        speakers = [d for d in drivers if isinstance(d, FrameDriver) and d.listens]
+        speakers = [d for d in drivers if isinstance(d, FrameDriver) and d.sends_unsolicited]
         return bool(speakers) and (len(drivers) > 1 or bool(speakers[0].settings.ask))
 
     @staticmethod

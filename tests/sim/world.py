@@ -176,7 +176,7 @@ class World:
                     tasks.append(asyncio.create_task(person.ask_now_and_then()))
                 elif device.control and device.driver.protocol == "computer-link":
                     tasks.append(asyncio.create_task(person.command_now_and_then()))
-            if isinstance(device.driver, FrameDriver) and device.driver.listens:
+            if isinstance(device.driver, FrameDriver) and device.driver.sends_unsolicited:
                 tasks.append(asyncio.create_task(self._speak(device.name, bus)))
         return tasks
 

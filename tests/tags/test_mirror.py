@@ -94,8 +94,8 @@ def test_a_deadband_counts_from_what_was_told_once_more() -> None:
     mirror.update([good(tag, 100, 1)])
     assert mirror.update([good(tag, 104, 2)]) == []
     again = [mirror[tag]]
-    assert mirror.told(again) == again  # which is news
-    assert mirror.told(again) == []
+    assert mirror.mark_published(again) == again  # which is news
+    assert mirror.mark_published(again) == []
     assert mirror.update([good(tag, 96, 3)]) == [good(tag, 96, 3)]
 
 
@@ -103,7 +103,7 @@ def test_what_was_told_once_more_and_had_not_changed_is_no_news() -> None:
     starting, known = make_tag("D0"), make_tag("D1", publish=Publish.ALWAYS)
     mirror = Mirror([starting, known], 0)
     mirror.update([good(known, 7, 1)])
-    assert mirror.told(list(mirror.samples())) == []
+    assert mirror.mark_published(list(mirror.samples())) == []
     assert mirror.update([good(starting, 1, 2)]) == [good(starting, 1, 2)]
 
 

@@ -175,7 +175,7 @@ def test_a_number_of_thousands_of_digits_is_refused() -> None:
         (41, "41 is above the greatest value 40"),
         (40.5, "40.5 is above the greatest value 40"),
         (0.5, "0.5 is below the least value 1"),
-        (math.nan, "nan is no whole number"),
+        (math.nan, "nan is not a whole number"),
         (math.inf, "inf is above the greatest value 40"),
     ],
 )
@@ -240,7 +240,7 @@ def test_a_float_limit_that_float32_cannot_hold_exactly_can_be_written() -> None
 
 @pytest.mark.parametrize("value", ["5", True])
 def test_limits_do_not_let_other_types_through(value: Value) -> None:
-    with pytest.raises(BadValue, match="is no number"):
+    with pytest.raises(BadValue, match="is not a number"):
         tag(write=WriteRule(min=0, max=9)).encode(value)
 
 

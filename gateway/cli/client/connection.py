@@ -10,9 +10,8 @@ import zenoh
 
 from gateway.cli.client.client import Client
 from gateway.cli.client.refusal import why_not
-from gateway.config import Config, ZenohConfig
+from gateway.config import Config, ZenohConfig, ZenohMode
 from gateway.errors import ConfigError, GatewayError
-from gateway.northbound import Mode, zenoh_settings
 from gateway.northbound.session import configure
 
 USER_VARIABLE = "PLC_GATEWAY_CLI_USER"
@@ -69,9 +68,7 @@ def _reachable(endpoint: str) -> str:
 def _setup(own: ZenohConfig, endpoints: tuple[str, ...]) -> zenoh.Config:
     """As little as there is to read of the gateway's own secrets: who runs this may be somebody
     else."""
-    settings = replace(
-        zenoh_settings(own), mode=Mode.CLIENT, listen=(), connect=endpoints, users_file=None
-    )
+    settings = replace(own, mode=ZenohMode.CLIENT, listen=(), connect=endpoints, users_file=None)
     if own.tls is not None and not own.tls.mutual:
         settings = replace(settings, tls=replace(own.tls, certificate=None, key=None))
     person = _person()

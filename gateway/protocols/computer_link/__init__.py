@@ -6,20 +6,18 @@ from gateway.protocols.computer_link.codec import (
     Frame,
     LinkCodec,
     Nak,
-    Reset,
     Text,
 )
 from gateway.protocols.computer_link.driver import ComputerLink
-from gateway.protocols.computer_link.refusals import SILENT_CAUSES
+from gateway.protocols.computer_link.refusals import NO_REPLY_CAUSES
 
 __all__ = [
-    "SILENT_CAUSES",
+    "NO_REPLY_CAUSES",
     "Ack",
     "ComputerLink",
     "Enquiry",
     "Frame",
     "LinkCodec",
     "Nak",
-    "Reset",
     "Text",
 ]

@@ -60,14 +60,7 @@ class Nak:
     pc: str = PC
 
 
-@dataclass(frozen=True, slots=True)
-class Reset:
-    """EOT or CL: the PLC begins its sequence anew and says nothing."""
-
-    control: Literal[0x04, 0x0C] = 0x04
-
-
-Frame = Enquiry | Text | Ack | Nak | Reset
+Frame = Enquiry | Text | Ack | Nak
 
 
 class LinkCodec:
@@ -96,8 +89,6 @@ class LinkCodec:
                 return bytes([ACK]) + f"{station:02X}{pc}".encode("ascii") + self._end
             case Nak(station, code, pc):
                 return bytes([NAK]) + f"{station:02X}{pc}{code}".encode("ascii") + self._end
-            case Reset(control):
-                return bytes([control]) + self._end
 
     def feed(self, data: bytes) -> list[Frame]:
         """The blocks completed by `data`; what is no block is passed over.

@@ -28,7 +28,7 @@ from gateway.protocols.computer_link.lists import (
     monitored_ways,
     scattered_ways,
 )
-from gateway.protocols.computer_link.refusals import SILENT_CAUSES, model_name, refused
+from gateway.protocols.computer_link.refusals import NO_REPLY_CAUSES, model_name, refused
 from gateway.protocols.computer_link.ways import Way, read_way, write_way
 from gateway.protocols.devices import parse_device, spell_device
 from gateway.protocols.driver import Address, Area, Cost, Span, Talk, Timing
@@ -205,10 +205,13 @@ class ComputerLink:
         await self._loopback(talk, f"Z{salt & 0xFFFF:04X}")
         return 0xFFFF
 
-    silent_causes = SILENT_CAUSES
+    no_reply_causes = NO_REPLY_CAUSES
 
-    def unasked(self, frame: Frame) -> str | None:
-        """What to say of a block that answers no question: on-demand data, an echo."""
+    def from_this_station(self, frame: Frame) -> bool:
+        return frame.station == self.station
+
+    def describe_stray(self, frame: Frame) -> str | None:
+        """Explains on-demand data of the PLC, and the echo of a request."""
         match frame:
             case Text(station, data, pc) if pc == PC_ON_DEMAND:
                 return f"on-demand data of station {station}: {data}"

@@ -13,7 +13,7 @@ _MEANINGS = {
     "18": (Refusal.OTHER, "remote run or stop is not possible now"),
 }
 
-SILENT_CAUSES = (
+NO_REPLY_CAUSES = (
     "A Computer Link PLC keeps silent, and keeps the reason in its D8063, when characters arrive "
     "damaged (6301: parity, framing or overrun; compare baud rate and character format with "
     "D8120), when a command other than the global flag goes to station FF (6305), and when a "

@@ -5,11 +5,11 @@ manual 8.4.
 """
 
 from gateway.protocols.frames.codec import FrameCodec, FrameReader
-from gateway.protocols.frames.device import Frames, Heard
+from gateway.protocols.frames.device import Frames
 from gateway.protocols.frames.driver import FrameDriver
 from gateway.protocols.frames.fields import Field
 from gateway.protocols.frames.framing import Framing
-from gateway.protocols.frames.listener import Listener, Said, Stale
+from gateway.protocols.frames.listener import Listener
 from gateway.protocols.frames.messages import Ask, Listen, Write
 
 __all__ = [
@@ -20,10 +20,7 @@ __all__ = [
     "FrameReader",
     "Frames",
     "Framing",
-    "Heard",
     "Listen",
     "Listener",
-    "Said",
-    "Stale",
     "Write",
 ]

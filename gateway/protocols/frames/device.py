@@ -18,21 +18,10 @@ from gateway.protocols.frames.framing import Framing
 from gateway.protocols.frames.messages import Ask, Listen, Values, Write, filled, listed
 from gateway.protocols.frames.patterns import check_pattern, longest_match
 from gateway.protocols.frames.presets import written_out
+from gateway.protocols.unsolicited import UnsolicitedFrame
 from gateway.values import Value
 
 T = TypeVar("T")
-
-
-@dataclass(frozen=True, slots=True)
-class Heard:
-    """An unasked frame that was understood: its fields, each a value or why there is none.
-
-    `answer` is the data of the frame to send back at once, None for none.
-    """
-
-    message: str
-    values: Values
-    answer: bytes | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -112,7 +101,7 @@ class Frames:
         reply = 0 if one.match is None else self._longest_reply(one.match, one.refused)
         return Cost(len(send.encode(around)) + value, reply)
 
-    def hear(self, frame: bytes) -> Heard | None:
+    def hear(self, frame: bytes) -> UnsolicitedFrame | None:
         """What an unasked frame says; None for a frame that `listen` does not know.
 
         An answer tells the device that it was understood: there is none where a field was not.
@@ -121,7 +110,7 @@ class Frames:
             values = one.values(frame)
             if values is not None:
                 good = not any(isinstance(value, Garbled) for value in values.values())
-                return Heard(name, values, one.answer_to(frame) if good else None)
+                return UnsolicitedFrame(name, values, one.answer_to(frame) if good else None)
         return None
 
     async def read(self, talk: Talk[bytes], question: str) -> Values:

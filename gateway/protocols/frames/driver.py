@@ -8,6 +8,7 @@ from gateway.protocols.driver import Address, Area, Cost, Span, Talk, Timing, Un
 from gateway.protocols.frames.codec import FrameCodec
 from gateway.protocols.frames.device import Frames
 from gateway.protocols.frames.fields import Field
+from gateway.protocols.frames.listener import Listener
 from gateway.values import Value
 
 LISTENED, WRITTEN = "listened", "written"
@@ -84,9 +85,18 @@ class FrameDriver:
         return self.settings.timing
 
     @property
-    def listens(self) -> bool:
-        """Whether it speaks unasked."""
+    def sends_unsolicited(self) -> bool:
         return bool(self.settings.listen)
+
+    @property
+    def unsolicited(self) -> frozenset[str]:
+        return self.settings.listened
+
+    def unsolicited_only(self, span: Span) -> bool:
+        return span.area == LISTENED
+
+    def listener(self, now: float) -> Listener:
+        return Listener(self.settings, now)
 
     def address(self, text: str) -> Address:
         """A tag's address is the name of a field. Raises `ConfigError` saying which there are."""

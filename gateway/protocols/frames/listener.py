@@ -1,34 +1,18 @@
-"""Listening to a device that speaks when it likes: bytes in, what they say out, in order.
-
-Pure: the line gives it the bytes and the time, wakes it when `due`, and sends its answers.
-"""
-
-from collections.abc import Iterable
-from dataclasses import dataclass
+"""Decodes unsolicited frames: bytes in, decoded frames, damage and stale fields out, in order."""
 
 from gateway.errors import Evidence, Garbled
-from gateway.protocols.frames.device import Frames, Heard
+from gateway.protocols.frames.device import Frames
+from gateway.protocols.unsolicited import Stale, UnsolicitedEvent
 
 _QUIET = 0.05  # s; after it a byte begins a frame, where nothing else says what begins one
 _LONGEST_PAUSE = 1.0  # s; voids half a frame where the framing has no gap: its rest is lost
 
 
-@dataclass(frozen=True, slots=True)
-class Stale:
-    """These fields were not heard for longer than their `stale_after`."""
-
-    fields: frozenset[str]
-
-
-Said = Heard | Garbled | Stale
-
-
 class Listener:
-    """What one device says unasked while its port is open.
+    """Decodes the unsolicited frames of one device while its port is open.
 
-    `Garbled` is damage, or a frame that `listen` does not know: whatever the device wanted to say,
-    none of its listened fields can be called known until they are heard again. A frame that may
-    be ignored has a `listen` entry without fields.
+    `Garbled` is damage, or a frame without an entry in `listen`: after it no field in `listen` is
+    known until it is received again. A frame to ignore has a `listen` entry without fields.
     """
 
     def __init__(self, device: Frames, now: float) -> None:
@@ -59,8 +43,8 @@ class Listener:
         return self._last_byte + (_QUIET if gap is None else max(gap, _QUIET))
 
     @property
-    def silent(self) -> bool:
-        """Whether all that it should say again and again is overdue."""
+    def all_stale(self) -> bool:
+        """True when every field with a `stale_after` is stale."""
         return not self._stale_at
 
     @property
@@ -68,13 +52,13 @@ class Listener:
         gap = self._reader.gap_timeout
         return _LONGEST_PAUSE if gap is None else gap
 
-    def received(self, data: bytes, now: float) -> list[Said]:
+    def received(self, data: bytes, now: float) -> list[UnsolicitedEvent]:
         """Bytes that arrived at `now`."""
         said = self._silence(now)
         self._last_byte = now
         return said + self._said(self._reader.feed(data), now)
 
-    def tick(self, now: float) -> list[Said]:
+    def tick(self, now: float) -> list[UnsolicitedEvent]:
         """Time has passed."""
         said = self._silence(now)
         stale = frozenset(name for name, due in self._stale_at.items() if due <= now)
@@ -82,17 +66,17 @@ class Listener:
             del self._stale_at[name]
         return [*said, Stale(stale)] if stale else said
 
-    def overheard(self, frames: Iterable[bytes], now: float) -> list[Said]:
-        """Whole frames that came while the device was asked for something else."""
-        heard = (self._understood(frame, now) for frame in frames)
-        return [news for news in heard if not isinstance(news, Garbled)]
+    def unmatched(self, frame: bytes, now: float) -> list[UnsolicitedEvent]:
+        """Decodes a whole frame of a transaction that is not its reply; an unknown one is none."""
+        event = self._understood(frame, now)
+        return [] if isinstance(event, Garbled) else [event]
 
-    def disturbed(self, now: float) -> None:
-        """Others have spoken on the line: what was half heard is void."""
+    def restart(self, now: float) -> None:
+        """Discards an incomplete frame, because other frames were on the line."""
         self._reader = self._device.reader(quiet=False)
         self._last_byte = now
 
-    def _silence(self, now: float) -> list[Said]:
+    def _silence(self, now: float) -> list[UnsolicitedEvent]:
         """What the silence up to `now` ended, by the time of the bytes, whoever woke us late."""
         # Reckoned as `due` is: a difference of the same times could fall short of the gap.
         if now >= self._last_byte + self._gap:
@@ -101,22 +85,22 @@ class Listener:
             self._reader.settle()
         return []
 
-    def _said(self, frames: list[bytes | Garbled], now: float) -> list[Said]:
+    def _said(self, frames: list[bytes | Garbled], now: float) -> list[UnsolicitedEvent]:
         """Damage upon damage is told once: noise must not fill lists."""
-        said: list[Said] = []
+        said: list[UnsolicitedEvent] = []
         for item in frames:
             news = item if isinstance(item, Garbled) else self._understood(item, now)
             if not (isinstance(news, Garbled) and said and isinstance(said[-1], Garbled)):
                 said.append(news)
         return said
 
-    def _understood(self, frame: bytes, now: float) -> Said:
-        heard = self._device.hear(frame)
-        if heard is None:
+    def _understood(self, frame: bytes, now: float) -> UnsolicitedEvent:
+        decoded = self._device.hear(frame)
+        if decoded is None:
             return Garbled("a frame that listen does not know", frame, evidence=Evidence.SHAPE)
-        stale_after = self._device.listen[heard.message].stale_after
-        for name in heard.values:
+        stale_after = self._device.listen[decoded.message].stale_after
+        for name in decoded.values:
             self._stale_at.pop(name, None)
             if stale_after is not None:
                 self._stale_at[name] = now + stale_after
-        return heard
+        return decoded

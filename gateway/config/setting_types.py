@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, Field, PlainValidator, WithJsonSchema
 
-from gateway.config import written
+from gateway.config import parsers
 from gateway.transport.port import PortAddress
 from gateway.values import Kind, Order
 
@@ -58,33 +58,33 @@ _PORT_SCHEMA = {
     "examples": ["/dev/ttyUSB0", "COM3", "tcp://10.0.0.7:4001", "rfc2217://host:port", "simulator"],
 }
 
-Duration = Annotated[float, PlainValidator(written.duration), WithJsonSchema(DURATION_SCHEMA)]
-Interval = Annotated[float, PlainValidator(written.interval), WithJsonSchema(INTERVAL_SCHEMA)]
+Duration = Annotated[float, PlainValidator(parsers.duration), WithJsonSchema(DURATION_SCHEMA)]
+Interval = Annotated[float, PlainValidator(parsers.interval), WithJsonSchema(INTERVAL_SCHEMA)]
 Text = Annotated[str, Field(strict=True), WithJsonSchema(TEXT_SCHEMA)]
 Name = Annotated[
-    str, PlainValidator(written.name), WithJsonSchema(TEXT_SCHEMA | {"pattern": NAME_PATTERN})
+    str, PlainValidator(parsers.name), WithJsonSchema(TEXT_SCHEMA | {"pattern": NAME_PATTERN})
 ]
 Group = Annotated[
-    str, PlainValidator(written.name), WithJsonSchema({"type": "string", "pattern": NAME_PATTERN})
+    str, PlainValidator(parsers.name), WithJsonSchema({"type": "string", "pattern": NAME_PATTERN})
 ]
 Prefix = Annotated[
     str,
-    PlainValidator(written.prefix),
+    PlainValidator(parsers.prefix),
     WithJsonSchema(TEXT_SCHEMA | {"pattern": f"^{_CHUNK}(/{_CHUNK})*$"}),
 ]
-Port = Annotated[PortAddress, PlainValidator(written.port), WithJsonSchema(_PORT_SCHEMA)]
+Port = Annotated[PortAddress, PlainValidator(parsers.port), WithJsonSchema(_PORT_SCHEMA)]
 Baudrate = Annotated[
     int | None,
-    PlainValidator(written.baudrate),
-    WithJsonSchema({"type": "integer", "enum": list(written.BAUDRATES)}),
+    PlainValidator(parsers.baudrate),
+    WithJsonSchema({"type": "integer", "enum": list(parsers.BAUDRATES)}),
 ]
 WebAddress = Annotated[
     tuple[str, int],
-    PlainValidator(written.web_address),
+    PlainValidator(parsers.web_address),
     WithJsonSchema({"type": "string", "pattern": f"^{_HOST}:[0-9]{{1,5}}$"}),
 ]
-FilePath = Annotated[Path, PlainValidator(written.path), WithJsonSchema({"type": "string"})]
-OrderName = Annotated[Order, PlainValidator(written.order), WithJsonSchema(_ORDER_SCHEMA)]
-Endpoint = Annotated[str, PlainValidator(written.endpoint), WithJsonSchema(_ENDPOINT_SCHEMA)]
-Endpoints = Annotated[list[Endpoint], AfterValidator(written.once)]
+FilePath = Annotated[Path, PlainValidator(parsers.path), WithJsonSchema({"type": "string"})]
+OrderName = Annotated[Order, PlainValidator(parsers.order), WithJsonSchema(_ORDER_SCHEMA)]
+Endpoint = Annotated[str, PlainValidator(parsers.endpoint), WithJsonSchema(_ENDPOINT_SCHEMA)]
+Endpoints = Annotated[list[Endpoint], AfterValidator(parsers.once)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]

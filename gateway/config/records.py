@@ -1,12 +1,19 @@
 """What the file says, checked and complete: plain data for the rest of the gateway."""
 
 from dataclasses import dataclass
+from enum import StrEnum
 from pathlib import Path
 
 from gateway.engine.device import DeviceSettings
 from gateway.planning.wire_timing import WireTiming
 from gateway.tags import Tag
 from gateway.transport.port import PortAddress, SerialSettings, SimulatorAddress
+
+
+class ZenohMode(StrEnum):
+    PEER = "peer"
+    CLIENT = "client"
+    ROUTER = "router"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -21,17 +28,21 @@ class TlsConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ZenohConfig:
-    """How to join the Zenoh network. `config_file` lies under these settings."""
+    """The Zenoh session.
+
+    `config_file` is a Zenoh JSON5 file for everything else. `mode` always counts; `listen`,
+    `connect` and the others replace the settings of that file where they are given.
+    """
 
     prefix: str = "plant"
-    mode: str = "peer"  # peer, client or router
+    mode: ZenohMode = ZenohMode.PEER
     listen: tuple[str, ...] = ()
     connect: tuple[str, ...] = ()
     config_file: Path | None = None
     tls: TlsConfig | None = None
-    user: str | None = None  # our own, where we connect to
+    user: str | None = None  # of this gateway, where it connects to
     password_file: Path | None = None
-    users_file: Path | None = None  # who may connect to us
+    users_file: Path | None = None  # for those who connect: a line `user:password` each
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -8,7 +8,7 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any, get_args, get_type_hints
 
-from gateway.config import written
+from gateway.config import parsers
 from gateway.config.messages import Mistakes, Path, meant
 from gateway.errors import ConfigError
 
@@ -41,7 +41,7 @@ def is_duration(hint: Any) -> bool:
 def _plain(hint: Any, value: Any, path: Path, mistakes: Mistakes) -> Any:
     if is_duration(hint):
         try:
-            return value if value is None else written.duration(value)
+            return value if value is None else parsers.duration(value)
         except ConfigError as error:
             mistakes.add(path, str(error))
             return _LEFT_OUT

@@ -1,0 +1,66 @@
+"""Samples: the values of tags with their quality, time and reason."""
+
+from enum import StrEnum
+from typing import NamedTuple
+
+from gateway.errors import Garbled
+from gateway.tags.tag import Tag
+from gateway.values import Value
+
+
+class Quality(StrEnum):
+    GOOD = "good"
+    BAD = "bad"
+
+
+class Reason(StrEnum):
+    """The cause of a bad sample."""
+
+    STARTING = "starting"  # not read yet
+    NO_REPLY = "no-reply"  # the device does not reply
+    GARBLED = "garbled"  # the device replies, but no reply can be decoded
+    REFUSED = "refused"  # an error reply: the device does not have this address
+    LINE_DOWN = "line-down"  # the port is closed
+    OVERDUE = "overdue"  # the device replies, but the last read of this tag is too old
+    DISABLED = "disabled"  # `enabled: false` in the file
+    NOT_A_NUMBER = "not-a-number"  # a good read, but no value of the tag's type (NaN, bad BCD)
+
+
+class Sample(NamedTuple):
+    """A value of a tag as the device had it at `time`, or the reason why there is none.
+
+    `time` is in nanoseconds since 1970, UTC: the arrival of the reply, or of the failure.
+    """
+
+    tag: Tag
+    value: Value | None
+    quality: Quality
+    time: int
+    reason: Reason | None = None
+    detail: str = ""  # one sentence for people, or empty
+
+
+def good(tag: Tag, value: Value, time: int) -> Sample:
+    return Sample(tag, value, Quality.GOOD, time)
+
+
+def of_field(tag: Tag, value: Value | Garbled, time: int) -> Sample:
+    """Returns the sample for a field of a frame: its value, or the error that replaced it."""
+    if isinstance(value, Garbled):
+        return bad(tag, Reason.GARBLED, time, str(value))
+    known = tag.decode([value])
+    return bad(tag, Reason.NOT_A_NUMBER, time) if known is None else good(tag, known, time)
+
+
+def bad(tag: Tag, reason: Reason, time: int, detail: str = "") -> Sample:
+    return Sample(tag, None, Quality.BAD, time, reason, detail)
+
+
+class WriteResult(NamedTuple):
+    """An acknowledged or broadcast write and the value the device now holds."""
+
+    value: Value
+    time: int  # ns since 1970: the acknowledgement
+    took: float  # seconds from submitting to the acknowledgement
+    verified: bool = False  # read back and found equal
+    acknowledged: bool = True  # False only for a broadcast: no device acknowledges it
