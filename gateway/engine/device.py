@@ -1,17 +1,17 @@
 """One device on a line: its settings, its plan, its health and its record."""
 
 import math
-from collections import Counter
 from dataclasses import dataclass, field
 from typing import Literal
 
 from gateway.engine.health import Health, State, diagnosis
-from gateway.errors import DeviceError, Garbled, NoReply, Refused
-from gateway.planning.bad_addresses import RETRY, Refusals
-from gateway.planning.monitor_lists import with_list
+from gateway.engine.records import Record
+from gateway.errors import LineDown
+from gateway.planning.bad_addresses import RETRY, BadAddresses
+from gateway.planning.monitor_lists import with_monitor_list
 from gateway.planning.planner import Block, plan
 from gateway.planning.wire_timing import WireTiming
-from gateway.protocols.driver import AnyDriver, Cost, Overhearing, Span, Timing, Windowed
+from gateway.protocols.driver import AnyDriver, Cost, NoReplyCauses, Span, Timing, Windowed
 from gateway.tags import Tag
 
 LEARN_EVERY = 50  # exchanges between two looks at the measured turnaround
@@ -37,81 +37,26 @@ class DeviceSettings:
 
 
 @dataclass(slots=True)
-class Record:
-    """Counts since the start. Times in seconds."""
-
-    exchanges: int = 0
-    writes: int = 0
-    wire_time: float = 0.0
-    late: int = 0  # replies after the time-out
-    unasked: int = 0  # stray frames
-    heard: int = 0  # unsolicited frames that were understood
-    overruns: int = 0  # polls left out because the one before was late
-    overdue: int = 0  # blocks whose values turned bad because they were not read for too long
-    failures: Counter[str] = field(default_factory=Counter)  # by evidence
-    refusals: Counter[str] = field(default_factory=Counter)  # by the maker's code
-    turnaround: float | None = None  # what the station takes, measured
-    slowest_write: float = 0.0
-
-    def count_exchanges(self, exchanges: int, characters: float, turnarounds: float) -> None:
-        """So many requests were answered; seconds of the wire, and of the station's own time."""
-        self.wire_time += characters + turnarounds
-        if exchanges:
-            self.exchanges += exchanges
-            own, known = turnarounds / exchanges, self.turnaround
-            # Smoothed over about ten exchanges.
-            self.turnaround = own if known is None else known + 0.1 * (own - known)
-
-    def count_write(self, took: float) -> None:
-        self.writes += 1
-        self.slowest_write = max(self.slowest_write, took)
-
-    def count_failure(self, error: DeviceError) -> None:
-        known = isinstance(error, NoReply | Garbled)
-        self.failures[error.evidence if known else "other"] += 1
-
-    def count_refusal(self, error: Refused) -> None:
-        self.refusals[error.code] += 1
-
-    def count_late(self) -> None:
-        self.late += 1
-
-    def count_stray(self, frames: int = 1) -> None:
-        self.unasked += frames
-
-    def count_unsolicited(self) -> None:
-        self.heard += 1
-
-    def count_overruns(self, missed: int) -> None:
-        self.overruns += missed
-
-    def count_overdue(self) -> None:
-        self.overdue += 1
-
-
-@dataclass(slots=True)
 class Turnaround:
-    """What a station takes for a reply, as far as plans and forecasts count on it."""
+    """What a station takes for a reply, as far as plans and forecasts count on it. Seconds."""
 
     configured: float | None
     expected: float | None = field(init=False)  # None: the protocol's usual
-    _look_at: int = LEARN_EVERY  # exchanges
+    look_at: float = LEARN_EVERY  # exchanges, until it is compared with the one measured
     _planned: float = 0.0  # with which the device was planned last
 
     def __post_init__(self) -> None:
         self.expected = self.configured
+        if self.configured is not None:
+            self.look_at = math.inf
 
-    def due(self, record: Record) -> bool:
-        """It is time to compare it with the one measured."""
-        if self.configured is not None or record.turnaround is None:
-            return False
-        return record.exchanges >= self._look_at
-
-    def take(self, record: Record) -> bool:
+    def learn(self, record: Record) -> bool:
         """Expect the measured one from now on. True when it moved enough to plan again."""
-        self._look_at = record.exchanges + LEARN_EVERY
+        if record.turnaround is None:
+            return False
+        self.look_at = record.exchanges + LEARN_EVERY
         self.expected = record.turnaround
-        return abs((record.turnaround or 0.0) - self._planned) >= WORTH_WHILE * self._planned
+        return abs(record.turnaround - self._planned) >= WORTH_WHILE * self._planned
 
     def planned(self) -> None:
         """The device is planned with the one expected now."""
@@ -126,23 +71,25 @@ class Device:
     wire: WireTiming
     health: Health = field(init=False)
     record: Record = field(default_factory=Record)
-    bad_addresses: Refusals = field(init=False)
+    bad_addresses: BadAddresses = field(init=False)
     turnaround: Turnaround = field(init=False)
     blocks: tuple[Block, ...] = ()
     registered: tuple[Span, ...] = ()  # the monitor list that the PLC holds, as far as known
     broadcast: bool = field(init=False)  # written or listened to, but never asked
     window: int = field(init=False)  # requests that may be open at once
+    silence: float = field(init=False)  # seconds before each request
     _lists: bool = True  # it may be read by a monitor list
     _use: tuple[float, float] = (0.0, 0.0)  # seconds of the wire, and when they were counted
 
     def __post_init__(self) -> None:
         driver = self.driver
-        self.bad_addresses = Refusals(driver.cost)
+        self.bad_addresses = BadAddresses(driver.cost)
         self.turnaround = Turnaround(self.settings.turnaround)
         used = [driver.areas[tag.span.area] for tag in self.tags] or driver.areas.values()
         self.broadcast = not any(area.readable for area in used)
         self.health = Health(answerable=not self.broadcast)
         self.window = driver.window if isinstance(driver, Windowed) else 1
+        self.silence = self.wire.silence(self.timing)
         self.plan()
 
     @property
@@ -178,14 +125,19 @@ class Device:
     def diagnosis(self) -> str:
         """One sentence for people: why it does not answer as it should; empty when it does."""
         driver = self.driver
-        causes = driver.silent_causes if isinstance(driver, Overhearing) else ""
+        causes = driver.no_reply_causes if isinstance(driver, NoReplyCauses) else ""
         return diagnosis(self.health.trouble, causes)
+
+    def restart(self, trouble: LineDown | None = None) -> None:
+        """The line was opened, or lost."""
+        self.health.restart(trouble)
+        self.forget_list()
 
     # The plan
 
     def seconds(self, cost: Cost) -> float:
         """One exchange on this line with this station."""
-        return self.wire.exchange(cost, self.timing, self.turnaround.expected)
+        return self.wire.transaction(cost, self.timing, self.turnaround.expected)
 
     @property
     def load(self) -> float:
@@ -198,7 +150,7 @@ class Device:
         bad = self.bad_addresses
         blocks = plan(self.tags, self.driver, self.seconds, bad.cuts)
         if self._lists:
-            blocks = with_list(blocks, self.driver, self.seconds, bad.bad.keys())
+            blocks = with_monitor_list(blocks, self.driver, self.seconds, bad.bad.keys())
         self.blocks = blocks
 
     def poll_nothing(self) -> None:
@@ -210,9 +162,9 @@ class Device:
 
         In either case the measured one is expected from now on.
         """
-        if not self.turnaround.due(self.record):
+        if self.record.exchanges < self.turnaround.look_at:
             return False
-        if not self.turnaround.take(self.record) or self._planning_takes_long:
+        if not self.turnaround.learn(self.record) or self._planning_takes_long:
             return False
         self.turnaround.planned()
         load, blocks = self.load, self.blocks

@@ -48,37 +48,37 @@ Effect = Samples | OnlineChange | RequestEnded | Pause | LogEvent
 class Effects:
     """Collects the effects of one call of the engine, in their order."""
 
-    __slots__ = ("_collected",)
+    __slots__ = ("collected",)
 
     def __init__(self) -> None:
-        self._collected: list[Effect] = []
+        self.collected: list[Effect] = []
 
     def take(self) -> list[Effect]:
         """All effects since the last call."""
-        collected, self._collected = self._collected, []
+        collected, self.collected = self.collected, []
         return collected
 
     def samples(self, samples: Sequence[Sample]) -> None:
-        self._collected.append(Samples(samples))
+        self.collected.append(Samples(samples))
 
     def bad(self, tags: Sequence[Tag], reason: Reason, time: int, detail: str) -> None:
         """The tags turn bad at `time` (ns since 1970)."""
-        self._collected.append(Samples([bad(tag, reason, time, detail) for tag in tags]))
+        self.collected.append(Samples([bad(tag, reason, time, detail) for tag in tags]))
 
     def online(self, device: Device, online: bool) -> None:
-        self._collected.append(OnlineChange(device, online))
+        self.collected.append(OnlineChange(device, online))
 
     def ended(self, request: Request, outcome: Outcome) -> None:
-        self._collected.append(RequestEnded(request, outcome))
+        self.collected.append(RequestEnded(request, outcome))
 
     def pause(self, seconds: float) -> None:
-        self._collected.append(Pause(seconds))
+        self.collected.append(Pause(seconds))
 
     def debug(self, event: str, **fields: object) -> None:
-        self._collected.append(LogEvent("debug", event, fields))
+        self.collected.append(LogEvent("debug", event, fields))
 
     def info(self, event: str, **fields: object) -> None:
-        self._collected.append(LogEvent("info", event, fields))
+        self.collected.append(LogEvent("info", event, fields))
 
     def warning(self, event: str, **fields: object) -> None:
-        self._collected.append(LogEvent("warning", event, fields))
+        self.collected.append(LogEvent("warning", event, fields))

@@ -5,7 +5,8 @@ from dataclasses import dataclass, field
 
 from gateway.engine.device import Device
 from gateway.engine.health import PAUSE_FIRST, PAUSE_LONGEST, State
-from gateway.engine.requests import Command, Write
+from gateway.engine.records import PollRecord
+from gateway.engine.requests import Command, Request, Write
 from gateway.errors import BadValue, DeviceError, LineDown
 from gateway.planning.planner import Block
 from gateway.protocols.driver import Span
@@ -22,16 +23,6 @@ class LastRead:
     ever: bool = False  # there was one
     units: Sequence[int] | None = None  # what was read
     samples: Sequence[Sample] | None = None  # what was made of it
-
-
-@dataclass(slots=True)
-class PollRecord:
-    """Counts of one block since it was planned. Times in seconds."""
-
-    reads: int = 0  # good ones
-    overruns: int = 0  # rounds left out because the one before was late
-    mean_gap: float = 0.0  # between two good reads, smoothed over about ten
-    worst_gap: float = 0.0
 
 
 @dataclass(slots=True, eq=False)
@@ -132,7 +123,8 @@ class Answer:
     until: float
 
 
-Unfinished = Poll | Probe | Write | WriteTogether | Command | Confirm | Repeat
+RequestJob = Write | WriteTogether | Command | Confirm | Repeat
+Unfinished = Poll | Probe | RequestJob
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -164,6 +156,34 @@ Transacted = Unfinished | Answer | Settle
 Job = Transacted | Idle
 
 
+def requests_of(job: Job) -> Sequence[Request]:
+    """The requests that the job carries out."""
+    match job:
+        case Write() | Command():
+            return (job,)
+        case WriteTogether(writes=writes):
+            return writes
+        case Confirm(write=write) | Repeat(write=write):
+            return (write,)
+        case Settle(after=after):
+            return requests_of(after)
+    return ()
+
+
+def span_of(job: Unfinished) -> Span | None:
+    """The span whose reply may still arrive after the job; None leaves an older one as it was."""
+    match job:
+        case Poll():
+            return job.block.span
+        case Write(tag=tag):
+            return tag.span
+        case WriteTogether(writes=[first, *_]):
+            return first.tag.span
+        case Confirm(write=write) | Repeat(write=write):
+            return write.tag.span
+    return None
+
+
 # Results
 
 
@@ -189,7 +209,7 @@ class Sent:
     """A write was carried out, or sent to stations that never acknowledge."""
 
     acknowledged: bool = True
-    held: Sequence[int] | None = None  # read back; None: not asked for
+    held: Sequence[int] | None = None  # read back; None: the tag does not say `verify`
     refused_back: DeviceError | None = None  # reading back was refused
 
 
@@ -200,6 +220,4 @@ class Settled:
     late: float | None
 
 
-Result = (
-    Sequence[int] | Resynced | Sent | Settled | str | DeviceError | BadValue | LineDown | None
-)
+Result = Sequence[int] | Resynced | Sent | Settled | str | DeviceError | BadValue | LineDown | None

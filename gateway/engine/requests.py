@@ -111,28 +111,25 @@ class RequestQueue:
     """The waiting requests of one line. Those of one device stay in their order."""
 
     def __init__(self) -> None:
-        self._requests: deque[Request] = deque()
-
-    def __len__(self) -> int:
-        return len(self._requests)
+        self.waiting: deque[Request] = deque()
 
     @property
     def first(self) -> Request:
-        return self._requests[0]
+        return self.waiting[0]
 
     def take(self) -> Request | None:
         """Takes out the first request to a device that needs no resync."""
-        for request in self._requests:
+        for request in self.waiting:
             if not request.device.health.needs_resync:
-                self._requests.remove(request)
+                self.waiting.remove(request)
                 return request
         return None
 
     def submit(self, request: Request) -> bool:
         """False when too many requests wait already."""
-        if len(self._requests) >= MOST_WAITING:
+        if len(self.waiting) >= MOST_WAITING:
             return False
-        self._requests.append(request)
+        self.waiting.append(request)
         return True
 
     def superseded(self, write: Write) -> list[Request]:
@@ -144,7 +141,7 @@ class RequestQueue:
     def companions(self, write: Write) -> list[Write]:
         """Takes out the device's next writes that fit in one exchange with this one."""
         found: list[Write] = []
-        for request in self._requests:
+        for request in self.waiting:
             if request.device is not write.device:
                 continue
             if not isinstance(request, Write) or not can_share([write, *found, request]):
@@ -158,7 +155,7 @@ class RequestQueue:
         """They were refused together, so none was carried out: they are next, one by one."""
         for write in reversed(writes):
             write.alone = True
-            self._requests.appendleft(write)
+            self.waiting.appendleft(write)
 
     def withdraw(self, device: Device | None = None) -> list[Request]:
         """Takes out the waiting requests (to one device) that will not be sent."""
@@ -166,10 +163,10 @@ class RequestQueue:
 
     def expired(self, now: float) -> list[Request]:
         """Takes out the requests that have waited too long."""
-        return self._out(lambda request: request.expires <= now) if self._requests else []
+        return self._out(lambda request: request.expires <= now) if self.waiting else []
 
     def _out(self, which: Callable[[Request], bool]) -> list[Request]:
-        taken = [request for request in self._requests if which(request)]
+        taken = [request for request in self.waiting if which(request)]
         if taken:
-            self._requests = deque(request for request in self._requests if not which(request))
+            self.waiting = deque(request for request in self.waiting if not which(request))
         return taken
