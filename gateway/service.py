@@ -56,7 +56,7 @@ async def _serve(config: Config, stop: asyncio.Event, started: Callable[[], None
     northbound = _northbound(config, gateway, history)
     state_file = None if config.state_file is None else StateFile(config.state_file)
     if state_file is not None:
-        state_file.recall(gateway.spoken_to)
+        state_file.restore(gateway.spoken_to)
     gateway.show_alive = northbound.set_online
     gateway.publish = northbound.publish
     if history is not None:
@@ -79,7 +79,7 @@ async def _serve(config: Config, stop: asyncio.Event, started: Callable[[], None
             ending.callback(event.cancel)
         lines: list[asyncio.Task[None]] = []
         await _first(exclusive, face, stopping)
-        if exclusive.done():  # otherwise a gateway that runs already may have this file and these lines
+        if exclusive.done():  # otherwise another process may have this file and these lines
             if history is not None:
                 history.start()
             await _first(active, face, stopping)
@@ -109,7 +109,10 @@ def _northbound(config: Config, gateway: Gateway, history: Historian | None) -> 
 
 
 async def _on_the_wire(
-    gateway: Gateway, history: Historian | None, state_file: StateFile | None, ending: AsyncExitStack
+    gateway: Gateway,
+    history: Historian | None,
+    state_file: StateFile | None,
+    ending: AsyncExitStack,
 ) -> list[asyncio.Task[None]]:
     if history is not None:
         history.record(gateway.mirror.samples())  # "starting" marks the restart
@@ -128,14 +131,14 @@ async def _kept(state_file: StateFile, gateway: Gateway) -> AsyncIterator[None]:
     try:
         yield
     finally:
-        state_file.end(state_file.page(gateway.spoken_to))
+        state_file.save_last(state_file.snapshot(gateway.spoken_to))
         await _ended([keeping])
 
 
 async def _keep(state_file: StateFile, gateway: Gateway) -> None:
     while True:
         await asyncio.sleep(KEEP_EVERY)
-        state_file.keep(state_file.page(gateway.spoken_to))
+        state_file.save_soon(state_file.snapshot(gateway.spoken_to))
 
 
 async def _put_away(

@@ -15,9 +15,8 @@ from gateway.history.reader import Part, Reader, in_order
 from gateway.history.recent import Recent, Shelved
 from gateway.history.timerange import TimeRange, time_range
 from gateway.history.writer import Writer
-from gateway.northbound import payload
-from gateway.northbound.payload import WriteOutcome
 from gateway.tags import Sample, Tag
+from gateway.tags.timestamps import rfc3339
 
 LONGEST_RUN = 32_768  # samples
 OLDEST_RUN = 600.0  # seconds
@@ -60,9 +59,9 @@ class Historian:
         that writes, is not felt here."""
         self._recent.add(samples)
 
-    def record_write(self, outcome: WriteOutcome) -> None:
-        """Keeps the line that also goes to the `writes` key."""
-        self._outcomes.add(outcome.time, payload.write_outcome(outcome).decode())
+    def record_write(self, time: int, outcome: str) -> None:
+        """Records the outcome of a write as on the `writes` key; `time`: ns since 1970."""
+        self._outcomes.add(time, outcome)
 
     def document(self) -> Mapping[str, object]:
         """For the status: `state` is `ok` or one sentence; counts since the start."""
@@ -77,7 +76,7 @@ class Historian:
             "writes_stored": self._outcomes.stored,
             "writes_lost": self._outcomes.lost,
             "bytes": writer.size,
-            "oldest": None if oldest is None else payload.rfc3339(oldest),
+            "oldest": None if oldest is None else rfc3339(oldest),
         }
 
     # -- any thread --

@@ -45,7 +45,7 @@ class Incoming:
 
     def counters(self) -> dict[str, int]:
         """Queries and puts since the start."""
-        counted: dict[str, int] = {}
+        counted = {"refusals_untold": self._audit.suppressed}
         if self._queries is not None:
             counted |= asdict(self._queries.counters)
         if self._puts is not None:

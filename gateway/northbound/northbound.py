@@ -114,8 +114,8 @@ class Northbound:
 
     def counters(self) -> dict[str, int]:
         """Messages out, in and dropped since the start."""
-        own = {"links": len(self._links), "refusals_untold": self._audit.suppressed}
-        return asdict(self._publisher.counters) | self._incoming.counters() | own
+        outgoing = asdict(self._publisher.counters) | {"links": len(self._links)}
+        return outgoing | self._incoming.counters()
 
     @property
     def active(self) -> asyncio.Event:
@@ -160,9 +160,7 @@ class Northbound:
             tasks.create_task(self._status.run())
             await self._standby.active.wait()
             self._declared += await off_loop(self._declare_plant, declarations)
-            republisher = Republisher(
-                self._batches.publish, self._plant, self._index, self._links
-            )
+            republisher = Republisher(self._batches.publish, self._plant, self._index, self._links)
             await republisher.publish_all()
             self._status.publish()
             self.opened.set()

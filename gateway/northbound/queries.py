@@ -80,15 +80,18 @@ class Queries:
                 history = partial(self._replies.history, parsed, time.time_ns())
                 self._pool.answer_wide(query, history)
             case Family.VALUE if query.parameters.get("max_age") is not None:
-                if not parsed.has_wildcard:
-                    self._start(self._fresh(query, parsed))
-                elif self._pool.admit_wide(query):
-                    task = self._start(self._fresh(query, parsed))
-                    task.add_done_callback(lambda _: self._pool.release_wide())
+                self._take_fresh(query, parsed)
             case _ if parsed.has_wildcard or parsed.family is Family.BLOCK:
                 self._pool.answer_wide(query, partial(self._replies.current, parsed))
             case _:
                 self._pool.answer(query, partial(self._replies.current, parsed))
+
+    def _take_fresh(self, query: zenoh.Query, parsed: ParsedKey) -> None:
+        if not parsed.has_wildcard:
+            self._start(self._fresh(query, parsed))
+        elif self._pool.admit_wide(query):
+            task = self._start(self._fresh(query, parsed))
+            task.add_done_callback(lambda _: self._pool.release_wide())
 
     async def close(self) -> None:
         """Ends the queries that wait for devices; their replies get half a second to leave."""
@@ -113,9 +116,7 @@ class Queries:
     async def _command(self, query: zenoh.Query) -> None:
         result: CommandResult | Failure = _ENDING
         try:
-            result = await self._commands.execute(
-                str(query.key_expr), _data(query), sender(query)
-            )
+            result = await self._commands.execute(str(query.key_expr), _data(query), sender(query))
         finally:
             self._pool.answer(query, partial(self._commands.reply, result))
 
