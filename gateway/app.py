@@ -15,12 +15,12 @@ from gateway.engine.jobs import Poll
 from gateway.engine.requests import CommandResult
 from gateway.errors import Busy, GatewayError, Offline
 from gateway.line.line import Line
-from gateway.northbound.payload import rfc3339
 from gateway.northbound.status import Document, device_document, line_document
 from gateway.simulator.plant import station_for
 from gateway.simulator.port import open_simulator
 from gateway.tags import Quality, Reason, Sample, Tag, WriteResult, bad
 from gateway.tags.mirror import Mirror
+from gateway.tags.timestamps import rfc3339
 from gateway.transport import Port, Receiver, SimulatorAddress, open_port
 from gateway.values import Value
 
@@ -145,7 +145,7 @@ class Gateway:
     def sample(self, tag: Tag) -> Sample:
         return self.mirror[tag]
 
-    def told(self, samples: Sequence[Sample]) -> None:
+    def mark_published(self, samples: Sequence[Sample]) -> None:
         if news := self.mirror.mark_published(samples):
             self.publish(news)  # as any other: what is published is kept in history too
 

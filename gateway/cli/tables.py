@@ -11,11 +11,11 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from gateway.tags.timestamps import rfc3339
 from gateway.cli.client import Shown
 from gateway.cli.scan import Report, spoken
 from gateway.config import Config
 from gateway.engine.forecast import LineForecast
-from gateway.northbound.payload import rfc3339
 from gateway.planning.planner import describe
 from gateway.planning.wire_timing import NETWORK_BAUD, WireTiming
 from gateway.tags import Quality, Sample, Tag, WriteRule

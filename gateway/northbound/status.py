@@ -1,4 +1,4 @@
-"""The state of lines and devices as documents: what status keys, status page and people read."""
+"""The state of lines and devices as documents, for status keys and the status page."""
 
 from collections.abc import Mapping, Sequence
 
@@ -6,9 +6,9 @@ from gateway.engine.device import Device
 from gateway.engine.forecast import LineForecast
 from gateway.engine.jobs import Poll
 from gateway.line.line import Line
-from gateway.northbound.payload import rfc3339
 from gateway.planning.bad_addresses import BadRange
 from gateway.planning.planner import describe
+from gateway.tags.timestamps import rfc3339
 
 MOST_REQUESTS = 200
 Document = Mapping[str, object]
@@ -42,7 +42,7 @@ def device_document(device: Device, polls: Sequence[Poll]) -> Document:
 
 
 def _request(poll: Poll) -> Document:
-    """One block: how often it is wanted and how often it came."""
+    """One block: its configured interval and the measured one."""
     return {
         "tags": describe(poll.block),
         "every": poll.block.every,
@@ -61,7 +61,7 @@ def refused_sentence(device: Device, bad: BadRange) -> str:
 
 
 def line_document(line: Line, expected: LineForecast, now: float) -> Document:
-    """One line: what was promised and what was measured. `now` by the loop's clock."""
+    """One line: the forecast and the measured figures. `now` by the loop's clock."""
     record = line.record
     open_for = now - record.since if line.is_open else 0.0
     busy = record.busy + record.turnarounds

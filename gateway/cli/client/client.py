@@ -13,12 +13,12 @@ from typing import NamedTuple
 import orjson
 import zenoh
 
+from gateway.tags.timestamps import rfc3339
 from gateway.cli.client.typed import matches, parse_value
 from gateway.config import Config
 from gateway.config.commands import TO_ALL
 from gateway.errors import GatewayError
 from gateway.northbound.keys import Keys
-from gateway.northbound.payload import rfc3339
 from gateway.tags import Tag
 from gateway.values import Kind, Value
 
