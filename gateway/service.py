@@ -56,12 +56,11 @@ async def _serve(config: Config, stop: asyncio.Event, started: Callable[[], None
     northbound = _northbound(config, gateway, history)
     state_file = None if config.state_file is None else StateFile(config.state_file)
     if state_file is not None:
-        state_file.restore(gateway.spoken_to)
-    gateway.show_alive = northbound.set_online
-    gateway.publish = northbound.publish
-    if history is not None:
-        gateway.publish = _both(history, northbound)
-        gateway.documents["history"] = history.document
+        state_file.restore(gateway.enabled_devices)
+    gateway.subscribe(northbound)
+    if history is not None:  # all that is published is kept, for clients that miss it
+        gateway.subscribe(_Recording(history))
+        gateway.add_document("history", history.document)
     async with AsyncExitStack() as ending:  # what began last ends first
         face = asyncio.create_task(northbound.run(), name="zenoh")
         ending.push_async_callback(_put_away, face, history, state_file)
@@ -118,7 +117,7 @@ async def _on_the_wire(
         history.record(gateway.mirror.samples())  # "starting" marks the restart
     if state_file is not None:
         await ending.enter_async_context(_kept(state_file, gateway))
-    lines = [asyncio.create_task(line.run(), name=line.name) for line in gateway.lines]
+    lines = [asyncio.create_task(line.run(), name=line.engine.name) for line in gateway.lines]
     ending.push_async_callback(_ended, lines)  # first of all, so that the last outcomes go out
     return lines
 
@@ -131,14 +130,14 @@ async def _kept(state_file: StateFile, gateway: Gateway) -> AsyncIterator[None]:
     try:
         yield
     finally:
-        state_file.save_last(state_file.snapshot(gateway.spoken_to))
+        state_file.save_last(state_file.snapshot(gateway.enabled_devices))
         await _ended([keeping])
 
 
 async def _keep(state_file: StateFile, gateway: Gateway) -> None:
     while True:
         await asyncio.sleep(KEEP_EVERY)
-        state_file.save_soon(state_file.snapshot(gateway.spoken_to))
+        state_file.save_soon(state_file.snapshot(gateway.enabled_devices))
 
 
 async def _put_away(
@@ -165,14 +164,20 @@ def _history(config: Config) -> Historian | None:
     return None if kept is None else Historian(kept.path, kept.keep, kept.max_size)
 
 
-def _both(history: Historian, northbound: Northbound) -> Callable[[Sequence[Sample]], None]:
-    """What is published is kept too, so that whoever misses it can ask for it."""
+class _Recording:
+    """Subscribes history to what is published.
 
-    def publish(news: Sequence[Sample]) -> None:
-        northbound.publish(news)
-        history.record(news)  # before the loop takes a question of whoever has seen them
+    A sample is recorded before the loop takes a question of a client that has seen it.
+    """
 
-    return publish
+    def __init__(self, history: Historian) -> None:
+        self._history = history
+
+    def publish(self, samples: Sequence[Sample]) -> None:
+        self._history.record(samples)
+
+    def set_online(self, device: str, online: bool) -> None:
+        """History keeps no device states."""
 
 
 async def _ended(tasks: Sequence[asyncio.Task[None]]) -> None:

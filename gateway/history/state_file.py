@@ -41,7 +41,7 @@ class StateFile:
         learned_by_name = self._load()
         for device in devices:
             if (learned := learned_by_name.get(device.name)) is not None:
-                device.refusals.restore(learned, device.tags)
+                device.bad_addresses.restore(learned, device.tags)
                 device.plan()
 
     def snapshot(self, devices: Iterable[Device]) -> bytes:
@@ -49,7 +49,7 @@ class StateFile:
         return orjson.dumps(
             {
                 "form": FORMAT,
-                "devices": {d.name: _to_json(d.refusals.known()) for d in devices},
+                "devices": {d.name: _to_json(d.bad_addresses.known()) for d in devices},
             },
             option=orjson.OPT_INDENT_2 | orjson.OPT_SORT_KEYS,
         )

@@ -65,6 +65,7 @@ class Line:
         self._wake = asyncio.Event()
         self._expiry = Alarm()
         self._armed = NEVER  # the engine's deadline when the alarm was set last
+        self.tried = asyncio.Event()  # set once the port was opened, or could not be
 
     # Clients
 
@@ -138,6 +139,7 @@ class Line:
                 if self.engine.is_open:
                     served = _now() - self.engine.record.since
                 self._deliver(self.engine.lost(LineDown(why), _now(), self._wall()))
+                self.tried.set()
             finally:
                 self._deliver(self.engine.stopped(_now()))
                 await self._close()  # last, as it may take a while
@@ -154,6 +156,7 @@ class Line:
             self._channel = Channel(port, self.engine.wire, WireLog(name), self._echo)
             log.info("line open", line=name)
             self._deliver(self.engine.opened(_now()))
+            self.tried.set()
             await self._serve(self._channel)
         except LineDown as error:
             known = str(error) == self.engine.record.trouble
