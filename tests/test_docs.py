@@ -18,7 +18,7 @@ import typer.main
 import yaml
 import zenoh
 
-from gateway.cli import main as cli
+from gateway.cli.main import cli
 from gateway.config import (
     Config,
     ConfigErrors,
@@ -396,7 +396,7 @@ def test_commands_are_found() -> None:
 @pytest.mark.parametrize(("page", "command"), COMMANDS)
 def test_a_command_in_the_pages_is_one_with_its_options(page: str, command: str) -> None:
     _, name, *arguments = shlex.split(command)
-    group: Any = typer.main.get_command(cli.cli)
+    group: Any = typer.main.get_command(cli)
     commands = group.commands
     assert name in commands, f"{page}: there is no command {name}"
     # Parsed, and not carried out; where it is mentioned without its arguments, these are missing.

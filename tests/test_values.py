@@ -47,7 +47,7 @@ def layout(kind: str, words: Order = LOW, octets: Order = HIGH) -> Layout:
     [("bool", 1), ("int16", 1), ("bcd16", 1), ("float32", 2), ("bcd32", 2), ("int64", 4),
      ("float64", 4), ("string[1]", 1), ("string[16]", 8), ("string[17]", 9), ("string[250]", 125)],
 )  # fmt: skip
-def test_a_type_takes_so_many_words(text: str, words: int) -> None:
+def test_the_number_of_words_of_a_type(text: str, words: int) -> None:
     kind = parse_type(text)
     assert kind.words == words
     assert str(kind) == text
@@ -58,7 +58,7 @@ def test_a_type_takes_so_many_words(text: str, words: int) -> None:
     ["", "int", "INT16", " int16", "string", "string[]", "string[0]", "string[251]",
      "string[-1]", "string[١]", "string[16]\n", "int16\n"],
 )  # fmt: skip
-def test_what_is_no_type(text: str) -> None:
+def test_invalid_types_are_refused(text: str) -> None:
     with pytest.raises(ConfigError):
         parse_type(text)
 
@@ -119,14 +119,14 @@ def test_a_text_of_odd_length_is_not_read_past_its_end() -> None:
 
 @pytest.mark.parametrize("raw", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("kind", ["float32", "float64"])
-def test_nan_and_infinity_are_no_values(kind: str, raw: float) -> None:
+def test_nan_and_infinity_give_none(kind: str, raw: float) -> None:
     octets = struct.pack(">f" if kind == "float32" else ">d", raw)
     words = struct.unpack(f">{len(octets) // 2}H", octets)
     assert from_words(layout(kind, HIGH))(words) is None
 
 
 @pytest.mark.parametrize("word", [0x000A, 0xA000, 0x12F4, 0xFFFF])
-def test_bcd_with_a_digit_above_9_is_no_value(word: int) -> None:
+def test_bcd_with_a_digit_above_9_gives_none(word: int) -> None:
     assert from_words(layout("bcd16"))([word]) is None
     assert from_words(layout("bcd32"))([0x1234, word]) is None
     assert from_words(layout("bcd32"))([word, 0x1234]) is None
@@ -172,7 +172,7 @@ def test_texts_survive_the_round_trip(value: str, octets: Order) -> None:
     orders,
     orders,
 )
-def test_whatever_the_words_a_value_that_was_read_can_be_written_back(
+def test_any_value_that_was_read_can_be_written_back(
     kind: str, data: st.DataObject, words: Order, octets: Order
 ) -> None:
     how = layout(kind, words, octets)
@@ -184,7 +184,7 @@ def test_whatever_the_words_a_value_that_was_read_can_be_written_back(
 
 
 @pytest.mark.parametrize("kind", list(INTEGERS))
-def test_what_is_one_beyond_the_bounds_is_refused(kind: Kind) -> None:
+def test_values_one_beyond_the_bounds_are_refused(kind: Kind) -> None:
     low, high = INTEGERS[kind]
     for value in (low - 1, high + 1, 10**300, -(10**300)):
         with pytest.raises(BadValue, match=f"does not fit.*{low} to {high}"):
@@ -193,7 +193,7 @@ def test_what_is_one_beyond_the_bounds_is_refused(kind: Kind) -> None:
 
 @pytest.mark.parametrize("kind", list(INTEGERS))
 @pytest.mark.parametrize("value", [0.5, math.nan, math.inf, True, False, "1", ""])
-def test_what_is_no_whole_number_is_refused(kind: Kind, value: Value) -> None:
+def test_values_without_a_whole_number_are_refused(kind: Kind, value: Value) -> None:
     with pytest.raises(BadValue):
         to_words(Layout(ValueType(kind)))(value)
 
@@ -204,18 +204,18 @@ def test_a_float_that_is_whole_is_a_whole_number() -> None:
 
 @pytest.mark.parametrize("kind", ["float32", "float64"])
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 10**400, True, "1.5"])
-def test_what_is_no_finite_number_is_refused(kind: str, value: Value) -> None:
+def test_values_without_a_finite_number_are_refused(kind: str, value: Value) -> None:
     with pytest.raises(BadValue):
         to_words(layout(kind))(value)
 
 
-def test_what_float32_cannot_hold_is_refused() -> None:
+def test_values_too_large_for_float32_are_refused() -> None:
     with pytest.raises(BadValue, match=r"does not fit float32 \(up to 3\.4e38 either way\)"):
         to_words(layout("float32"))(1e39)
 
 
 @pytest.mark.parametrize("value", [2, -1, 0.5, math.nan, "true", "1"])
-def test_what_is_neither_true_nor_false_is_refused(value: Value) -> None:
+def test_values_other_than_true_and_false_are_refused(value: Value) -> None:
     with pytest.raises(BadValue, match="neither true nor false"):
         to_words(layout("bool"))(value)
 
@@ -226,7 +226,7 @@ def test_zero_and_one_are_booleans(value: Value) -> None:
 
 
 @pytest.mark.parametrize("value", ["ABCDE", "€", "A\0", 5, True])
-def test_what_is_no_text_of_four_characters_is_refused(value: Value) -> None:
+def test_values_other_than_four_characters_are_refused(value: Value) -> None:
     with pytest.raises(BadValue):
         to_words(layout("string[4]"))(value)
 

@@ -1,12 +1,10 @@
-"""Reading and writing without a running gateway: the command line opens the port itself."""
+"""Reads, writes and commands without a running gateway: opens the port in this process."""
 
 import asyncio
 import time
 from collections.abc import Sequence
 from collections.abc import Set as AbstractSet
 from contextlib import suppress
-
-import orjson
 
 from gateway.app import device_of, opener
 from gateway.config import Config, LineConfig
@@ -16,15 +14,14 @@ from gateway.engine.requests import CommandResult
 from gateway.engine.unsolicited import listened
 from gateway.errors import BadValue, GatewayError, LineDown
 from gateway.line.line import Line
-from gateway.northbound import payload
 from gateway.tags import Reason, Sample, Tag, WriteResult, bad
 from gateway.values import Value
 
-LISTEN_FOR = 5.0  # seconds, for what comes unasked
+LISTEN_FOR = 5.0  # seconds, for unsolicited frames
 
 
 class _Once:
-    """Upstairs for a line that lives until every wanted tag has been heard of."""
+    """Receives the samples of a line until it has one of every wanted tag."""
 
     def __init__(self, wanted: AbstractSet[Tag] = frozenset()) -> None:
         self.heard: dict[Tag, Sample] = {}
@@ -43,7 +40,7 @@ class _Once:
 
 
 async def read(config: Config, tags: Sequence[Tag]) -> list[Sample]:
-    """One sample of each tag, good or bad, in the order asked."""
+    """Returns one sample of each tag, good or bad, in the order of `tags`."""
     found: dict[Tag, Sample] = {}
     for line_config in config.lines:
         enabled = {device.name for device in line_config.devices if device.enabled}
@@ -56,7 +53,7 @@ async def read(config: Config, tags: Sequence[Tag]) -> list[Sample]:
 
 
 async def _read(config: LineConfig, tags: Sequence[Tag]) -> dict[Tag, Sample]:
-    """What is not in any block (nobody can read it) is not in the answer either."""
+    """Returns samples of the tags that can be read. Tags of no block are left out."""
     line = _line(config, tags, once := _Once())
     asked = {tag for device in line.devices for block in device.blocks for tag in block.tags}
     unasked = {tag for device in line.devices for tag in listened(device)}
@@ -71,7 +68,7 @@ async def _read(config: LineConfig, tags: Sequence[Tag]) -> dict[Tag, Sample]:
 
 
 async def _listen(once: _Once, unasked: AbstractSet[Tag]) -> None:
-    """What comes unasked is waited for a while: a scale streams, a bar code may never come."""
+    """Waits a while for unsolicited values: a scale streams, a bar code may never arrive."""
     once.all_heard.clear()
     once.wanted |= unasked
     once.samples(())
@@ -81,7 +78,7 @@ async def _listen(once: _Once, unasked: AbstractSet[Tag]) -> None:
 
 
 async def write(config: Config, tag: Tag, value: Value) -> WriteResult:
-    """Raises `GatewayError` when it was not done, or nobody knows; `BadValue` before anything."""
+    """Writes one tag. Raises `GatewayError`; `BadValue` only before anything is sent."""
     units = tag.encode(value)
     (line_config,) = (line for line in config.lines if tag in line.tags)
     if not any(device.enabled for device in line_config.devices if device.name == tag.device):
@@ -89,7 +86,7 @@ async def write(config: Config, tag: Tag, value: Value) -> WriteResult:
     once = _Once({tag})
     line = _line(line_config, [tag], once)
     (device,) = line.devices
-    device.blocks = ()  # nothing is to be read
+    device.blocks = ()  # read nothing
     task = asyncio.create_task(line.run())
     while not line.is_open and not once.heard:
         await asyncio.sleep(0.01)
@@ -103,12 +100,12 @@ async def write(config: Config, tag: Tag, value: Value) -> WriteResult:
 
 
 async def control(config: Config, device: str, command: str, argument: str) -> CommandResult:
-    """Raises `GatewayError`; `BadValue` before anything is sent."""
+    """Sends one command. Raises `GatewayError`; `BadValue` only before anything is sent."""
     check_command(config, device, command)
     line_config = line_of(config, device)
     line = _line(line_config, [tag for tag in line_config.tags if tag.device == device], _Once())
     (told,) = line.devices
-    told.blocks = ()  # nothing is to be read
+    told.blocks = ()  # read nothing
     task = asyncio.create_task(line.run())
     while not line.is_open and not line.record.trouble:
         await asyncio.sleep(0.01)
@@ -123,16 +120,6 @@ async def control(config: Config, device: str, command: str, argument: str) -> C
     return CommandResult(result, time.time_ns(), loop.time() - started)
 
 
-def told(config: Config, tag: Tag, value: Value) -> dict[str, object]:
-    """`write`, and the outcome as a gateway would have told it. Not to be awaited."""
-    try:
-        result = payload.outcome(asyncio.run(write(config, tag, value)))
-    except GatewayError as error:
-        result = payload.outcome(payload.failure(error))
-    answer: dict[str, object] = orjson.loads(result)
-    return answer
-
-
 def _line(config: LineConfig, tags: Sequence[Tag], once: _Once) -> Line:
     names = {tag.device for tag in tags}
     devices = [_narrowed(device, tags, config) for device in config.devices if device.name in names]
@@ -142,7 +129,7 @@ def _line(config: LineConfig, tags: Sequence[Tag], once: _Once) -> Line:
 
 
 def _narrowed(device: DeviceSettings, tags: Sequence[Tag], line: LineConfig) -> Device:
-    """The device with the wanted tags alone."""
+    """Returns the device with only the given tags."""
     found = device_of(device, line)
     found.tags = tuple(tag for tag in tags if tag.device == device.name)
     found.plan()

@@ -1,4 +1,4 @@
-"""Where log lines go and what they look like."""
+"""Configures the log."""
 
 import logging
 import sys
@@ -20,7 +20,7 @@ class LogLevel(StrEnum):
 
 
 def set_up(form: LogFormat, level: LogLevel) -> None:
-    """To stderr: text for people, or one JSON document a line for machines."""
+    """Logs to stderr: text for people, or one JSON document per line for programs."""
     logging.basicConfig(
         format="%(message)s", stream=sys.stderr, level=getattr(logging, level.upper())
     )

@@ -1,12 +1,18 @@
-"""`plc-gateway simulate`: the configured devices as simulated PLCs for other programs."""
+"""The `simulate` command: serves the configured devices as simulated PLCs."""
 
 import asyncio
 import signal
 from collections.abc import Callable
 from contextlib import AsyncExitStack
+from functools import partial
 from pathlib import Path
+from typing import Annotated
 
-from gateway.config import Config, LineConfig
+import typer
+
+from gateway.cli.logs import LogFormat, LogLevel, set_up
+from gateway.cli.terminal import ConfigPath
+from gateway.config import Config, LineConfig, load
 from gateway.errors import ConfigError
 from gateway.planning.wire_timing import NETWORK_BAUD
 from gateway.simulator.plant import station_for
@@ -14,13 +20,29 @@ from gateway.simulator.serve import Served, serve_on_pty, serve_on_tcp
 from gateway.transport import TcpAddress
 
 
+def simulate(
+    config: ConfigPath,
+    tcp: Annotated[
+        str | None,
+        typer.Option(metavar="HOST:PORT", help="Serve on TCP: first line here, next port up"),
+    ] = None,
+    links: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Make a link to the pty of each line in DIR")
+    ] = None,
+) -> None:
+    """Serve the configured devices as simulated PLCs on ptys or TCP ports."""
+    loaded = load(config)
+    set_up(LogFormat.TEXT, LogLevel.INFO)
+    asyncio.run(serve(loaded, tcp, links, partial(print, flush=True)))
+
+
 async def serve(
     config: Config, tcp: str | None, links: Path | None, say: Callable[[str], None]
 ) -> None:
-    """Serve every line until SIGTERM or SIGINT.
+    """Serves every line until SIGTERM or SIGINT.
 
-    A line with a `tcp://` port is served on that port of this machine, others on a pty, or all
-    on TCP from `tcp` (HOST:PORT) upwards. Raises `ConfigError`, `LineDown`.
+    A line with a `tcp://` port uses that port of this machine, other lines use a pty. With `tcp`
+    (HOST:PORT) all lines use TCP ports from that one upwards. Raises `ConfigError`, `LineDown`.
     """
     if links is not None and not links.is_dir():
         raise ConfigError(f"--links {links}: there is no such folder: make it first")

@@ -11,7 +11,7 @@ from typing import Protocol, cast
 from gateway.planning.wire_timing import WireTiming
 from gateway.simulator.port import HalfDuplex
 from gateway.stations.station import Station
-from gateway.transport.trouble import line_down
+from gateway.transport.os_errors import line_down
 
 _MOST_READ = 4096  # bytes
 

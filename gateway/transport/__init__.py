@@ -1,4 +1,4 @@
-"""The one place that touches a port: `open_port` for serial ports, TCP and RFC 2217."""
+"""Ports: serial, TCP and RFC 2217, opened by `open_port`."""
 
 from gateway.transport.port import (
     Port,
@@ -17,20 +17,20 @@ from gateway.transport.tcp import open_tcp
 
 
 async def open_port(
-    where: PortAddress, settings: SerialSettings, ear: Receiver, *, timeout: float = 5.0
+    where: PortAddress, settings: SerialSettings, receiver: Receiver, *, timeout: float = 5.0
 ) -> Port:
-    """Open the port; from now on `ear` hears it. `timeout` is in seconds.
+    """Opens the port; `receiver` gets the received bytes. `timeout` is in seconds.
 
-    Raises `LineDown` with a sentence for people. Nobody reopens a port here: that is the
-    line's business. A simulator is opened by `open_simulator`, with its stations.
+    Raises `LineDown` with a sentence for people. The line, not this package, reopens a lost port.
+    `open_simulator` opens the simulator, which needs its stations.
     """
     match where:
         case SerialPath():
-            return await open_serial(where, settings, ear, timeout=timeout)
+            return await open_serial(where, settings, receiver, timeout=timeout)
         case TcpAddress():
-            return await open_tcp(where, ear, timeout=timeout)
+            return await open_tcp(where, receiver, timeout=timeout)
         case Rfc2217Address():
-            return await open_rfc2217(where, settings, ear, timeout=timeout)
+            return await open_rfc2217(where, settings, receiver, timeout=timeout)
         case SimulatorAddress():
             raise ValueError("a simulator needs its stations: open_simulator")
 

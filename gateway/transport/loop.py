@@ -1,4 +1,4 @@
-"""The event loop that ports live on: uvloop's; on Windows, where there is none, asyncio's own."""
+"""Creates the event loop: uvloop's with an exact clock, or asyncio's own on Windows."""
 
 import asyncio
 import importlib
@@ -7,13 +7,13 @@ from typing import Any
 
 
 def new_event_loop() -> asyncio.AbstractEventLoop:
-    """For `asyncio.Runner(loop_factory=...)`."""
+    """Returns a new loop, for `asyncio.Runner(loop_factory=...)`."""
     uvloop = _uvloop()
     return asyncio.new_event_loop() if uvloop is None else _exact(uvloop)
 
 
 def _uvloop() -> Any:
-    """The library, or None where there is none."""
+    """Returns the uvloop library, or None where it is not installed."""
     try:
         return importlib.import_module("uvloop")
     except ImportError:
@@ -21,8 +21,10 @@ def _uvloop() -> Any:
 
 
 def _exact(uvloop: Any) -> asyncio.AbstractEventLoop:
-    """uvloop's own clock counts milliseconds and stands still while code runs: a silence of 1.75 ms
-    cannot be kept by it. So it is told the time by the system's clock, the one its timers use too.
+    """Returns a uvloop loop that reads the system's monotonic clock.
+
+    uvloop's own clock counts milliseconds and stands still while code runs, too coarse for a
+    silence of 1.75 ms. Its timers use the same monotonic clock.
     """
     loop: asyncio.AbstractEventLoop = type(
         "ExactLoop", (uvloop.Loop,), {"time": staticmethod(time.monotonic)}

@@ -1,4 +1,4 @@
-"""What a port is to the line that owns it, and how a port is written in the file."""
+"""The port contract, and port addresses as the configuration file writes them."""
 
 import re
 from dataclasses import dataclass
@@ -8,22 +8,22 @@ from gateway.errors import ConfigError
 
 
 class Receiver(Protocol):
-    """Who hears a port. Called from the event loop."""
+    """Gets the bytes and the loss of a port. Called on the event loop."""
 
     def received(self, data: bytes) -> None: ...
 
     def lost(self, error: Exception) -> None:
-        """The port is gone; called once, never after `close`."""
+        """Reports the loss of the port: called once, never after `close`."""
 
 
 class Port(Protocol):
     """An open port. Bytes that arrive go to the `Receiver` it was opened with."""
 
     def write(self, data: bytes) -> None:
-        """Hand the bytes to the system; returns at once. Raises `LineDown`."""
+        """Hands the bytes to the system and returns at once. Raises `LineDown`."""
 
     async def close(self) -> None:
-        """Give the port back; never raises."""
+        """Closes the port; never raises."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +43,7 @@ class TcpAddress:
 
 @dataclass(frozen=True, slots=True)
 class Rfc2217Address:
-    """A device server that takes baud rate and format from us: `rfc2217://host:port`."""
+    """A device server that accepts baud rate and format: `rfc2217://host:port`."""
 
     host: str
     port: int
@@ -59,7 +59,7 @@ PortAddress = SerialPath | TcpAddress | Rfc2217Address | SimulatorAddress
 
 @dataclass(frozen=True, slots=True)
 class SerialSettings:
-    """Baud rate and character format of a wire; `format` as in `7E1`."""
+    """Baud rate and character format of a serial port; `format` as in `7E1`."""
 
     baudrate: int = 9600
     format: str = "8N1"
@@ -70,7 +70,7 @@ _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+://")
 
 
 def parse_port(text: str) -> PortAddress:
-    """The port as the file writes it. Raises `ConfigError`."""
+    """Parses a port as the file writes it. Raises `ConfigError`."""
     if text == "simulator":
         return SimulatorAddress()
     if match := _URL.match(text):
@@ -80,7 +80,7 @@ def parse_port(text: str) -> PortAddress:
         return TcpAddress(host, port) if scheme == "tcp" else Rfc2217Address(host, port)
     if _SCHEME.match(text) or not text.strip() or text != text.strip():
         raise ConfigError(
-            f"{text!r} is no port: write a path such as /dev/ttyUSB0 or COM3, "
+            f"{text!r} is not a port: write a path such as /dev/ttyUSB0 or COM3, "
             "tcp://host:port, rfc2217://host:port, or simulator"
         )
     return SerialPath(text)

@@ -1,4 +1,4 @@
-"""Serial ports behind device servers that take baud rate and format from us (RFC 2217)."""
+"""Opens serial ports behind device servers and sets their baud rate and format (RFC 2217)."""
 
 import asyncio
 from collections.abc import Callable
@@ -17,79 +17,83 @@ from gateway.transport.telnet import (
     PURGE_BOTH,
     Acknowledged,
     Agreed,
-    Answer,
     Consent,
     Event,
     Received,
+    Send,
     Setting,
     Telnet,
 )
 
-# Many servers leave some settings unanswered, some answer none: nobody waits longer for one.
-LONGEST_WAIT = 1.0  # seconds
-_LONGEST_WORDS = 80
+# Many servers acknowledge only some settings, or none.
+LONGEST_WAIT = 1.0  # seconds for each setting
+_LONGEST_TEXT = 80
 
 _log = structlog.get_logger(__name__)
 
 
 async def open_rfc2217(
-    where: Rfc2217Address, settings: SerialSettings, ear: Receiver, *, timeout: float = 5.0
+    where: Rfc2217Address, settings: SerialSettings, receiver: Receiver, *, timeout: float = 5.0
 ) -> Port:
-    """Connect, agree on COM-PORT-OPTION, and ask for baud rate and format. Raises `LineDown`.
+    """Connects, agrees on COM-PORT-OPTION, and sets baud rate and format. Raises `LineDown`.
 
-    `timeout` is for the connection and the agreement (which has at least a second); each setting
-    may take a second more.
-    What a server does not confirm is logged as a warning, and the port is used as it is.
+    `timeout` covers the connection and the agreement, which gets at least a second. Each setting
+    may take another second. A setting that the server does not acknowledge is logged as a warning,
+    and the port is used nevertheless.
     """
     loop = asyncio.get_running_loop()
     begin = loop.time()
-    port = Rfc2217Port(ear)
+    port = Rfc2217Port(receiver)
     tcp = await open_tcp(TcpAddress(where.host, where.port), port, timeout=timeout)
     try:
         left = max(begin + timeout - loop.time(), LONGEST_WAIT)
         await port.set_up(tcp, settings, left)
     finally:
-        if not port.live:  # refused, lost or cancelled
+        if not port.is_open:  # refused, lost or cancelled
             await tcp.close()
     return port
 
 
 class Rfc2217Port:
-    """The `Port` to its owner, and the `Receiver` of the TCP connection beneath."""
+    """The `Port` of the line and the `Receiver` of the TCP connection beneath."""
 
-    def __init__(self, ear: Receiver) -> None:
-        self._ear = ear
+    def __init__(self, receiver: Receiver) -> None:
+        self._receiver = receiver
         self._telnet = Telnet()
         self._tcp: StreamPort | None = None
-        self._early = b""  # what arrived before the port was ready; servers may speak first
-        self.live = False
+        self._early = b""  # bytes received before the port is open; servers may send first
+        self.is_open = False
         self._loss: Exception | None = None
-        self._said: dict[Setting, int] = {}  # what the server acknowledged, as it said it
-        self._news = asyncio.Event()
+        self._acknowledged: dict[Setting, int] = {}  # with the value that the server reports
+        self._changed = asyncio.Event()
 
     async def set_up(self, tcp: StreamPort, settings: SerialSettings, timeout: float) -> None:
-        """Raises `LineDown`."""
+        """Agrees on the options and sets baud rate and format. Raises `LineDown`."""
         self._tcp = tcp
-        with suppress(LineDown):  # `lost` will say so, and what the server said before
+        with suppress(LineDown):  # `lost` reports it, with the text the server sent before
             tcp.write(self._telnet.start())
         early, self._early = self._early, b""
         self.received(early)
         await self._agree(tcp, timeout)
         data_bits, parity, stop_bits = tuple(settings.format)
-        asked = {
+        requested = {
             Setting.BAUDRATE: settings.baudrate,
             Setting.DATA_BITS: int(data_bits),
             Setting.PARITY: PARITIES[parity],
             Setting.STOP_BITS: int(stop_bits),
             Setting.PURGE: PURGE_BOTH,
         }
-        for setting, value in asked.items():
+        for setting, value in requested.items():
             await self._ask(tcp, setting, value)
         if self._telnet.consent(BINARY, ours=True) is not Consent.YES:
-            _log.warning("not agreed: 8-bit data may be changed on the way", port=tcp.name)
-        if self._loss is not None:  # it came together with the last answer
+            _log.warning(
+                "binary mode not agreed",
+                port=tcp.name,
+                consequence="the server may change 8-bit data",
+            )
+        if self._loss is not None:  # lost together with the last acknowledgement
             raise self._loss
-        self.live = True
+        self.is_open = True
 
     async def _agree(self, tcp: StreamPort, timeout: float) -> None:
         def settled() -> bool:
@@ -109,31 +113,31 @@ class Rfc2217Port:
 
     async def _ask(self, tcp: StreamPort, setting: Setting, value: int) -> None:
         tcp.write(Telnet.request(setting, value))
-        if not await self._until(lambda: setting in self._said, LONGEST_WAIT):
+        if not await self._until(lambda: setting in self._acknowledged, LONGEST_WAIT):
             _log.warning("setting not acknowledged", port=tcp.name, setting=setting.name.lower())
-        elif self._said[setting] != value:
+        elif self._acknowledged[setting] != value:
             _log.warning(
-                "setting not taken",
+                "setting refused",
                 port=tcp.name,
                 setting=setting.name.lower(),
-                asked=value,
-                is_now=self._said[setting],
+                requested=value,
+                actual=self._acknowledged[setting],
             )
 
     async def _until(self, happened: Callable[[], bool], timeout: float) -> bool:
-        """Whether it happened in time. Raises `LineDown` when the connection is lost."""
+        """Returns True when it happens in time. Raises `LineDown` when the connection is lost."""
         try:
             async with asyncio.timeout(timeout):
                 while not happened():
                     if self._loss is not None:
                         raise self._loss
-                    self._news.clear()
-                    await self._news.wait()
+                    self._changed.clear()
+                    await self._changed.wait()
         except TimeoutError:
             return happened()
         return True
 
-    # The port to its owner.
+    # The `Port` of the line.
 
     def write(self, data: bytes) -> None:
         if self._tcp is None:
@@ -141,11 +145,11 @@ class Rfc2217Port:
         self._tcp.write(Telnet.encode(data))
 
     async def close(self) -> None:
-        self.live = False
+        self.is_open = False
         if self._tcp is not None:
             await self._tcp.close()
 
-    # The ear of the connection.
+    # The `Receiver` of the connection.
 
     def received(self, data: bytes) -> None:
         if self._tcp is None:
@@ -157,24 +161,24 @@ class Rfc2217Port:
     def _take(self, event: Event) -> None:
         match event:
             case Received(data):
-                if self.live:
-                    self._ear.received(data)
-                else:  # of another baud rate, or the server's own words
-                    self._early = (self._early + data)[:_LONGEST_WORDS]
-            case Answer(data):
+                if self.is_open:
+                    self._receiver.received(data)
+                else:  # received at another baud rate, or text of the server
+                    self._early = (self._early + data)[:_LONGEST_TEXT]
+            case Send(data):
                 if self._tcp is not None:
-                    with suppress(LineDown):  # `lost` will say so
+                    with suppress(LineDown):  # `lost` reports it
                         self._tcp.write(data)
             case Agreed():
-                self._news.set()
+                self._changed.set()
             case Acknowledged(setting, value):
-                self._said[setting] = value
-                self._news.set()
+                self._acknowledged[setting] = value
+                self._changed.set()
 
     def lost(self, error: Exception) -> None:
-        words = self._early.decode("ascii", "replace").strip()
-        self._loss = LineDown(f"{error}, saying {words!r}") if words and not self.live else error
-        self._news.set()
-        if self.live:
-            self.live = False
-            self._ear.lost(error)
+        text = self._early.decode("ascii", "replace").strip()
+        self._loss = LineDown(f"{error}, saying {text!r}") if text and not self.is_open else error
+        self._changed.set()
+        if self.is_open:
+            self.is_open = False
+            self._receiver.lost(error)

@@ -1,4 +1,4 @@
-"""Local serial ports, by serialx: opened exclusively, never blocking the event loop."""
+"""Opens local serial ports through serialx, exclusively and without blocking the event loop."""
 
 import asyncio
 import errno
@@ -9,9 +9,9 @@ from pathlib import Path
 import serialx
 
 from gateway.errors import LineDown
+from gateway.transport.os_errors import line_down
 from gateway.transport.port import Port, Receiver, SerialPath, SerialSettings
 from gateway.transport.stream import StreamPort
-from gateway.transport.trouble import line_down
 
 _SENTENCES = {
     errno.ENOENT: "no such port",
@@ -22,19 +22,19 @@ _SENTENCES = {
     errno.EISDIR: "not a serial port",
     errno.EACCES: "permission denied: is the user in group dialout?",
     errno.EPERM: "permission denied: is the user in group dialout?",
-    errno.EINVAL: "does not take this baud rate and format",
+    errno.EINVAL: "does not support this baud rate and format",
 }
 _PTYS = range(136, 144)  # Linux' major device numbers of pseudo terminals
 
 
 async def open_serial(
-    where: SerialPath, settings: SerialSettings, ear: Receiver, *, timeout: float = 5.0
+    where: SerialPath, settings: SerialSettings, receiver: Receiver, *, timeout: float = 5.0
 ) -> Port:
-    """Open and lock a serial port of this computer. Raises `LineDown`.
+    """Opens and locks a serial port of this computer. Raises `LineDown`.
 
-    What the system had received before is thrown away.
+    Bytes that the system received before are discarded.
     """
-    port = StreamPort(where.path, ear)
+    port = StreamPort(where.path, receiver)
     data_bits, parity, stop_bits = tuple(settings.format)
     if await asyncio.to_thread(_is_pty, where.path):
         data_bits, parity = "8", "N"
@@ -51,7 +51,7 @@ async def open_serial(
                 exclusive=True,
             )
         port.ready()
-    # ValueError: a path that no system takes (a NUL in it), a format that serialx does not know.
+    # ValueError: an invalid path (with a NUL), a format unknown to serialx.
     except (OSError, serialx.SerialException, ValueError, LineDown) as error:
         await port.close()
         raise line_down(where.path, error, _SENTENCES) from error
@@ -59,11 +59,13 @@ async def open_serial(
 
 
 def _is_pty(path: str) -> bool:
-    """A pseudo terminal always carries 8 bits without parity. Asked for anything else, Linux
-    agrees the first time and refuses from then on, so it is not asked."""
+    """Returns True for a pseudo terminal, which always carries 8 bits without parity.
+
+    Linux accepts another format once and refuses it from then on.
+    """
     if sys.platform != "linux":
         return False
     try:
         return os.major(Path(path).stat().st_rdev) in _PTYS
     except (OSError, ValueError):
-        return False  # opening it will say why
+        return False  # the open that follows gives the reason

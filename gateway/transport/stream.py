@@ -1,88 +1,88 @@
-"""A port over anything asyncio calls a transport: bytes straight through, the end told once."""
+"""A port on any asyncio transport: passes bytes through and reports its loss once."""
 
 import asyncio
 from contextlib import suppress
 from typing import cast
 
 from gateway.errors import LineDown
+from gateway.transport.os_errors import line_down
 from gateway.transport.port import Receiver
-from gateway.transport.trouble import line_down
 
-# More than this waiting to be sent means that nobody takes it: what waits are old requests, which
-# must not reach a machine after they have been reported as failed.
+# More unsent bytes mean that the other side reads nothing. They are old requests, which must not
+# reach a machine after the line has reported them as failed.
 MOST_UNSENT = 4096  # bytes
-# asyncio and serialx make room for 256 KiB at every read. Where the system gives that memory anew
-# each time, and takes it back, this costs more than the read itself.
+# asyncio and serialx allocate 256 KiB for every read. On some systems the allocation costs more
+# than the read itself.
 MOST_READ = 4096  # bytes
-# A driver may hold a port back until it has sent what it has; nobody waits longer for it.
+# A driver may close a port only after it has sent its buffer; `close` waits no longer than this.
 LONGEST_CLOSE = 1.0  # seconds
 
 
 class StreamPort(asyncio.Protocol):
     """A `Port` that is also the protocol object of its own asyncio transport.
 
-    `Receiver.lost` is called only between `ready` and `close`: whoever opens the port hears of
-    an earlier end by the exception of `ready`.
+    `Receiver.lost` is called only between `ready` and `close`. `ready` raises the exception of an
+    earlier loss.
     """
 
-    def __init__(self, name: str, ear: Receiver) -> None:
+    def __init__(self, name: str, receiver: Receiver) -> None:
         self.name = name
-        self._ear = ear
-        self._live = False
+        self._receiver = receiver
+        self._is_open = False
         self._loss: LineDown | None = None
         self._transport: asyncio.Transport | None = None
-        self._gone = asyncio.Event()
+        self._closed = asyncio.Event()
 
     def ready(self) -> None:
-        """The opening is over. Raises `LineDown` if the port has ended meanwhile."""
+        """Ends the opening. Raises `LineDown` when the port was lost meanwhile."""
         if self._loss is not None:
             raise self._loss
-        self._live = True
+        self._is_open = True
 
     def write(self, data: bytes) -> None:
         transport = self._transport
         if transport is None or transport.is_closing():
-            raise self._ending()
+            raise self._line_down()
         try:
             transport.write(data)
         except OSError as error:
             raise line_down(self.name, error) from error
         if transport.is_closing():  # asyncio swallows the error of a write that failed
-            raise self._ending()
+            raise self._line_down()
 
-    def _ending(self) -> LineDown:
-        # A new one each time: one that is raised again and again drags all its tracebacks along.
+    def _line_down(self) -> LineDown:
+        # A new one each time: an exception raised again and again collects tracebacks.
         return LineDown(str(self._loss)) if self._loss else line_down(self.name, None)
 
     async def close(self) -> None:
-        self._live = False
+        self._is_open = False
         if self._transport is None:
             return
         self._loss = self._loss or LineDown(f"{self.name}: closed")
-        self._transport.abort()  # not `close`: nothing may be sent after the port was given back
+        self._transport.abort()  # not `close`: that would send the buffer first
         with suppress(TimeoutError):
             async with asyncio.timeout(LONGEST_CLOSE):
-                await self._gone.wait()
+                await self._closed.wait()
 
-    # What asyncio calls.
+    # Called by asyncio.
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = cast(asyncio.Transport, transport)
         self._transport.set_write_buffer_limits(high=MOST_UNSENT)
-        if hasattr(transport, "max_size"):  # not of uvloop, which keeps its own
+        if hasattr(transport, "max_size"):  # uvloop has its own
             transport.max_size = MOST_READ
 
     def data_received(self, data: bytes) -> None:
-        self._ear.received(data)
+        self._receiver.received(data)
 
     def pause_writing(self) -> None:
-        self._loss = LineDown(f"{self.name}: does not take what is sent")
+        self._loss = LineDown(f"{self.name}: the other side accepts no data")
         if self._transport is not None:
             self._transport.abort()
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._loss = self._loss or line_down(self.name, exc)
-        self._gone.set()
-        if self._live:
-            self._live = False
-            self._ear.lost(self._loss)
+        self._closed.set()
+        if self._is_open:
+            self._is_open = False
+            self._receiver.lost(self._loss)

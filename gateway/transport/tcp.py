@@ -1,48 +1,48 @@
-"""Raw TCP (device servers, Modbus TCP devices) that notices a dead peer within a minute."""
+"""Opens TCP connections that detect a dead peer within a minute."""
 
 import asyncio
 import socket
 
 from gateway.errors import LineDown
+from gateway.transport.os_errors import line_down
 from gateway.transport.port import Receiver, TcpAddress
 from gateway.transport.stream import StreamPort
-from gateway.transport.trouble import line_down
 
-# A peer that lost its power says nothing. After 20 s of quiet it is asked, every 10 s, three
-# times; and what was sent must be acknowledged within 50 s, or the line is down. The names
-# differ between systems: those that this one does not have are left out.
-_WATCH = {
+# A peer without power sends nothing. After 20 s of silence the system sends a keep-alive three
+# times, every 10 s. Sent data must be acknowledged within 50 s, or the line is down. The names
+# differ between systems: names that this system lacks are left out.
+KEEPALIVE = {
     "TCP_KEEPIDLE": 20,  # seconds
-    "TCP_KEEPALIVE": 20,  # macOS' name for it
+    "TCP_KEEPALIVE": 20,  # the name on macOS
     "TCP_KEEPINTVL": 10,  # seconds
     "TCP_KEEPCNT": 3,
     "TCP_USER_TIMEOUT": 50_000,  # milliseconds; Linux only
 }
 
 
-async def open_tcp(where: TcpAddress, ear: Receiver, *, timeout: float = 5.0) -> StreamPort:
-    """Connect. Raises `LineDown`."""
+async def open_tcp(where: TcpAddress, receiver: Receiver, *, timeout: float = 5.0) -> StreamPort:
+    """Connects to a device server or Modbus TCP device. Raises `LineDown`."""
     name = f"{where.host}:{where.port}"
-    port = StreamPort(name, ear)
+    port = StreamPort(name, receiver)
     try:
         async with asyncio.timeout(timeout):
             transport, _ = await asyncio.get_running_loop().create_connection(
                 lambda: port, where.host, where.port
             )
-        watch(transport.get_extra_info("socket"))
+        configure(transport.get_extra_info("socket"))
         port.ready()
-    # UnicodeError: a host name that cannot be looked up, such as one with an empty label.
+    # UnicodeError: an invalid host name, for example with an empty label.
     except (OSError, UnicodeError, LineDown) as error:
         await port.close()
         raise line_down(name, error) from error
     return port
 
 
-def watch(connection: socket.socket) -> None:
-    """Send at once, and notice a peer that is gone. Raises `OSError`."""
+def configure(connection: socket.socket) -> None:
+    """Sends without delay and detects a dead peer. Raises `OSError`."""
     connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-    for name, value in _WATCH.items():
+    for name, value in KEEPALIVE.items():
         option = getattr(socket, name, None)
         if option is not None:
             connection.setsockopt(socket.IPPROTO_TCP, option, value)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from gateway.cli import tables as show
+from gateway.cli import scan_command as show
 from gateway.cli.scan import Plan, Report, planned, scan
 from gateway.errors import ConfigError, LineDown
 from gateway.stations.computer_link import ComputerLinkStation
@@ -70,7 +70,7 @@ async def test_the_speed_and_format_at_which_they_answer_is_found() -> None:
     assert told == ["asking 32 stations at 9600 7E1", "asking 32 stations at 19200 7E1"]
     assert line.closed == 2
     assert not report.noises
-    assert show.stations(report, "/dev/ttyS9").splitlines() == [
+    assert show.found_stations(report, "/dev/ttyS9").splitlines() == [
         "lines:",
         "  found:",
         "    port: /dev/ttyS9",
@@ -99,7 +99,7 @@ async def test_a_vigor_at_cp1_is_found() -> None:
 @on_virtual_time
 async def test_a_station_that_is_named_twice_is_asked_and_shown_once() -> None:
     report = await scan(sought(OldLine(VigorStation(1)), "vigor", "1-3,1"))
-    assert show.stations(report, "COM3").count("station-1:") == 1
+    assert show.found_stations(report, "COM3").count("station-1:") == 1
 
 
 @on_virtual_time
@@ -116,7 +116,7 @@ async def test_nonsense_is_no_answer_but_it_is_told() -> None:
     report = await scan(sought(line, "vigor", "1-2"))
     assert stations(report) == [1]
     [sentence] = show.noises(report)
-    assert sentence.startswith("at 9600 7E1 something was heard that is no answer: ")
+    assert sentence.startswith("at 9600 7E1 bytes arrived that are no reply: ")
 
 
 @pytest.mark.parametrize("frame_format", [1, 4])
@@ -135,8 +135,8 @@ async def test_a_station_that_says_no_to_everything_is_there_all_the_same() -> N
     line = OldLine(NaySayer(ComputerLinkStation(5, "liyan", 4, True)))
     [found] = (await scan(sought(line, "computer-link", "5"))).found
     assert "10" in found.refusal
-    text = show.stations(Report([found]), "COM3")
-    assert text.endswith(f"tags: {{}}}}  # it said no: {found.refusal}")
+    text = show.found_stations(Report([found]), "COM3")
+    assert text.endswith(f"tags: {{}}}}  # error reply: {found.refusal}")
 
 
 class NaySayer:
@@ -177,7 +177,7 @@ async def test_modbus(framing: str) -> None:
     assert plan.serial == [None]
     report = await scan(plan)
     assert stations(report) == [9]
-    assert "baudrate" not in show.stations(report, "tcp://10.0.0.7:502")
+    assert "baudrate" not in show.found_stations(report, "tcp://10.0.0.7:502")
 
 
 @on_virtual_time
@@ -194,7 +194,7 @@ async def test_a_port_that_goes_ends_it() -> None:
         ({"protocol": "frames"}, "frames cannot be sought: use one of vigor, "),
         ({"protocol": "profibus"}, "profibus cannot be sought"),
         ({"port": "simulator"}, "need no scan"),
-        ({"port": "udp://a:1"}, "is no port"),
+        ({"port": "udp://a:1"}, "is not a port"),
         ({"protocol": "modbus-tcp"}, "tcp://host:port"),
         ({"stations": "1-x"}, "'x' is no number"),
         ({"stations": ""}, "'' is no number"),

@@ -318,8 +318,8 @@ LINES = [
             "port: udp://10.0.0.7:4001\nbaudrate: 1920\nformat: 7X1\necho: maybe\n"
             "parity: even\ndevices: {mixer: {protocol: vigor}}"
         ),
-        "3: lines.hall.port: 'udp://10.0.0.7:4001' is no port: write a path such as /dev/ttyUSB0 "
-        "or COM3, tcp://host:port, rfc2217://host:port, or simulator",
+        "3: lines.hall.port: 'udp://10.0.0.7:4001' is not a port: write a path such as "
+        "/dev/ttyUSB0 or COM3, tcp://host:port, rfc2217://host:port, or simulator",
         "4: lines.hall.baudrate: 1920 is no baud rate of serial ports; the nearest is 2400",
         "5: lines.hall.format: '7X1' is no character format: write data bits (7 or 8), parity "
         "(N, E or O) and stop bits (1 or 2), such as 7E1",

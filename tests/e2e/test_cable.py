@@ -78,7 +78,7 @@ def stack() -> Iterator[ExitStack]:
 
 
 @pytest.mark.parametrize("way", [_cable, _tcp, _rfc2217], ids=lambda way: way.__name__[1:])
-async def test_the_line_goes_down_and_returns_by_itself(
+async def test_the_line_recovers_by_itself(
     way: Callable[[ExitStack, Path], Link], stack: ExitStack, tmp_path: Path
 ) -> None:
     endpoint = free_endpoint()

@@ -88,7 +88,7 @@ async def test_values_and_writes(oven: Oven) -> None:
         assert "BT" in oven.plc.tell("heard").split()
 
 
-async def test_a_plc_that_forgets_its_list_and_speaks_out_of_turn(oven: Oven) -> None:
+async def test_a_plc_that_loses_its_list_and_sends_unsolicited_frames(oven: Oven) -> None:
     async with ZenohPeer("client", connect=[oven.endpoint]) as client:
         heard = await client.subscribe("plant/oven/*")
         oven.plc.tell("set D0100 215")
@@ -106,7 +106,7 @@ async def test_a_plc_that_forgets_its_list_and_speaks_out_of_turn(oven: Oven) ->
         )
 
 
-async def test_an_address_that_is_not_there_and_a_plc_that_does_not_answer(oven: Oven) -> None:
+async def test_a_bad_address_and_an_offline_plc(oven: Oven) -> None:
     async with ZenohPeer("client", connect=[oven.endpoint]) as client:
         heard = await client.subscribe("plant/oven/*")
         oven.plc.tell("gone D0500")

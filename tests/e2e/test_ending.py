@@ -60,7 +60,7 @@ def busy_plant(tmp_path: Path) -> Iterator[Plant]:
 
 
 @pytest.mark.parametrize("by", [signal.SIGTERM, signal.SIGINT])
-async def test_it_ends_in_time_under_load(busy_plant: Plant, by: signal.Signals) -> None:
+async def test_the_gateway_ends_in_time_under_load(busy_plant: Plant, by: signal.Signals) -> None:
     with started(busy_plant.config) as gateway:
         async with ZenohPeer("client", connect=[busy_plant.endpoint]) as client:
             alive = await client.liveliness("plant/**")
@@ -104,7 +104,7 @@ def slow_plant(tmp_path: Path) -> Iterator[Plant]:
     yield from _plant(tmp_path, tags, reply_timeout="5s")
 
 
-async def test_a_write_in_flight_is_answered_and_so_is_the_one_behind_it(
+async def test_writes_in_flight_and_in_the_queue_get_a_reply(
     slow_plant: Plant,
 ) -> None:
     plc = slow_plant.plc
@@ -130,7 +130,7 @@ async def test_a_write_in_flight_is_answered_and_so_is_the_one_behind_it(
             assert errors == {"7": "unclear", "0": "line-down"}
 
 
-def test_a_client_without_its_router_ends_in_time_too(tmp_path: Path) -> None:
+def test_a_client_without_its_router_ends_in_time(tmp_path: Path) -> None:
     """It waits for the router, and polls; nobody has to wait for it."""
     lines = {"hall": vigor_line("simulator", {"speed": {"address": "D10"}})}
     zenoh = {"mode": "client", "listen": [], "connect": [free_endpoint()]}
@@ -144,7 +144,7 @@ def test_a_client_without_its_router_ends_in_time_too(tmp_path: Path) -> None:
         assert not program.has_said("Traceback")
 
 
-async def test_a_second_gateway_at_the_same_port_says_so_and_waits(
+async def test_a_second_gateway_at_the_same_port_reports_it_and_waits(
     plant: Plant, tmp_path: Path
 ) -> None:
     endpoint = free_endpoint()
@@ -176,7 +176,7 @@ async def test_a_second_gateway_at_the_same_port_says_so_and_waits(
                 await heard.next(lambda s: s.json["quality"] == "good")
 
 
-def test_a_zenoh_port_in_use_is_said_in_one_line(plant: Plant, tmp_path: Path) -> None:
+def test_a_zenoh_port_in_use_is_reported_in_one_line(plant: Plant, tmp_path: Path) -> None:
     lines = {"hall": vigor_line("simulator", {"speed": {"address": "D10"}})}
     other = write_config(tmp_path / "other.yaml", plant.endpoint, lines)
     with started(plant.config):

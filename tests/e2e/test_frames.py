@@ -113,9 +113,7 @@ async def test_a_scale_streams_weights(tmp_path: Path, endpoint: str) -> None:
         assert scale.heard == b""
 
 
-async def test_every_bar_code_is_an_event_also_one_read_twice(
-    tmp_path: Path, endpoint: str
-) -> None:
+async def test_every_bar_code_is_an_event_even_if_read_twice(tmp_path: Path, endpoint: str) -> None:
     codes = ["4006381333931", "4006381333931", "A-17", "4006381333931"]
     with ByteDevice() as reader:
         config = configured(tmp_path, "barcode-reader", reader.port, endpoint)
@@ -163,7 +161,7 @@ class _Inverter:
         return _frame(b"OK")
 
 
-async def test_an_inverter_is_asked_and_told_by_ascii_command(
+async def test_an_inverter_is_read_and_written_by_ascii_commands(
     tmp_path: Path, endpoint: str
 ) -> None:
     with ByteDevice(_Inverter()) as inverter:

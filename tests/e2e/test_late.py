@@ -30,7 +30,7 @@ class PtyBench(Bench):
         return self
 
 
-async def test_late_replies_make_no_wrong_value_in_real_time() -> None:
+async def test_late_replies_give_no_wrong_value_in_real_time() -> None:
     """Both at once, on two lines: what they do is mostly waiting."""
     await asyncio.gather(_no_wrong_value(ModbusRtu), _no_wrong_value(ModbusAscii))
 

@@ -9,7 +9,7 @@ from tests.e2e.processes import PATIENCE, ROOT, Done, Program, started
 from tests.zenoh_peer import free_endpoint
 
 
-def test_the_example_runs_and_what_it_says_to_type_works(tmp_path: Path) -> None:
+def test_the_example_runs_and_its_proposed_commands_work(tmp_path: Path) -> None:
     text = (ROOT / "config.example.yaml").read_text()
     assert text.count("listen: [tcp/127.0.0.1:7447]") == 1
     path = tmp_path / "config.yaml"  # as it is, but for the port, which may be taken here

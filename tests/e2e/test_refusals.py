@@ -66,7 +66,7 @@ def plant(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Plant]:
         ("name", b'"ABCDE"', "bad-value", "ABCDE"),
     ],
 )
-async def test_nothing_is_sent(
+async def test_an_invalid_write_sends_nothing(
     plant: Plant, tag: str, payload: bytes, error: str, says: str
 ) -> None:
     async with ZenohPeer("client", connect=[plant.endpoint]) as client:
@@ -80,7 +80,7 @@ async def test_nothing_is_sent(
 
 
 @pytest.mark.parametrize(("tag", "payload"), [("absent", b"5"), ("absent-bit", b"true")])
-async def test_status_28_of_the_plc_is_handed_on(plant: Plant, tag: str, payload: bytes) -> None:
+async def test_error_code_28_of_the_plc_is_reported(plant: Plant, tag: str, payload: bytes) -> None:
     async with ZenohPeer("client", connect=[plant.endpoint]) as client:
         told = await client.subscribe("plant/@gateway/demo/writes")
         [reply] = await client.get(f"plant/mixer/{tag}/@set", payload)
@@ -91,7 +91,7 @@ async def test_status_28_of_the_plc_is_handed_on(plant: Plant, tag: str, payload
         assert (outcome.json["outcome"], outcome.json["code"]) == ("refused", "28")
 
 
-async def test_a_hole_takes_no_other_tag_down(plant: Plant) -> None:
+async def test_a_bad_address_makes_no_other_tag_bad(plant: Plant) -> None:
     async with ZenohPeer("client", connect=[plant.endpoint]) as client:
         heard = await client.subscribe("plant/mixer/*")
         first = await heard.next(lambda s: s.key == "plant/mixer/speed")
@@ -107,7 +107,7 @@ async def test_a_hole_takes_no_other_tag_down(plant: Plant) -> None:
         assert sorted(said) == ["D700 of mixer: refused with 28", "M30 of mixer: refused with 28"]
 
 
-async def test_a_put_writes_too_and_its_outcome_is_told(plant: Plant) -> None:
+async def test_a_put_writes_and_its_outcome_is_published(plant: Plant) -> None:
     async with ZenohPeer("client", connect=[plant.endpoint]) as client:
         told = await client.subscribe("plant/@gateway/demo/writes")
         await client.put("plant/mixer/trim/@set", b'{"value": -12}')
@@ -120,7 +120,7 @@ async def test_a_put_writes_too_and_its_outcome_is_told(plant: Plant) -> None:
         assert refused.json["outcome"] == "bad-value"
 
 
-async def test_what_was_written_is_what_the_plc_holds(plant: Plant) -> None:
+async def test_the_plc_holds_the_written_values(plant: Plant) -> None:
     """The station's own memory is asked, not the gateway."""
     async with ZenohPeer("client", connect=[plant.endpoint]) as client:
         for value in (7, 40, 1):

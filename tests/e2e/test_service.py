@@ -70,7 +70,7 @@ def taken(endpoint: str) -> Iterator[None]:
 
 
 @pytest.mark.parametrize("mode", ["peer", "router"])
-async def test_a_gateway_started_twice_touches_neither_wire_nor_file(
+async def test_a_gateway_started_twice_uses_neither_wire_nor_file(
     tmp_path: Path, mode: str
 ) -> None:
     endpoint, number = free_endpoint(), free_port()
@@ -137,7 +137,7 @@ async def _searched(endpoint: str) -> Any:
                 return device.json
 
 
-async def test_refused_addresses_are_known_after_a_restart(tmp_path: Path) -> None:
+async def test_bad_addresses_are_known_after_a_restart(tmp_path: Path) -> None:
     path, endpoint, state = _plant(tmp_path)
     with station("pty", str(tmp_path / "tty")) as plc:
         plc.tell("hole 1 D 703")
@@ -153,7 +153,7 @@ async def test_refused_addresses_are_known_after_a_restart(tmp_path: Path) -> No
     assert after["refusals"].get("28", 0) <= 1
 
 
-async def test_what_was_learned_is_written_while_the_gateway_runs(tmp_path: Path) -> None:
+async def test_the_state_file_is_written_while_the_gateway_runs(tmp_path: Path) -> None:
     path, _, state = _plant(tmp_path)
     with station("pty", str(tmp_path / "tty")) as plc:
         plc.tell("hole 1 D 703")
@@ -163,7 +163,7 @@ async def test_what_was_learned_is_written_while_the_gateway_runs(tmp_path: Path
             assert program.running
 
 
-async def test_a_history_that_fails_keeps_nothing_from_being_published(tmp_path: Path) -> None:
+async def test_a_failing_history_does_not_stop_publishing(tmp_path: Path) -> None:
     endpoint = free_endpoint()
     path = write_config(
         tmp_path / "config.yaml",
@@ -184,7 +184,7 @@ async def test_a_history_that_fails_keeps_nothing_from_being_published(tmp_path:
         assert await asyncio.to_thread(program.end) == 0
 
 
-async def test_what_was_published_is_found_by_the_next_question(tmp_path: Path) -> None:
+async def test_a_published_value_is_found_by_the_next_query(tmp_path: Path) -> None:
     """One turn of the loop: a line tells something, then what has arrived is taken."""
     speed = tag("speed")
     found: dict[str, list[object]] = {}
@@ -210,7 +210,7 @@ async def test_what_was_published_is_found_by_the_next_question(tmp_path: Path) 
     assert await asyncio.to_thread(historian.close)
 
 
-def test_a_disk_that_stands_still_keeps_nothing_from_ending(tmp_path: Path) -> None:
+def test_a_stalled_disk_does_not_delay_the_end(tmp_path: Path) -> None:
     path, _, _ = _plant(tmp_path)
     os.mkfifo(tmp_path / "state.json.new")  # whose writer waits for a reader
     with Program(sys.executable, "-c", SOON, "run", path) as program:
@@ -220,7 +220,7 @@ def test_a_disk_that_stands_still_keeps_nothing_from_ending(tmp_path: Path) -> N
         assert not program.has_said("Traceback")
 
 
-async def test_the_disk_has_the_time_that_zenoh_leaves() -> None:
+async def test_history_gets_the_time_that_zenoh_leaves() -> None:
     """Together less than the 2 s in which the gateway ends."""
     zenoh_takes = 0.3
 

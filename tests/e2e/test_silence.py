@@ -102,7 +102,7 @@ async def test_quality_goes_bad_within_two_intervals_and_good_again(plant: Plant
         assert device.json["failures"]["silence"] >= 3
 
 
-async def test_a_write_whose_answer_is_lost_is_unclear(plant: Plant) -> None:
+async def test_a_write_with_a_lost_reply_is_unclear(plant: Plant) -> None:
     """A mute station obeys: whoever says it was not done, or that it was, is guessing."""
     async with ZenohPeer("client", connect=[plant.endpoint]) as client:
         [good] = await client.get("plant/mixer/recipe/@set", b"3")
@@ -115,7 +115,7 @@ async def test_a_write_whose_answer_is_lost_is_unclear(plant: Plant) -> None:
         assert reply.json["error"] == "unclear" or not done
 
 
-async def test_the_gateways_own_token_goes_with_it(plant: Plant) -> None:
+async def test_the_gateways_token_ends_with_the_gateway(plant: Plant) -> None:
     """Seen through a router between gateway and client, killed without a word."""
     endpoint = free_endpoint()
     async with (

@@ -14,7 +14,12 @@ from tests.e2e.processes import Program, free_port, station
 from tests.zenoh_peer import ZenohPeer, free_endpoint
 
 # The command itself; only the longest wait is shorter, so that the suite is.
-RUN = "import gateway.northbound.election as s; s.HOLD = 2.0; from gateway.cli import main; main.main()"
+RUN = """
+import gateway.northbound.election as election
+election.HOLD = 2.0
+from gateway.cli.main import main
+main()
+"""
 HOLD, CLAIM = 2.0, 1.5
 
 
@@ -121,7 +126,7 @@ async def says(program: Program, words: str, after: int = 0) -> int:
 
 
 @pytest.mark.parametrize("watched", ["a", "b"])
-async def test_watch_goes_on_with_whichever_gateway_of_the_group_serves(
+async def test_watch_continues_with_the_active_gateway_of_the_group(
     tmp_path: Path, watched: str
 ) -> None:
     """By the file of either of them; and when nobody is left all is bad at once."""

@@ -73,7 +73,9 @@ def test_the_page_is_a_story_of_three_pages() -> None:
 
 
 @pytest.mark.parametrize(("program", "shown"), PROGRAMS[:-1], ids=str)
-def test_a_program_says_what_the_page_shows(program: Block, shown: Block, beginning: Story) -> None:
+def test_a_program_prints_the_output_of_the_page(
+    program: Block, shown: Block, beginning: Story
+) -> None:
     path = beginning.folder / "program.py"
     path.write_text(inside(beginning, program.text), encoding="utf-8")
     lines = shown.text.splitlines()
@@ -135,7 +137,7 @@ with zenoh.open(config) as session:
         ((), NOBODY_KNOWS),
     ],
 )
-def test_a_write_is_done_or_not_done_or_nobody_knows(
+def test_a_write_is_done_or_not_done_or_unclear(
     answers: tuple[str, ...], said: str, tmp_path: Path
 ) -> None:
     endpoint = free_endpoint()
@@ -157,7 +159,7 @@ def test_a_write_is_done_or_not_done_or_nobody_knows(
             assert program.lines == [said] * 3
 
 
-def test_with_the_doors_closed_a_viewer_reads_and_does_not_write(end: Story) -> None:
+def test_with_access_control_a_viewer_reads_and_does_not_write(end: Story) -> None:
     program, shown = PROGRAMS[-1]
     command = [sys.executable, "-c", program.text]
 

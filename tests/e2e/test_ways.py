@@ -76,7 +76,9 @@ def stack() -> Iterator[ExitStack]:
 
 
 @pytest.mark.parametrize("way", [_pty, _cable, _tcp, _rfc2217], ids=lambda way: way.__name__[1:])
-async def test_values_come_and_writes_go(way: Way, stack: ExitStack, tmp_path: Path) -> None:
+async def test_values_arrive_and_writes_are_done(
+    way: Way, stack: ExitStack, tmp_path: Path
+) -> None:
     endpoint = free_endpoint()
     port = way(stack, tmp_path)
     config = write_config(tmp_path / "config.yaml", endpoint, {"hall": vigor_line(port, TAGS)})

@@ -21,7 +21,12 @@ from tests.zenoh_peer import ZenohPeer, free_endpoint
 
 # The command itself; only how long a dead peer may go unnoticed is shorter.
 SHORT = "{'TCP_KEEPIDLE': 1, 'TCP_KEEPINTVL': 1, 'TCP_KEEPCNT': 1, 'TCP_USER_TIMEOUT': 3000}"
-RUN = f"import gateway.transport.tcp as t; t._WATCH = {SHORT}; from gateway.cli import main; main.main()"
+RUN = f"""
+import gateway.transport.tcp as tcp
+tcp.KEEPALIVE = {SHORT}
+from gateway.cli.main import main
+main()
+"""
 PORT = 4001
 SPEED = "plant/mixer/speed"
 
@@ -92,7 +97,7 @@ async def test_a_peer_that_vanishes_without_a_word_is_noticed_and_comes_back(
         Program(sys.executable, "-c", RUN, "run", config) as service,
     ):
         plc.tell("set 1 D 10 5")
-        await asyncio.to_thread(service.says, "Zenoh session ready")
+        await asyncio.to_thread(service.says, "on Zenoh")
         async with ZenohPeer("client", connect=[endpoint]) as client:
             heard = await client.subscribe("plant/mixer/*")
             await heard.next(_is(5))

@@ -79,7 +79,7 @@ def _end(work: Any) -> Any:
 @pytest.mark.parametrize("name", DRIVERS)
 @often
 @given(heard=BYTES, piece=st.integers(1, 40))
-def test_whatever_is_heard_is_words_or_an_error_of_ours(
+def test_any_received_bytes_give_words_or_a_gateway_error(
     name: str, heard: bytes, piece: int
 ) -> None:
     driver, span = DRIVERS[name]
@@ -94,7 +94,7 @@ def test_whatever_is_heard_is_words_or_an_error_of_ours(
 @pytest.mark.parametrize("name", DRIVERS)
 @often
 @given(data=st.data())
-def test_a_damaged_answer_is_right_or_refused_but_for_the_sum_s_blind_spot(
+def test_a_damaged_reply_is_right_or_refused_except_for_undetectable_errors(
     name: str, data: st.DataObject
 ) -> None:
     """One byte of a good answer is another one: no check sum misses that."""
@@ -117,7 +117,7 @@ def test_a_damaged_answer_is_right_or_refused_but_for_the_sum_s_blind_spot(
 @pytest.mark.parametrize("name", DRIVERS)
 @often
 @given(heard=BYTES)
-def test_a_simulated_station_survives_whatever_it_hears(name: str, heard: bytes) -> None:
+def test_a_simulated_station_survives_any_bytes(name: str, heard: bytes) -> None:
     driver, _ = DRIVERS[name]
     station = station_for(driver, ())
     for now, byte in enumerate(heard):
@@ -127,7 +127,7 @@ def test_a_simulated_station_survives_whatever_it_hears(name: str, heard: bytes)
 
 @often
 @given(st.one_of(st.binary(max_size=60), st.text(max_size=40).map(str.encode)))
-def test_a_payload_is_a_value_or_refused(payload: bytes) -> None:
+def test_any_payload_is_a_value_or_is_refused(payload: bytes) -> None:
     with suppress(BadValue):
         assert isinstance(parse_write(payload), (bool, int, float, str))
 
@@ -146,7 +146,7 @@ LINES = st.lists(
 
 @often
 @given(lines=LINES)
-def test_any_file_is_a_configuration_or_a_list_of_mistakes(
+def test_any_file_gives_a_configuration_or_a_list_of_mistakes(
     tmp_path_factory: pytest.TempPathFactory, lines: list[tuple[int, list[str]]]
 ) -> None:
     path = _folder(tmp_path_factory) / "config.yaml"

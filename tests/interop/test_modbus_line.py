@@ -159,7 +159,7 @@ async def test_a_whole_line_with(name: str, request: pytest.FixtureRequest, tmp_
 
 
 @pytest.mark.usefixtures("socat")
-async def test_the_commands_read_and_write_a_slave_directly(
+async def test_direct_commands_read_and_write_a_slave(
     request: pytest.FixtureRequest, tmp_path: Path
 ) -> None:
     """In a process of their own, from the file to the exit code."""

@@ -107,7 +107,7 @@ async def test_the_driver_talks_to_libmodbus_over_tcp(libmodbus: Path) -> None:
         await all_a_driver_does(end, ModbusTcp())
 
 
-async def test_eight_questions_are_open_at_once_with_libmodbus(libmodbus: Path) -> None:
+async def test_eight_requests_are_open_at_once_with_libmodbus(libmodbus: Path) -> None:
     port, driver = free_port(), ModbusTcp(window=8)
     slave = (libmodbus / "modbus_slave", "tcp", str(port))
     async with running(*slave, ready=b"ready"), tcp_end(port) as end:

@@ -356,11 +356,11 @@ def test_behind_closed_doors_the_command_line_may_what_its_user_may(
         assert json.loads(typed("health", "health", path).out)["name"] == "demo"
         done = typed("health", "read", path)
         assert (done.code, done.out) == (1, "")
-        assert "nothing was answered: " in done.err
-        assert "may health ask it?" in done.err
+        assert "no reply: " in done.err
+        assert "may health query it?" in done.err
         done = typed("operator", "read", path, password="wrong")  # noqa: S106  (it is none)
         assert (done.code, done.out) == (1, "")
-        assert "does not let operator in: a wrong name or password" in done.err
+        assert "refuses the user operator: the name or password is wrong" in done.err
         assert len(done.err.splitlines()) == 1
 
 
@@ -369,7 +369,7 @@ def test_without_a_name_the_command_line_is_told_how_to_say_one(tmp_path: Path) 
         for command in ("read", "health"):
             done = typed(None, command, path)
             assert (done.code, done.out) == (1, "")
-            assert "lets nobody in without name and password" in done.err
+            assert "requires a name and password" in done.err
             assert f"set {USER_VARIABLE} and {PASSWORD_VARIABLE}" in done.err
 
 
@@ -382,7 +382,7 @@ def test_at_a_router_the_gateways_own_user_may_ask_whether_it_is_well_and_no_mor
         assert json.loads(done.out)["name"] == "demo"
         done = typed(None, "read", path)
         assert (done.code, done.out) == (1, "")
-        assert "may gateway ask it?" in done.err
+        assert "may gateway query it?" in done.err
 
 
 def test_with_mutual_tls_the_command_line_shows_the_certificate_of_the_gateway(
@@ -411,7 +411,7 @@ def test_a_certificate_that_does_not_hold_the_address_is_named_as_the_reason(
     with started(path):
         done = typed(None, "read", path)
     assert (done.code, done.out) == (1, "")
-    assert done.err.startswith(f"{endpoint} shows a certificate that is not believed: ")
+    assert done.err.startswith(f"{endpoint} has an untrusted certificate: ")
     assert "not valid for '127.0.0.1'" in done.err
 
 

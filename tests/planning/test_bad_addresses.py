@@ -67,7 +67,7 @@ def bad_numbers(found: Device) -> set[int]:
 
 @settings(max_examples=200, deadline=None)
 @given(st.sets(st.integers(0, 63), min_size=1), st.sets(st.integers(0, 63), max_size=6))
-def test_any_set_of_refused_addresses_is_found(numbers: set[int], missing: set[int]) -> None:
+def test_any_set_of_bad_addresses_is_found(numbers: set[int], missing: set[int]) -> None:
     """Those of tags are named; holes in the gaps are planned around; all else is read."""
     found = words(*sorted(numbers))
     asker = Asker(found, missing)
@@ -80,7 +80,7 @@ def test_any_set_of_refused_addresses_is_found(numbers: set[int], missing: set[i
 
 @settings(max_examples=100, deadline=None)
 @given(st.sets(st.integers(0, 63), max_size=5))
-def test_neighbours_of_the_culprits_stay_merged(missing: set[int]) -> None:
+def test_neighbours_of_bad_addresses_stay_in_one_block(missing: set[int]) -> None:
     """With every address in use: one block for each run between two culprits, no more."""
     found = words(*range(64))
     Asker(found, missing).settle()
@@ -91,7 +91,9 @@ def test_neighbours_of_the_culprits_stay_merged(missing: set[int]) -> None:
 
 @settings(max_examples=100, deadline=None)
 @given(st.sets(st.integers(0, 63), min_size=1, max_size=6))
-def test_the_search_takes_about_two_log_n_exchanges_for_each_culprit(missing: set[int]) -> None:
+def test_the_search_takes_about_two_log_n_transactions_for_each_bad_address(
+    missing: set[int],
+) -> None:
     found = words(*range(64))
     asker = Asker(found, missing)
     (whole,) = found.blocks
@@ -104,7 +106,9 @@ def test_the_search_takes_about_two_log_n_exchanges_for_each_culprit(missing: se
     st.sets(st.integers(0, 40), min_size=1, max_size=6),
     st.lists(st.integers(0, 40), min_size=1, max_size=6),
 )
-def test_an_address_that_comes_back_is_merged_again(missing: set[int], returns: list[int]) -> None:
+def test_an_address_that_works_again_rejoins_its_block(
+    missing: set[int], returns: list[int]
+) -> None:
     found = words(*range(41))
     asker = Asker(found, missing)
     asker.settle()
@@ -125,7 +129,7 @@ def test_an_address_that_comes_back_is_merged_again(missing: set[int], returns: 
     assert [block.span.size for block in found.blocks] == [41]
 
 
-def test_a_culprit_that_rides_in_a_faster_block_is_fenced_off() -> None:
+def test_a_bad_address_in_a_faster_block_is_cut_off() -> None:
     """Its boundaries lie in a gap of the faster tags: they must be kept there too."""
     fast = [make_tag(f"D{n}", every=0.1) for n in (0, 1, 8, 9)]
     found = device([*fast, make_tag("D5", every=5.0)])
@@ -136,7 +140,7 @@ def test_a_culprit_that_rides_in_a_faster_block_is_fenced_off() -> None:
     assert sorted(block.span.start for block in found.blocks) == [0, 5, 8]
 
 
-def test_the_range_is_remembered_with_its_time_code_and_tags() -> None:
+def test_a_bad_range_keeps_its_time_code_and_tags() -> None:
     found = words(3)
     (block,) = found.blocks
     assert found.refusals.refused(block, 77, "28") == ()
@@ -146,7 +150,7 @@ def test_the_range_is_remembered_with_its_time_code_and_tags() -> None:
     assert found.refusals.bad[block.span].since == 77
 
 
-def test_a_refused_address_is_asked_rarely() -> None:
+def test_a_bad_address_is_read_rarely() -> None:
     found = words(3)
     (block,) = found.blocks
     assert found.interval(block) == 1.0

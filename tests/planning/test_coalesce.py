@@ -88,7 +88,7 @@ def rows(draw: st.DrawFn) -> Row:
     st.integers(3, 20),
     st.sampled_from([1, 8]),
 )
-def test_no_cover_is_cheaper(
+def test_no_set_of_requests_costs_less(
     row: Row, data: st.DataObject, overhead: float, limit: int, grain: int
 ) -> None:
     pick = st.sampled_from([1.0, 2.0, 10.0]) if len(row) < 5 else st.sampled_from([1.0, 3.0])
@@ -101,7 +101,7 @@ def test_no_cover_is_cheaper(
 
 @settings(max_examples=100, deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 4), st.sampled_from([0.5, 1.0, 5.0])), max_size=40))
-def test_the_short_cut_for_even_costs_loses_nothing(steps: list[tuple[int, float]]) -> None:
+def test_even_costs_give_the_same_result_faster(steps: list[tuple[int, float]]) -> None:
     row, at = [], 0
     for gap, _ in steps:
         row.append((at + gap, 1))
@@ -112,13 +112,13 @@ def test_the_short_cut_for_even_costs_loses_nothing(steps: list[tuple[int, float
     assert spent(quick, seconds) == pytest.approx(spent(slow, seconds))
 
 
-def test_a_slower_item_rides_in_a_faster_request() -> None:
+def test_a_slower_item_joins_a_faster_request() -> None:
     row = [(0, 1), (1, 1), (2, 1)]
     found = coalesce([1.0, 10.0, 1.0], wire(row, 10, 1, 64))
     assert found == [Request(0, 2, 1.0)]
 
 
-def test_a_slower_request_reaches_over_a_faster_one() -> None:
+def test_a_slower_request_overlaps_a_faster_one() -> None:
     row = [(0, 20), (20, 1), (21, 20)]
     found = coalesce([100.0, 0.1, 100.0], wire(row, 10, 1, 64))
     assert sorted(found) == [Request(0, 2, 100.0), Request(1, 1, 0.1)]
@@ -153,7 +153,7 @@ def test_the_work_grows_with_the_number_of_items_not_with_its_square() -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_where_characters_cost_next_to_nothing_the_cheapest_ways_are_enough(
+def test_on_a_network_the_cheapest_states_are_enough(
     seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As on a network, with many intervals: then not all ways are followed."""

@@ -56,14 +56,14 @@ def test_scattered_addresses_are_read_by_a_list(addresses: list[str]) -> None:
     ],
     ids=["neighbours", "a single one", "32 bits", "not wanted"],
 )
-def test_no_list_where_it_is_not_cheaper_or_not_wanted(
+def test_no_list_if_it_saves_nothing_or_is_disabled(
     addresses: list[str], settings: dict[str, Any]
 ) -> None:
     _, dev = one(*addresses, **settings)
     assert listed(dev) == []
 
 
-def test_a_list_is_never_dearer_and_every_tag_is_read_once() -> None:
+def test_a_list_never_costs_more_and_every_tag_is_read_once() -> None:
     chance = random.Random(7)
     chosen = 0
     for _ in range(60):
@@ -168,7 +168,7 @@ TROUBLES = [_lost, _power_cycle, _timed_out, _line_lost, _somebody_else_spoke]
 
 @pytest.mark.parametrize("trouble", TROUBLES, ids=lambda trouble: trouble.__name__[1:])
 @on_virtual_time
-async def test_after_any_trouble_the_list_is_registered_again(trouble: Any) -> None:
+async def test_after_every_fault_the_list_is_registered_again(trouble: Any) -> None:
     line, dev = one(*SCATTERED)
     station = line.stations[0]
     clockwork(station.memory, [int(text[1:]) for text in SCATTERED])
@@ -191,7 +191,7 @@ async def test_after_any_trouble_the_list_is_registered_again(trouble: Any) -> N
 
 
 @on_virtual_time
-async def test_a_registration_that_is_not_acknowledged_is_not_believed() -> None:
+async def test_a_registration_without_an_acknowledgement_is_repeated() -> None:
     """Two lists of one length: the PLC still holds the other."""
     line, dev = one(*SCATTERED)
     station = line.stations[0]
@@ -220,7 +220,7 @@ async def test_a_registration_that_is_not_acknowledged_is_not_believed() -> None
 
 
 @on_virtual_time
-async def test_an_address_that_is_not_there_is_found_and_the_others_are_listed_again() -> None:
+async def test_a_bad_address_is_found_and_the_others_are_listed_again() -> None:
     line, dev = one(*SCATTERED)
     station = line.stations[0]
     station.inner.holes = {("D", 800)}
@@ -261,7 +261,7 @@ async def test_a_plc_without_these_commands_is_read_without_lists() -> None:
 
 
 @on_virtual_time
-async def test_falling_back_keeps_the_age_of_what_was_read() -> None:
+async def test_a_change_of_blocks_keeps_the_age_of_the_values() -> None:
     """When the device fails before the new requests were asked once, old values still turn bad."""
     line, dev = one(*SCATTERED, every=2.0, reply_timeout=1.0, guard=1.0, retries=20)
     async with running(line):
@@ -306,7 +306,7 @@ class Witness:
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 @on_virtual_time
-async def test_whatever_happens_to_the_list_no_wrong_value_is_shown_as_good(seed: int) -> None:
+async def test_no_fault_of_the_list_gives_a_wrong_good_value(seed: int) -> None:
     line, dev = one(*SCATTERED, every=0.2, type="uint16", guard=0.3)
     station = line.stations[0]
     clockwork(station.memory, [int(text[1:]) for text in SCATTERED])

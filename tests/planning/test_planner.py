@@ -97,7 +97,7 @@ def brute_force(area: str, tags: Sequence[Tag], seconds: partial[float], cuts: C
     st.sampled_from([0.0, 0.005, 0.05]),
     st.sets(st.integers(0, 130), max_size=3),
 )
-def test_no_cover_of_one_interval_is_cheaper(
+def test_no_plan_of_one_interval_costs_less(
     tags: list[Tag], baud: int, turnaround: float, fences: set[int]
 ) -> None:
     seconds, area = at(baud, turnaround), tags[0].span.area
@@ -108,7 +108,7 @@ def test_no_cover_of_one_interval_is_cheaper(
 
 @settings(max_examples=100, deadline=None)
 @given(st.lists(mixed, max_size=40), bauds, st.sets(st.integers(0, 300), max_size=4))
-def test_every_tag_is_asked_once_within_the_limits_and_often_enough(
+def test_every_tag_is_read_once_within_the_limits_and_often_enough(
     tags: list[Tag], baud: int, fences: set[int]
 ) -> None:
     cuts = frozenset(("D", n) for n in fences)
@@ -154,13 +154,13 @@ def test_a_cut_in_a_gap_is_kept() -> None:
     ]
 
 
-def test_how_far_it_reads_over_a_gap_depends_on_the_baud_rate() -> None:
+def test_the_baud_rate_decides_which_gaps_a_block_spans() -> None:
     tags = [make_tag("D0"), make_tag("D14")]
     assert len(plan(tags, DRIVER, at(4800))) == 2
     assert len(plan(tags, DRIVER, at(115200))) == 1
 
 
-def test_a_slower_tag_inside_a_faster_block_rides_along() -> None:
+def test_a_slower_tag_joins_a_faster_block() -> None:
     fast = [make_tag("D0", every=0.5), make_tag("D9", every=0.5)]
     slow = make_tag("D5", every=10.0)
     (block,) = plan([slow, *fast], DRIVER, at(19200))
@@ -168,7 +168,7 @@ def test_a_slower_tag_inside_a_faster_block_rides_along() -> None:
     assert set(block.tags) == {slow, *fast}
 
 
-def test_bits_and_words_of_one_place_share_a_block() -> None:
+def test_bits_and_words_of_one_address_share_a_block() -> None:
     tags = [
         make_tag("D7"),
         make_tag("D7.3"),
@@ -182,7 +182,7 @@ def test_bits_and_words_of_one_place_share_a_block() -> None:
     assert all(s.time == 5 for s in samples)
 
 
-def test_what_is_no_value_of_its_type_is_bad() -> None:
+def test_words_without_a_value_give_a_bad_sample() -> None:
     (block,) = plan(
         [make_tag("D0", type="float32"), make_tag("D2", type="bcd16")], DRIVER, at(9600)
     )
@@ -192,11 +192,11 @@ def test_what_is_no_value_of_its_type_is_bad() -> None:
     ] * 2
 
 
-def test_nothing_is_planned_for_nothing() -> None:
+def test_no_tags_give_no_blocks() -> None:
     assert plan([], DRIVER, at(9600)) == ()
 
 
-def test_a_tag_that_no_request_can_carry_is_an_error() -> None:
+def test_a_tag_too_long_for_a_request_is_an_error() -> None:
     with pytest.raises(ConfigError, match="D0 cannot be read in one request"):
         plan([make_tag("D0", type="string[200]")], DRIVER, at(9600))
 

@@ -25,14 +25,14 @@ def test_the_longest_vigor_frames_take_141_and_139_ms_at_19200(
     )
 
 
-def test_rtu_keeps_three_and_a_half_characters_of_silence_or_what_was_set() -> None:
+def test_rtu_keeps_3_5_characters_of_silence_or_the_configured_time() -> None:
     rtu = Timing(silence=0.00175, silence_chars=3.5)
     assert WireTiming(9600, 11).silence(rtu) == pytest.approx(3.5 * 11 / 9600)
     assert WireTiming(115200, 11).silence(rtu) == 0.00175
     assert WireTiming(9600, 11).silence(Timing(silence=0.01, silence_chars=3.5)) == 0.01
 
 
-def test_an_exchange_is_silence_request_turnaround_and_reply() -> None:
+def test_a_transaction_is_silence_request_turnaround_and_reply() -> None:
     wire, timing = WireTiming(9600, 10), Timing(turnaround=0.02, silence=0.005)
     cost = Cost(14, 12)
     assert wire.transaction(cost, timing) == pytest.approx(0.005 + 26 / 960 + 0.02)

@@ -29,11 +29,11 @@ def test_before_the_first_reading_a_tag_is_starting() -> None:
     assert list(mirror.samples()) == [mirror[tag]]
 
 
-def test_a_change_is_told_and_sameness_is_not() -> None:
+def test_a_change_is_published_and_an_equal_value_is_not() -> None:
     assert values(make_tag("D0"), 1, 1, 2, 2, 1) == [1, 2, 1]
 
 
-def test_the_current_sample_is_kept_even_when_it_is_not_told() -> None:
+def test_the_current_sample_is_kept_even_if_it_is_not_published() -> None:
     tag = make_tag("D0", deadband=Deadband(10))
     mirror = Mirror([tag], 0)
     mirror.update([good(tag, 100, 1)])
@@ -41,11 +41,11 @@ def test_the_current_sample_is_kept_even_when_it_is_not_told() -> None:
     assert mirror[tag] == good(tag, 105, 2)
 
 
-def test_a_deadband_counts_from_the_last_told_value_not_from_the_last() -> None:
+def test_a_deadband_counts_from_the_last_published_value() -> None:
     assert values(make_tag("D0", deadband=Deadband(5)), 0, 3, 4, 5, 9, 10, 6, 5) == [0, 5, 10, 5]
 
 
-def test_a_deadband_in_percent_is_of_the_last_told_value() -> None:
+def test_a_deadband_in_percent_is_of_the_last_published_value() -> None:
     assert values(make_tag("D0", deadband=Deadband(10, percent=True)), 100, 109, 110, 120, 121) == [
         100,
         110,
@@ -53,27 +53,27 @@ def test_a_deadband_in_percent_is_of_the_last_told_value() -> None:
     ]
 
 
-def test_at_zero_a_deadband_in_percent_lets_every_change_through() -> None:
+def test_at_zero_a_deadband_in_percent_publishes_every_change() -> None:
     assert values(make_tag("D0", deadband=Deadband(10, percent=True)), 0, 0, 1) == [0, 1]
 
 
 @pytest.mark.parametrize(
     ("kind", "samples"), [("D0.1", (True, False, False)), ("M3", (True, False, False))]
 )
-def test_a_deadband_does_not_hold_back_bits(kind: str, samples: tuple[bool, ...]) -> None:
+def test_a_deadband_does_not_suppress_bits(kind: str, samples: tuple[bool, ...]) -> None:
     assert values(make_tag(kind, deadband=Deadband(5)), *samples) == [True, False]
 
 
-def test_nor_texts() -> None:
+def test_a_deadband_does_not_suppress_texts() -> None:
     tag = make_tag("D0", type="string[4]", deadband=Deadband(5))
     assert values(tag, "A", "A", "B") == ["A", "B"]
 
 
-def test_a_tag_can_be_told_always() -> None:
+def test_a_tag_can_be_published_always() -> None:
     assert values(make_tag("D0", publish=Publish.ALWAYS), 1, 1, 1) == [1, 1, 1]
 
 
-def test_a_heartbeat_tells_what_has_not_changed() -> None:
+def test_a_heartbeat_publishes_an_unchanged_value() -> None:
     assert values(make_tag("D0", heartbeat=3.0), 7, 7, 7, 7, 7, 7, 7) == [7, 7, 7]
 
 
@@ -88,7 +88,7 @@ def test_a_heartbeat_goes_on_when_the_clock_was_set_back() -> None:
     ]
 
 
-def test_a_deadband_counts_from_what_was_told_once_more() -> None:
+def test_a_deadband_counts_from_a_republished_value() -> None:
     tag = make_tag("D0", deadband=Deadband(5))
     mirror = Mirror([tag], 0)
     mirror.update([good(tag, 100, 1)])
@@ -99,7 +99,7 @@ def test_a_deadband_counts_from_what_was_told_once_more() -> None:
     assert mirror.update([good(tag, 96, 3)]) == [good(tag, 96, 3)]
 
 
-def test_what_was_told_once_more_and_had_not_changed_is_no_news() -> None:
+def test_republished_equal_values_are_not_reported_as_changed() -> None:
     starting, known = make_tag("D0"), make_tag("D1", publish=Publish.ALWAYS)
     mirror = Mirror([starting, known], 0)
     mirror.update([good(known, 7, 1)])
@@ -107,7 +107,7 @@ def test_what_was_told_once_more_and_had_not_changed_is_no_news() -> None:
     assert mirror.update([good(starting, 1, 2)]) == [good(starting, 1, 2)]
 
 
-def test_a_change_of_quality_or_reason_is_told_once() -> None:
+def test_a_change_of_quality_or_reason_is_published_once() -> None:
     tag = make_tag("D0", deadband=Deadband(100), publish=Publish.ALWAYS)
     assert told(
         tag,
@@ -128,7 +128,7 @@ def test_a_bad_tag_keeps_the_time_when_it_became_bad() -> None:
     assert mirror[tag].time == 2
 
 
-def test_news_come_in_the_order_of_the_samples() -> None:
+def test_samples_to_publish_keep_their_order() -> None:
     tags = [make_tag(f"D{n}") for n in range(5)]
     mirror = Mirror(tags, 0)
     samples = [good(tag, 1, 1) for tag in tags]

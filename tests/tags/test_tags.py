@@ -112,7 +112,7 @@ def test_a_bit_device_is_a_boolean() -> None:
     assert door.encode(True) == [1]
 
 
-def test_words_that_are_no_value_stay_none_when_scaled() -> None:
+def test_words_without_a_value_stay_none_when_scaled() -> None:
     assert tag("float32", scale=0.1).decode([0, 0x7FC0]) is None
     assert tag("bcd16", scale=0.1).decode([0xFFFF]) is None
 
@@ -122,14 +122,14 @@ def test_a_scale_does_not_touch_texts_and_bits() -> None:
     assert tag("bool", Unit.BIT, scale=2.0, offset=1.0).decode([1]) is True
 
 
-def test_a_value_that_its_scale_blows_up_is_no_value() -> None:
+def test_a_value_that_its_scale_makes_infinite_is_none() -> None:
     most = tag("float64").encode(1.7e308)
     assert tag("float64", scale=10.0).decode(most) is None
     assert tag("uint16", scale=1e308).decode([0xFFFF]) is None
 
 
 @given(st.integers(0, 2**64 - 1), st.floats(allow_nan=False, allow_infinity=False).filter(bool))
-def test_what_is_decoded_is_finite_or_none(raw: int, scale: float) -> None:
+def test_a_decoded_value_is_finite_or_none(raw: int, scale: float) -> None:
     words = [raw >> shift & 0xFFFF for shift in (0, 16, 32, 48)]
     for kind in ("int64", "float64"):
         value = tag(kind, scale=scale).decode(words)
@@ -148,7 +148,7 @@ def test_what_is_decoded_is_finite_or_none(raw: int, scale: float) -> None:
     st.floats(allow_nan=False, allow_infinity=False).filter(bool),
     st.floats(allow_nan=False, allow_infinity=False),
 )
-def test_whatever_is_written_it_becomes_words_or_is_refused(
+def test_any_value_becomes_words_or_is_refused(
     kind: str, value: Value, scale: float, offset: float
 ) -> None:
     for one in (tag(kind), tag(kind, scale=scale, offset=offset)):
@@ -179,7 +179,7 @@ def test_a_number_of_thousands_of_digits_is_refused() -> None:
         (math.inf, "inf is above the greatest value 40"),
     ],
 )
-def test_what_the_limits_forbid_is_refused(value: float, says: str) -> None:
+def test_a_value_outside_the_limits_is_refused(value: float, says: str) -> None:
     recipe = tag(write=WriteRule(min=1, max=40))
     with pytest.raises(BadValue) as caught:
         recipe.encode(value)
@@ -191,7 +191,7 @@ def test_the_limits_themselves_are_allowed() -> None:
     assert [recipe.encode(value) for value in (1, 40, 1.0, 40.0)] == [[1], [40], [1], [40]]
 
 
-def test_the_limits_are_told_with_all_their_digits() -> None:
+def test_the_limits_are_printed_with_all_their_digits() -> None:
     with pytest.raises(BadValue, match=r"greatest value 1234567\.5$"):
         tag("int32", write=WriteRule(max=1234567.5)).encode(2000000)
 
@@ -217,7 +217,7 @@ def test_rounding_to_the_devices_steps_does_not_pass_a_limit() -> None:
     st.floats(-100, 100),
     st.floats(-200, 200),
 )
-def test_what_goes_to_the_device_keeps_the_limits(
+def test_the_sent_value_keeps_the_limits(
     scale: float, one: float, other: float, value: float
 ) -> None:
     low, high = min(one, other), max(one, other)
@@ -263,7 +263,7 @@ def test_tags_of_one_kind_share_their_decoder() -> None:
     )
 
 
-def test_samples_say_what_is_known() -> None:
+def test_a_sample_is_good_with_a_value_or_bad_with_a_reason() -> None:
     speed = tag()
     known = good(speed, 5, 7)
     assert (known.value, known.quality, known.time, known.reason) == (5, Quality.GOOD, 7, None)

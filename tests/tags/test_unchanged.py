@@ -53,7 +53,7 @@ class Reader:
 TWO = ("D0", "D1")
 
 
-def test_the_third_reading_alike_makes_nothing_but_a_new_time() -> None:
+def test_the_third_equal_read_only_moves_the_time() -> None:
     a, b = tags = [make_tag(text) for text in TWO]
     reader = Reader(*tags)
     for _ in range(3):
@@ -66,7 +66,7 @@ def test_the_third_reading_alike_makes_nothing_but_a_new_time() -> None:
     assert reader.passed[1:] == [good(b, 8, 3)]
 
 
-def test_a_change_after_any_number_of_readings_alike_is_told() -> None:
+def test_a_change_after_any_number_of_equal_reads_is_published() -> None:
     a, b = tags = [make_tag(text) for text in TWO]
     reader = Reader(*tags)
     for count in range(5):
@@ -79,7 +79,7 @@ def test_a_change_after_any_number_of_readings_alike_is_told() -> None:
 
 
 @pytest.mark.parametrize("before", [1, 2, 3])
-def test_what_turned_bad_is_told_to_be_good_again_though_the_words_are_the_same(
+def test_a_bad_value_becomes_good_again_with_equal_words(
     before: int,
 ) -> None:
     a, b = tags = [make_tag(text) for text in TWO]
@@ -95,7 +95,7 @@ def test_what_turned_bad_is_told_to_be_good_again_though_the_words_are_the_same(
         assert reader.mirror[a] == good(a, 7, reader.time)
 
 
-def test_another_value_heard_in_between_does_not_stay() -> None:
+def test_another_value_in_between_is_replaced() -> None:
     """A block read late, when another that holds its tags was asked for already."""
     a, b = tags = [make_tag(text) for text in TWO]
     reader = Reader(*tags)
@@ -109,7 +109,7 @@ def test_another_value_heard_in_between_does_not_stay() -> None:
             assert reader.mirror[b] == good(b, 8, reader.time)
 
 
-def test_a_value_that_is_none_keeps_the_time_it_became_so() -> None:
+def test_words_without_a_value_keep_the_time_they_became_bad() -> None:
     nan = make_tag("D0", type="float32")
     number = make_tag("D2")
     reader = Reader(nan, number)
@@ -122,7 +122,7 @@ def test_a_value_that_is_none_keeps_the_time_it_became_so() -> None:
 
 
 @pytest.mark.parametrize("settings", [{"publish": Publish.ALWAYS}, {"heartbeat": 2e-9}])
-def test_who_is_to_hear_of_it_though_nothing_changed_does(settings: dict[str, Any]) -> None:
+def test_heartbeat_and_always_publish_equal_reads(settings: dict[str, Any]) -> None:
     eager, quiet = make_tag("D0", **settings), make_tag("D1")
     reader = Reader(eager, quiet)
     told = []
@@ -132,7 +132,7 @@ def test_who_is_to_hear_of_it_though_nothing_changed_does(settings: dict[str, An
     assert told == (list(range(1, 10)) if "publish" in settings else [1, 3, 5, 7, 9])
 
 
-def test_blocks_planned_anew_begin_anew() -> None:
+def test_new_blocks_share_no_samples_with_old_ones() -> None:
     a, b = tags = [make_tag(text) for text in TWO]
     reader = Reader(*tags)
     for _ in range(3):
@@ -182,9 +182,7 @@ def at_look_up(number: int, do: Callable[[], None]) -> None:
 
 @pytest.mark.parametrize("again", [1000, 1500])
 @pytest.mark.parametrize("number", [1, 2, 3])
-def test_who_is_interrupted_by_a_change_gives_no_value_the_time_of_another(
-    number: int, again: int
-) -> None:
+def test_a_change_during_a_look_up_never_mixes_value_and_time(number: int, again: int) -> None:
     """As an answering thread is by the event loop, wherever it likes."""
     tag, mirror = interrupted(again)
 
@@ -201,9 +199,7 @@ def test_who_is_interrupted_by_a_change_gives_no_value_the_time_of_another(
 
 @pytest.mark.parametrize("again", [1000, 1500])
 @pytest.mark.parametrize("number", range(1, 7))
-def test_who_looks_in_the_middle_of_a_change_sees_the_one_or_the_other(
-    number: int, again: int
-) -> None:
+def test_a_look_up_during_a_change_finds_the_old_or_the_new_sample(number: int, again: int) -> None:
     tag, mirror = interrupted(again)
     seen: list[Sample] = []
     at_look_up(number, lambda: seen.append(mirror[tag]))
@@ -215,7 +211,7 @@ def test_who_looks_in_the_middle_of_a_change_sees_the_one_or_the_other(
 
 
 @on_virtual_time
-async def test_a_failure_between_two_readings_alike_leaves_no_old_value_good() -> None:
+async def test_a_failure_between_two_equal_reads_makes_the_value_bad() -> None:
     tag = make_tag("D0")
     reader = Reader(tag)
     for _ in range(3):

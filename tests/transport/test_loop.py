@@ -36,7 +36,7 @@ def run(coroutine: Coroutine[Any, Any, T]) -> T:
         return runner.run(coroutine)
 
 
-def test_where_it_is_installed_it_is_taken_and_its_clock_moves_while_code_runs(
+def test_an_installed_uvloop_is_used_and_its_clock_moves_while_code_runs(
     uvloop: Any,
 ) -> None:
     async def within_one_callback() -> float:
@@ -49,7 +49,7 @@ def test_where_it_is_installed_it_is_taken_and_its_clock_moves_while_code_runs(
     assert 0 < run(within_one_callback()) < 0.1
 
 
-def test_where_it_is_missing_asyncio_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_uvloop_asyncio_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(loop, "_uvloop", lambda: None)
 
     async def which() -> str:
@@ -59,7 +59,7 @@ def test_where_it_is_missing_asyncio_is_taken(monkeypatch: pytest.MonkeyPatch) -
 
 
 @pytest.mark.usefixtures("uvloop")
-def test_the_silence_before_a_request_is_kept_though_its_timers_fire_early() -> None:
+def test_the_silence_before_a_request_is_kept_although_timers_fire_early() -> None:
     """They count whole milliseconds: 1.75 ms of RTU silence would be cut to 1 or less."""
     silence, wire = 0.00175, WireTiming(115200, 10)
     kept: list[float] = []
@@ -88,7 +88,7 @@ def test_the_silence_before_a_request_is_kept_though_its_timers_fire_early() -> 
 
 
 @pytest.mark.usefixtures("uvloop")
-def test_a_serial_port_works_on_it() -> None:
+def test_a_serial_port_works_on_uvloop() -> None:
     async def conversation() -> None:
         plug, ear = Master(), Heard()
         port = await open_port(SerialPath(plug.path), SerialSettings(19200, "7E1"), ear)

@@ -98,7 +98,7 @@ class Managed(asyncio.Protocol):
     ("settings", "parity", "bits", "stop"),
     [(SEVEN_EVEN, "E", 7, 1), (SerialSettings(115200, "8O2"), "O", 8, 2)],
 )
-async def test_pyserials_server_sets_what_is_asked(
+async def test_pyserials_server_sets_baud_rate_and_format(
     settings: SerialSettings, parity: str, bits: int, stop: int
 ) -> None:
     fake, ear = FakeSerial(), Heard()
@@ -173,7 +173,7 @@ async def test_ser2net_sets_the_speed_and_passes_every_byte_value(
     await port.close()
 
 
-async def test_ser2net_at_7e1_and_its_end_is_told_once(
+async def test_ser2net_at_7e1_and_its_end_is_reported_once(
     ser2net: tuple[Rfc2217Address, Master],
 ) -> None:
     where, master = ser2net
@@ -205,13 +205,13 @@ async def _refused(server: Server, ear: Heard, timeout: float) -> str:
     return str(caught.value)
 
 
-async def test_a_raw_port_is_refused_with_what_to_write_instead() -> None:
+async def test_a_raw_port_is_refused_with_a_hint() -> None:
     silent = Server(b"", lambda *_: None)
     assert "does not speak RFC 2217" in (said := await refused(silent))
     assert "tcp://" in said
 
 
-async def test_a_serial_device_that_talks_is_no_telnet_server() -> None:
+async def test_a_serial_device_that_streams_is_refused() -> None:
     talking = Server(REPLY, lambda server, _: server.transport.write(REPLY))
     assert "does not speak RFC 2217" in await refused(talking)
 
@@ -225,12 +225,12 @@ async def test_a_telnet_server_without_com_port_is_refused_at_once() -> None:
     assert asyncio.get_running_loop().time() - begin < PATIENCE / 2
 
 
-async def test_a_server_that_hangs_up_while_agreeing_is_line_down() -> None:
+async def test_a_server_that_closes_during_the_agreement_is_line_down() -> None:
     hanging_up = Server(b"", lambda server, _: server.transport.close())
     assert "closed by the other side" in await refused(hanging_up)
 
 
-async def test_a_server_whose_port_is_taken_is_quoted() -> None:
+async def test_the_text_of_a_server_whose_port_is_in_use_is_quoted() -> None:
     class Taken(Server):
         def connection_made(self, transport: Any) -> None:
             super().connection_made(transport)
@@ -245,7 +245,7 @@ def agree(server: Server, data: bytes) -> None:
         server.transport.write(bytes((IAC, DO, COM_PORT)))
 
 
-async def test_what_is_not_acknowledged_is_logged_and_the_port_is_used(
+async def test_a_missing_acknowledgement_is_logged_and_the_port_is_used(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(rfc2217, "LONGEST_WAIT", 0.02)
@@ -276,11 +276,11 @@ async def test_a_server_that_sets_something_else_is_logged(
         with capture_logs() as logs:
             port = await open_port(where, SEVEN_EVEN, Heard())
         await port.close()
-    row = next(row for row in logs if row["event"] == "setting not taken")
-    assert (row["setting"], row["asked"], row["is_now"]) == ("data_bits", 7, 8)
+    row = next(row for row in logs if row["event"] == "setting refused")
+    assert (row["setting"], row["requested"], row["actual"]) == ("data_bits", 7, 8)
 
 
-async def test_a_server_that_goes_with_its_last_answer_is_line_down() -> None:
+async def test_a_server_lost_with_its_last_acknowledgement_is_line_down() -> None:
     class Gone:
         """A connection that ends with the answer to the last request."""
 
@@ -299,11 +299,11 @@ async def test_a_server_that_goes_with_its_last_answer_is_line_down() -> None:
     port: Any = rfc2217.Rfc2217Port(ear)
     with pytest.raises(LineDown, match="gone"):
         await port.set_up(Gone(), SEVEN_EVEN, 1.0)
-    assert not port.live
+    assert not port.is_open
     assert ear.losses == []
 
 
-async def test_a_server_that_speaks_first_is_answered(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_server_may_send_first(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rfc2217, "LONGEST_WAIT", 0.02)
     greeting = bytes((IAC, DO, COM_PORT, IAC, WILL, COM_PORT)) + REPLY
     ear, server = Heard(), Server(greeting, lambda *_: None)
@@ -320,7 +320,7 @@ async def test_a_server_that_speaks_first_is_answered(monkeypatch: pytest.Monkey
     assert ear.data == b""  # of another baud rate, perhaps
 
 
-async def test_opening_that_is_cancelled_hangs_up() -> None:
+async def test_a_cancelled_opening_closes_the_connection() -> None:
     class Watched(Server):
         gone = False
 

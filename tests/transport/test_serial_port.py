@@ -82,7 +82,7 @@ async def test_speed_and_stop_bits_are_set(
     await port.close()
 
 
-async def test_a_port_in_use_is_refused_until_it_is_given_back(plug: Master) -> None:
+async def test_a_port_in_use_is_refused_until_it_is_closed(plug: Master) -> None:
     first = await open_port(SerialPath(plug.path), SEVEN_EVEN, Heard())
     with pytest.raises(LineDown, match=f"^{plug.path}: in use by another program$"):
         await open_port(SerialPath(plug.path), SEVEN_EVEN, Heard())
@@ -100,7 +100,7 @@ async def test_a_port_in_use_is_refused_until_it_is_given_back(plug: Master) -> 
         ("/tmp", "not a serial port"),
     ],
 )
-async def test_what_is_no_port_is_said_plainly(path: str, sentence: str) -> None:
+async def test_a_path_without_a_serial_port_is_explained(path: str, sentence: str) -> None:
     with pytest.raises(LineDown) as caught:
         await open_port(SerialPath(path), SEVEN_EVEN, Heard())
     assert str(caught.value) == f"{path}: {sentence}"
@@ -137,7 +137,7 @@ def test_permission_denied_names_the_group() -> None:
 
 
 @pytest.mark.parametrize("path", ["a\0b", "x" * 5000])
-async def test_a_path_no_system_takes_is_line_down(path: str) -> None:
+async def test_an_invalid_path_is_line_down(path: str) -> None:
     with pytest.raises(LineDown):
         await open_port(SerialPath(path), SEVEN_EVEN, Heard())
 
@@ -149,7 +149,7 @@ async def test_a_pty_can_be_opened_as_7e1_again_and_again(plug: Master) -> None:
         await port.close()
 
 
-async def test_unplugging_is_told_once_and_writing_fails_after_it(plug: Master) -> None:
+async def test_unplugging_is_reported_once_and_later_writes_fail(plug: Master) -> None:
     ear = Heard()
     port = await open_port(SerialPath(plug.path), SEVEN_EVEN, ear)
     plug.unplug()
@@ -161,7 +161,7 @@ async def test_unplugging_is_told_once_and_writing_fails_after_it(plug: Master) 
     assert [type(error) for error in ear.losses] == [LineDown]
 
 
-async def test_a_write_that_meets_the_unplugging_fails(plug: Master) -> None:
+async def test_a_write_during_the_unplugging_fails(plug: Master) -> None:
     ear = Heard()
     port = await open_port(SerialPath(plug.path), SEVEN_EVEN, ear)
     plug.unplug()
@@ -172,7 +172,7 @@ async def test_a_write_that_meets_the_unplugging_fails(plug: Master) -> None:
     assert len(ear.losses) == 1
 
 
-async def test_nothing_is_told_after_close(plug: Master) -> None:
+async def test_nothing_is_reported_after_close(plug: Master) -> None:
     ear = Heard()
     port = await open_port(SerialPath(plug.path), SEVEN_EVEN, ear)
     await asyncio.gather(port.close(), port.close())
@@ -183,7 +183,7 @@ async def test_nothing_is_told_after_close(plug: Master) -> None:
     assert (ear.data, ear.losses) == (b"", [])
 
 
-async def test_a_port_that_takes_nothing_is_down_and_keeps_no_old_requests(plug: Master) -> None:
+async def test_a_port_that_accepts_no_data_is_down_and_keeps_no_old_requests(plug: Master) -> None:
     ear = Heard()
     port = await open_port(SerialPath(plug.path), SEVEN_EVEN, ear)
 
@@ -191,14 +191,14 @@ async def test_a_port_that_takes_nothing_is_down_and_keeps_no_old_requests(plug:
         for _ in range(1000):  # nobody reads the pty
             port.write(REQUEST * 10)
 
-    with pytest.raises(LineDown, match="does not take what is sent"):
+    with pytest.raises(LineDown, match="accepts no data"):
         keep_writing()
     await ear.until(lambda e: bool(e.losses))
     await port.close()
     assert len(ear.losses) == 1
 
 
-async def test_what_was_received_before_opening_is_not_heard(plug: Master) -> None:
+async def test_bytes_from_before_the_opening_are_discarded(plug: Master) -> None:
     plug.write(REPLY)
     ear = Heard()
     port = await open_port(SerialPath(plug.path), SEVEN_EVEN, ear)
@@ -226,7 +226,7 @@ async def test_opening_and_closing_leaves_nothing_behind(plug: Master) -> None:
     )
 
 
-async def test_opening_that_is_cancelled_gives_the_port_back(plug: Master) -> None:
+async def test_a_cancelled_opening_closes_the_port(plug: Master) -> None:
     files = open_files()
     opening = asyncio.create_task(open_port(SerialPath(plug.path), SEVEN_EVEN, Heard()))
     await asyncio.sleep(0)

@@ -10,8 +10,8 @@ import pytest
 
 from gateway.errors import LineDown
 from gateway.transport import Port, SerialSettings, TcpAddress, open_port
+from gateway.transport.os_errors import line_down
 from gateway.transport.stream import LONGEST_CLOSE, StreamPort
-from gateway.transport.trouble import line_down
 from tests.transport.ends import PATIENCE, Heard, free_port, listening
 from tests.vectors import vectors
 
@@ -51,7 +51,7 @@ async def test_every_byte_value_passes_both_ways() -> None:
     assert ear.losses == []
 
 
-async def test_nobody_there_is_connection_refused() -> None:
+async def test_a_closed_port_is_connection_refused() -> None:
     where = TcpAddress("127.0.0.1", free_port())
     with pytest.raises(LineDown, match=rf"^127.0.0.1:{where.port}: connection refused$"):
         await open_port(where, ANY, Heard())
@@ -66,13 +66,13 @@ async def test_a_host_with_two_addresses_that_both_refuse() -> None:
     assert str(line_down("localhost:1", both)) == "localhost:1: connection refused"
 
 
-async def test_a_name_nobody_knows_is_said_plainly() -> None:
+async def test_an_unknown_host_is_explained() -> None:
     unknown = socket.gaierror(socket.EAI_NONAME, "Name or service not known")
     assert str(line_down("moxa:4001", unknown)) == "moxa:4001: unknown host"
 
 
 @pytest.mark.parametrize("host", ["a..b", "x" * 300])
-async def test_a_name_that_cannot_be_looked_up_is_line_down(host: str) -> None:
+async def test_an_invalid_host_name_is_line_down(host: str) -> None:
     with pytest.raises(LineDown):
         await open_port(TcpAddress(host, 4001), ANY, Heard())
 
@@ -105,7 +105,7 @@ async def test_a_silent_host_times_out_and_the_loop_goes_on() -> None:
     assert ticks > 10
 
 
-async def test_a_reset_is_told_once_and_writing_fails_after_it() -> None:
+async def test_a_reset_is_reported_once_and_later_writes_fail() -> None:
     ear = Heard()
     async with connected(ear) as (port, peer):
         reset(peer)
@@ -131,7 +131,7 @@ async def test_a_half_close_ends_the_port() -> None:
     assert len(ear.losses) == 1
 
 
-async def test_closing_sends_what_was_written_and_is_not_told() -> None:
+async def test_closing_sends_the_written_bytes_and_reports_nothing() -> None:
     ear, loop = Heard(), asyncio.get_running_loop()
     async with connected(ear) as (port, peer):
         port.write(REQUEST)
@@ -143,7 +143,7 @@ async def test_closing_sends_what_was_written_and_is_not_told() -> None:
     assert ear.losses == []
 
 
-async def test_a_peer_that_takes_nothing_is_down_and_keeps_no_old_requests() -> None:
+async def test_a_peer_that_accepts_no_data_is_down_and_keeps_no_old_requests() -> None:
     ear = Heard()
     async with connected(ear) as (port, _):
 
@@ -151,13 +151,13 @@ async def test_a_peer_that_takes_nothing_is_down_and_keeps_no_old_requests() -> 
             for _ in range(10_000):  # nobody reads the other end
                 port.write(REQUEST * 100)
 
-        with pytest.raises(LineDown, match="does not take what is sent"):
+        with pytest.raises(LineDown, match="accepts no data"):
             keep_writing()
         await ear.until(lambda e: bool(e.losses))
     assert len(ear.losses) == 1
 
 
-async def test_a_connection_reset_at_once_is_told_by_open_or_by_the_ear_but_once() -> None:
+async def test_a_connection_reset_at_once_is_reported_once() -> None:
     ear, loop = Heard(), asyncio.get_running_loop()
     with listening() as server:
 
@@ -177,7 +177,7 @@ async def test_a_connection_reset_at_once_is_told_by_open_or_by_the_ear_but_once
         await refusing
 
 
-async def test_opening_that_is_cancelled_leaves_no_connection() -> None:
+async def test_a_cancelled_opening_leaves_no_connection() -> None:
     with listening() as server:
         where = TcpAddress(*server.getsockname())
         opening = asyncio.create_task(open_port(where, ANY, Heard()))
@@ -187,7 +187,7 @@ async def test_opening_that_is_cancelled_leaves_no_connection() -> None:
             await opening
 
 
-async def test_closing_does_not_wait_for_a_peer_that_takes_nothing() -> None:
+async def test_closing_does_not_wait_for_a_peer_that_accepts_no_data() -> None:
     loop = asyncio.get_running_loop()
     async with connected(Heard()) as (port, peer):
         assert isinstance(port, StreamPort)
@@ -202,7 +202,7 @@ async def test_closing_does_not_wait_for_a_peer_that_takes_nothing() -> None:
             arrived = len(await loop.sock_recv(peer, 1_000_000))
 
 
-async def test_a_dead_peer_is_noticed_within_a_minute_and_nothing_waits_to_be_sent() -> None:
+async def test_a_dead_peer_is_detected_within_a_minute_and_nothing_is_buffered() -> None:
     async with connected(Heard()) as (port, _):
         assert isinstance(port, StreamPort)
         assert port._transport is not None

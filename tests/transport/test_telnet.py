@@ -8,10 +8,10 @@ from gateway.transport.telnet import (
     COM_PORT,
     Acknowledged,
     Agreed,
-    Answer,
     Consent,
     Event,
     Received,
+    Send,
     Setting,
     Telnet,
 )
@@ -58,7 +58,7 @@ def begun() -> Telnet:
 
 
 @given(st.binary(max_size=300))
-def test_data_comes_back_as_it_was_sent(data: bytes) -> None:
+def test_encoded_data_is_decoded_unchanged(data: bytes) -> None:
     heard = b"".join(e.data for e in Telnet().feed(Telnet.encode(data)) if isinstance(e, Received))
     assert heard == data
 
@@ -75,15 +75,15 @@ def test_any_chopping_gives_the_same_events(stream: bytes, draw: st.DataObject) 
 
 
 @given(st.lists(st.binary(max_size=40), max_size=10))
-def test_any_bytes_at_all_never_raise(stream: list[bytes]) -> None:
+def test_no_bytes_raise(stream: list[bytes]) -> None:
     telnet = begun()
     for part in stream:
         for event in telnet.feed(part):
-            assert isinstance(event, Received | Answer | Agreed | Acknowledged)
+            assert isinstance(event, Received | Send | Agreed | Acknowledged)
 
 
 @given(pieces_of_telnet, st.binary(max_size=20).filter(lambda data: IAC not in data))
-def test_data_is_heard_again_after_any_noise(noise: bytes, data: bytes) -> None:
+def test_data_is_received_again_after_any_noise(noise: bytes, data: bytes) -> None:
     telnet = begun()
     telnet.feed(noise)
     telnet.feed(bytes((IAC, SE, IAC, SE)))  # ends whatever had begun
@@ -95,12 +95,12 @@ def test_data_is_heard_again_after_any_noise(noise: bytes, data: bytes) -> None:
 @given(
     st.lists(st.sampled_from([bytes((v, o)) for v in (WILL, WONT, DO, DONT) for o in range(50)]))
 )
-def test_two_of_our_kind_do_not_answer_each_other_for_ever(opening: list[bytes]) -> None:
+def test_two_clients_do_not_answer_each_other_forever(opening: list[bytes]) -> None:
     ends = begun(), begun()
     on_the_way = b"".join(bytes((IAC,)) + verb for verb in opening)
     for turn in range(6):
         events = ends[turn % 2].feed(on_the_way)
-        on_the_way = b"".join(event.data for event in events if isinstance(event, Answer))
+        on_the_way = b"".join(event.data for event in events if isinstance(event, Send))
     assert on_the_way == b""
 
 
@@ -115,7 +115,7 @@ def test_an_acknowledgement_with_ff_in_its_number_is_understood() -> None:
     assert Telnet().feed(answer) == [Acknowledged(Setting.BAUDRATE, 0xFF00)]
 
 
-def test_data_around_a_note_keeps_its_place() -> None:
+def test_data_around_a_subnegotiation_keeps_its_place() -> None:
     note = bytes((IAC, SB, COM_PORT, 103, 3, IAC, SE))
     assert Telnet().feed(b"before" + note + b"after") == [
         Received(b"before"),
@@ -132,16 +132,16 @@ def test_com_port_agreed_and_refused() -> None:
     assert no.consent(COM_PORT, ours=True) is Consent.DECLINED
 
 
-def test_echo_is_declined_and_com_port_of_theirs_is_taken() -> None:
+def test_echo_is_declined_and_com_port_of_the_server_is_accepted() -> None:
     telnet = begun()
-    assert telnet.feed(bytes((IAC, WILL, ECHO))) == [Answer(bytes((IAC, DONT, ECHO)))]
+    assert telnet.feed(bytes((IAC, WILL, ECHO))) == [Send(bytes((IAC, DONT, ECHO)))]
     assert telnet.feed(bytes((IAC, WILL, COM_PORT))) == [
-        Answer(bytes((IAC, DO, COM_PORT))),
+        Send(bytes((IAC, DO, COM_PORT))),
         Agreed(COM_PORT, ours=False, yes=True),
     ]
 
 
-def test_a_note_that_does_not_end_does_not_swallow_the_line() -> None:
+def test_an_endless_subnegotiation_does_not_swallow_the_data() -> None:
     telnet = Telnet()
     telnet.feed(bytes((IAC, SB, COM_PORT)) + bytes(300))
     assert telnet.feed(b"data") == [Received(b"data")]

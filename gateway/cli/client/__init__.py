@@ -1,7 +1,15 @@
-"""The command line as a Zenoh client of a running gateway."""
+"""The client of a running gateway, over Zenoh."""
 
-from gateway.cli.client.client import Client, Shown
+from gateway.cli.client.arguments import matches, parse_value, tags_by_key, wanted_keys
+from gateway.cli.client.client import Client, Row
 from gateway.cli.client.connection import connected
-from gateway.cli.client.typed import matches, parse_value, wanted_keys
 
-__all__ = ["Client", "Shown", "connected", "matches", "parse_value", "wanted_keys"]
+__all__ = [
+    "Client",
+    "Row",
+    "connected",
+    "matches",
+    "parse_value",
+    "tags_by_key",
+    "wanted_keys",
+]

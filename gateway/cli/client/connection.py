@@ -1,4 +1,4 @@
-"""The way to a running gateway: where it is, and as whom the command line comes."""
+"""Connects to a running gateway: its endpoints, and the user of the command line."""
 
 import json
 import os
@@ -9,7 +9,7 @@ from dataclasses import replace
 import zenoh
 
 from gateway.cli.client.client import Client
-from gateway.cli.client.refusal import why_not
+from gateway.cli.client.diagnosis import connection_failure
 from gateway.config import Config, ZenohConfig, ZenohMode
 from gateway.errors import ConfigError, GatewayError
 from gateway.northbound.session import configure
@@ -17,7 +17,7 @@ from gateway.northbound.session import configure
 USER_VARIABLE = "PLC_GATEWAY_CLI_USER"
 PASSWORD_VARIABLE = "PLC_GATEWAY_CLI_PASSWORD"  # noqa: S105  (the name of a variable)
 _USER = "transport/auth/usrpwd/user"
-# What a Zenoh file says of those who connect to the gateway is not meant for this session.
+# Settings of the gateway's Zenoh file for its own clients: they must not apply here.
 _OPEN: dict[str, object] = {
     "listen/endpoints": [],
     "access_control/enabled": False,
@@ -27,61 +27,63 @@ _OPEN: dict[str, object] = {
 
 @contextmanager
 def connected(config: Config, tell: Callable[[str], None]) -> Iterator[Client]:
-    """A client of the gateway that `config` describes, which may `tell` people something.
+    """Yields a client of the gateway that `config` describes. `tell` gets sentences for people.
 
-    It comes as the user of the environment, or else as the gateway itself. Raises `GatewayError`
-    when none is there, or it does not let us in.
+    The client uses the user of the environment variables, or else the gateway's own. Raises
+    `GatewayError` when no gateway is reachable or it refuses the user.
     """
     endpoints = _endpoints(config)
     if not endpoints:
-        raise GatewayError("zenoh.listen and zenoh.connect are empty: no way to the gateway")
+        raise GatewayError("zenoh.listen and zenoh.connect are empty: no gateway can be reached")
     setup = _setup(config.zenoh, endpoints)
     user = json.loads(setup.get_json(_USER))
     try:
         session = zenoh.open(setup)
     except zenoh.ZError:
-        ways = f"set {USER_VARIABLE} and {PASSWORD_VARIABLE}"
-        raise GatewayError(why_not(setup, endpoints, user, ways)) from None
+        hint = f"set {USER_VARIABLE} and {PASSWORD_VARIABLE}"
+        raise GatewayError(connection_failure(setup, endpoints, user, hint)) from None
     try:
         yield Client(session, config, tell, user)
     finally:
-        with suppress(zenoh.ZError):  # it times out now and then where the gateway is frozen
+        with suppress(zenoh.ZError):  # may time out when the gateway hangs
             session.close()  # type: ignore[no-untyped-call]  # Zenoh's stub lacks it
 
 
 def _endpoints(config: Config) -> tuple[str, ...]:
-    """Where to connect: the first that is there is taken."""
+    """Returns the endpoints to try, in order."""
     own = config.zenoh
     if own.mode == "client":
         return own.connect
     here = tuple(_reachable(endpoint) for endpoint in own.listen)
     if config.standby is None:
         return here or own.connect
-    return own.connect + here  # another of the group may serve, and is seen from there
+    return own.connect + here  # another member of the group may be active
 
 
 def _reachable(endpoint: str) -> str:
-    """An endpoint that listens everywhere is reached on this machine."""
+    """Replaces the address of all interfaces by the one of this machine."""
     return endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
 
 
 def _setup(own: ZenohConfig, endpoints: tuple[str, ...]) -> zenoh.Config:
-    """As little as there is to read of the gateway's own secrets: who runs this may be somebody
-    else."""
+    """Returns the Zenoh configuration. Reads no secret of the gateway that it does not need.
+
+    The user of the command line may have no access to the files of the gateway.
+    """
     settings = replace(own, mode=ZenohMode.CLIENT, listen=(), connect=endpoints, users_file=None)
     if own.tls is not None and not own.tls.mutual:
         settings = replace(settings, tls=replace(own.tls, certificate=None, key=None))
-    person = _person()
-    if person:
+    user = _user()
+    if user:
         settings = replace(settings, user=None, password_file=None)
     setup = configure(settings)
-    for path, value in (_OPEN | person).items():
+    for path, value in (_OPEN | user).items():
         setup.insert_json5(path, json.dumps(value))
     return setup
 
 
-def _person() -> dict[str, object]:
-    """Whoever types this, where a name and a password are given; nothing otherwise."""
+def _user() -> dict[str, object]:
+    """Returns the settings for the user of the environment variables, or none."""
     user, password = os.environ.get(USER_VARIABLE), os.environ.get(PASSWORD_VARIABLE)
     if not user and not password:
         return {}

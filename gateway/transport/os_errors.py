@@ -1,4 +1,4 @@
-"""What the system says about a port, in the words of the people who have to go and look."""
+"""Translates the system's errors about a port into sentences for people."""
 
 import errno
 import re
@@ -28,10 +28,10 @@ _ERRNO = re.compile(r"\[Errno (\d+)\]")
 def line_down(
     name: str, error: BaseException | None, sentences: Mapping[int, str] | None = None
 ) -> LineDown:
-    """`LineDown` with one sentence about the port `name`, whatever exception was met.
+    """Returns `LineDown` with one sentence about the port `name` for any exception.
 
-    None is what asyncio says when the other side closed in good order. `sentences` are
-    better words for some errnos.
+    None stands for a regular close by the other side, as in asyncio. `sentences` replaces the
+    sentences of some errnos.
     """
     match error:
         case None:
@@ -48,10 +48,10 @@ def line_down(
             return LineDown(f"{name}: {error or type(error).__name__}")
 
 
-def _sentence(error: OSError, better: Mapping[int, str]) -> str:
+def _sentence(error: OSError, sentences: Mapping[int, str]) -> str:
     number = error.errno
-    # A host with several addresses fails with all their errors in one text and no number.
+    # A host with several addresses fails with one text for all errors and without a number.
     if number is None and (found := _ERRNO.search(str(error))):
         number = int(found[1])
-    words = {**_SENTENCES, **better}.get(number or 0)
-    return words or error.strerror or str(error) or type(error).__name__
+    sentence = {**_SENTENCES, **sentences}.get(number or 0)
+    return sentence or error.strerror or str(error) or type(error).__name__

@@ -1,0 +1,107 @@
+"""The `check` command: validates the file and prints the plan of each line."""
+
+from collections.abc import Sequence
+from typing import Annotated
+
+import typer
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from gateway import app, northbound
+from gateway.cli.terminal import ConfigPath, err, out
+from gateway.config import Config, load
+from gateway.engine.forecast import LineForecast
+from gateway.planning.planner import describe
+from gateway.planning.wire_timing import NETWORK_BAUD, WireTiming
+
+
+def check(
+    config: ConfigPath,
+    blocks: Annotated[
+        bool | None,
+        typer.Option("--blocks/--no-blocks", help="Every request (default: if at most 100)"),
+    ] = None,
+) -> None:
+    """Validate the file and print the plan of each line. Sends nothing."""
+    loaded = load(config)
+    northbound.check(loaded)
+    lines = app.forecasts(loaded)
+    few = sum(len(line.blocks) for line in lines) <= 100
+    out.print(plan(lines, every_block=few if blocks is None else blocks))
+    for tag in (tag for device in loaded.devices for tag in device.tags):
+        if tag.write is not None and tag.address.bit is not None:
+            err.print(
+                f"note: writing {tag.key} ({tag.text}) reads the word, changes one bit and writes "
+                "the word back; changes by the PLC in between are lost"
+            )
+    for line in lines:
+        if line.overloaded:
+            err.print(f"warning: {line.advice()}")
+    print(f"{config}: good, {size(loaded)}")
+
+
+def size(config: Config) -> str:
+    """Returns the size of a configuration: `22 tags on 3 lines`."""
+    tags = sum(len(device.tags) for device in config.devices)
+    return f"{_counted(tags, 'tag')} on {_counted(len(config.lines), 'line')}"
+
+
+def plan(lines: Sequence[LineForecast], *, every_block: bool) -> RenderableType:
+    """Renders the plan of all lines."""
+    parts: list[RenderableType] = []
+    for line in lines:
+        parts.append(_line(line))
+        if every_block:
+            parts.append(_blocks(line))
+        parts.append(Text())
+    return Group(*parts)
+
+
+def _line(line: LineForecast) -> Text:
+    writes = (
+        f"\n  worst write latency {seconds(line.worst_write)}, "
+        f"{seconds(line.worst_write_silent)} when a station has just gone offline"
+    )
+    if not line.blocks:
+        text = f"line {line.name}: no requests {_speed(line.wire)}"
+        return Text(text + writes if line.worst_write else text)
+    return Text(
+        f"line {line.name}: {_counted(len(line.blocks), 'request')}, {line.requests:.2f} a second, "
+        f"{line.characters:.0f} characters a second {_speed(line.wire)}\n"
+        f"  load {line.load:.1%} of the wire; one round of all requests takes {seconds(line.cycle)}"
+        + writes
+    )
+
+
+def _blocks(line: LineForecast) -> Table:
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    for column in ("  device", "request", "tags", "every", "characters", "takes", "worst age"):
+        table.add_column(column)
+    for row in line.blocks:
+        block = row.block
+        table.add_row(
+            f"  {row.device.name}",
+            describe(block),
+            str(len(block.tags)),
+            seconds(block.every),
+            f"{block.cost.request} + {block.cost.reply}",
+            seconds(row.seconds),
+            seconds(row.worst_age),
+        )
+    for device, tags in line.unasked:
+        table.add_row(f"  {device.name}", "unsolicited", str(tags))
+    return table
+
+
+def seconds(time: float) -> str:
+    """Formats a duration: `12.3 ms`, `1.43 s`."""
+    return f"{time * 1000:.1f} ms" if time < 1 else f"{time:.2f} s"
+
+
+def _speed(wire: WireTiming) -> str:
+    return "over the network" if wire.baudrate == NETWORK_BAUD else f"at {wire.baudrate} baud"
+
+
+def _counted(number: int, noun: str) -> str:
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"

@@ -1,0 +1,54 @@
+"""Parses arguments of the command line: tags, devices, wildcards, values."""
+
+import json
+import math
+
+import zenoh
+
+from gateway.config import Config
+from gateway.errors import ConfigError
+from gateway.tags import Tag
+from gateway.values import Value
+
+
+def tags_by_key(config: Config) -> dict[str, Tag]:
+    """Returns all tags by `device/tag`."""
+    return {tag.key: tag for device in config.devices for tag in device.tags}
+
+
+def wanted_keys(config: Config, names: list[str] | None) -> list[str]:
+    """Returns key expressions for names of tags and devices and for wildcards.
+
+    No names mean all tags. Raises `ConfigError` for a name that matches no tag.
+    """
+    if not names:
+        return ["**"]
+    known = tags_by_key(config)
+    devices = {device.name for device in config.devices}
+    wanted = []
+    for name in names:
+        key = f"{name}/**" if name in devices else name
+        try:
+            found = any(matches(tag, [key]) for tag in known)
+        except zenoh.ZError:
+            raise ConfigError(f"{key} is not a tag, and not a wildcard like 'mixer/**'") from None
+        if not found:
+            raise ConfigError(f"there is no tag or device {key}")
+        wanted.append(key)
+    return wanted
+
+
+def matches(key: str, wanted: list[str]) -> bool:
+    """Returns True when a key expression matches the key. Raises `ZError` for an invalid one."""
+    return any(zenoh.KeyExpr(expression).intersects(zenoh.KeyExpr(key)) for expression in wanted)
+
+
+def parse_value(text: str) -> Value:
+    """Parses a JSON scalar (`true`, `12.5`, `"AB"`); any other text is a string."""
+    try:
+        value = json.loads(text)
+    except ValueError:
+        return text
+    if isinstance(value, float) and not math.isfinite(value):
+        return text  # NaN and 1e999 are not JSON
+    return value if isinstance(value, (bool, int, float, str)) else text

@@ -1,0 +1,35 @@
+"""The `control` command: sends a command like `run` or `stop` to a PLC."""
+
+import asyncio
+from typing import Annotated
+
+import typer
+
+from gateway.cli import direct
+from gateway.cli.client import connected
+from gateway.cli.logs import LogFormat, LogLevel, set_up
+from gateway.cli.terminal import ConfigPath, Direct, end, err
+from gateway.cli.write import error_code, outcome
+from gateway.config import load
+from gateway.config.commands import check_command, line_of
+
+
+def control(
+    config: ConfigPath,
+    device: Annotated[str, typer.Argument(metavar="DEVICE")],
+    command: Annotated[str, typer.Argument(metavar="COMMAND", help="run, stop, model ...")],
+    argument: Annotated[str, typer.Argument(metavar="[ARGUMENT]", help="text; on, off")] = "",
+    without_gateway: Direct = False,
+) -> None:
+    """Run or stop a PLC, and other commands that the file allows by `control: true`."""
+    loaded = load(config)
+    check_command(loaded, device, command)
+    if without_gateway:
+        set_up(LogFormat.TEXT, LogLevel.ERROR)
+        print(asyncio.run(direct.control(loaded, device, command, argument)).answer)
+        return
+    with connected(loaded, err.print) as client:
+        answer = client.control(line_of(loaded, device).name, device, command, argument)
+    if "error" in answer:
+        end(outcome(device, answer), error_code(answer))
+    print(answer["answer"])

@@ -1,0 +1,71 @@
+"""The `run` command: the service."""
+
+import asyncio
+import shlex
+import shutil
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from gateway import service
+from gateway.cli.check import size
+from gateway.cli.logs import LogFormat, LogLevel, set_up
+from gateway.cli.terminal import ConfigPath, err
+from gateway.config import Config, load
+from gateway.tags import Tag, WriteRule
+from gateway.transport.loop import new_event_loop
+from gateway.values import Kind
+
+
+def run(
+    config: ConfigPath,
+    log_format: Annotated[LogFormat, typer.Option(help="text for people, json for programs")] = (
+        LogFormat.TEXT
+    ),
+    log_level: Annotated[LogLevel, typer.Option(help="debug shows every byte")] = LogLevel.INFO,
+) -> None:
+    """Run the service: poll, publish on Zenoh, accept writes. SIGTERM or Ctrl-C ends it."""
+    loaded = load(config)
+    set_up(log_format, log_level)
+    hint = next_steps(loaded, config, program())
+    with asyncio.Runner(loop_factory=new_event_loop) as runner:
+        runner.run(service.run(loaded, lambda: err.print(hint)))
+
+
+def program() -> str:
+    """Returns the command that started this program, in a form that can be typed again."""
+    path = Path(sys.argv[0])
+    if path.name == "__main__.py":
+        return f"{sys.executable} -m {path.parent.name}"
+    return path.name if shutil.which(path.name) else str(path)
+
+
+def next_steps(config: Config, path: Path, command: str) -> str:
+    """Returns the commands to try in a second terminal; `command` starts this program."""
+    file = shlex.quote(str(path))
+    tags = [tag for device in config.devices for tag in device.tags]
+    lines = [
+        f"Gateway {config.name}: {size(config)}. In a second terminal:",
+        f"  {command} watch {file}",
+    ]
+    if tags:
+        lines.append(f"  {command} read {file} {tags[0].key}")
+    for tag in tags:
+        if tag.write is not None:
+            lines.append(f"  {command} write {file} {tag.key} {_example(tag)}")
+            break
+    lines.append("Ctrl-C ends it.")
+    return "\n".join(lines)
+
+
+def _example(tag: Tag) -> str:
+    """Returns a value that the tag accepts."""
+    kind, rule = tag.layout.type, tag.write or WriteRule()
+    if kind.kind is Kind.STRING:
+        return "AB"[: kind.length]
+    if not kind.is_number:
+        return "true"
+    value = 1 if rule.min is None else rule.min + 1
+    return f"{value if rule.max is None else min(value, rule.max):g}"

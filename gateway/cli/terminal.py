@@ -1,0 +1,32 @@
+"""Terminal output, exit codes and the arguments that several commands share."""
+
+import sys
+from pathlib import Path
+from typing import Annotated, NoReturn
+
+import typer
+from rich.console import Console
+
+USER_MISTAKE, FAILED = 2, 1
+# Values of tags may hold brackets and colons: no markup.
+out = Console(
+    highlight=False, markup=False, emoji=False, width=None if sys.stdout.isatty() else 200
+)
+err = Console(stderr=True, highlight=False, markup=False, emoji=False, soft_wrap=True)
+
+ConfigPath = Annotated[Path, typer.Argument(metavar="CONFIG", help="The YAML file.")]
+TagNames = Annotated[
+    list[str] | None,
+    typer.Argument(metavar="[TAG]...", help="device/tag; wildcards as in Zenoh: 'mixer/**'"),
+]
+Direct = Annotated[
+    bool,
+    typer.Option("--direct", help="Open the port without a gateway; none may be running on it."),
+]
+AsJson = Annotated[bool, typer.Option("--json", help="One JSON document per line.")]
+
+
+def end(message: str, code: int) -> NoReturn:
+    """Prints the message to stderr and exits with the code."""
+    err.print(message)
+    sys.exit(code)

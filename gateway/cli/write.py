@@ -1,0 +1,89 @@
+"""The `write` command: writes one tag and prints the outcome."""
+
+import asyncio
+import json
+import sys
+from typing import Annotated
+
+import orjson
+import typer
+
+from gateway.cli import direct
+from gateway.cli.client import connected, parse_value, tags_by_key
+from gateway.cli.logs import LogFormat, LogLevel, set_up
+from gateway.cli.tables import value_text
+from gateway.cli.terminal import FAILED, USER_MISTAKE, AsJson, ConfigPath, Direct, err
+from gateway.config import Config, load
+from gateway.errors import BadValue, ConfigError, GatewayError
+from gateway.northbound import payload
+from gateway.northbound.payload import Problem
+from gateway.tags import Tag
+from gateway.values import Kind, Value
+
+_USER_MISTAKES = {Problem.BAD_VALUE, Problem.NOT_WRITABLE, Problem.UNKNOWN_TAG}
+
+
+def write(
+    config: ConfigPath,
+    tag: Annotated[str, typer.Argument(metavar="TAG", help="device/tag")],
+    value: Annotated[str, typer.Argument(metavar="VALUE", help="JSON: true, 12.5, AB")],
+    without_gateway: Direct = False,
+    as_json: AsJson = False,
+) -> None:
+    """Write one tag and print the reply of the PLC."""
+    loaded = load(config)
+    target = tags_by_key(loaded).get(tag)
+    if target is None:
+        raise ConfigError(f"there is no tag {tag} in {config}")
+    if target.write is None:
+        raise ConfigError(f"{tag} cannot be written: it has no `write: true` in {config}")
+    parsed = parse_value(value)
+    if target.layout.type.kind is Kind.STRING and not isinstance(parsed, str):
+        parsed = value  # 12 is a text for this tag
+    try:
+        target.encode(parsed)
+    except BadValue as error:
+        raise BadValue(f"{tag}: {error}") from None
+    if without_gateway:
+        set_up(LogFormat.TEXT, LogLevel.ERROR)
+        answer = _write_directly(loaded, target, parsed)
+    else:
+        with connected(loaded, err.print) as client:
+            answer = client.write(tag, parsed)
+    if as_json:
+        print(json.dumps(answer))
+    elif "error" in answer:
+        err.print(outcome(tag, answer), style="red")
+    else:
+        print(outcome(tag, answer))
+    if "error" in answer:
+        sys.exit(error_code(answer))
+
+
+def _write_directly(config: Config, tag: Tag, value: Value) -> dict[str, object]:
+    """Writes without a gateway. Returns the outcome in the words of a gateway."""
+    try:
+        encoded = payload.outcome(asyncio.run(direct.write(config, tag, value)))
+    except GatewayError as error:
+        encoded = payload.outcome(payload.failure(error))
+    answer: dict[str, object] = orjson.loads(encoded)
+    return answer
+
+
+def error_code(answer: dict[str, object]) -> int:
+    """Returns the exit code for a failed write or command."""
+    return USER_MISTAKE if answer["error"] in _USER_MISTAKES else FAILED
+
+
+def outcome(target: str, answer: dict[str, object]) -> str:
+    """Describes the outcome of a write or command in one line."""
+    if "error" in answer:
+        code = f" {answer['code']}" if answer.get("code") else ""
+        return f"{target}: {answer['error']}{code}: {answer.get('reason')}"
+    took = f"{float(str(answer['took'])) * 1000:.0f} ms"
+    how = "acknowledged by the PLC"
+    if answer.get("verified"):
+        how = "acknowledged and read back"
+    elif answer.get("acknowledged") is False:
+        how = "broadcast, without acknowledgement"
+    return f"{target} = {value_text(answer['value'])}: {how}, {took}"

@@ -1,0 +1,107 @@
+"""The `check` command."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gateway.cli.check import seconds
+from tests.cli.conftest import TAGS, Command
+from tests.e2e.processes import plc_gateway, vigor_line, write_config
+from tests.zenoh_peer import free_endpoint
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
+
+def test_check_prints_the_plan(command: Command, config: Path) -> None:
+    done = command("check", config)
+    assert done.code == 0
+    assert "line hall: " in done.out
+    assert "characters a second at 19200 baud" in done.out
+    assert "worst write latency" in done.out
+    rows = [line.split() for line in done.out.splitlines() if line.startswith("  mixer")]
+    assert "Y20" in [row[1] for row in rows]
+    assert f"{config}: good, 7 tags on 1 line" in done.out
+    assert "writing mixer/valve (D7.3) reads the word" in done.err
+    assert "warning" not in done.err
+
+
+def test_check_lists_unsolicited_tags(command: Command) -> None:
+    out = command("check", EXAMPLES / "barcode-reader.yaml").out
+    assert "line conveyor: no requests at 9600 baud\n  device" in out
+    assert "  reader  unsolicited  1" in out
+
+
+def test_check_warns_of_an_overloaded_line(command: Command, tmp_path: Path) -> None:
+    tags = {f"d{i}": {"address": f"D{200 * i}", "every": "20ms"} for i in range(20)}
+    lines = {"hall": vigor_line("/dev/ttyUSB9", tags)}
+    path = write_config(tmp_path / "config.yaml", free_endpoint(), lines)
+    done = command("check", path)
+    assert done.code == 0
+    assert "warning: line hall is asked for" in done.err
+    assert "of what it can carry at 19200 baud: multiply the intervals by" in done.err
+
+
+@pytest.mark.parametrize(("option", "shown"), [("--blocks", True), ("--no-blocks", False)])
+def test_check_shows_every_request_or_none(
+    command: Command, config: Path, option: str, shown: bool
+) -> None:
+    done = command("check", config, option)
+    assert ("  device" in done.out) is shown
+
+
+def test_check_prints_brackets_unchanged(command: Command, tmp_path: Path) -> None:
+    folder = tmp_path / "[red]plant[/red]"
+    folder.mkdir(parents=True)
+    lines = {"hall": vigor_line("simulator", {"speed": {"address": "D10"}})}
+    path = write_config(folder / "config.yaml", free_endpoint(), lines)
+    assert f"{path}: good, 1 tag on 1 line\n" in command("check", path).out
+
+
+MISTAKES: dict[str, tuple[dict[str, Any], str]] = {
+    "client of nobody": ({"mode": "client", "listen": []}, "say in `connect` which router"),
+    "no port": (
+        {"listen": ["tcp/foo"]},
+        "1: zenoh.listen[0]: 'tcp/foo': write it as tcp/host:port",
+    ),
+    "twice": ({"listen": ["tcp/[::1]:7447"] * 2}, "1: zenoh.listen: tcp/[::1]:7447 is there twice"),
+    "no certificate": ({"listen": ["tls/localhost:7447"]}, "'tls/localhost:7447': it needs a cert"),
+    "certificate": (
+        {"tls": {"certificate": "text", "key": "text"}},
+        "text holds no certificate in PEM form",
+    ),
+    "no JSON5": ({"config_file": "text"}, "zenoh config_file"),
+    "misspelt": ({"config_file": "misspelt"}, "unknown field `acces_control`"),
+    "open to all": ({"users_file": "open"}, "open is open to everybody on this machine"),
+    "no users": ({"users_file": "text"}, "text, line 1: write it as name:password"),
+    "writers": ({}, "writers.file"),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_check_and_run_refuse_the_same_mistakes_with_2(
+    command: Command, tmp_path: Path, mistake: str
+) -> None:
+    zenoh, says = MISTAKES[mistake]
+    for name, text in (("text", "hello\n"), ("misspelt", "{acces_control: {}}"), ("open", "a:b\n")):
+        (tmp_path / name).write_text(text)
+        (tmp_path / name).chmod(0o644 if name == "open" else 0o600)
+    path = write_config(
+        tmp_path / "config.yaml",
+        free_endpoint(),
+        {"hall": vigor_line("simulator", TAGS)},
+        zenoh={"listen": [free_endpoint()], **zenoh},
+        writers={"file": "text"} if mistake == "writers" else None,
+    )
+    checked = command("check", path)
+    assert (checked.code, checked.out) == (2, "")
+    assert says in checked.err
+    assert plc_gateway("run", path) == checked
+
+
+@pytest.mark.parametrize(
+    ("duration", "text"),
+    [(0.0123, "12.3 ms"), (0.9994, "999.4 ms"), (1.434, "1.43 s"), (float("inf"), "inf s")],
+)
+def test_durations_are_formatted(duration: float, text: str) -> None:
+    assert seconds(duration) == text

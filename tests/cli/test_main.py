@@ -1,0 +1,113 @@
+"""The commands as a whole: help, usage, version, exit codes. People see no traceback."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from gateway import __version__
+from gateway.config import schema as config_schema
+from tests.cli.conftest import Command
+from tests.e2e.processes import Done, plc_gateway
+
+COMMANDS = [
+    *("run", "check", "read", "write", "control", "watch", "scan", "simulate"),
+    *("health", "schema", "version"),
+]
+
+
+def test_help_names_every_command(command: Command) -> None:
+    done = command("--help")
+    assert done.code == 0
+    assert all(f"\n  {name} " in done.out for name in COMMANDS)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_helps(command: Command, name: str) -> None:
+    done = command(name, "--help")
+    assert done.code == 0
+    assert f"plc-gateway {name}" in done.out
+    assert "--help" in done.out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ([], "Usage"),
+        (["fly"], "No such command 'fly'"),
+        (["check"], "Missing argument 'CONFIG'"),
+        (["read", "a.yaml", "--fast"], "No such option"),
+        (["run", "a.yaml", "--log-format", "xml"], "xml"),
+        (["write", "a.yaml", "mixer/trim"], "Missing argument 'VALUE'"),
+    ],
+)
+def test_wrong_usage_ends_with_2(command: Command, arguments: list[str], says: str) -> None:
+    done = command(*arguments)
+    assert done.code == 2
+    assert says in done.err + done.out
+
+
+@pytest.mark.parametrize(
+    ("name", *("more",)),
+    [
+        ("run", []),
+        ("check", []),
+        ("read", []),
+        ("write", ["mixer/trim", "1"]),
+        ("control", ["mixer", "stop"]),
+        ("watch", []),
+        ("simulate", []),
+        ("health", []),
+    ],
+)
+def test_a_bad_file_ends_every_command_with_2(
+    command: Command, tmp_path: Path, name: str, more: list[str]
+) -> None:
+    path = tmp_path / "bad.yaml"
+    path.write_text("lines: {hall: {port: simulator, devices: {mixer: {protocol: vigour}}}}\n")
+    done = command(name, path, *more)
+    assert done.code == 2
+    assert done.err.startswith(f"{path}:1: lines.hall.devices.mixer.protocol: 'vigour'")
+    assert "did you mean vigor?" in done.err
+    assert done.out == ""
+
+
+@pytest.mark.parametrize("name", ["run", "check", "read", "simulate"])
+def test_a_file_that_is_not_there_ends_with_2(command: Command, tmp_path: Path, name: str) -> None:
+    done = command(name, tmp_path / "none.yaml")
+    assert done.code == 2
+    assert done.err == f"{tmp_path / 'none.yaml'}: there is no such file\n"
+
+
+def test_a_folder_instead_of_a_file_ends_with_2(command: Command, tmp_path: Path) -> None:
+    done = command("check", tmp_path)
+    assert done.code == 2
+    assert len(done.err.splitlines()) == 1
+
+
+def test_schema_prints_the_schema(command: Command) -> None:
+    done = command("schema")
+    assert (done.code, json.loads(done.out)) == (0, config_schema())
+
+
+def test_the_version_is_an_option_and_a_command(command: Command) -> None:
+    assert command("--version") == Done(0, f"plc-gateway {__version__}\n", "")
+    assert command("version") == Done(0, f"{__version__}\n", "")
+
+
+@pytest.mark.parametrize(
+    "arguments", [["read"], ["write", "mixer/trim", "1"], ["watch"], ["health"]]
+)
+def test_without_a_gateway_commands_end_with_1(config: Path, arguments: list[str]) -> None:
+    name, *more = arguments
+    done = plc_gateway(name, config, *more)
+    assert (done.code, done.out) == (1, "")
+    assert "no gateway at tcp/127.0.0.1:" in done.err
+    assert "start it with `plc-gateway run`, or use --direct" in done.err
+    assert len(done.err.splitlines()) == 1
+
+
+def test_health_prints_the_status(running: Path) -> None:
+    done = plc_gateway("health", running)
+    assert done.code == 0
+    assert json.loads(done.out)["devices"] == {"mixer": "up"}

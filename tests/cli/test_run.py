@@ -1,0 +1,68 @@
+"""The commands that `run` proposes."""
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gateway.cli.run import next_steps, program
+from gateway.config import load
+from tests.e2e.processes import vigor_line, write_config
+
+
+@pytest.mark.parametrize(
+    ("tag", "typed"),
+    [
+        ({"address": "D1", "write": {"min": -5, "max": 40}}, "-4"),
+        ({"address": "D1", "write": {"min": 7, "max": 7}}, "7"),
+        ({"address": "D1", "write": {"max": -10}}, "-10"),
+        ({"address": "D1", "scale": 0.1, "write": {"min": 0.5, "max": 1}}, "1"),
+        ({"address": "D1", "write": True}, "1"),
+        ({"address": "D1", "type": "float32", "write": {"min": 0.25, "max": 0.5}}, "0.5"),
+        ({"address": "Y20", "write": True}, "true"),
+        ({"address": "D1", "type": "string[2]", "write": True}, "AB"),
+        ({"address": "D1", "type": "string[1]", "write": True}, "A"),
+    ],
+)
+def test_the_proposed_write_is_accepted_by_its_tag(
+    tmp_path: Path, tag: dict[str, Any], typed: str
+) -> None:
+    path = write_config(
+        tmp_path / "c.yaml", "tcp/127.0.0.1:7447", {"hall": vigor_line("simulator", {"t": tag})}
+    )
+    config = load(path)
+    steps = next_steps(config, path, "plc-gateway").splitlines()
+    [line] = [line for line in steps if line.startswith("  plc-gateway write")]
+    assert line == f"  plc-gateway write {path} mixer/t {typed}"
+    [made] = config.devices[0].tags
+    try:
+        value = json.loads(typed)
+    except ValueError:
+        value = typed
+    made.encode(value)
+
+
+def test_a_proposed_command_quotes_a_path_with_a_blank(tmp_path: Path) -> None:
+    tags = {"t": {"address": "D1"}}
+    path = write_config(
+        tmp_path / "my plant.yaml", "tcp/127.0.0.1:7447", {"hall": vigor_line("simulator", tags)}
+    )
+    assert f"plc-gateway watch '{path}'" in next_steps(load(path), path, "plc-gateway")
+
+
+@pytest.mark.parametrize(
+    ("started", "found", "typed"),
+    [
+        (".venv/bin/plc-gateway", None, ".venv/bin/plc-gateway"),
+        ("/usr/bin/plc-gateway", "/usr/bin/plc-gateway", "plc-gateway"),
+        ("/x/gateway/__main__.py", None, f"{sys.executable} -m gateway"),
+    ],
+)
+def test_the_proposed_commands_begin_as_this_program_was_started(
+    monkeypatch: pytest.MonkeyPatch, started: str, found: str | None, typed: str
+) -> None:
+    monkeypatch.setattr(sys, "argv", [started])
+    monkeypatch.setattr("shutil.which", lambda name: found)
+    assert program() == typed
