@@ -220,7 +220,7 @@ def watch(config: ConfigPath, tags: TagNames = None, as_json: AsJson = False) ->
 @cli.command(name="scan")
 def scan_command(
     port: Annotated[str, typer.Option(help="/dev/ttyUSB0, COM3, tcp://host:port, rfc2217://...")],
-    protocol: Annotated[str, typer.Option(help="vigor, computer-link, modbus-rtu ...")],
+    protocol: Annotated[str, typer.Option(help="as the file names it after `protocol:`")],
     stations: Annotated[
         str | None, typer.Option(help="which to ask: 1-31,40; left out: those up to 31")
     ] = None,

@@ -1,4 +1,4 @@
-"""Raw TCP (device servers, Modbus TCP devices) that notices a dead peer within a minute."""
+"""Raw TCP (device servers, network devices) that notices a dead peer within a minute."""
 
 import asyncio
 import socket

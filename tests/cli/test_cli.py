@@ -553,7 +553,10 @@ def test_scan_prints_what_to_write_in_the_file(tmp_path: Path) -> None:
     ("options", "says"),
     [
         (["--protocol", "vigor"], "--port"),
-        (["--port", "COM3", "--protocol", "frames"], "frames cannot be sought: use one of vigor"),
+        (
+            ["--port", "COM3", "--protocol", "frames"],
+            "scan cannot look for frames: use one of vigor",
+        ),
         (["--port", "COM3", "--protocol", "vigor", "--baud", "fast"], "'fast' is no number"),
     ],
 )
