@@ -91,9 +91,7 @@ def planned(
 ) -> Plan:
     """Parses the options of the command. Raises `ConfigError`."""
     where, hints = parse_port(port), _hints(protocol)
-    numbers = list(
-        dict.fromkeys(_numbers(f"{hints.first_station}-31" if stations is None else stations))
-    )
+    numbers = list(hints.stations if stations is None else dict.fromkeys(_numbers(stations)))
     drivers = [driver for number in numbers for driver, _ in variants(protocol, number)]
     if isinstance(where, SimulatorAddress):
         raise ConfigError("simulated PLCs need no scan: the file lists them")

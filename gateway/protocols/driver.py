@@ -282,7 +282,7 @@ class ScanHints:
     """How `scan` looks for stations of a protocol."""
 
     formats: Sequence[str] = ("8N1",)  # of a serial line, the most likely first
-    first_station: int = 1
+    stations: range = range(1, 32)  # that it asks unless told otherwise
     variants: Sequence[Mapping[str, object]] = ({},)  # YAML settings to try at each station
 
 

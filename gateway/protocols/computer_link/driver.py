@@ -62,7 +62,7 @@ class ComputerLink:
 
     scan_hints: ClassVar = ScanHints(
         formats=("7E1", "8N1", "8E1", "7O1"),
-        first_station=0,
+        stations=range(32),
         variants=tuple(
             {"frame_format": form, "sum_check": checked}
             for form in (1, 4)

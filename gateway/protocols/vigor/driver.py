@@ -65,7 +65,7 @@ class Vigor:
     protocol: Literal["vigor"] = "vigor"
     station: int = 0
 
-    scan_hints: ClassVar = ScanHints(formats=("7E1", "8N1"), first_station=0)
+    scan_hints: ClassVar = ScanHints(formats=("7E1", "8N1"), stations=range(32))
 
     def __post_init__(self) -> None:
         if not 0 <= self.station <= 255:
