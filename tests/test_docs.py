@@ -29,7 +29,6 @@ from gateway.config import (
     schema,
 )
 from gateway.config.commands import TO_ALL, every_command
-from gateway.config.validate import DRIVERS
 from gateway.config.yaml_file import read_yaml
 from gateway.engine.device import DeviceSettings
 from gateway.history import Historian
@@ -37,6 +36,7 @@ from gateway.northbound import StandbySettings, payload
 from gateway.northbound.standby import Standby
 from gateway.northbound.keys import Keys
 from gateway.northbound.payload import Problem
+from gateway.protocols.registry import PROTOCOLS
 from gateway.tags import Reason, WriteResult, bad, good
 from tests.e2e.processes import ROOT, Program, plc_gateway, started, until
 from tests.zenoh_peer import free_endpoint
@@ -156,7 +156,7 @@ def test_a_device_in_the_pages_loads_as_soon_as_its_protocol_is_there(
         for number, (name, made) in enumerate(devices.items())
     }
     text = json.dumps({"lines": lines})
-    if "frames" in DRIVERS:
+    if "frames" in PROTOCOLS:
         assert len(loaded(text, tmp_path).devices) == len(devices)
         return
     with pytest.raises(ConfigErrors) as told:
@@ -216,7 +216,7 @@ def test_every_setting_of_a_section_is_on_the_page_and_no_other(heading: str, sh
     assert set(settings(heading)) == properties(shape)
 
 
-@pytest.mark.parametrize("protocol", DRIVERS)
+@pytest.mark.parametrize("protocol", PROTOCOLS)
 def test_every_setting_of_a_protocol_is_on_the_page_and_no_other(protocol: str) -> None:
     common = set(settings("A device"))
     own = set(settings({"modbus-ascii": "modbus-rtu"}.get(protocol, protocol)))
@@ -319,7 +319,7 @@ def test_the_customs_of_a_protocol_are_what_holds_when_nothing_is_said(
 
 def test_every_protocol_has_its_customs() -> None:
     rows = table("configuration.md", "What a protocol is used to", "protocol")
-    assert {bare(row[0]) for row in rows} == set(DRIVERS)
+    assert {bare(row[0]) for row in rows} == set(PROTOCOLS)
 
 
 @pytest.mark.parametrize(
