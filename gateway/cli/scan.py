@@ -1,15 +1,15 @@
 """Looks for the stations on an unknown line: which answer, at which speed, in which format."""
 
-import asyncio
 from collections.abc import Awaitable, Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import product
 
 from gateway.config import parsers
+from gateway.engine.device import Device, DeviceSettings
 from gateway.errors import ConfigError, Garbled, LineDown, Refused, Unclear
-from gateway.line.clock import Clock
-from gateway.line.transaction import Turn
-from gateway.line.wire_log import Recorder
+from gateway.line.channel import Channel
+from gateway.line.transaction import Transaction
+from gateway.line.wire_log import WireLog
 from gateway.planning.wire_timing import WireTiming, character_bits
 from gateway.protocols.driver import AnyDriver, ScanHints, Scannable
 from gateway.protocols.registry import PROTOCOLS
@@ -158,60 +158,53 @@ class _Scan:
         self._report = report
         behind = serial or SerialSettings()  # there may be a slow wire behind a network
         self._wire = WireTiming(behind.baudrate, character_bits(behind.format))
-        self._clock = Clock(now=asyncio.get_running_loop().time)
-        self._turn: Turn | None = None
+        self._transaction: Transaction | None = None
         self._lost: LineDown | None = None
 
     def received(self, data: bytes) -> None:
-        if self._turn is not None:
-            self._turn.received(data)
+        if self._transaction is not None:
+            self._transaction.received(data)
 
     def lost(self, error: Exception) -> None:
         self._lost = error if isinstance(error, LineDown) else LineDown(str(error))
-        if self._turn is not None:
-            self._turn.lost(self._lost)
+        if self._transaction is not None:
+            self._transaction.lost(self._lost)
 
     async def ask(self) -> None:
         port = await self._plan.open_port(self._serial, self)
+        channel = Channel(port, self._wire, WireLog("scan"), echo=None)
         try:
             for probe_token, station in enumerate(self._plan.stations):
-                if (found := await self._seek(port, station, probe_token)) is not None:
+                if (found := await self._seek(channel, station, probe_token)) is not None:
                     self._report.found.append(found)
         finally:
-            await port.close()
+            await channel.close()
 
-    async def _seek(self, port: Port, station: int, probe_token: int) -> Found | None:
+    async def _seek(self, channel: Channel, station: int, probe_token: int) -> Found | None:
         """Returns the station. An error reply shows that it exists, perhaps with other settings."""
         refused: Found | None = None
         for driver, settings in variants(self._plan.protocol, station):
             try:
-                if await self._replies(port, driver, probe_token):
+                if await self._replies(channel, driver, probe_token):
                     return Found(self._serial, driver, settings)
             except Refused as error:
                 refused = refused or Found(self._serial, driver, settings, str(error))
         return refused
 
-    async def _replies(self, port: Port, driver: AnyDriver, probe_token: int) -> bool:
+    async def _replies(self, channel: Channel, driver: AnyDriver, probe_token: int) -> bool:
         """Raises `Refused` and `LineDown`."""
         if self._lost is not None:
             raise self._lost
-        turn = self._turn = Turn(
-            port,
-            driver.codec,
-            self._wire,
-            self._wire.silence(driver.timing),
-            self._plan.timeout,
-            self._clock,
-            Recorder("scan"),
-            driver.station,
-        )
+        timing = replace(driver.timing, reply_timeout=self._plan.timeout)
+        settings = DeviceSettings(name=f"station {driver.station}", driver=driver, timing=timing)
+        transaction = self._transaction = Transaction(channel, Device(settings, self._wire))
         try:
-            await driver.resync(turn, None, probe_token)
+            await driver.resync(transaction, None, probe_token)
         except Unclear as error:
             if isinstance(error, Garbled):
                 self._report.noises.setdefault(self._serial, str(error))
-                await turn.settle(LONGEST_NOISE, QUIET)
+                await transaction.settle(LONGEST_NOISE, QUIET)
             return False
         finally:
-            self._turn = None
+            self._transaction = None
         return True

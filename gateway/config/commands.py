@@ -4,8 +4,8 @@ from collections.abc import Mapping
 
 from gateway.config import Config, LineConfig
 from gateway.engine.device import DeviceSettings
-from gateway.errors import BadValue
 from gateway.engine.requests import why_not_commanded
+from gateway.errors import BadValue
 from gateway.protocols.driver import Controllable
 
 TO_ALL = "global"  # every station of the line hears it, and none answers

@@ -97,17 +97,12 @@ class Line:
         channel, transaction = self._channel, self._transaction
         if channel is None:  # still opening: no listener has begun
             return
+        if transaction is not None and transaction.has_sent:
+            transaction.received(data)
+            return
         if channel.wire_log.active:
             channel.wire_log.heard(data)
         now = channel.now()
-        if transaction is not None and transaction.has_sent:
-            channel.quiet_since = now
-            transaction.traffic.heard += len(data)
-            if channel.echo.strip:
-                data = channel.echo.without(data)
-            if data:
-                transaction.received(data)
-            return
         # No less quiet than is kept after a broadcast, whose echo this may be.
         channel.quiet_since = max(channel.quiet_since, now)
         if channel.echo.strip:

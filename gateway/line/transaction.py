@@ -144,7 +144,14 @@ class Transaction:
         self._heard = b""
 
     def received(self, data: bytes) -> None:
-        """Bytes that arrived, without an echo."""
+        """Bytes that arrived at the port."""
+        channel = self._channel
+        if channel.wire_log.active:
+            channel.wire_log.heard(data)
+        channel.quiet_since = channel.now()
+        self.traffic.heard += len(data)
+        if channel.echo.strip and not (data := channel.echo.without(data)):
+            return
         if len(self._heard) < MOST_REMEMBERED:
             self._heard += data
         if self._broken is not None:
@@ -169,6 +176,7 @@ class Transaction:
 
     def lost(self, error: LineDown) -> None:
         """The port is gone."""
+        self._channel.lost_by = error
         if self._late is not None:
             self._late.wake()
         for request in self._open:
