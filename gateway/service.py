@@ -14,7 +14,7 @@ import structlog
 from gateway.app import Gateway
 from gateway.config import Config
 from gateway.history import Historian
-from gateway.history.state_file import Notebook
+from gateway.history.state_file import StateFile
 from gateway.northbound import Northbound, StandbySettings
 from gateway.tags import Sample
 
@@ -35,7 +35,7 @@ async def run(config: Config, started: Callable[[], None] = lambda: None) -> Non
     """The service, until SIGTERM or SIGINT. Raises `GatewayError` when it cannot start.
 
     `started` is called when everything is open on Zenoh: once, or whenever this gateway of a
-    standby group goes on duty.
+    standby group becomes active.
     """
     sys.setswitchinterval(SWITCH)
     gc.set_threshold(*COLLECT)
@@ -54,42 +54,41 @@ async def _serve(config: Config, stop: asyncio.Event, started: Callable[[], None
     gc.freeze()  # tags live as long as the gateway: no need to look at them again and again
     history = _history(config)
     northbound = _northbound(config, gateway, history)
-    notebook = None if config.state_file is None else Notebook(config.state_file)
-    if notebook is not None:
-        notebook.recall(gateway.spoken_to)
-    gateway.show_alive = northbound.alive
-    gateway.publish = northbound.publish
-    if history is not None:
-        gateway.publish = _both(history, northbound)
-        gateway.documents["history"] = history.document
+    state_file = None if config.state_file is None else StateFile(config.state_file)
+    if state_file is not None:
+        state_file.restore(gateway.enabled_devices)
+    gateway.subscribe(northbound)
+    if history is not None:  # all that is published is kept, for clients that miss it
+        gateway.subscribe(_Recording(history))
+        gateway.add_document("history", history.document)
     async with AsyncExitStack() as ending:  # what began last ends first
         face = asyncio.create_task(northbound.run(), name="zenoh")
-        ending.push_async_callback(_put_away, face, history, notebook)
-        sole, on_duty, opened, relieved, stopping = events = [
+        ending.push_async_callback(_put_away, face, history, state_file)
+        exclusive, active, opened, replaced, stopping = events = [
             asyncio.create_task(event.wait())
             for event in (
-                northbound.sole,
-                northbound.on_duty,
+                northbound.exclusive,
+                northbound.active,
                 northbound.opened,
-                northbound.relieved,
+                northbound.replaced,
                 stop,
             )
         ]
         for event in events:
             ending.callback(event.cancel)
         lines: list[asyncio.Task[None]] = []
-        await _first(sole, face, stopping)
-        if sole.done():  # otherwise a gateway that runs already may have this file and these lines
+        await _first(exclusive, face, stopping)
+        if exclusive.done():  # otherwise another process may have this file and these lines
             if history is not None:
                 history.start()
-            await _first(on_duty, face, stopping)
-            if on_duty.done():
-                lines = await _on_the_wire(gateway, history, notebook, ending)
-        await _first(opened, face, stopping, relieved)
+            await _first(active, face, stopping)
+            if active.done():
+                lines = await _on_the_wire(gateway, history, state_file, ending)
+        await _first(opened, face, stopping, replaced)
         if opened.done():
             started()
-        await _first(face, stopping, relieved, *lines)
-    return northbound.relieved.is_set() and not stop.is_set()
+        await _first(face, stopping, replaced, *lines)
+    return northbound.replaced.is_set() and not stop.is_set()
 
 
 async def _first(*tasks: asyncio.Task[Any]) -> None:
@@ -103,45 +102,46 @@ def _northbound(config: Config, gateway: Gateway, history: Historian | None) -> 
         config.name,
         gateway,
         history=history,
-        record_write=None if history is None else history.record_write,
         writers=config.writers_file,
-        commanded=gateway,
         standby=None if group is None else StandbySettings(group, config.standby_alone),
     )
 
 
 async def _on_the_wire(
-    gateway: Gateway, history: Historian | None, notebook: Notebook | None, ending: AsyncExitStack
+    gateway: Gateway,
+    history: Historian | None,
+    state_file: StateFile | None,
+    ending: AsyncExitStack,
 ) -> list[asyncio.Task[None]]:
     if history is not None:
         history.record(gateway.mirror.samples())  # "starting" marks the restart
-    if notebook is not None:
-        await ending.enter_async_context(_kept(notebook, gateway))
-    lines = [asyncio.create_task(line.run(), name=line.name) for line in gateway.lines]
+    if state_file is not None:
+        await ending.enter_async_context(_kept(state_file, gateway))
+    lines = [asyncio.create_task(line.run(), name=line.engine.name) for line in gateway.lines]
     ending.push_async_callback(_ended, lines)  # first of all, so that the last outcomes go out
     return lines
 
 
 @asynccontextmanager
-async def _kept(notebook: Notebook, gateway: Gateway) -> AsyncIterator[None]:
+async def _kept(state_file: StateFile, gateway: Gateway) -> AsyncIterator[None]:
     """What is learned meanwhile is written down, now and then and at the end."""
-    notebook.start()
-    keeping = asyncio.create_task(_keep(notebook, gateway), name="state")
+    state_file.start()
+    keeping = asyncio.create_task(_keep(state_file, gateway), name="state")
     try:
         yield
     finally:
-        notebook.end(notebook.page(gateway.spoken_to))
+        state_file.save_last(state_file.snapshot(gateway.enabled_devices))
         await _ended([keeping])
 
 
-async def _keep(notebook: Notebook, gateway: Gateway) -> None:
+async def _keep(state_file: StateFile, gateway: Gateway) -> None:
     while True:
         await asyncio.sleep(KEEP_EVERY)
-        notebook.keep(notebook.page(gateway.spoken_to))
+        state_file.save_soon(state_file.snapshot(gateway.enabled_devices))
 
 
 async def _put_away(
-    face: asyncio.Task[None], history: Historian | None, notebook: Notebook | None
+    face: asyncio.Task[None], history: Historian | None, state_file: StateFile | None
 ) -> None:
     """First Zenoh, so that what is told last is kept too, then the files: a disk may stand still,
     and nobody on the network shall have to wait for it."""
@@ -153,9 +153,9 @@ async def _put_away(
             left = by - time.monotonic()
             if not await asyncio.to_thread(history.close, left):
                 log.error("history did not end in time: what the disk has not taken is lost")
-        if notebook is not None:
+        if state_file is not None:
             left = min(KEPT_WITHIN, by - time.monotonic())
-            if not await asyncio.to_thread(notebook.close, left):
+            if not await asyncio.to_thread(state_file.close, left):
                 log.warning("the disk did not take in time what was learned of the devices")
 
 
@@ -164,14 +164,20 @@ def _history(config: Config) -> Historian | None:
     return None if kept is None else Historian(kept.path, kept.keep, kept.max_size)
 
 
-def _both(history: Historian, northbound: Northbound) -> Callable[[Sequence[Sample]], None]:
-    """What is published is kept too, so that whoever misses it can ask for it."""
+class _Recording:
+    """Subscribes history to what is published.
 
-    def publish(news: Sequence[Sample]) -> None:
-        northbound.publish(news)
-        history.record(news)  # before the loop takes a question of whoever has seen them
+    A sample is recorded before the loop takes a question of a client that has seen it.
+    """
 
-    return publish
+    def __init__(self, history: Historian) -> None:
+        self._history = history
+
+    def publish(self, samples: Sequence[Sample]) -> None:
+        self._history.record(samples)
+
+    def set_online(self, device: str, online: bool) -> None:
+        """History keeps no device states."""
 
 
 async def _ended(tasks: Sequence[asyncio.Task[None]]) -> None:

@@ -29,14 +29,14 @@ from gateway.config import (
     schema,
 )
 from gateway.config.commands import TO_ALL, every_command
-from gateway.config.validate import DRIVERS
 from gateway.config.yaml_file import read_yaml
 from gateway.engine.device import DeviceSettings
 from gateway.history import Historian
 from gateway.northbound import StandbySettings, payload
-from gateway.northbound.duty import Duty
 from gateway.northbound.keys import Keys
 from gateway.northbound.payload import Problem
+from gateway.northbound.standby import Standby
+from gateway.protocols.registry import PROTOCOLS
 from gateway.tags import Reason, WriteResult, bad, good
 from tests.e2e.processes import ROOT, Program, plc_gateway, started, until
 from tests.zenoh_peer import free_endpoint
@@ -170,7 +170,6 @@ def loaded(text: str, folder: Path) -> Any:
 # ---- docs/configuration.md ---------------------------------------------------------------------
 
 CONFIGURATION = TEXT["configuration.md"]
-PROTOCOLS = frozenset(DRIVERS)
 TIMES = ("baudrate", "format", "reply_timeout", "silence", "retries")
 
 
@@ -217,7 +216,7 @@ def test_every_setting_of_a_section_is_on_the_page_and_no_other(heading: str, sh
     assert set(settings(heading)) == properties(shape)
 
 
-@pytest.mark.parametrize("protocol", DRIVERS)
+@pytest.mark.parametrize("protocol", PROTOCOLS)
 def test_every_setting_of_a_protocol_is_on_the_page_and_no_other(protocol: str) -> None:
     common = set(settings("A device"))
     own = set(settings({"modbus-ascii": "modbus-rtu"}.get(protocol, protocol)))
@@ -319,7 +318,7 @@ def test_the_defaults_of_a_protocol_on_the_page_are_those_of_the_gateway(
 
 
 def test_the_page_has_the_defaults_of_every_protocol() -> None:
-    assert {bare(row[0]) for row in DEFAULTS_OF_PROTOCOLS} == set(DRIVERS)
+    assert {bare(row[0]) for row in DEFAULTS_OF_PROTOCOLS} == set(PROTOCOLS)
 
 
 @pytest.mark.parametrize(
@@ -598,7 +597,7 @@ def test_the_status_documents_have_the_fields_of_the_page(endpoint: str, tmp_pat
         assert asking.ended() == 0
         found = dict(line.split(maxsplit=1) for line in asking.lines)
     known: dict[str, Any] = {"history": Historian(tmp_path / "history.db", 1, 10**8).document()}
-    known |= Duty(StandbySettings("hall"), Keys("plant", "demo"), zenoh.Config()).documents()
+    known |= Standby(StandbySettings("hall"), Keys("plant", "demo"), zenoh.Config()).documents()
     for key, text in found.items():
         path_there = re.sub(r"/.*", "/", key.removeprefix("plant/@gateway/demo/"))
         known[path_there] = json.loads(text)

@@ -2,17 +2,18 @@
 
 import asyncio
 import time
-from collections.abc import Sequence
+from collections.abc import AsyncIterator, Collection, Sequence
 from collections.abc import Set as AbstractSet
-from contextlib import suppress
+from contextlib import asynccontextmanager, suppress
+from dataclasses import replace
 
-from gateway.app import device_of, opener
+from gateway import app
 from gateway.config import Config, LineConfig
 from gateway.config.commands import check_command, line_of
-from gateway.engine.device import Device, DeviceSettings
+from gateway.engine.device import Device
 from gateway.engine.requests import CommandResult
-from gateway.engine.unsolicited import listened
-from gateway.errors import BadValue, GatewayError, LineDown
+from gateway.engine.unsolicited import unsolicited_tags
+from gateway.errors import BadValue, LineDown
 from gateway.line.line import Line
 from gateway.tags import Reason, Sample, Tag, WriteResult, bad
 from gateway.values import Value
@@ -35,8 +36,8 @@ class _Once:
         if self.wanted <= self.heard.keys():
             self.all_heard.set()
 
-    def alive(self, device: Device, alive: bool) -> None:
-        pass
+    def online(self, device: Device, online: bool) -> None:
+        """The samples say all that counts here."""
 
 
 async def read(config: Config, tags: Sequence[Tag]) -> list[Sample]:
@@ -53,24 +54,25 @@ async def read(config: Config, tags: Sequence[Tag]) -> list[Sample]:
 
 
 async def _read(config: LineConfig, tags: Sequence[Tag]) -> dict[Tag, Sample]:
-    """Returns samples of the tags that can be read. Tags of no block are left out."""
-    line = _line(config, tags, once := _Once())
-    asked = {tag for device in line.devices for block in device.blocks for tag in block.tags}
-    unasked = {tag for device in line.devices for tag in listened(device)}
-    if asked | unasked:
-        once.wanted = asked
-        task = asyncio.create_task(line.run())
-        if asked:
-            await once.all_heard.wait()
-        await _listen(once, unasked)
-        await _end(task)
+    """The samples of tags that can be read; a tag in no request has none."""
+    once = _Once()
+    line = _line(config, {tag.device for tag in tags}, tags, once)
+    devices = line.engine.devices
+    polled = {tag for device in devices for block in device.blocks for tag in block.tags}
+    unsolicited = {tag for device in devices for tag in unsolicited_tags(device)}
+    if polled | unsolicited:
+        once.wanted = polled
+        async with _running(line):
+            if polled:
+                await once.all_heard.wait()
+            await _listen(once, unsolicited)
     return once.heard
 
 
-async def _listen(once: _Once, unasked: AbstractSet[Tag]) -> None:
+async def _listen(once: _Once, unsolicited: AbstractSet[Tag]) -> None:
     """Waits a while for unsolicited values: a scale streams, a bar code may never arrive."""
     once.all_heard.clear()
-    once.wanted |= unasked
+    once.wanted |= unsolicited
     once.samples(())
     with suppress(TimeoutError):
         async with asyncio.timeout(LISTEN_FOR):
@@ -83,61 +85,46 @@ async def write(config: Config, tag: Tag, value: Value) -> WriteResult:
     (line_config,) = (line for line in config.lines if tag in line.tags)
     if not any(device.enabled for device in line_config.devices if device.name == tag.device):
         raise BadValue(f"device {tag.device} is disabled")
-    once = _Once({tag})
-    line = _line(line_config, [tag], once)
-    (device,) = line.devices
-    device.blocks = ()  # read nothing
-    task = asyncio.create_task(line.run())
-    while not line.is_open and not once.heard:
-        await asyncio.sleep(0.01)
-    outcome: asyncio.Future[WriteResult | GatewayError] = asyncio.get_running_loop().create_future()
-    line.submit(device, tag, units, outcome.set_result)
-    result = await outcome
-    await _end(task)
-    if isinstance(result, GatewayError):
-        raise result
-    return result
+    line = _line(line_config, {tag.device}, [tag], _Once())
+    (device,) = line.engine.devices
+    device.poll_nothing()
+    async with _running(line):
+        await line.tried.wait()
+        return await line.write(device, tag, units)
 
 
 async def control(config: Config, device: str, command: str, argument: str) -> CommandResult:
     """Sends one command. Raises `GatewayError`; `BadValue` only before anything is sent."""
     check_command(config, device, command)
     line_config = line_of(config, device)
-    line = _line(line_config, [tag for tag in line_config.tags if tag.device == device], _Once())
-    (told,) = line.devices
-    told.blocks = ()  # read nothing
+    line = _line(line_config, {device}, line_config.tags, _Once())
+    (commanded,) = line.engine.devices
+    commanded.poll_nothing()
+    async with _running(line):
+        await line.tried.wait()
+        loop = asyncio.get_running_loop()
+        started = loop.time()
+        answer = await line.command(commanded, command, argument)
+        return CommandResult(answer, time.time_ns(), loop.time() - started)
+
+
+def _line(config: LineConfig, devices: Collection[str], tags: Sequence[Tag], once: _Once) -> Line:
+    """The line with these devices, each with only the given tags."""
+    chosen = [
+        replace(device, tags=tuple(tag for tag in tags if tag.device == device.name))
+        for device in config.devices
+        if device.name in devices
+    ]
+    return app.line_of(config, chosen, once)
+
+
+@asynccontextmanager
+async def _running(line: Line) -> AsyncIterator[None]:
     task = asyncio.create_task(line.run())
-    while not line.is_open and not line.record.trouble:
-        await asyncio.sleep(0.01)
-    loop = asyncio.get_running_loop()
-    started = loop.time()
-    outcome: asyncio.Future[str | GatewayError] = loop.create_future()
-    line.command(told, command, argument, outcome.set_result)
-    result = await outcome
-    await _end(task)
-    if isinstance(result, GatewayError):
-        raise result
-    return CommandResult(result, time.time_ns(), loop.time() - started)
-
-
-def _line(config: LineConfig, tags: Sequence[Tag], once: _Once) -> Line:
-    names = {tag.device for tag in tags}
-    devices = [_narrowed(device, tags, config) for device in config.devices if device.name in names]
-    return Line(
-        config.name, devices, config.wire, opener(config), once, time.time_ns, echo=config.echo
-    )
-
-
-def _narrowed(device: DeviceSettings, tags: Sequence[Tag], line: LineConfig) -> Device:
-    """Returns the device with only the given tags."""
-    found = device_of(device, line)
-    found.tags = tuple(tag for tag in tags if tag.device == device.name)
-    found.plan()
-    return found
-
-
-async def _end(task: asyncio.Task[None]) -> None:
-    task.cancel()
-    for outcome in await asyncio.gather(task, return_exceptions=True):
-        if isinstance(outcome, LineDown):
-            raise outcome
+    try:
+        yield
+    finally:
+        task.cancel()
+        for outcome in await asyncio.gather(task, return_exceptions=True):
+            if isinstance(outcome, LineDown):
+                raise outcome

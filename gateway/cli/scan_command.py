@@ -15,7 +15,7 @@ from gateway.cli.terminal import FAILED, end, err
 
 def scan(
     port: Annotated[str, typer.Option(help="/dev/ttyUSB0, COM3, tcp://host:port, rfc2217://...")],
-    protocol: Annotated[str, typer.Option(help="vigor, computer-link, modbus-rtu ...")],
+    protocol: Annotated[str, typer.Option(help="as the file names it after `protocol:`")],
     stations: Annotated[
         str | None, typer.Option(help="the stations, e.g. 1-31,40 (default: up to 31)")
     ] = None,

@@ -8,8 +8,8 @@ from rich.text import Text
 
 from gateway.cli.client import Row
 from gateway.cli.terminal import out
-from gateway.northbound.payload import rfc3339
 from gateway.tags import Quality, Sample, Tag
+from gateway.tags.timestamps import rfc3339
 
 
 def row_of(sample: Sample) -> Row:

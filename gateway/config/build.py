@@ -28,7 +28,6 @@ from gateway.config.records import (
 )
 from gateway.config.tag_rules import TagSource, build_tag, inherit
 from gateway.config.validate import (
-    DRIVERS,
     driver_of,
     driver_settings,
     protocols,
@@ -38,7 +37,8 @@ from gateway.config.validate import (
 from gateway.engine.device import DeviceSettings
 from gateway.errors import ConfigError
 from gateway.protocols.driver import AnyDriver, Timing
-from gateway.protocols.frames import FrameDriver
+from gateway.protocols.registry import PROTOCOLS
+from gateway.protocols.typed_fields import TypedFields
 from gateway.tags import Tag
 
 
@@ -154,8 +154,8 @@ class Builder:
         if protocol is None:
             self.mistakes.add(place, f"missing: a device needs its protocol: {protocols()}")
             return None
-        if not isinstance(protocol, str) or protocol not in DRIVERS:
-            hint = meant(str(protocol), DRIVERS)
+        if not isinstance(protocol, str) or protocol not in PROTOCOLS:
+            hint = meant(str(protocol), PROTOCOLS)
             self.mistakes.add(place, f"{shown(protocol)} is no protocol: {hint}")
             return None
         known = driver_settings(protocol)
@@ -186,8 +186,8 @@ class Builder:
                 continue
             doubt = isinstance(raw, dict) and "type" in raw and own.type is None
             source = TagSource(device, name, own, defaults, place, type_unknown=doubt)
-            if isinstance(driver, FrameDriver):
-                tag = field_tag(source, driver, self.mistakes)
+            if isinstance(driver, TypedFields):
+                tag = field_tag(source, driver, driver, self.mistakes)
             else:
                 tag = build_tag(source, driver, self.mistakes)
             if tag is not None:

@@ -4,8 +4,8 @@ from collections.abc import Mapping
 
 from gateway.config import Config, LineConfig
 from gateway.engine.device import DeviceSettings
+from gateway.engine.requests import why_not_commanded
 from gateway.errors import BadValue
-from gateway.line.writing import not_obeyed
 from gateway.protocols.driver import Controllable
 
 TO_ALL = "global"  # every station of the line hears it, and none answers
@@ -52,7 +52,7 @@ def check_command(config: Config, device: str, command: str) -> None:
     """
     line = line_of(config, device)
     (asked,) = (one for one in line.devices if one.name == device)
-    if why := not_obeyed(asked.driver, command, control=True):
+    if why := why_not_commanded(asked.driver, command, control=True):
         raise BadValue(f"{device}: {why}")
     if not asked.enabled:
         raise BadValue(f"device {device} is disabled")

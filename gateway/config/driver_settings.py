@@ -5,7 +5,7 @@ dataclass does not know.
 """
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, get_args, get_type_hints
 
 from gateway.config import parsers
@@ -36,6 +36,16 @@ def plain_settings(
 def is_duration(hint: Any) -> bool:
     """Every float among a protocol's settings is a time."""
     return float in (hint, *get_args(hint))
+
+
+def dataclasses_in(kind: type[Any]) -> Iterator[type[Any]]:
+    """The dataclasses among the settings of a dataclass, to any depth."""
+    hints = get_type_hints(kind)
+    for hint in (hints[field.name] for field in dataclasses.fields(kind) if field.init):
+        for part in (hint, *get_args(hint)):
+            if isinstance(part, type) and dataclasses.is_dataclass(part):
+                yield part
+                yield from dataclasses_in(part)
 
 
 def _plain(hint: Any, value: Any, path: Path, mistakes: Mistakes) -> Any:

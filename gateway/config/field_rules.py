@@ -1,5 +1,4 @@
-"""From what the file says of a tag to the tag, for devices without a protocol: its field says
-the most of it."""
+"""Makes the tags of devices with typed fields: the driver says most of what a tag is."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -12,98 +11,69 @@ from gateway.config.tag_rules import (
     assemble,
     check_bounds,
     inherit,
+    only_for_numbers,
     write_rule,
 )
-from gateway.protocols.driver import Address, Span, Unit
-from gateway.protocols.frames import Field, FrameDriver
+from gateway.protocols.driver import AnyDriver, Span, Unit
+from gateway.protocols.typed_fields import TypedField, TypedFields
 from gateway.tags import Publish, Tag, WriteRule
-from gateway.values import LONGEST_STRING, Kind, Layout, ValueType
+from gateway.values import Layout
 
-# What is not among the types of words is told as the next wider of them.
-_KINDS = {
-    "uint8": Kind.UINT16,
-    "int8": Kind.INT16,
-    "bcd8": Kind.BCD16,
-    "integer": Kind.INT64,
-    "decimal": Kind.FLOAT64,
-}
 _OF_WORDS = ("type", "word_order", "byte_order")
 
 
-def field_tag(source: TagSource, driver: FrameDriver, mistakes: Mistakes) -> Tag | None:
-    """The tag, or None after its mistakes were noted."""
+def field_tag(
+    source: TagSource, driver: AnyDriver, fields: TypedFields, mistakes: Mistakes
+) -> Tag | None:
+    """Returns the tag, or None after its mistakes were noted. `fields` is the driver as well."""
     before = len(mistakes)
     address = address_of(source, driver, mistakes)
     if address is None:
         return None
     settings = inherit(source.inherited, source.own)
-    kind = _kind(driver.settings.field_of(source.own.address))
-    write = _write(source, settings, driver, address, kind, mistakes)
-    for place, problem in _misfits(source, driver, address, kind, write):
-        mistakes.add((*source.path, place), problem)
+    name, field = driver.spell(address), fields.typed_field(address)
+    write = _write(source, settings, name, field, mistakes)
+    for setting, problem in _misfits(source, name, field, write):
+        mistakes.add((*source.path, setting), problem)
     if len(mistakes) > before:
         return None
     span = Span(address.area, address.number, 1)
-    tag = assemble(source, settings, address, span, Unit.WORD, Layout(kind), write)
-    tag = replace(tag, shape=driver.shape(address), event=source.own.event)
+    tag = assemble(source, settings, address, span, Unit.WORD, Layout(field.type), write)
+    tag = replace(tag, shape=field.shape, event=source.own.event)
     if tag.event:
         tag = replace(tag, publish=Publish.ALWAYS, heartbeat=None)
     check_bounds(source, tag, mistakes)
     return tag
 
 
-def _kind(field: Field) -> ValueType:
-    if field.bit is not None:
-        return ValueType(Kind.BOOL)
-    if field.type == "text":
-        first, _, last = (field.columns or "").partition("-")
-        width = int(last) - int(first) + 1 if last else LONGEST_STRING
-        return ValueType(Kind.STRING, width)
-    return ValueType(_KINDS.get(field.type) or Kind(field.type))
-
-
 def _write(
-    source: TagSource,
-    settings: TagDefaults,
-    driver: FrameDriver,
-    address: Address,
-    kind: ValueType,
-    mistakes: Mistakes,
+    source: TagSource, settings: TagDefaults, name: str, field: TypedField, mistakes: Mistakes
 ) -> WriteRule | None:
     if settings.write is False:
         return None
-    if driver.writable(address):
-        return write_rule(source, settings.write, kind, mistakes)
+    if field.writable:
+        return write_rule(source, settings.write, field.type, mistakes)
     if source.says("write"):
-        name = driver.spell(address)
-        mistakes.add(
-            (*source.path, "write"),
-            f"{name} cannot be written: the device has no frame for it, `write: {{{name}: ...}}`",
-        )
+        problem = f"{name} cannot be written: the device has no frame for it"
+        hint = f", {field.write_hint}" if field.write_hint else ""
+        mistakes.add((*source.path, "write"), problem + hint)
     return None
 
 
 def _misfits(
-    source: TagSource,
-    driver: FrameDriver,
-    address: Address,
-    kind: ValueType,
-    write: WriteRule | None,
+    source: TagSource, name: str, field: TypedField, write: WriteRule | None
 ) -> Iterator[tuple[str, str]]:
     """(setting, what is wrong with it)."""
-    name = driver.spell(address)
-    asked, listened = name in driver.settings.asked, name in driver.settings.listened
     for setting in filter(source.says, _OF_WORDS):
-        yield setting, f"what {name} is, its field says: no {setting} here"
-    if not kind.is_number:
-        for setting in filter(source.says, ("scale", "offset", "deadband")):
-            yield setting, f"a {kind} has no {setting}: only numbers have"
-    if source.own.event and not listened:
-        yield "event", f"{name} never comes unasked: events are fields under `listen`"
-    if source.says("every") and not asked:
-        yield "every", f"{name} is never asked for: it has no interval"
-    if not asked and not listened and write is None:
-        yield "write", f"{name} is only written: it needs write: true"
+        yield setting, f"the field {name} has its own type: remove {setting} here"
+    yield from only_for_numbers(source, field.type)
+    if source.own.event and not field.unsolicited:
+        hint = f": {field.event_hint}" if field.event_hint else ""
+        yield "event", f"{name} never arrives unsolicited{hint}"
+    if source.says("every") and not field.polled:
+        yield "every", f"{name} is never polled: it has no interval"
+    if not field.polled and not field.unsolicited and write is None:
+        yield "write", f"{name} can only be written: it needs write: true"
     rule = source.own.write
-    if isinstance(rule, WriteSection) and rule.verify and not asked:
-        yield "write", f"{name} cannot be read back, no question asks for it: no verify"
+    if isinstance(rule, WriteSection) and rule.verify and not field.polled:
+        yield "write", f"{name} cannot be read back, no request reads it: remove verify"

@@ -1,67 +1,70 @@
-"""What must agree among the devices that share a wire: station numbers, speed, format."""
+"""Checks the devices that share a line: station numbers, speed, format, unsolicited frames."""
 
 from collections.abc import Sequence
 
-from gateway.config.customs import custom
 from gateway.config.messages import Mistakes, Path
 from gateway.config.model import LineSection
 from gateway.engine.device import DeviceSettings
 from gateway.planning.wire_timing import NETWORK_BAUD, WireTiming, character_bits
-from gateway.protocols.computer_link import ComputerLink
-from gateway.protocols.frames import FrameDriver
+from gateway.protocols.driver import EchoConflict
 from gateway.protocols.unsolicited import Unsolicited
+from gateway.stations.registry import can_simulate
 from gateway.transport.port import SerialSettings, SimulatorAddress, TcpAddress
 
 
 def check_line(
     line: LineSection, devices: Sequence[DeviceSettings], path: Path, mistakes: Mistakes
 ) -> None:
-    """Note what cannot live together on this line."""
-    stations: dict[int, str] = {}
-    _check_listening(devices, path, mistakes)
+    """Notes every conflict between the line and its devices."""
+    _check_unsolicited(devices, path, mistakes)
+    _check_stations(devices, path, mistakes)
     for device in devices:
-        place = (*path, "devices", device.name)
-        number = device.driver.station
-        if isinstance(device.driver, FrameDriver):  # it has no number
-            if isinstance(line.port, SimulatorAddress):
-                mistakes.add(
-                    (*path, "port"), f"{device.name} cannot be simulated: it has no protocol"
-                )
-            continue
-        other = stations.setdefault(number, device.name)
-        if other != device.name:
+        driver, place = device.driver, (*path, "devices", device.name)
+        if isinstance(line.port, SimulatorAddress) and not can_simulate(driver):
             mistakes.add(
-                (*place, "station"),
-                f"{other} on this line is station {number} already: both would answer at once",
+                (*path, "port"),
+                f"{device.name} cannot be simulated: there is no station for {driver.protocol}",
             )
-        if line.echo and isinstance(device.driver, ComputerLink) and device.driver.send_area_c:
-            mistakes.add(
-                (*place, "send_area_c"),
-                "the line has `echo: true`, and the echo of this acknowledgement looks exactly "
-                "like the PLC's to a write: leave it out, no PLC is known to need it",
-            )
-        if custom(device.driver).baudrate is None:
+        if line.echo and isinstance(driver, EchoConflict) and driver.echo_conflict is not None:
+            setting, reason = driver.echo_conflict
+            mistakes.add((*place, setting), f"the line has `echo: true`, and {reason}")
+        if driver.traits.over_network:
             _check_network(line, devices, device, place, mistakes)
-        elif custom(device.driver).eight_bits and line.format and line.format[0] == "7":
+        elif driver.traits.binary and line.format and line.format[0] == "7":
             mistakes.add(
                 (*path, "format"),
                 f"{line.format} has 7 data bits, but {device.name} speaks "
-                f"{device.driver.protocol}, which needs 8, such as 8{line.format[1:]}",
+                f"{driver.protocol}, which needs 8, such as 8{line.format[1:]}",
             )
 
 
-def _check_listening(devices: Sequence[DeviceSettings], path: Path, mistakes: Mistakes) -> None:
-    """Of what comes unasked nobody could tell which of two devices said it."""
-    speakers = [
+def _check_stations(devices: Sequence[DeviceSettings], path: Path, mistakes: Mistakes) -> None:
+    stations: dict[int, str] = {}
+    for device in devices:
+        if not device.driver.traits.numbered:
+            continue
+        number = device.driver.station
+        other = stations.setdefault(number, device.name)
+        if other != device.name:
+            mistakes.add(
+                (*path, "devices", device.name, "station"),
+                f"{other} on this line is station {number} already: both would answer at once",
+            )
+
+
+def _check_unsolicited(devices: Sequence[DeviceSettings], path: Path, mistakes: Mistakes) -> None:
+    """An unsolicited frame does not say which device sent it."""
+    senders = [
         device.name
         for device in devices
         if isinstance(device.driver, Unsolicited) and device.driver.sends_unsolicited
     ]
-    for name in speakers[1:]:
+    for name in senders[1:]:
         mistakes.add(
             (*path, "devices", name, "listen"),
-            f"{speakers[0]} on this line speaks unasked already, and nobody could tell which of "
-            "them did: give it a line of its own, or write both as one device",
+            f"{senders[0]} on this line sends unsolicited frames already, and a frame does not "
+            "say which device sent it: give this device a line of its own, or write both as one "
+            "device",
         )
 
 
@@ -75,24 +78,25 @@ def _check_network(
     protocol = device.driver.protocol
     if not isinstance(line.port, (TcpAddress, SimulatorAddress)):
         mistakes.add(
-            (*path, "protocol"), f"{protocol} needs a port tcp://host:port, it has no wire"
+            (*path, "protocol"),
+            f"{protocol} needs a port tcp://host:port: it does not run on a serial line",
         )
-    wired = [other for other in devices if custom(other.driver).baudrate is not None]
-    if wired:
+    serial = [other for other in devices if not other.driver.traits.over_network]
+    if serial:
         mistakes.add(
             (*path, "protocol"),
-            f"{protocol} cannot share a line with {wired[0].name}, "
-            f"which speaks {wired[0].driver.protocol}: give it a line of its own",
+            f"{protocol} cannot share a line with {serial[0].name}, "
+            f"which speaks {serial[0].driver.protocol}: give it a line of its own",
         )
 
 
 def line_wire(
     line: LineSection, devices: Sequence[DeviceSettings], path: Path, mistakes: Mistakes
 ) -> tuple[SerialSettings, WireTiming]:
-    """Speed and format, as written or as all protocols of the line are used to."""
-    customs = {device.driver.protocol: custom(device.driver) for device in devices}
-    rates = {name: habit.baudrate for name, habit in customs.items()}
-    formats = {name: habit.format for name, habit in customs.items()}
+    """Returns speed and format: those of the file, or the defaults of all protocols of the line."""
+    traits = {device.driver.protocol: device.driver.traits for device in devices}
+    rates = {name: usual.baudrate for name, usual in traits.items()}
+    formats = {name: usual.format for name, usual in traits.items()}
     if line.baudrate is None and set(rates.values()) == {None}:
         return SerialSettings(), WireTiming(NETWORK_BAUD, 10)
     for setting, given, usual in (
@@ -100,9 +104,9 @@ def line_wire(
         ("format", line.format, formats),
     ):
         if given is None and len(set(usual.values())) > 1:
-            habits = ", ".join(f"{name} {value}" for name, value in usual.items())
+            defaults = ", ".join(f"{name} {value}" for name, value in usual.items())
             mistakes.add(
-                (*path, setting), f"missing: the devices of this line differ in it ({habits})"
+                (*path, setting), f"missing: the devices of this line differ in it ({defaults})"
             )
     baudrate = line.baudrate or next(filter(None, rates.values()), 9600)
     serial = SerialSettings(baudrate, line.format or next(iter(formats.values()), "8N1"))

@@ -1,12 +1,11 @@
 """The JSON schema of the file, for editors that complete and check."""
 
-import dataclasses
-from collections.abc import Iterator, Mapping
-from typing import Any, get_args, get_type_hints
+from collections.abc import Mapping
+from typing import Any, get_type_hints
 
 from pydantic import TypeAdapter
 
-from gateway.config.driver_settings import is_duration
+from gateway.config.driver_settings import dataclasses_in, is_duration
 from gateway.config.model import (
     DeviceSection,
     FileSection,
@@ -22,8 +21,8 @@ from gateway.config.setting_types import (
     NAME_PATTERN,
     TAG_NAME_PATTERN,
 )
-from gateway.config.validate import DRIVERS
 from gateway.errors import ConfigError
+from gateway.protocols.registry import PROTOCOLS
 
 _TIMES = (DURATION_SCHEMA["pattern"], INTERVAL_SCHEMA["pattern"])
 _PARTS: dict[str, type[Section]] = {"Line": LineSection, "Tag": TagSection, "Defaults": TagDefaults}
@@ -35,18 +34,18 @@ def schema() -> dict[str, Any]:
     shared: dict[str, Any] = root.setdefault("$defs", {})
     for name, part in _PARTS.items():
         shared[name] = _hoisted(part.model_json_schema(), shared)
-    for protocol in DRIVERS:
+    for protocol in PROTOCOLS:
         shared[protocol] = _device(protocol, shared)
     shared["Device"] = {
         "type": "object",
         "required": ["protocol"],
-        "properties": {"protocol": {"enum": list(DRIVERS)}},
+        "properties": {"protocol": {"enum": list(PROTOCOLS)}},
         "allOf": [
             {
                 "if": {"properties": {"protocol": {"const": name}}, "required": ["protocol"]},
                 "then": _ref(name),
             }
-            for name in DRIVERS
+            for name in PROTOCOLS
         ],
     }
     root["properties"]["lines"] |= _by_name("Line") | {"minProperties": 1}
@@ -61,13 +60,13 @@ def schema() -> dict[str, Any]:
 
 
 def _device(protocol: str, shared: dict[str, Any]) -> dict[str, Any]:
-    driver = DRIVERS[protocol]
+    driver = PROTOCOLS[protocol].settings
     settings = _hoisted(TypeAdapter(driver).json_schema(), shared)["properties"]
     _mend(driver, settings)
     if "station" in settings:
         stations = [number for number in range(256) if _is_station(driver, number)]
         settings["station"] |= {"minimum": stations[0], "maximum": stations[-1]}
-    for inner in set(_dataclasses_in(driver)):
+    for inner in set(dataclasses_in(driver)):
         shared[inner.__name__] |= {"additionalProperties": False}
         _mend(inner, shared[inner.__name__]["properties"])
     common = _hoisted(DeviceSection.model_json_schema(), shared)["properties"]
@@ -121,16 +120,6 @@ def _in_unit(amount: float, units: Mapping[str, float]) -> str:
     whole = [unit for unit, size in units.items() if amount and amount % size == 0]
     unit = max(whole, key=units.__getitem__, default=min(units, key=units.__getitem__))
     return f"{amount / units[unit]:g}{unit}"
-
-
-def _dataclasses_in(kind: type[Any]) -> Iterator[type[Any]]:
-    """Those that a dataclass's settings are made of, to any depth."""
-    hints = get_type_hints(kind)
-    for hint in (hints[field.name] for field in dataclasses.fields(kind) if field.init):
-        for part in (hint, *get_args(hint)):
-            if isinstance(part, type) and dataclasses.is_dataclass(part):
-                yield part
-                yield from _dataclasses_in(part)
 
 
 def _hoisted(part: dict[str, Any], shared: dict[str, Any]) -> dict[str, Any]:

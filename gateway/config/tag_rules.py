@@ -3,13 +3,12 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from gateway.config.customs import byte_order, default_type
 from gateway.config.messages import Mistakes, Path
 from gateway.config.model import TagDefaults, TagSection, WriteSection
 from gateway.errors import BadValue, ConfigError
 from gateway.protocols.driver import Address, AnyDriver, Area, Span, Unit
 from gateway.tags import Tag, WriteRule
-from gateway.values import Kind, Layout, ValueType
+from gateway.values import Kind, Layout, Order, ValueType
 
 _WIDE = (Kind.INT32, Kind.UINT32, Kind.FLOAT32, Kind.BCD32)
 
@@ -118,21 +117,32 @@ def _type(
     mistakes: Mistakes,
 ) -> ValueType:
     area = driver.areas[address.area]
-    custom = default_type(driver, Unit.BIT if address.bit is not None else area.unit)
+    default = _default_type(driver, Unit.BIT if address.bit is not None else area.unit)
     if settings.type is None:
-        return custom
+        return default
     misfit = _type_misfit(settings.type, area, address, driver)
     if misfit is None:
         return settings.type
     if source.says("type"):
         mistakes.add((*source.path, "type"), misfit)
-    return custom
+    return default
+
+
+def _default_type(driver: AnyDriver, unit: Unit) -> ValueType:
+    match unit:
+        case Unit.BIT:
+            return ValueType(Kind.BOOL)
+        case Unit.WORD:
+            return ValueType(driver.traits.word_type)
+        case Unit.DWORD:
+            return ValueType(Kind.INT32)
 
 
 def _layout(settings: TagDefaults, driver: AnyDriver, area: Area, kind: ValueType) -> Layout:
     if area.unit is Unit.DWORD:  # the driver puts it together, whatever its order on the wire
         return Layout(kind)
-    return Layout(kind, settings.word_order, settings.byte_order or byte_order(driver, kind.kind))
+    usual = driver.traits.string_order if kind.kind is Kind.STRING else Order.HIGH_FIRST
+    return Layout(kind, settings.word_order, settings.byte_order or usual)
 
 
 def _type_misfit(kind: ValueType, area: Area, address: Address, driver: AnyDriver) -> str | None:
@@ -189,6 +199,11 @@ def _unsuited(
         yield "word_order", f"{spelt} is {kind}: only numbers of 32 or 64 bits have a word_order"
     if kind.kind is Kind.BOOL and source.says("byte_order"):
         yield "byte_order", f"{spelt} is {kind}: only words have a byte_order"
+    yield from only_for_numbers(source, kind)
+
+
+def only_for_numbers(source: TagSource, kind: ValueType) -> Iterator[tuple[str, str]]:
+    """Settings of numbers that a text or a bit has."""
     if not kind.is_number:
         for setting in filter(source.says, ("scale", "offset", "deadband")):
             yield setting, f"a {kind} has no {setting}: only numbers have"

@@ -3,25 +3,20 @@
 import dataclasses
 import json
 from collections.abc import Collection, Mapping
-from typing import Any, TypeVar, get_args, get_type_hints
+from functools import cache
+from typing import Any, TypeVar, get_args
 
 from pydantic import TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
 
-from gateway.config.driver_settings import plain_settings
+from gateway.config.driver_settings import dataclasses_in, plain_settings
 from gateway.config.messages import Mistakes, Path, meant, one_of, shown
 from gateway.config.model import Section
-from gateway.protocols import Frames, PlcDriver
 from gateway.protocols.driver import AnyDriver
-from gateway.protocols.frames import FrameDriver
+from gateway.protocols.registry import PROTOCOLS, Protocol
 
 S = TypeVar("S", bound=Section)
 
-# What is in the file for each protocol: drivers, and the settings that one is made of.
-DRIVERS: dict[str, type[Any]] = {
-    get_args(get_type_hints(driver)["protocol"])[0]: driver for driver in get_args(PlcDriver)
-}
-_ADAPTERS = {name: TypeAdapter(driver) for name, driver in DRIVERS.items()}
 # The branches of `write:`, which pydantic names in its places but the file does not.
 _BRANCHES = ("flag", "rule")
 
@@ -56,12 +51,13 @@ def _without(raw: Any, place: Path) -> Any:
 def driver_of(
     protocol: str, settings: Mapping[str, Any], path: Path, mistakes: Mistakes
 ) -> AnyDriver | None:
-    """The driver with these settings; one with the settings that are right if some are wrong."""
+    """Returns the driver with these settings; with mistakes, one with the correct settings."""
     before = len(mistakes)
-    values = plain_settings(DRIVERS[protocol], settings, path, mistakes)
-    framed = DRIVERS[protocol] is Frames
-    if framed and len(mistakes) > before:
-        return None  # of fields that are not what they should be nothing more can be said
+    kind = PROTOCOLS[protocol].settings
+    values = plain_settings(kind, settings, path, mistakes)
+    nested = any(dataclasses_in(kind))
+    if nested and len(mistakes) > before:
+        return None  # the rest cannot be checked without the part that is wrong
     try:
         return _driver(protocol, values)
     except ValidationError as error:
@@ -74,7 +70,7 @@ def driver_of(
                 place, text = (first,), text.removeprefix(f"{first}: ")
             mistakes.add((*path, *place), text)
             values.pop(str(place[0]) if place else "station", None)
-    if framed:
+    if nested:
         return None
     try:
         return _driver(protocol, values)
@@ -84,14 +80,19 @@ def driver_of(
 
 def driver_settings(protocol: str) -> set[str]:
     """The names of its own settings in the file."""
-    return {field.name for field in dataclasses.fields(DRIVERS[protocol]) if field.init}
+    return {field.name for field in dataclasses.fields(PROTOCOLS[protocol].settings) if field.init}
 
 
 def _driver(protocol: str, values: Mapping[str, Any]) -> AnyDriver:
     # As JSON, because pydantic is strict there (true is no number) and still builds dataclasses.
     text = json.dumps({"protocol": protocol, **values}, default=str)
-    made: AnyDriver | Frames = _ADAPTERS[protocol].validate_json(text, strict=True)
-    return FrameDriver(made) if isinstance(made, Frames) else made
+    known = PROTOCOLS[protocol]
+    return known.driver(_adapter(known).validate_json(text, strict=True))
+
+
+@cache
+def _adapter(known: Protocol) -> TypeAdapter[Any]:
+    return TypeAdapter(known.settings)
 
 
 def _known(kind: type[Section], place: Path) -> Collection[str]:
@@ -155,4 +156,4 @@ def unknown(name: str, owner: str, known: Collection[str]) -> str:
 
 
 def protocols() -> str:
-    return one_of(DRIVERS)
+    return one_of(PROTOCOLS)

@@ -24,7 +24,7 @@ def asked(devices: Sequence[Device]) -> list[Asked]:
 
 def asked_of(device: Device, block: Block) -> Asked:
     """One block, read as often as its device wants to be believed."""
-    return Asked(device, block, device.verify_reads * device.seconds(block.cost))
+    return Asked(device, block, device.settings.verify_reads * device.seconds(block.cost))
 
 
 def load_of(blocks: Sequence[Asked]) -> float:

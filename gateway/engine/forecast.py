@@ -60,7 +60,7 @@ def forecast(name: str, devices: Sequence[Device], wire: WireTiming) -> LineFore
     load = load_of(blocks)
     longest = max((one.seconds for one in blocks), default=0.0)
     write = max((_longest_write(device) for device in devices), default=0.0)
-    silence = max((device.patience for device in devices), default=0.0)
+    silence = max((device.longest_reply for device in devices), default=0.0)
     cycle = sum(one.seconds for one in blocks)
     unasked = [(device, _unsolicited(device)) for device in devices]
     return LineForecast(
@@ -91,7 +91,7 @@ def _unsolicited(device: Device) -> int:
 def _round(device: Device) -> float:
     """One reading of all tags, planned as if all had the same interval."""
     alike = [replace(tag, every=1.0) for tag in device.tags]
-    blocks = plan(alike, device.driver, device.seconds, device.refusals.cuts)
+    blocks = plan(alike, device.driver, device.seconds, device.bad_addresses.cuts)
     return sum(device.seconds(block.cost) for block in blocks)
 
 

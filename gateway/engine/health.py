@@ -138,7 +138,7 @@ class Health:
         self.next_probe = now + self.pause * spread
 
     def probe_soon(self) -> None:
-        """A client waits for the offline device: probe it as soon as its share of the wire allows."""
+        """A client waits for the device: probe it as soon as the share of the wire allows."""
         self.next_probe = 0.0
 
     def next_probe_token(self) -> int:

@@ -1,84 +1,223 @@
-"""What a line can have to do next."""
+"""Jobs that an engine hands to its line, and their results."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from gateway.engine.device import Device
-from gateway.engine.requests import Order
+from gateway.engine.health import PAUSE_FIRST, PAUSE_LONGEST, State
+from gateway.engine.records import PollRecord
+from gateway.engine.requests import Command, Request, Write
+from gateway.errors import BadValue, DeviceError, LineDown
 from gateway.planning.planner import Block
+from gateway.protocols.driver import Span
 from gateway.tags import Sample
 
-PAUSE_FIRST = 1.0
-PAUSE_LONGEST = 60.0
-URGENT, NOWHERE = -1, -2  # tickets of polls that are in no heap
+EXPEDITED, NOT_QUEUED = -1, -2  # tickets of polls that are in no heap
+
+
+@dataclass(slots=True)
+class LastRead:
+    """The last good read of a block."""
+
+    at: float | None = None  # by the line's clock; None: the block's values are bad
+    ever: bool = False  # there was one
+    units: Sequence[int] | None = None  # what was read
+    samples: Sequence[Sample] | None = None  # what was made of it
 
 
 @dataclass(slots=True, eq=False)
 class Poll:
-    """A block and when it is due. Times in seconds of the loop's clock."""
+    """A job: read one block. It also holds when the block is due. Times by the line's clock."""
 
     device: Device
     block: Block
     due: float
     tries: int = 0
-    setbacks: int = 0  # rounds in a row that got no answer, though the device answers otherwise
-    last_good: float | None = None  # when it was read last; None: its values are bad
-    seen: bool = False  # it was read at least once
+    missed: int = 0  # rounds in a row without a reply, though the device answers otherwise
     asked: float = 0.0  # when it was handed out last
-    hurried: bool = False  # before its turn, as somebody wants to see it
+    expedited: bool = False  # before its turn, as a client waits for it
     phased: bool = True  # it has found its place in the period
-    live: bool = True  # False once the device was planned anew
-    reads: int = 0  # good ones
-    overruns: int = 0  # rounds left out because the one before was late
-    mean_gap: float = 0.0  # seconds between two good reads, smoothed over about ten
-    worst_gap: float = 0.0
-    ticket: int = NOWHERE  # its one valid place in the queues
-    units: Sequence[int] | None = None  # as they were read last, and
-    told: Sequence[Sample] | None = None  # what was told of them
+    live: bool = True  # False once the device was planned again
+    ticket: int = NOT_QUEUED  # its one valid place in the queues
+    register: bool = False  # its monitor list must be registered first
+    last: LastRead = field(default_factory=LastRead)
+    record: PollRecord = field(default_factory=PollRecord)
 
     def read(self, now: float) -> None:
-        """Its values have just come."""
-        if self.last_good is not None:
-            gap = now - self.last_good
-            self.worst_gap = max(self.worst_gap, gap)
-            self.mean_gap += (gap - self.mean_gap) / max(1, min(10, self.reads))
-        self.reads += 1
-        self.last_good = now
-        self.seen = True
+        """It was read well."""
+        last, record = self.last, self.record
+        if last.at is not None:
+            gap = now - last.at
+            if gap > record.worst_gap:
+                record.worst_gap = gap
+            record.mean_gap += (gap - record.mean_gap) / max(1, min(10, record.reads))
+        record.reads += 1
+        last.at = now
+        last.ever = True
 
     def forget(self, now: float) -> float:
-        """Its values turn bad. Returns how old they were."""
-        age = 0.0 if self.last_good is None else now - self.last_good
-        self.worst_gap = max(self.worst_gap, age)
-        self.last_good = None
+        """Its values turn bad. Returns their age."""
+        age = 0.0 if self.last.at is None else now - self.last.at
+        self.record.worst_gap = max(self.record.worst_gap, age)
+        self.last.at = None
         return age
 
     @property
     def every(self) -> float:
-        """How often it is asked: less and less where no answer comes."""
+        """Seconds until it is due again: more and more where no reply comes."""
         every = self.device.interval(self.block)
-        if self.setbacks:
-            every = max(every, min(PAUSE_FIRST * 2.0 ** min(self.setbacks, 10), PAUSE_LONGEST))
+        if self.missed:
+            every = max(every, min(PAUSE_FIRST * 2.0 ** min(self.missed, 10), PAUSE_LONGEST))
         return every
 
     @property
     def deadline(self) -> float:
-        """An address asked for rarely, as it was refused, does not wait as long when it is due."""
+        """A bad address is polled rarely, but then it does not wait as long."""
         return self.due + self.block.every
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Probe:
-    """Ask a device we are in doubt about something harmless."""
+    """A job: resync with a device by a harmless request with its own token."""
 
     device: Device
+    outstanding: Span | None  # its reply must not be taken for an older one's
+    token: int
+    again: bool = False  # the line has settled: any reply is this one's
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WriteTogether:
+    """A job: several writes to one device in one exchange."""
+
+    device: Device
+    writes: Sequence[Write]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Confirm:
+    """A job: resync, then read back what an unclear write left in the device."""
+
+    device: Device
+    write: Write
+    error: DeviceError  # the unclear end
+    outstanding: Span | None
+    token: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Repeat:
+    """A job: the same write once more, as its tag allows."""
+
+    device: Device
+    write: Write
+    error: DeviceError  # the unclear end of the first try
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Answer:
+    """A job: reply to an unsolicited frame. `until`: by the line's clock."""
+
+    device: Device
+    frame: bytes
+    until: float
+
+
+RequestJob = Write | WriteTogether | Command | Confirm | Repeat
+Unfinished = Poll | Probe | RequestJob
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Settle:
+    """A job: keep the transaction open and silent, so that a late reply disturbs nothing.
+
+    After a time-out until the late reply has arrived, or for `guard` seconds. After noise until
+    `gap` seconds have passed without a byte, at most `guard`.
+    """
+
+    device: Device
+    guard: float
+    gap: float
+    after: Unfinished
+    error: DeviceError | None = None  # None: the reply may have been an older request's
+    before: State = State.ONLINE  # of the device before it failed
+    sent: bool = True  # something was sent at all
+    failed: Sequence[tuple[Poll, DeviceError]] = ()  # polls of the same transaction
 
 
 @dataclass(frozen=True, slots=True)
 class Idle:
-    """Nothing to say until then, unless a write comes."""
+    """Nothing to send until then, unless something comes in."""
 
     until: float
 
 
-Job = Poll | Order | Probe | Idle
+Transacted = Unfinished | Answer | Settle
+Job = Transacted | Idle
+
+
+def requests_of(job: Job) -> Sequence[Request]:
+    """The requests that the job carries out."""
+    match job:
+        case Write() | Command():
+            return (job,)
+        case WriteTogether(writes=writes):
+            return writes
+        case Confirm(write=write) | Repeat(write=write):
+            return (write,)
+        case Settle(after=after):
+            return requests_of(after)
+    return ()
+
+
+def span_of(job: Unfinished) -> Span | None:
+    """The span whose reply may still arrive after the job; None leaves an older one as it was."""
+    match job:
+        case Poll():
+            return job.block.span
+        case Write(tag=tag):
+            return tag.span
+        case WriteTogether(writes=[first, *_]):
+            return first.tag.span
+        case Confirm(write=write) | Repeat(write=write):
+            return write.tag.span
+    return None
+
+
+# Results
+
+
+@dataclass(slots=True)
+class Traffic:
+    """What passed on the wire for a job."""
+
+    sent: int = 0  # characters
+    heard: int = 0  # characters
+    exchanges: int = 0  # requests answered
+    turnaround: float = 0.0  # seconds that the station took for them, beyond the characters
+
+
+@dataclass(frozen=True, slots=True)
+class Resynced:
+    """A probe was answered. Its reply can be told from those of so many open requests."""
+
+    told_from: int
+
+
+@dataclass(frozen=True, slots=True)
+class Sent:
+    """A write was carried out, or sent to stations that never acknowledge."""
+
+    acknowledged: bool = True
+    held: Sequence[int] | None = None  # read back; None: the tag does not say `verify`
+    refused_back: DeviceError | None = None  # reading back was refused
+
+
+@dataclass(frozen=True, slots=True)
+class Settled:
+    """The line is quiet again. `late`: seconds from the time-out to the late reply, if it came."""
+
+    late: float | None
+
+
+Result = Sequence[int] | Resynced | Sent | Settled | str | DeviceError | BadValue | LineDown | None

@@ -1,4 +1,4 @@
-"""What people want of a device: writes and commands, on their way down the line."""
+"""Requests of clients: writes and commands, and the queue in which they wait for the line."""
 
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -7,126 +7,166 @@ from typing import NamedTuple
 
 from gateway.engine.device import Device
 from gateway.errors import GatewayError
+from gateway.protocols.driver import AnyDriver, Controllable, ScatteredWriter
 from gateway.tags import Tag, WriteResult
+from gateway.values import Value
 
-Done = Callable[[WriteResult | GatewayError], None]
-Told = Callable[[str | GatewayError], None]
-
-
-@dataclass(slots=True, eq=False)
-class Write:
-    """A value for a tag; `done` is called exactly once. Times by the loop's clock."""
-
-    device: Device
-    tag: Tag
-    units: Sequence[int]
-    submitted: float
-    expires: float  # not sent any more after this: whoever asked has given up
-    done: Done
-    alone: bool = False  # it was refused together with others
-
-    @property
-    def plain(self) -> bool:
-        """One exchange and no more: it may share that exchange with others."""
-        rule = self.tag.write
-        conversation = rule is not None and (rule.verify or rule.repeat)
-        return not (self.alone or conversation) and self.tag.address.bit is None
-
-    @property
-    def latest(self) -> bool:
-        """Of several that wait, only the last is to be sent."""
-        return self.tag.write is not None and self.tag.write.latest
+WRITE_EXPIRY = 5.0  # seconds after which a waiting request is no longer sent
+MOST_WAITING = 1000  # requests
 
 
 class CommandResult(NamedTuple):
-    """What a device said to a command; `time` in ns since 1970, `took` in seconds."""
+    """A device's answer to a command; `time` in ns since 1970, `took` in seconds."""
 
     answer: str
     time: int
     took: float
 
 
+Outcome = WriteResult | str | GatewayError
+
+
+@dataclass(slots=True, eq=False)
+class Write:
+    """A value for a tag. Times in seconds of the line's clock."""
+
+    device: Device
+    tag: Tag
+    units: Sequence[int]
+    submitted: float
+    alone: bool = False  # it was refused together with others: it is sent alone now
+
+    @property
+    def expires(self) -> float:
+        """When it is no longer sent: its client has given up."""
+        return self.submitted + WRITE_EXPIRY
+
+    @property
+    def plain(self) -> bool:
+        """One exchange is enough, so it may share that exchange with others."""
+        rule = self.tag.write
+        needs_more = rule is not None and (rule.verify or rule.repeat)
+        return not (self.alone or needs_more) and self.tag.address.bit is None
+
+    @property
+    def latest(self) -> bool:
+        """Of several that wait, only the last is sent."""
+        return self.tag.write is not None and self.tag.write.latest
+
+    def holds(self, units: Sequence[int]) -> bool:
+        """The device holds what was written. `units`: as read back from it."""
+        if self.tag.shape is not None:  # bytes are written, a value is read
+            return self.tag.decode(units) == self.tag.from_units(self.units)
+        bit = self.tag.address.bit
+        if bit is not None:
+            return (units[0] >> bit & 1) == self.units[0]
+        return list(units) == list(self.units)
+
+    def result(
+        self, now: float, time: int, *, verified: bool = False, acknowledged: bool = True
+    ) -> WriteResult:
+        """It was carried out. `now` by the line's clock, `time` in ns since 1970."""
+        value: Value | None = self.tag.from_units(self.units)
+        known = False if value is None else value
+        return WriteResult(known, time, now - self.submitted, verified, acknowledged)
+
+
 @dataclass(slots=True, eq=False)
 class Command:
-    """Run, stop, loopback, model ...; `done` is called exactly once."""
+    """Run, stop, loopback, model ... for one device."""
 
     device: Device
     name: str
     argument: str
     submitted: float
-    expires: float
-    done: Told
-
-
-Order = Write | Command
-
-
-WAITING_ORDERS = 1000
-
-
-class OrderQueue:
-    """The orders of one line that wait. What a device is told stays in the order it was asked."""
-
-    def __init__(self) -> None:
-        self._orders: deque[Order] = deque()
-
-    def __len__(self) -> int:
-        return len(self._orders)
 
     @property
-    def first(self) -> Order:
-        return self._orders[0]
+    def expires(self) -> float:
+        """When it is no longer sent: its client has given up."""
+        return self.submitted + WRITE_EXPIRY
 
-    def undoubted(self) -> Order | None:
-        """Takes out the first to a device that is not in doubt."""
-        for order in self._orders:
-            if not order.device.doubtful:
-                self._orders.remove(order)
-                return order
+
+Request = Write | Command
+
+
+def can_share(writes: Sequence[Write]) -> bool:
+    """All these writes to one device fit in one exchange."""
+    driver = writes[0].device.driver
+    if not isinstance(driver, ScatteredWriter) or not all(write.plain for write in writes):
+        return False
+    return driver.scattered_write_cost([write.tag.span for write in writes]) is not None
+
+
+def why_not_commanded(driver: AnyDriver, command: str, *, control: bool) -> str:
+    """The reason why a device does not take this command; empty where it does."""
+    known = driver.controls if isinstance(driver, Controllable) else frozenset()
+    if not known:
+        return f"a {driver.protocol} device takes no commands"
+    if command not in known:
+        return f"{command!r} is none of its commands: {', '.join(sorted(known))}"
+    return "" if control else "the file does not say `control: true` of it"
+
+
+class RequestQueue:
+    """The waiting requests of one line. Those of one device stay in their order."""
+
+    def __init__(self) -> None:
+        self.waiting: deque[Request] = deque()
+
+    @property
+    def first(self) -> Request:
+        return self.waiting[0]
+
+    def take(self) -> Request | None:
+        """Takes out the first request to a device that needs no resync."""
+        for request in self.waiting:
+            if not request.device.health.needs_resync:
+                self.waiting.remove(request)
+                return request
         return None
 
-    def submit(self, order: Order) -> bool:
-        """False when too many orders wait already."""
-        if len(self._orders) >= WAITING_ORDERS:
+    def submit(self, request: Request) -> bool:
+        """False when too many requests wait already."""
+        if len(self.waiting) >= MOST_WAITING:
             return False
-        self._orders.append(order)
+        self.waiting.append(request)
         return True
 
-    def superseded(self, write: Write) -> list[Order]:
-        """The waiting writes that need not be sent, as `write` follows: its tag says `latest`."""
+    def superseded(self, write: Write) -> list[Request]:
+        """Takes out the waiting writes that `write` replaces: its tag says `latest`."""
         if not write.latest:
             return []
         return self._out(lambda other: isinstance(other, Write) and other.tag is write.tag)
 
-    def companions(self, write: Write, fit: Callable[[Sequence[Write]], bool]) -> list[Write]:
-        """The next orders of its device as far as all can go out with it; they are taken out."""
+    def companions(self, write: Write) -> list[Write]:
+        """Takes out the device's next writes that fit in one exchange with this one."""
         found: list[Write] = []
-        for order in self._orders:
-            if order.device is not write.device:
+        for request in self.waiting:
+            if request.device is not write.device:
                 continue
-            if not isinstance(order, Write) or not fit([write, *found, order]):
+            if not isinstance(request, Write) or not can_share([write, *found, request]):
                 break
-            found.append(order)
+            found.append(request)
         if found:
-            self._out(lambda order: order in found)
+            self._out(lambda request: request in found)
         return found
 
     def each_alone(self, writes: Sequence[Write]) -> None:
-        """They were refused together, so nothing of them was done: they are next, one by one."""
+        """They were refused together, so none was carried out: they are next, one by one."""
         for write in reversed(writes):
             write.alone = True
-            self._orders.appendleft(write)
+            self.waiting.appendleft(write)
 
-    def withdraw(self, device: Device | None = None) -> list[Order]:
-        """The waiting orders (to one device) that will not be sent any more."""
-        return self._out(lambda order: device is None or order.device is device)
+    def withdraw(self, device: Device | None = None) -> list[Request]:
+        """Takes out the waiting requests (to one device) that will not be sent."""
+        return self._out(lambda request: device is None or request.device is device)
 
-    def expired(self, now: float) -> list[Order]:
-        """The waiting orders nobody waits for any longer; they are forgotten here."""
-        return self._out(lambda order: order.expires <= now) if self._orders else []
+    def expired(self, now: float) -> list[Request]:
+        """Takes out the requests that have waited too long."""
+        return self._out(lambda request: request.expires <= now) if self.waiting else []
 
-    def _out(self, which: Callable[[Order], bool]) -> list[Order]:
-        taken = [order for order in self._orders if which(order)]
+    def _out(self, which: Callable[[Request], bool]) -> list[Request]:
+        taken = [request for request in self.waiting if which(request)]
         if taken:
-            self._orders = deque(order for order in self._orders if not which(order))
+            self.waiting = deque(request for request in self.waiting if not which(request))
         return taken

@@ -1,247 +1,242 @@
-"""What follows from how a conversation went: for the device, the schedule, and those who watch."""
+"""Applies the result of a transaction to device health, schedule and samples."""
 
-import asyncio
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import Any, Protocol
+from collections.abc import Sequence
+from typing import Any
 
-import structlog
-
-from gateway.engine.device import Device, Standing
+from gateway.engine.device import Device
+from gateway.engine.effects import Effects, Samples
+from gateway.engine.health import State
 from gateway.engine.jobs import Poll
 from gateway.engine.schedule import Schedule
-from gateway.engine.staleness import Overdue
+from gateway.engine.staleness import Staleness
 from gateway.errors import (
-    Evidence,
+    DeviceError,
     Garbled,
     GatewayError,
-    LineDown,
+    Offline,
     Refusal,
     Refused,
-    Unclear,
     Unsteady,
 )
 from gateway.planning.planner import describe
 from gateway.protocols.driver import Span
-from gateway.tags import Reason, Sample, Tag, bad
+from gateway.tags import Reason, Sample
 from gateway.tags.unchanged import Unchanged
 
-log = structlog.get_logger("gateway.line")
 BUSY_PAUSE = 0.2  # seconds left to a device that said it was busy, doubled each time
 
 
-class Upstairs(Protocol):
-    """What a line hands its news to. Called on the event loop."""
+class Results:
+    """The rules for results of polls and probes, and for every unclear end."""
 
-    def samples(self, samples: Sequence[Sample]) -> None: ...
+    def __init__(
+        self, line: str, schedule: Schedule, staleness: Staleness, effects: Effects
+    ) -> None:
+        self._line = line
+        self._schedule = schedule
+        self._staleness = staleness
+        self._effects = effects
 
-    def alive(self, device: Device, alive: bool) -> None: ...
+    # Replies
 
+    def answered(self, device: Device, now: float, time: int) -> None:
+        """The device replied to the request, with good or bad news."""
+        health = device.health
+        if health.state is State.ONLINE and not health.needs_resync:
+            return
+        if health.answered():
+            self._effects.online(device, True)
+            self._effects.info("device online", line=self._line, device=device.name)
+            device.bad_addresses.abandon()
+            self._schedule.came_online(device, now)
+            self._staleness.look(now, time)
 
-@dataclass(slots=True)
-class Consequences:
-    """Draws them. Never waits, never speaks on the wire."""
-
-    line: str
-    schedule: Schedule
-    upstairs: Upstairs
-    wall: Callable[[], int]  # ns since 1970
-    overdue: Overdue = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.overdue = Overdue(self.schedule, self.bad)
-
-    def read(self, poll: Poll, units: Sequence[int], now: float) -> None:
+    def read(self, poll: Poll, units: Sequence[int], now: float, time: int) -> None:
         """A block was read well."""
         device, block = poll.device, poll.block
         poll.read(now)
-        self.upstairs.samples(self._samples(poll, units))
+        self._effects.collected.append(Samples(self._samples(poll, units, time)))
         if block.of_fields:
-            self._note_garbled(device, units)
-        self.schedule.polled(poll, now)
-        refusals = device.refusals
-        if refusals.searching or refusals.bad:
-            if refusals.read(block):
-                log.info("address is there now", device=device.name, block=describe(poll.block))
-                self._replan(device)
-            self._settle(device)
-        if not refusals.searching and device.learn():
-            log.info("planned anew", device=device.name, turnaround=device.reckoned)
-            self.schedule.plan(device, now)
+            self._count_garbled(device, units)
+        self._schedule.polled(poll, now)
+        bad = device.bad_addresses
+        if bad.searching or bad.bad:
+            if bad.read(block):
+                self._effects.info("address returned", device=device.name, block=describe(block))
+                self._plan(device, now)
+            self._end_search(device, now)
+        if device.record.exchanges < device.turnaround.look_at or bad.searching:
+            return
+        if device.learn_turnaround():
+            expected = device.turnaround.expected
+            self._effects.info("plan updated", device=device.name, turnaround=expected)
+            self._schedule.plan(device, now)
 
-    def _samples(self, poll: Poll, units: Sequence[int]) -> Sequence[Sample]:
-        """What was read. The same units mean the same values: they are not decoded again."""
-        time, told = self.wall(), poll.told
-        if told is None or units != poll.units or poll.block.eager:
-            poll.units = units
-            poll.told = told = poll.block.decode(units, time)
-        elif not isinstance(told, Unchanged):
-            poll.told = told = Unchanged(told, time)
-        elif told.superseded:
-            poll.told = told = poll.block.decode(units, time)
+    def _samples(self, poll: Poll, units: Sequence[int], time: int) -> Sequence[Sample]:
+        """The samples of what was read. Equal units mean equal values: they are not decoded."""
+        last = poll.last
+        samples = last.samples
+        if samples is None or units != last.units or poll.block.eager:
+            last.units = units
+            last.samples = samples = poll.block.decode(units, time)
+        elif not isinstance(samples, Unchanged):
+            last.samples = samples = Unchanged(samples, time)
+        elif samples.superseded:
+            last.samples = samples = poll.block.decode(units, time)
         else:
-            told.time = time
-        return told
+            samples.time = time
+        return samples
 
-    def _note_garbled(self, device: Device, fields: Sequence[Any]) -> None:
+    def _count_garbled(self, device: Device, fields: Sequence[Any]) -> None:
         """A good frame may hold a field that cannot be read."""
         for value in fields:
             if isinstance(value, Garbled):
-                device.record.failures[value.evidence] += 1
+                device.record.count_failure(value)
                 heard = value.data.hex(" ")
-                log.info("not understood", device=device.name, why=str(value), bytes=heard)
+                self._effects.info("field garbled", device=device.name, why=str(value), bytes=heard)
 
-    @property
-    def flowed(self) -> float:
-        """When anything was read last on this line: what was asked before has gone through."""
-        polls = (poll for device in self.schedule.devices for poll in self.schedule.polls(device))
-        return max((at for poll in polls if (at := poll.last_good) is not None), default=-math.inf)
-
-    def answered(self, device: Device) -> None:
-        """The device said something to the point, good or bad news."""
-        if device.standing is Standing.UP and not device.doubtful:
-            return
-        before = device.standing
-        device.answered()
-        if before in (Standing.STARTING, Standing.SILENT):
-            self.upstairs.alive(device, True)
-            log.info("device answers", line=self.line, device=device.name)
-            device.refusals.abandon()
-            self.schedule.woke(device, _now())
-            self.overdue.watch()
-
-    def doubt(self, device: Device, error: Unclear, asked: Span | None) -> Standing:
-        """A conversation ended unclear. Returns the device's standing before."""
-        before = device.standing
-        device.failed(error, asked, _now())
-        log.info("no good reply", line=self.line, device=device.name, why=str(error))
-        self.overdue.watch()
-        return before
-
-    def unclear(self, device: Device, before: Standing, took: float, late: float | None) -> None:
-        """The quiet after an unclear conversation is over; it took `took` seconds in all.
-
-        `late`: how long after the time-out the right answer came, if it came.
-        """
-        if late is not None:
-            device.record.late += 1
-            if device.open_questions(self.flowed) <= 1:  # otherwise perhaps of an older one
-                device.doubtful = False
-                device.unanswered.clear()
-            total = device.timing.reply_timeout + late
-            device.trouble = Garbled(
-                f"it took {total:.2f} s, reply_timeout is {device.timing.reply_timeout:g} s",
-                evidence=Evidence.SLOW,
-            )
-        if before is not Standing.SILENT:
-            self.schedule.failed(_now(), took)
-        unknown = before in (Standing.STARTING, Standing.SILENT)
-        if not unknown and device.failures <= device.timing.retries:
-            return
-        if device.broadcast:  # no question could bring it back: only its own word can
-            device.start()
-            if not unknown:
-                self.upstairs.alive(device, False)
-            return
-        self.schedule.silent(device, _now(), took)
-        self.bad(device.asked, device.reason, device.diagnosis())
-        if before is not Standing.SILENT:
-            self.upstairs.alive(device, False)
-            log.warning("device silent", device=device.name, why=device.diagnosis())
-
-    def unread(self, poll: Poll, error: GatewayError) -> None:
-        """A poll ended unclear: again in its turn, or its tags are bad."""
-        device = poll.device
-        if device.standing is Standing.SILENT:
-            return
-        if poll.tries < device.timing.retries and not poll.setbacks:
-            self.schedule.again(poll)
-            return
-        poll.forget(_now())
-        self.bad(poll.block.tags, device.reason, str(error))
-        self.schedule.polled(poll, _now(), answered=False)
-
-    def unsteady(self, poll: Poll, error: Unsteady) -> None:
-        """The device is well, but what it says is not believed: again in its turn, or bad."""
+    def unsteady(self, poll: Poll, error: Unsteady, now: float, time: int) -> None:
+        """Two reads of the block differ: it is asked again in its turn, or its tags are bad."""
         if poll.tries < poll.device.timing.retries:
-            self.schedule.again(poll)
+            self._schedule.again(poll)
             return
-        poll.forget(_now())
-        self.bad(poll.block.tags, Reason.GARBLED, str(error))
-        self.schedule.polled(poll, _now())
+        self._end_badly(poll, Reason.GARBLED, error, now, time)
 
-    def refused(self, poll: Poll, error: Refused) -> None:
-        """A poll was refused: asked again, halved to find the culprit, or its tags are bad."""
+    def refused(self, poll: Poll, error: Refused, now: float, time: int) -> None:
+        """A poll was refused: it is asked again, halved to find the bad address, or its tags
+        are bad."""
         device, block = poll.device, poll.block
-        device.record.refusals[error.code] += 1
+        device.record.count_refusal(error)
+        if block.listed:
+            device.forget_list()
         if error.refusal is Refusal.DAMAGED and poll.tries < device.timing.retries:
-            self.schedule.again(poll)
+            self._schedule.again(poll)
             return
         if error.refusal is Refusal.BUSY and poll.tries < device.timing.retries:
-            self.schedule.again(poll, _now() + BUSY_PAUSE * 2**poll.tries)
+            self._schedule.again(poll, now + BUSY_PAUSE * 2**poll.tries)
             return
         if block.listed:
-            self._unlisted(poll, error)
+            self._list_refused(poll, error, now)
             return
-        if error.refusal is Refusal.ADDRESS and poll.seen and not poll.tries:
-            self.schedule.again(poll)  # it was there: noise can make a request another one
+        if error.refusal is Refusal.ADDRESS and poll.last.ever and not poll.tries:
+            self._schedule.again(poll)  # it was read before: noise can change a request
             return
         if error.refusal is Refusal.ADDRESS:
-            halves = device.refusals.refused(block, self.wall(), error.code)
+            halves = device.bad_addresses.refused(block, time, error.code)
             if halves:
-                self.schedule.replace(poll, halves, _now())
+                self._schedule.replace(poll, halves, now)
                 return
-            log.warning(
-                "address refused", device=device.name, block=describe(poll.block), why=str(error)
+            self._effects.warning(
+                "address refused", device=device.name, block=describe(block), why=str(error)
             )
-        poll.forget(_now())
-        self.bad(block.tags, Reason.REFUSED, str(error))
-        self.schedule.polled(poll, _now())
-        self._settle(device)
+        self._end_badly(poll, Reason.REFUSED, error, now, time)
+        self._end_search(device, now)
 
-    def _unlisted(self, poll: Poll, error: Refused) -> None:
-        """A list was refused: the device forgot it, or it names an address that is not there."""
+    def _list_refused(self, poll: Poll, error: Refused, now: float) -> None:
+        """The device forgot its monitor list, or one of its addresses is bad."""
         if poll.tries < 1:
-            self.schedule.again(poll)
+            self._schedule.again(poll)
             return
-        log.warning("no list any more", device=poll.device.name, why=str(error))
-        poll.device.lists = False
-        self._replan(poll.device)
+        device = poll.device
+        self._effects.warning("monitor list refused", device=device.name, why=str(error))
+        device.allow_lists(False)
+        self._plan(device, now)
 
-    def hasten(self, device: Device, tag: Tag) -> None:
-        """Read the tag's block before all other polls."""
-        poll = self.schedule.reader(device, tag)
-        if poll is not None:
-            self.schedule.hasten(poll)
+    def _end_badly(
+        self, poll: Poll, reason: Reason, error: GatewayError, now: float, time: int
+    ) -> None:
+        """The device answered, but not with values."""
+        poll.forget(now)
+        self._effects.bad(poll.block.tags, reason, time, str(error))
+        self._schedule.polled(poll, now)
 
-    def bad(self, tags: Sequence[Tag], reason: Reason, detail: str) -> None:
-        now = self.wall()
-        self.upstairs.samples([bad(tag, reason, now, detail) for tag in tags])
+    def _end_search(self, device: Device, now: float) -> None:
+        if device.bad_addresses.settle():
+            device.allow_lists(True)  # the address for which a list was refused may be known now
+            self._plan(device, now)
 
-    def line_down(self, why: str) -> None:
-        self.overdue.stop()
-        for device in self.schedule.devices:
-            device.start(LineDown(why))
-            self.upstairs.alive(device, False)
-            self.bad(device.tags, Reason.LINE_DOWN, why)
-
-    def line_up(self) -> None:
-        """Every device is to be heard anew; a doubt from before the loss stays."""
-        for device in self.schedule.devices:
-            device.start()
-        self.schedule.opened(_now())
-
-    def _settle(self, device: Device) -> None:
-        if device.refusals.settle():
-            device.lists = True  # what a list was refused for may be known now
-            self._replan(device)
-
-    def _replan(self, device: Device) -> None:
-        device.refusals.abandon()
+    def _plan(self, device: Device, now: float) -> None:
+        device.bad_addresses.abandon()
         device.plan()
-        self.schedule.plan(device, _now())
+        self._schedule.plan(device, now)
+
+    # Unclear ends
+
+    def unclear(
+        self, device: Device, error: DeviceError, asked: Span | None, now: float, time: int
+    ) -> State:
+        """A transaction ended unclear. Returns the state of the device before."""
+        before = device.health.state
+        device.health.unclear(error, asked, now)
+        device.record.count_failure(error)
+        device.forget_list()  # it may have been switched off
+        name, why = device.name, str(error)
+        self._effects.info("transaction failed", line=self._line, device=name, why=why)
+        self._staleness.look(now, time)
+        return before
+
+    def settled(
+        self,
+        device: Device,
+        before: State,
+        took: float,
+        late: float | None,
+        now: float,
+        time: int,
+    ) -> None:
+        """The line is quiet after an unclear transaction, which took `took` seconds in all.
+
+        `late`: seconds from the time-out to the right reply, if it came.
+        """
+        health = device.health
+        if late is not None:
+            device.record.count_late()
+            timeout = device.timing.reply_timeout
+            last = self.outstanding_requests(device) <= 1
+            health.replied_late(timeout + late, timeout, last=last)
+        if before is not State.OFFLINE:
+            self._schedule.failed(now, took)
+        unknown = before in (State.STARTING, State.OFFLINE)
+        if not unknown and health.consecutive_failures <= device.timing.retries:
+            return
+        if device.broadcast:  # no request could bring it back: only its own frames can
+            device.restart()
+            if not unknown:
+                self._effects.online(device, False)
+            return
+        self._schedule.went_offline(device, now, took)
+        why = device.diagnosis()
+        self._effects.bad(device.polled_tags, health.reason, time, why)
+        if before is not State.OFFLINE:
+            self._effects.online(device, False)
+            self._effects.warning("device offline", device=device.name, why=why)
+        for request in self._schedule.requests.withdraw(device):
+            self._effects.ended(request, offline(device))
+
+    def unread(self, poll: Poll, error: GatewayError, now: float, time: int) -> None:
+        """A poll ended unclear: it is asked again in its turn, or its tags are bad."""
+        device = poll.device
+        if device.health.state is State.OFFLINE:
+            return
+        if poll.tries < device.timing.retries and not poll.missed:
+            self._schedule.again(poll)
+            return
+        poll.forget(now)
+        self._effects.bad(poll.block.tags, device.health.reason, time, str(error))
+        self._schedule.polled(poll, now, answered=False)
+
+    def outstanding_requests(self, device: Device) -> int:
+        """How many requests to the device may still be answered.
+
+        A read on this line shows that the requests before it went through.
+        """
+        schedule = self._schedule
+        polls = (poll for each in schedule.devices for poll in schedule.polls(each))
+        flowed = max((at for poll in polls if (at := poll.last.at) is not None), default=-math.inf)
+        return device.health.outstanding_requests(flowed - device.longest_reply)
 
 
-def _now() -> float:
-    return asyncio.get_running_loop().time()
+def offline(device: Device) -> Offline:
+    """The outcome of a request that is not sent."""
+    return Offline(f"{device.name} does not answer; nothing was sent")

@@ -1,89 +1,85 @@
-"""No good value outlives its time: what was not read for too long turns bad, whatever the cause."""
+"""Staleness: a value that was not read for too long turns bad, whatever the cause."""
 
-import asyncio
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
-
-import structlog
+from collections.abc import Iterator, Sequence
 
 from gateway.engine.ages import asked_of, worst_ages
-from gateway.engine.device import Device, Standing
+from gateway.engine.device import Device
+from gateway.engine.effects import Effects
+from gateway.engine.health import State
 from gateway.engine.jobs import Poll
 from gateway.engine.schedule import Schedule
 from gateway.planning.planner import describe
-from gateway.tags import Reason, Tag
+from gateway.tags import Reason
 
-log = structlog.get_logger("gateway.line")
-TELL_EVERY = 60.0  # seconds for each device
-WHY = "others on the line, or writes, take its time"
+LOG_EVERY = 60.0  # seconds for each device
+CAUSE = "others on the line, or writes, take its time"
+NEVER = float("inf")
 
 
-@dataclass(slots=True)
-class Overdue:
-    """Looks after the values of one line.
+class Staleness:
+    """Limits the age of the values of one line.
 
-    Those of a device that fails turn bad once they are two intervals old. All others do at twice
-    the worst age that `check` promises, and already at once that while some device fails, as the
-    whole line may be dead; in either case after the longest that one failure holds up the line.
+    A value of a failing device turns bad after two intervals. All others turn bad at twice the
+    worst age that `check` prints; at once that age while some device fails, as the whole line may
+    be dead. In either case the longest wait for one reply is added.
     """
 
-    schedule: Schedule
-    bad: Callable[[Sequence[Tag], Reason, str], None]
-    _timer: asyncio.TimerHandle | None = None
-    _reckoned: list[tuple[Device, Sequence[Poll], float | None]] = field(default_factory=list)
-    _ages: list[float] = field(default_factory=list)
-    _told: dict[Device, float] = field(default_factory=dict)
+    def __init__(self, schedule: Schedule, effects: Effects) -> None:
+        self.due = NEVER  # when `look` must be called again
+        self._schedule = schedule
+        self._effects = effects
+        self._plan: list[tuple[Device, Sequence[Poll], float | None]] = []
+        self._ages: list[float] = []
+        self._logged: dict[Device, float] = {}
 
     def stop(self) -> None:
-        if self._timer is not None:
-            self._timer.cancel()
-            self._timer = None
+        """The line is closed: all its values are bad."""
+        self.due = NEVER
 
-    def watch(self) -> None:
-        """Look at every value now, and again when the next may be too old."""
-        self.stop()
-        loop = asyncio.get_running_loop()
-        now, later = loop.time(), float("inf")
+    def look(self, now: float, time: int) -> None:
+        """Turns bad what is too old. `time`: ns since 1970."""
+        self.due = NEVER
         for poll, limit in self._limits():
-            if poll.last_good is None:
-                later = min(later, now + limit)
-            elif poll.last_good + limit > now:
-                later = min(later, poll.last_good + limit)
+            if poll.last.at is None:
+                self.due = min(self.due, now + limit)
+            elif poll.last.at + limit > now:
+                self.due = min(self.due, poll.last.at + limit)
             else:
-                self._turn_bad(poll, now)
-        if later < float("inf"):
-            self._timer = loop.call_at(later, self.watch)
+                self._turn_bad(poll, now, time)
 
     def _limits(self) -> Iterator[tuple[Poll, float]]:
-        """How old the values of each may get. Those of devices not served are bad already."""
-        devices = self.schedule.devices
-        failing = any(device.standing is Standing.FAILING for device in devices)
+        """How old the values of each poll may get. Those of devices not online are bad already."""
+        devices = self._schedule.devices
+        failing = any(device.health.state is State.FAILING for device in devices)
         stretch = 1.0 if failing else 2.0
-        held_up = max(device.patience for device in devices)
+        longest_reply = max(device.longest_reply for device in devices)
         for poll, age in zip(*self._worst_ages(), strict=True):
-            if poll.device.standing is Standing.FAILING:
+            if poll.device.health.state is State.FAILING:
                 yield poll, 2 * poll.block.every
             else:
-                yield poll, stretch * age + held_up
+                yield poll, stretch * age + longest_reply
 
     def _worst_ages(self) -> tuple[list[Poll], list[float]]:
-        """Reckoned anew where the plan has changed."""
-        served = [device for device in self.schedule.devices if device.served]
-        plan = [(device, self.schedule.polls(device), device.reckoned) for device in served]
+        """Computed again only where the plan has changed."""
+        online = [device for device in self._schedule.devices if device.health.online]
+        plan = [(d, self._schedule.polls(d), d.turnaround.expected) for d in online]
         polls = [poll for _, polls, _ in plan for poll in polls]
-        if plan != self._reckoned:
+        if plan != self._plan:
             blocks = [asked_of(poll.device, poll.block) for poll in polls]
-            self._reckoned, self._ages = plan, worst_ages(blocks)
+            self._plan, self._ages = plan, worst_ages(blocks)
         return polls, self._ages
 
-    def _turn_bad(self, poll: Poll, now: float) -> None:
+    def _turn_bad(self, poll: Poll, now: float, time: int) -> None:
         device, age = poll.device, poll.forget(now)
-        if device.standing is Standing.FAILING:
-            self.bad(poll.block.tags, device.reason, device.diagnosis())
+        if device.health.state is State.FAILING:
+            self._effects.bad(poll.block.tags, device.health.reason, time, device.diagnosis())
             return
-        device.record.overdue += 1
-        self.bad(poll.block.tags, Reason.OVERDUE, f"not read for {age:.1f} s: {WHY}")
-        if now - self._told.get(device, float("-inf")) >= TELL_EVERY:
-            self._told[device] = now
+        device.record.count_overdue()
+        detail = f"not read for {age:.1f} s: {CAUSE}"
+        self._effects.bad(poll.block.tags, Reason.OVERDUE, time, detail)
+        if now - self._logged.get(device, -NEVER) >= LOG_EVERY:
+            self._logged[device] = now
             block = describe(poll.block)
-            log.warning("overdue", device=device.name, block=block, age=round(age, 1), why=WHY)
+            self._effects.warning(
+                "block overdue", device=device.name, block=block, age=round(age, 1), why=CAUSE
+            )

@@ -1,56 +1,52 @@
-"""Blocks that nobody had asked for: counted, and told as the driver that knows them puts it."""
+"""Stray frames: counted, and explained in the log by the driver that knows them."""
 
-import asyncio
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
-import structlog
-
 from gateway.engine.device import Device
+from gateway.engine.effects import Effects
 from gateway.errors import Garbled
 from gateway.protocols.driver import Codec, StrayFrames
 
-log = structlog.get_logger("gateway.line")
-TELL_EVERY = 10.0  # seconds for each device; what comes between is told to debuggers only
-PAUSE = 0.1  # seconds without a byte after which a block begins anew
+LOG_EVERY = 10.0  # seconds for each device; frames in between are logged for debugging only
+PAUSE = 0.1  # seconds without a byte after which a frame begins
 
 
-@dataclass(slots=True)
-class Overheard:
-    """What is heard on one line while nothing was asked, or beside the answer.
+class Stray:
+    """Frames of one line that are no reply to any request.
 
-    A list registered in a PLC counts as forgotten then: perhaps somebody else spoke to it.
+    A PLC counts as having forgotten its monitor list then: another master may have spoken to it.
     """
 
-    line: str
-    devices: Sequence[Device]
-    _codecs: dict[Device, Codec[Any]] = field(default_factory=dict)
-    _last: float = float("-inf")
-    _told: dict[Device, float] = field(default_factory=dict)
+    def __init__(self, line: str, devices: Sequence[Device], effects: Effects) -> None:
+        self._line = line
+        self._devices = devices
+        self._effects = effects
+        self._codecs: dict[Device, Codec[Any]] = {}
+        self._last = float("-inf")
+        self._logged: dict[Device, float] = {}
 
-    def idle(self, data: bytes) -> None:
-        """Bytes that came while nothing was asked."""
-        now = _now()
+    def received(self, data: bytes, now: float) -> None:
+        """Bytes that arrived outside of a transaction."""
         if now - self._last > PAUSE:
             self._codecs.clear()
         self._last = now
-        for device in self.devices:
-            device.registered = ()
+        for device in self._devices:
+            device.forget_list()
             if isinstance(device.driver, StrayFrames):
                 heard = self._feed(device, data)
-                frames = [frame for frame in heard if device.driver.from_this_station(frame)]
-                device.record.unasked += len(frames)
-                self.frames(device, frames)
+                own = [frame for frame in heard if device.driver.from_this_station(frame)]
+                device.record.count_stray(len(own))
+                self.frames(device, own, now)
 
-    def frames(self, device: Device, frames: Iterable[Any]) -> None:
-        """Whole ones that answered nothing, already counted."""
+    def frames(self, device: Device, frames: Iterable[Any], now: float) -> None:
+        """Whole frames, already counted."""
         for frame in frames:
-            device.registered = ()
+            device.forget_list()
             if not isinstance(device.driver, StrayFrames):
                 continue
-            if said := device.driver.describe_stray(frame):
-                self._tell(device, said)
+            if text := device.driver.describe_stray(frame):
+                self._log(device, text, now)
 
     def _feed(self, device: Device, data: bytes) -> list[Any]:
         codec = self._codecs.setdefault(device, device.driver.codec())
@@ -60,19 +56,10 @@ class Overheard:
             del self._codecs[device]
             return []
 
-    def _tell(self, device: Device, said: str) -> None:
-        now = _now()
-        due = now - self._told.get(device, float("-inf")) >= TELL_EVERY
+    def _log(self, device: Device, text: str, now: float) -> None:
+        due = now - self._logged.get(device, float("-inf")) >= LOG_EVERY
         if due:
-            self._told[device] = now
-        (log.info if due else log.debug)(
-            "nobody asked for this",
-            line=self.line,
-            device=device.name,
-            what=said,
-            count=device.record.unasked,
-        )
-
-
-def _now() -> float:
-    return asyncio.get_running_loop().time()
+            self._logged[device] = now
+        log = self._effects.info if due else self._effects.debug
+        count = device.record.unasked
+        log("stray frame", line=self._line, device=device.name, what=text, count=count)

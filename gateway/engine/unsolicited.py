@@ -1,23 +1,15 @@
-"""What devices say unasked on one line: bytes in, samples up, answers back.
+"""Unsolicited frames of one line: bytes in, samples out, replies back."""
 
-A line that has no such device never comes here but for one look at an empty table.
-"""
-
-import asyncio
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any
 
-import structlog
-
 from gateway.engine.device import Device
-from gateway.engine.jobs import Idle
-from gateway.engine.results import Consequences
+from gateway.engine.effects import Effects
+from gateway.engine.jobs import Answer, Idle
+from gateway.engine.results import Results
 from gateway.errors import BadValue, Garbled
-from gateway.line.transaction import Turn
-from gateway.protocols.driver import Talk
 from gateway.protocols.unsolicited import (
     Stale,
     Unsolicited,
@@ -25,39 +17,24 @@ from gateway.protocols.unsolicited import (
     UnsolicitedFrame,
     UnsolicitedListener,
 )
-from gateway.tags import Reason, Sample, Tag, bad, of_field
+from gateway.tags import Reason, Tag, of_field
 
-log = structlog.get_logger("gateway.line")
-ANSWER_WITHIN = 1.0  # seconds; whoever waited longer has given up
-MOST_ANSWERS = 16  # waiting
-HELD_FOR = 1.0  # seconds that a frame which does not end may keep the line from everybody else
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Answer:
-    """What a device waits for that spoke unasked. `until`: by the loop's clock."""
-
-    device: Device
-    frame: Any
-    until: float
-
-    async def give(self, talk: Talk[Any]) -> None:
-        try:
-            await talk.tell(self.frame)
-        except Garbled as error:
-            log.warning("not answered", device=self.device.name, why=str(error))
+REPLY_WITHIN = 1.0  # seconds; a device that waited longer has given up
+MOST_REPLIES = 16  # waiting
+HELD_FOR = 1.0  # seconds that an incomplete frame may keep the line from all others
+NEVER = float("inf")
 
 
 @dataclass(slots=True, eq=False)
 class _Speaker:
-    """A device that speaks unasked, and the tags that it speaks of."""
+    """A device that sends unsolicited frames, and the tags of its fields."""
 
     device: Device
     listener: UnsolicitedListener
     unsolicited: Collection[str]
     tags: dict[str, list[Tag]] = field(default_factory=dict)  # by field
-    understood: bool = True  # the last it said
-    unread: set[str] = field(default_factory=set)  # fields that the last frame with them spoilt
+    understood: bool = True  # its last frame was
+    unreadable: set[str] = field(default_factory=set)  # fields, in the last frame with them
 
     def __post_init__(self) -> None:
         for tag in self.device.tags:
@@ -65,86 +42,82 @@ class _Speaker:
             if name in self.unsolicited:
                 self.tags.setdefault(name, []).append(tag)
 
+    def tags_of(self, fields: Iterable[str]) -> list[Tag]:
+        return [tag for name in fields for tag in self.tags.get(name, ())]
 
-def listened(device: Device) -> list[Tag]:
-    """Its tags whose values come unasked and in no other way."""
+
+def unsolicited_tags(device: Device) -> list[Tag]:
+    """The tags whose values arrive unsolicited and in no other way."""
     driver = device.driver
     if not isinstance(driver, Unsolicited):
         return []
     return [tag for tag in device.tags if driver.unsolicited_only(tag.span)]
 
 
-class Listening:
-    """The listeners of one line. Never waits, never speaks on the wire."""
+class UnsolicitedFrames:
+    """The listeners of one line. A line without a device that speaks unsolicited has none."""
 
-    def __init__(self, devices: Sequence[Device], then: Consequences) -> None:
+    def __init__(self, devices: Sequence[Device], results: Results, effects: Effects) -> None:
+        self.speakers: list[_Speaker] = []
         self._devices = devices
-        self._then = then
-        self._speakers: list[_Speaker] = []
-        self._answers: deque[Answer] = deque(maxlen=MOST_ANSWERS)
-        self._echo = b""  # of what was told, still on its way back
+        self._results = results
+        self._effects = effects
+        self._replies: deque[Answer] = deque(maxlen=MOST_REPLIES)
         self._held_since: float | None = None
 
     def opened(self, now: float) -> None:
-        """The port was opened: a frame may be on its way already."""
-        self._answers.clear()
-        self._echo, self._held_since = b"", None
-        self._speakers = [
+        """The port was opened, perhaps in the middle of a frame."""
+        self._replies.clear()
+        self._held_since = None
+        self.speakers = [
             _Speaker(device, device.driver.listener(now), device.driver.unsolicited)
             for device in self._devices
             if isinstance(device.driver, Unsolicited) and device.driver.sends_unsolicited
         ]
 
-    def received(self, data: bytes, now: float) -> None:
-        """Bytes that nobody had asked for."""
-        if self._echo:
-            data = self._without_echo(data)
-        for speaker in self._speakers:
-            self._take(speaker, speaker.listener.received(data, now), now)
+    def received(self, data: bytes, now: float, time: int) -> None:
+        """Bytes that arrived outside of a transaction."""
+        for speaker in self.speakers:
+            self._apply(speaker, speaker.listener.received(data, now), now, time)
 
-    def beside(self, device: Device) -> Callable[[Any], None] | None:
-        """For what it says in a conversation with it, and is no answer."""
-        for speaker in self._speakers:
+    def unmatched(self, device: Device, frame: Any, now: float, time: int) -> None:
+        """A frame that arrived during a transaction with this device and is not its reply."""
+        for speaker in self.speakers:
             if speaker.device is device:
-                return partial(self._beside, speaker)
-        return None
+                self._apply(speaker, speaker.listener.unmatched(frame, now), now, time)
 
-    def _beside(self, speaker: _Speaker, frame: Any) -> None:
-        now = _now()
-        self._take(speaker, speaker.listener.unmatched(frame, now), now)
-
-    def ended(self, device: Device, turn: Turn) -> None:
-        """A conversation is over: what was half heard before it is void."""
-        self._echo = turn.unreturned
-        for speaker in self._speakers:
-            if turn.heard or (turn.sent and speaker.device is not device):
-                speaker.listener.restart(_now())
+    def transaction_ended(self, device: Device, now: float, *, sent: int, heard: int) -> None:
+        """An incomplete frame from before is void."""
+        for speaker in self.speakers:
+            if heard or (sent and speaker.device is not device):
+                speaker.listener.restart(now)
 
     @property
     def due(self) -> float:
-        """When `next` has something to do though nothing was heard."""
-        return min(
-            (due for each in self._speakers if (due := each.listener.due) is not None),
-            default=float("inf"),
-        )
+        """When `tick` must be called, though nothing was received."""
+        dues = (due for each in self.speakers if (due := each.listener.due) is not None)
+        return min(dues, default=NEVER)
+
+    def tick(self, now: float, time: int) -> None:
+        """Time has passed: silence ends frames, and fields turn stale."""
+        for speaker in self.speakers:
+            if (due := speaker.listener.due) is not None and due <= now:
+                self._apply(speaker, speaker.listener.tick(now), now, time)
 
     def next(self, now: float) -> Answer | Idle | None:
-        """What goes before all other jobs: an answer, or not to speak into a frame."""
-        if not self._speakers:
-            return None
-        for speaker in self._speakers:
-            if (due := speaker.listener.due) is not None and due <= now:
-                self._take(speaker, speaker.listener.tick(now), now)
-        while self._answers:
-            answer = self._answers.popleft()
-            if now < answer.until:
-                return answer
-            log.warning("too late to answer", device=answer.device.name)
+        """The job that goes before all others: a reply, or to stay quiet during a frame."""
+        while self._replies:
+            reply = self._replies.popleft()
+            if now < reply.until:
+                return reply
+            self._effects.warning(
+                "reply dropped", device=reply.device.name, why="the line was busy for too long"
+            )
         until = self._busy_until(now)
         return None if until is None else Idle(until)
 
     def _busy_until(self, now: float) -> float | None:
-        until = max((each.listener.busy_until or 0.0 for each in self._speakers), default=0.0)
+        until = max((each.listener.busy_until or 0.0 for each in self.speakers), default=0.0)
         if until <= now:
             self._held_since = None
             return None
@@ -153,96 +126,82 @@ class Listening:
         end = min(until, self._held_since + HELD_FOR)
         return end if now < end else None
 
-    def _without_echo(self, data: bytes) -> bytes:
-        """Our own words, which a two-wire adapter hands back, were said by nobody else."""
-        size = min(len(data), len(self._echo))
-        if data[:size] == self._echo[:size]:
-            self._echo = self._echo[size:]
-            return data[size:]
-        self._echo = b""
-        return data
-
-    def _take(self, speaker: _Speaker, said: Iterable[UnsolicitedEvent], now: float) -> None:
-        for one in said:
-            match one:
+    def _apply(
+        self, speaker: _Speaker, events: Iterable[UnsolicitedEvent], now: float, time: int
+    ) -> None:
+        for event in events:
+            match event:
                 case UnsolicitedFrame():
-                    self._heard(speaker, one, now)
+                    self._understood(speaker, event, now, time)
                 case Garbled():
-                    self._garbled(speaker, one)
+                    self._garbled(speaker, event, time)
                 case Stale(fields):
-                    self._stale(speaker, fields)
+                    self._stale(speaker, fields, time)
 
-    def _heard(self, speaker: _Speaker, heard: UnsolicitedFrame, now: float) -> None:
-        device, time = speaker.device, self._then.wall()
-        device.record.heard += 1
+    def _understood(
+        self, speaker: _Speaker, frame: UnsolicitedFrame, now: float, time: int
+    ) -> None:
+        device = speaker.device
+        device.record.count_unsolicited()
         speaker.understood = True
-        if device.broadcast:  # who is asked too must answer to be believed alive
-            device.trouble = None
-            self._then.answered(device)
-        self._look_over(speaker, heard)
+        if device.broadcast:  # a device that is polled must reply to count as online
+            device.health.understood()
+            self._results.answered(device, now, time)
+        self._count_unreadable(speaker, frame)
         samples = [
             of_field(tag, value, time)
-            for name, value in heard.values.items()
+            for name, value in frame.values.items()
             for tag in speaker.tags.get(name, ())
         ]
-        self._tell(samples)
-        if heard.reply is not None:
-            self._answer(speaker, heard.reply, now)
+        if samples:
+            self._effects.samples(samples)
+        if frame.reply is not None:
+            self._queue_reply(device, frame.reply, now)
 
-    def _look_over(self, speaker: _Speaker, heard: UnsolicitedFrame) -> None:
-        """Count the fields that could not be read; told are those that could before."""
-        for name, value in heard.values.items():
+    def _count_unreadable(self, speaker: _Speaker, frame: UnsolicitedFrame) -> None:
+        """Fields that could be read before are logged."""
+        for name, value in frame.values.items():
             if not isinstance(value, Garbled):
-                speaker.unread.discard(name)
+                speaker.unreadable.discard(name)
                 continue
-            speaker.device.record.failures[value.evidence] += 1
-            if name not in speaker.unread:
-                speaker.unread.add(name)
-                self._note(speaker.device, value)
+            speaker.device.record.count_failure(value)
+            if name not in speaker.unreadable:
+                speaker.unreadable.add(name)
+                self._log(speaker.device, value)
 
-    def _garbled(self, speaker: _Speaker, damage: Garbled) -> None:
+    def _garbled(self, speaker: _Speaker, damage: Garbled, time: int) -> None:
         device = speaker.device
         if device.broadcast:
-            device.trouble = damage
-        if speaker.understood:  # what does not end is told once
-            self._note(device, damage)
+            device.health.not_understood(damage)
+        if speaker.understood:  # damage after damage is logged once
+            self._log(device, damage)
         speaker.understood = False
-        device.record.failures[damage.evidence] += 1
-        self._bad(speaker, speaker.tags, Reason.GARBLED, str(damage))
+        device.record.count_failure(damage)
+        self._bad(speaker, speaker.tags, Reason.GARBLED, str(damage), time)
 
-    def _stale(self, speaker: _Speaker, fields: Iterable[str]) -> None:
+    def _stale(self, speaker: _Speaker, fields: Iterable[str], time: int) -> None:
         device = speaker.device
-        self._bad(speaker, fields, Reason.NO_REPLY, "not heard for longer than its stale_after")
-        if device.broadcast and speaker.listener.all_stale and device.served:
-            device.start()
-            self._then.upstairs.alive(device, False)
-            log.warning("device silent", device=device.name)
+        detail = "not heard for longer than its stale_after"
+        self._bad(speaker, fields, Reason.NO_REPLY, detail, time)
+        if device.broadcast and speaker.listener.all_stale and device.health.online:
+            device.restart()
+            self._effects.online(device, False)
+            self._effects.warning("device offline", device=device.name, why=detail)
 
-    def _answer(self, speaker: _Speaker, frame: Any, now: float) -> None:
+    def _queue_reply(self, device: Device, frame: Any, now: float) -> None:
         try:
-            speaker.device.driver.codec().encode(frame)
+            device.driver.codec().encode(frame)
         except BadValue as error:
-            log.warning("not answered", device=speaker.device.name, why=str(error))
+            self._effects.warning("reply dropped", device=device.name, why=str(error))
         else:
-            self._answers.append(Answer(speaker.device, frame, now + ANSWER_WITHIN))
+            self._replies.append(Answer(device, frame, now + REPLY_WITHIN))
 
-    def _bad(self, speaker: _Speaker, fields: Iterable[str], reason: Reason, detail: str) -> None:
-        time = self._then.wall()
-        self._tell(
-            [
-                bad(tag, reason, time, detail)
-                for name in fields
-                for tag in speaker.tags.get(name, ())
-            ]
-        )
+    def _bad(
+        self, speaker: _Speaker, fields: Iterable[str], reason: Reason, detail: str, time: int
+    ) -> None:
+        if tags := speaker.tags_of(fields):
+            self._effects.bad(tags, reason, time, detail)
 
-    def _tell(self, samples: Sequence[Sample]) -> None:
-        if samples:
-            self._then.upstairs.samples(samples)
-
-    def _note(self, device: Device, damage: Garbled) -> None:
-        log.info("not understood", device=device.name, why=str(damage), bytes=damage.data.hex(" "))
-
-
-def _now() -> float:
-    return asyncio.get_running_loop().time()
+    def _log(self, device: Device, damage: Garbled) -> None:
+        heard = damage.data.hex(" ")
+        self._effects.info("frame garbled", device=device.name, why=str(damage), bytes=heard)

@@ -1,4 +1,4 @@
-"""Samples of the past: kept on disk for as long as the file says, found by tag and time."""
+"""The history: samples on disk, as long as the configuration says, found by tag and time."""
 
 from gateway.history.historian import Historian
 from gateway.history.timerange import TimeRange, time_range

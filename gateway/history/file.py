@@ -1,9 +1,9 @@
 """The history file: an SQLite database that is written in order and sorted run by run.
 
-Samples arrive in table `recent`, in the order of arrival. When a run is closed it moves to
-`sample` in one transaction, sorted by tag and time, at the end of that table: nothing is ever
-inserted in the middle, so a commit writes few pages however many tags there are, and dropping the
-oldest run frees whole pages at the beginning. Every method is one transaction.
+Samples are stored in table `recent`, in the order of arrival. A closed run moves to `sample` in
+one transaction, sorted by tag and time, at the end of that table: nothing is inserted in the
+middle, so a commit writes few pages however many tags there are, and dropping the oldest run frees
+whole pages at the beginning. Every method is one transaction.
 """
 
 import os
@@ -18,7 +18,7 @@ import structlog
 
 from gateway.history.lock import locked
 from gateway.history.outcomes import Outcome
-from gateway.history.recent import Extent, Identity, Shelved
+from gateway.history.recent import Extent, Identity, SortedRun
 from gateway.history.rows import to_row
 from gateway.tags import Sample
 
@@ -56,26 +56,25 @@ CREATE TABLE file (mark BLOB);
 INSERT INTO file VALUES (randomblob(16));
 """
 
-# Many rows in one statement: for each statement the interpreter lock is given away and must be
-# had again, which takes long when the event loop is busy.
+# Many rows in one statement: SQLite releases the interpreter lock for each statement, and taking it
+# again takes long when the event loop is busy.
 _INSERTS = [
-    # Only places for values are put together here, hence no S608.
-    (size, f"INSERT INTO recent VALUES {', '.join(['(?, ?, ?, ?, ?, ?, ?)'] * size)}")  # noqa: S608
+    (size, f"INSERT INTO recent VALUES {', '.join(['(?, ?, ?, ?, ?, ?, ?)'] * size)}")  # noqa: S608  (placeholders only)
     for size in (128, 16, 1)
 ]
 
 
 class HistoryFile:
-    """The one connection that writes. Raises `sqlite3.Error` and `OSError` as they come.
+    """The one connection that writes. Raises `sqlite3.Error` and `OSError` unchanged.
 
-    `path` is that of the file itself, not of a link to it. While it is open no other gateway can
-    open the file, which is a `BlockingIOError` there.
+    `path` names the file itself, not a link to it. While it is open, another gateway that opens
+    the file gets a `BlockingIOError`.
     """
 
     def __init__(self, path: Path, max_size: int) -> None:
         self.path = path
-        self._log = Path(f"{path}-wal")  # made once: every new path costs the interpreter a string
-        # What is in the log and not yet in the file proper counts as well.
+        self._log = Path(f"{path}-wal")
+        # The size limit of the file includes its log.
         self.log_limit = max(256 * 1024, min(4 * 1024 * 1024, max_size // 16))
         with ExitStack() as undo:
             undo.callback(os.close, locked(path))
@@ -86,15 +85,15 @@ class HistoryFile:
             self._database.execute(f"PRAGMA journal_size_limit = {self.log_limit}")
             self._tags = dict(self._database.execute("SELECT key, id FROM tag"))
             self.identity = identity(self._database, path)
-            self._held = undo.pop_all()
+            self._resources = undo.pop_all()
 
     def close(self) -> None:
-        self._held.close()
+        self._resources.close()
 
     # -- writing --
 
     def new_run(self) -> int:
-        """A number that is higher than any in use."""
+        """Returns a number higher than any in use."""
         [(number,)] = self._database.execute(
             "SELECT 1 + max(ifnull((SELECT max(run) FROM run), 0),"
             " ifnull((SELECT max(run) FROM recent), 0))"
@@ -102,7 +101,7 @@ class HistoryFile:
         return int(number)
 
     def store(self, run: int, start: int, samples: Sequence[Sample]) -> None:
-        """Samples `start` and following of a run, in the order of arrival."""
+        """Stores samples of a run in the order of arrival; the first has number `start` in it."""
         with self._transaction():
             rows = [
                 (run, n, self._tag(sample.tag.key), *to_row(sample))
@@ -121,7 +120,7 @@ class HistoryFile:
         return number
 
     def store_writes(self, outcomes: Sequence[Outcome], most: int) -> int:
-        """Returns the number of the last; the newest `most` are kept."""
+        """Stores outcomes and keeps the newest `most`. Returns the number of the last."""
         with self._transaction():
             self._database.executemany(
                 "INSERT INTO written (time, outcome) VALUES (?, ?)", outcomes
@@ -131,9 +130,9 @@ class HistoryFile:
             )
             return self.last_write()
 
-    def sort(self, run: int, now: int) -> Shelved | None:
-        """Moves a run from `recent` to `sample`, also where the beginning of it is there already;
-        None if there is nothing of it."""
+    def sort(self, run: int, now: int) -> SortedRun | None:
+        """Moves a run from `recent` to `sample`, which may hold its beginning already. Returns None
+        if `recent` has nothing of it."""
         with self._transaction():
             [(first, last, count)] = self._database.execute(
                 "SELECT min(time), max(time), count(*) FROM recent WHERE run = ?", (run,)
@@ -153,7 +152,7 @@ class HistoryFile:
             )
             self._database.execute("DELETE FROM recent WHERE run = ?", (run,))
             [row] = self._database.execute("SELECT * FROM run WHERE run = ?", (run,))
-        return Shelved(*row)
+        return SortedRun(*row)
 
     def drop(self, run: int) -> None:
         with self._transaction():
@@ -161,7 +160,7 @@ class HistoryFile:
             self._database.execute("DELETE FROM run WHERE run = ?", (run,))
 
     def drop_writes(self, before: int) -> None:
-        """Some of those that ended before this time, if there are any."""
+        """Drops some outcomes from before this time, if there are any."""
         with self._transaction():
             self._database.execute(
                 "DELETE FROM written WHERE id IN"
@@ -169,39 +168,39 @@ class HistoryFile:
                 (before,),
             )
 
-    def sync(self, full: bool) -> None:
-        """Whether the next transactions wait until they outlast a power cut."""
+    def set_sync(self, full: bool) -> None:
+        """`full`: the next transactions wait until they are safe from a power cut."""
         self._database.execute(f"PRAGMA synchronous = {'FULL' if full else 'NORMAL'}")
 
     def shrink(self) -> None:
-        """Gives some unused pages back to the disk, if an eighth of the file is unused."""
+        """Returns some unused pages to the disk, if an eighth of the file is unused."""
         if self._pragma("freelist_count") * 8 > self._pragma("page_count"):
-            # `execute` would give back one page only: this pragma takes a step for each.
+            # `execute` would return one page only: this pragma takes a step for each.
             self._database.executescript("PRAGMA incremental_vacuum(256)")
 
     def empty_log(self) -> None:
-        """Moves the log into the file proper, as far as nobody reads an old state."""
+        """Moves the log into the database file, as far as no reader uses an old state."""
         self._database.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
 
-    # -- what is there --
+    # -- content --
 
-    def shelved(self) -> list[Shelved]:
-        return [Shelved(*row) for row in self._database.execute("SELECT * FROM run ORDER BY run")]
+    def sorted_runs(self) -> list[SortedRun]:
+        return [SortedRun(*row) for row in self._database.execute("SELECT * FROM run ORDER BY run")]
 
-    def unsorted(self) -> dict[int, Extent]:
-        """Runs in `recent`, with what there is of each."""
+    def unsorted_runs(self) -> dict[int, Extent]:
+        """Returns the extent of each run in `recent`."""
         rows = self._database.execute(
             "SELECT run, min(time), max(time), count(*) FROM recent GROUP BY run ORDER BY run"
         )
         return {run: Extent(*extent) for run, *extent in rows}
 
     def last_write(self) -> int:
-        """The number of the last outcome of a write, 0 where there is none."""
+        """Returns the number of the last outcome of a write, 0 if there is none."""
         [(number,)] = self._database.execute("SELECT ifnull(max(id), 0) FROM written")
         return int(number)
 
     def size(self) -> int:
-        """Bytes on disk, the log included."""
+        """Returns the bytes on disk, the log included."""
         return self.path.stat().st_size + self.log_size()
 
     def log_size(self) -> int:
@@ -211,11 +210,11 @@ class HistoryFile:
             return 0
 
     def used(self) -> int:
-        """Bytes of the file proper that hold something."""
+        """Returns the bytes of the pages in use, without the log."""
         return (self._pragma("page_count") - self._pragma("freelist_count")) * 4096
 
-    def is_there(self) -> bool:
-        """Whether the path still names the file that is open."""
+    def is_in_place(self) -> bool:
+        """True if the path still names the open file."""
         try:
             return self.path.stat().st_ino == self.identity.inode
         except FileNotFoundError:
@@ -237,13 +236,13 @@ class HistoryFile:
 
 
 def identity(database: sqlite3.Connection, path: Path) -> Identity:
-    """Of the file that is open, unless it has left its path meanwhile."""
+    """Returns the identity of the open file, if it is still at its path."""
     [(mark,)] = database.execute("SELECT mark FROM file")
     return Identity(path.stat().st_ino, mark)
 
 
 def is_damage(error: sqlite3.Error) -> bool:
-    """The file itself is broken, or none of SQLite's."""
+    """True if the file is damaged, or no SQLite database."""
     name = getattr(error, "sqlite_errorname", "")
     return name.startswith(("SQLITE_CORRUPT", "SQLITE_NOTADB"))
 
@@ -259,8 +258,8 @@ def _opened(path: Path) -> sqlite3.Connection:
     return database
 
 
-class Foreign(Exception):
-    """A database, but not a history this version can use."""
+class ForeignFile(Exception):
+    """A database, but no history that this version can use."""
 
 
 def _prepare(database: sqlite3.Connection, path: Path) -> None:
@@ -268,9 +267,9 @@ def _prepare(database: sqlite3.Connection, path: Path) -> None:
     [(version,)] = database.execute("PRAGMA user_version")
     [(tables,)] = database.execute("SELECT count(*) FROM sqlite_schema")
     if tables and application != APPLICATION:
-        raise Foreign(f"{path} is a database of another program")
+        raise ForeignFile(f"{path} is a database of another program")
     if tables and version != SCHEMA_VERSION:
-        raise Foreign(f"{path} has format {version}, and this gateway writes {SCHEMA_VERSION}")
+        raise ForeignFile(f"{path} has format {version}, and this gateway writes {SCHEMA_VERSION}")
     database.execute("PRAGMA page_size = 4096")
     database.execute("PRAGMA auto_vacuum = INCREMENTAL")
     database.execute("PRAGMA journal_mode = WAL")
@@ -285,12 +284,12 @@ def _prepare(database: sqlite3.Connection, path: Path) -> None:
 
 
 def move_aside(path: Path, why: str) -> None:
-    """Renames a file that is of no use, with what SQLite keeps beside it."""
+    """Renames an unusable file, together with the files that SQLite keeps beside it."""
     stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%S.%fZ")
     aside = path.with_name(f"{path.name}.aside-{stamp}")
     path.rename(aside)
     for tail in ("-wal", "-shm", "-journal"):
-        beside = Path(f"{path}{tail}")
-        if beside.exists():
-            beside.rename(f"{aside}{tail}")
-    log.error("the history file is of no use and was moved aside", why=why, aside=str(aside))
+        companion = Path(f"{path}{tail}")
+        if companion.exists():
+            companion.rename(f"{aside}{tail}")
+    log.error("history file moved aside", why=why, moved_to=str(aside))

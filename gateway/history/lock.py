@@ -1,4 +1,4 @@
-"""The lock on a history file: one gateway writes it, and only that one."""
+"""The lock on a history file, so that only one gateway writes it."""
 
 import errno
 import os
@@ -26,30 +26,33 @@ _TAKEN = (errno.EAGAIN, errno.EWOULDBLOCK, errno.EACCES)  # the last on Windows
 
 
 def locked(path: Path) -> int:
-    """Takes the lock on a file that need not be there yet; to be closed with `os.close`.
+    """Takes the lock for a file that may not exist yet. Release it with `os.close`.
 
-    It is on a file of its own beside the other, which stays there: SQLite would lose its locks
-    if anybody else in this process closed the database. The system lets go of it when a process
-    ends, in whatever way. Raises `OSError`, of type `BlockingIOError` where it is taken.
+    The lock is on a separate file, `<path>.lock`, which is not deleted: a lock on the database
+    itself would end SQLite's own locks when it is closed. The system releases the lock when the
+    process ends, however it ends. Raises `OSError`, of type `BlockingIOError` if another process
+    has the lock.
     """
-    beside = f"{path}.lock"
+    lock_path = f"{path}.lock"
     try:
-        file = _opened(beside)
+        file = _opened(lock_path)
     except OSError as error:
-        said = f"the file cannot be opened ({beside}: {error.strerror})"
-        raise OSError(error.errno, said) from None
+        message = f"the file cannot be opened ({lock_path}: {error.strerror})"
+        raise OSError(error.errno, message) from None
     try:
         _take(file)
     except OSError as error:
         if error.errno in _TAKEN:
             os.close(file)
             raise BlockingIOError(error.errno, "another gateway writes this file") from None
-        log.warning("this disk has no locks: one gateway only may write here", path=str(path))
+        log.warning(
+            "history lock unavailable", path=str(path), so="only one gateway may write this file"
+        )
     return file
 
 
 def _opened(path: str) -> int:
-    """For writing where that is allowed: over NFS there is no lock without."""
+    """Opens for writing where permitted: over NFS a lock needs that."""
     try:
         return os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
     except PermissionError:

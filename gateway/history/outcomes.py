@@ -1,4 +1,4 @@
-"""Outcomes of writes on their way to the disk, where a question finds them all the same."""
+"""Outcomes of writes that wait for the disk. Queries find them here meanwhile."""
 
 import threading
 from collections import deque
@@ -11,26 +11,26 @@ MOST_WAITING = 10_000
 
 
 class Outcome(NamedTuple):
-    """As on the `writes` key."""
+    """One outcome, as on the `writes` key."""
 
     time: int  # ns since 1970
-    told: str  # JSON
+    text: str  # JSON
 
 
 class Pending(NamedTuple):
-    """What is not on disk at one moment, and how to find the rest: nothing is in both."""
+    """The outcomes in memory at one moment, and the limit that separates them from the file's."""
 
-    file: Identity | None  # where the others are
+    file: Identity | None  # the file with the other outcomes
     last: int  # the number of the last of them
     outcomes: list[Outcome]  # by time
 
 
 class Outcomes:
-    """Bounded; every method takes the lock for a moment only, never while the disk is busy."""
+    """Bounded. Every method holds the lock for a moment only, never while the disk is busy."""
 
     def __init__(self) -> None:
         self.stored = 0  # since the start
-        self.lost = 0  # for want of room
+        self.lost = 0  # because too many waited
         self._waiting: deque[Outcome] = deque()
         self._storing: list[Outcome] = []
         self._file: Identity | None = None
@@ -39,19 +39,19 @@ class Outcomes:
 
     # -- any thread --
 
-    def add(self, time: int, told: str) -> None:
+    def add(self, time: int, text: str) -> None:
         with self._lock:
             if len(self._waiting) >= MOST_WAITING:
                 self._waiting.popleft()
                 self.lost += 1
-            self._waiting.append(Outcome(time, told))
+            self._waiting.append(Outcome(time, text))
 
     def pending(self, wanted: TimeRange) -> Pending:
         with self._lock:
             file, last, found = self._file, self._last, [*self._storing, *self._waiting]
         first, latest = wanted
-        asked = [outcome for outcome in found if first <= outcome.time <= latest]
-        return Pending(file, last, sorted(asked, key=lambda outcome: outcome.time))
+        in_range = [outcome for outcome in found if first <= outcome.time <= latest]
+        return Pending(file, last, sorted(in_range, key=lambda outcome: outcome.time))
 
     def __len__(self) -> int:
         with self._lock:
@@ -60,27 +60,27 @@ class Outcomes:
     # -- the history thread --
 
     def opened(self, file: Identity, last: int) -> None:
-        """A file whose last outcome has this number."""
+        """Notes the open file; its last outcome has number `last`."""
         with self._lock:
             self._file, self._last = file, last
 
-    def begin(self, last: int) -> list[Outcome]:
-        """What is to be stored now, behind the last one in the file."""
+    def begin_storing(self, last: int) -> list[Outcome]:
+        """Returns the outcomes to store now, after number `last` in the file."""
         with self._lock:
             self._last = last
             self._storing = list(self._waiting)
             self._waiting.clear()
             return self._storing
 
-    def done(self, last: int) -> None:
-        """What was begun is on disk, the last of it with this number."""
+    def are_stored(self, last: int) -> None:
+        """The outcomes of `begin_storing` are in the file, the last with number `last`."""
         with self._lock:
             self._last = last
             self.stored += len(self._storing)
             self._storing = []
 
-    def undone(self) -> None:
-        """What was begun is not on disk: it is stored before what came meanwhile."""
+    def not_stored(self) -> None:
+        """The outcomes of `begin_storing` are not in the file: they wait again, as the first."""
         with self._lock:
             self._waiting.extendleft(reversed(self._storing))
             self._storing = []

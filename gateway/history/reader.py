@@ -12,14 +12,14 @@ from typing import NamedTuple
 from gateway.errors import Busy
 from gateway.history.file import identity
 from gateway.history.outcomes import Outcome
-from gateway.history.recent import Identity, Shelved
+from gateway.history.recent import Identity, SortedRun
 from gateway.history.rows import from_row
 from gateway.history.timerange import TimeRange
 from gateway.tags import Sample, Tag
 
 
 class Part(NamedTuple):
-    """Samples of one tag and one run; none is earlier than `first`."""
+    """The samples of one tag in one run; none is earlier than `first`."""
 
     first: int
     samples: Callable[[], Iterable[Sample]]  # in the order of time
@@ -28,8 +28,8 @@ class Part(NamedTuple):
 def in_order(parts: Iterable[Part]) -> Iterator[Sample]:
     """Merges parts by time; samples of equal time in the order of the parts.
 
-    A part is begun when its time has come, so that only those are open at once which overlap
-    (after the clock was set back).
+    Starts a part only when the merge reaches its first time. So several parts are open at once
+    only if they overlap (after the clock was set back).
     """
     coming = deque(sorted(enumerate(parts), key=lambda numbered: numbered[1].first))
     heap: list[tuple[int, int, Sample, Iterator[Sample]]] = []
@@ -52,23 +52,23 @@ def _push(
 
 
 class Reader:
-    """Connections that only read. No question holds one for longer than one run takes: a long
-    read would keep SQLite from emptying its log.
+    """Read-only connections. A query holds one for one run at a time: a longer read would keep
+    SQLite from emptying its log.
 
-    Runs and tags have numbers of their own in every file, so each question says which file it
-    means. Raises `sqlite3.Error`, `OSError`, and `Busy` where there is another file now.
+    Runs and tags have different numbers in every file, so each query names its file. Raises
+    `sqlite3.Error`, `OSError`, and `Busy` if another file is in its place now.
     """
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._lock = threading.Lock()
         self._idle: list[sqlite3.Connection] = []
-        self._age = 0  # of the file: connections to an older one are not used again
+        self._generation = 0  # connections of an older one are not used again
 
     def samples(
-        self, file: Identity | None, tag: Tag, run: Shelved, wanted: TimeRange, limit: int | None
+        self, file: Identity | None, tag: Tag, run: SortedRun, wanted: TimeRange, limit: int | None
     ) -> list[Sample] | None:
-        """The first of one run: all of them without a limit. None where the run is gone."""
+        """Returns the first `limit` samples of a tag in one run. None if the run was dropped."""
         with self._connection(file) as database:
             rows = database.execute(
                 "SELECT time, value, kind, bad FROM sample"
@@ -76,14 +76,14 @@ class Reader:
                 " AND time BETWEEN ? AND ? ORDER BY time, n LIMIT ?",
                 (run.number, tag.key, *wanted, -1 if limit is None else limit),
             ).fetchall()
-            # It goes with its samples, and its number is given to another one.
-            there = database.execute(
+            # A dropped run leaves its number to another one, with another time.
+            is_same = database.execute(
                 "SELECT 1 FROM run WHERE run = ? AND closed = ?", (run.number, run.closed)
             ).fetchall()
-        return [from_row(tag, row) for row in rows] if there else None
+        return [from_row(tag, row) for row in rows] if is_same else None
 
     def writes(self, file: Identity | None, last: int, wanted: TimeRange) -> Iterator[Outcome]:
-        """The outcomes of writes in the order of time; `last`: none with a higher number."""
+        """Yields outcomes of writes in the order of time, up to number `last`."""
         after = (wanted.first, -1)
         begun = False
         while True:
@@ -93,19 +93,21 @@ class Reader:
                     " AND time <= ? AND id <= ? ORDER BY time, id LIMIT 1000",
                     (*after, wanted.last, last),
                 ).fetchall()
-                there = database.execute("SELECT 1 FROM written WHERE id = ?", after[1:]).fetchall()
-            if begun and not there:  # nor perhaps those that came after it
+                is_there = database.execute(
+                    "SELECT 1 FROM written WHERE id = ?", after[1:]
+                ).fetchall()
+            if begun and not is_there:  # perhaps later ones were dropped too
                 raise Busy("history has dropped meanwhile what was to come next: ask again")
             begun = True
             if not rows:
                 return
-            yield from (Outcome(time, told) for time, _, told in rows)
+            yield from (Outcome(time, text) for time, _, text in rows)
             after = rows[-1][:2]
 
     def renew(self) -> None:
-        """The path names another file now, or none."""
+        """Closes idle connections: the path may name another file now, or none."""
         with self._lock:
-            self._age += 1
+            self._generation += 1
             idle, self._idle = self._idle, []
         for database in idle:
             database.close()
@@ -113,7 +115,7 @@ class Reader:
     @contextmanager
     def _connection(self, file: Identity | None) -> Iterator[sqlite3.Connection]:
         with self._lock:
-            age = self._age
+            generation = self._generation
             database = self._idle.pop() if self._idle else None
         if database is None:
             database = sqlite3.connect(
@@ -126,7 +128,7 @@ class Reader:
             yield database
             undo.pop_all()
         with self._lock:
-            if age == self._age:
+            if generation == self._generation:
                 self._idle.append(database)
                 return
         database.close()

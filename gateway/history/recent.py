@@ -1,8 +1,8 @@
-"""The newest samples, in memory: what waits for the disk, and what the disk has not sorted yet.
+"""The newest samples, in memory: until they are on disk, and until they are sorted there.
 
-Samples are collected in **runs**. A run is closed when it is long enough or old enough; its
-samples are on disk within 100 ms of their arrival, in the order of arrival, and once it is closed
-they are sorted by tag and time in one go. Until then questions are answered from here.
+Samples are collected in **runs**. A run is closed when it is long enough or old enough. Its
+samples are on disk within 100 ms of their arrival, in the order of arrival; once it is closed they
+are sorted by tag and time in one transaction. Until then queries are answered from memory.
 """
 
 import threading
@@ -13,19 +13,19 @@ from typing import NamedTuple
 
 from gateway.tags import Sample
 
-MOST_RUNS = 8  # in memory; while the disk is away the oldest is dropped for the next
+MOST_RUNS = 8  # in memory; while the disk fails, the oldest is dropped for a new one
 
 
 class Identity(NamedTuple):
-    """Which file it is. A copy has the same mark, and a new file may get the inode of one that is
-    gone: only both together are one file's own."""
+    """The identity of one file. A copy has the same mark, and a new file may get the inode of a
+    deleted one: only both together identify a file."""
 
     inode: int
     mark: bytes
 
 
 class Extent(NamedTuple):
-    """What there is of a run somewhere. Times are ns since 1970."""
+    """The part of a run that is stored somewhere. Times are ns since 1970."""
 
     first: int  # the earliest and the latest sample
     last: int
@@ -35,7 +35,7 @@ class Extent(NamedTuple):
 _NOTHING = Extent(0, 0, 0)
 
 
-class Shelved(NamedTuple):
+class SortedRun(NamedTuple):
     """A run that is sorted on disk. Times are ns since 1970."""
 
     number: int
@@ -51,19 +51,19 @@ class Shelved(NamedTuple):
 
 @dataclass(slots=True, eq=False)
 class Run:
-    """Samples in the order of arrival. The event loop appends; the rest is the writer's."""
+    """Samples in the order of arrival. The event loop appends; the history thread does the rest."""
 
     started: float  # seconds of the monotonic clock
     samples: list[Sample] = field(default_factory=list)
     by_tag: dict[str, list[Sample]] = field(default_factory=dict)
-    closed: bool = False  # nothing is added any more
-    dropped: bool = False  # for want of room
-    number: int = 0  # on disk; 0 while nothing of it is there
+    closed: bool = False  # no sample is added any more
+    dropped: bool = False  # because too many runs waited
+    number: int = 0  # on disk; 0 while none of it is there
     stored: int = 0  # of the samples, on disk
 
     def begins_with(self, extent: Extent) -> bool:
-        """Whether what a file has under this run's number is the beginning of this run: another
-        file, or an older copy of it, may have another run there."""
+        """True if `extent`, found in a file under this run's number, is the beginning of this run:
+        another file, or an older copy, may hold another run with that number."""
         times = [sample.time for sample in self.samples[: extent.samples]]
         return bool(times) and Extent(min(times), max(times), len(times)) == extent
 
@@ -72,10 +72,10 @@ class Run:
 
 
 class Recent:
-    """The runs in memory, and the list of those that are sorted on disk.
+    """The runs in memory, and the list of the runs that are sorted on disk.
 
-    Bounded; every method takes the lock for a moment only, never while the disk is busy. A run is
-    either in memory or on the shelf, so that a question sees each sample once.
+    Bounded. Every method holds the lock for a moment only, never while the disk is busy. A run is
+    either in memory or in the list, so that a query sees each sample once.
     """
 
     def __init__(
@@ -84,19 +84,19 @@ class Recent:
         """A run has at most `longest` samples and stays open for `oldest` seconds."""
         self.recorded = 0
         self.lost = 0
-        self.file: Identity | None = None  # that has the shelf
-        self.shelf: tuple[Shelved, ...] = ()  # in the order of recording
+        self.file: Identity | None = None  # the file with the sorted runs
+        self.sorted_runs: tuple[SortedRun, ...] = ()  # in the order of recording
         self._longest = longest
         self._oldest = oldest
         self._clock = clock
         self._lock = threading.Lock()
         self._closed: list[Run] = []
-        self._newest = Run(clock())  # there always is one for what comes next
+        self._newest = Run(clock())  # always open for the next sample
 
     # -- event loop --
 
     def add(self, samples: Iterable[Sample]) -> None:
-        """Samples of tags without `history` are passed over."""
+        """Adds the samples of tags with `history`."""
         with self._lock:
             run = self._newest
             for sample in samples:
@@ -111,11 +111,11 @@ class Recent:
 
     # -- any thread --
 
-    def of(self, tag: str) -> tuple[Identity | None, tuple[Shelved, ...], list[list[Sample]]]:
-        """The shelf and its file, and what is in memory of a tag, run by run."""
+    def find(self, tag: str) -> tuple[Identity | None, tuple[SortedRun, ...], list[list[Sample]]]:
+        """Returns the sorted runs and their file, and the samples of a tag in memory, by run."""
         with self._lock:
             newest = [list(run.by_tag[tag]) for run in self._runs if tag in run.by_tag]
-            return self.file, self.shelf, newest
+            return self.file, self.sorted_runs, newest
 
     @property
     def waiting(self) -> int:
@@ -132,47 +132,47 @@ class Recent:
                 self._begin()
 
     def runs(self) -> list[Run]:
-        """Oldest first."""
+        """The runs in memory, oldest first."""
         with self._lock:
             return self._runs
 
-    def stored(self, run: Run, upto: int) -> None:
-        """The first `upto` samples of the run are on disk."""
+    def stored(self, run: Run, count: int) -> None:
+        """The first `count` samples of the run are on disk."""
         with self._lock:
-            self._stored(run, upto)
+            self._stored(run, count)
 
-    def sorted_on_disk(self, run: Run, shelved: Shelved | None) -> None:
+    def sorted_on_disk(self, run: Run, result: SortedRun | None) -> None:
         with self._lock:
-            if shelved is not None:
-                self.shelf += (shelved,)
+            if result is not None:
+                self.sorted_runs += (result,)
             if run in self._closed:
                 self._closed.remove(run)
 
-    def reshelve(self, shelf: Iterable[Shelved]) -> None:
-        """What is sorted on disk now, in the same file."""
+    def set_sorted(self, runs: Iterable[SortedRun]) -> None:
+        """Replaces the list of sorted runs of the same file."""
         with self._lock:
-            self.shelf = tuple(shelf)
+            self.sorted_runs = tuple(runs)
 
     def opened(
-        self, file: Identity, shelf: Iterable[Shelved], unsorted: Mapping[int, Extent]
+        self, file: Identity, sorted_runs: Iterable[SortedRun], unsorted: Mapping[int, Extent]
     ) -> None:
-        """What a file holds that was just opened: the one before, or another.
+        """Compares the runs in memory with a file that was just opened: the same or another.
 
-        A run in memory leaves if the file has the whole of it, sorted. If it has the beginning,
-        unsorted, the rest waits for the disk; of all others everything does.
+        A run leaves memory if the file has the whole of it, sorted. If the file has its beginning,
+        unsorted, the rest is stored next. Every other run is stored from its beginning.
         """
-        shelf = tuple(shelf)
-        extents = {run.number: run.extent for run in shelf}
+        sorted_runs = tuple(sorted_runs)
+        extents = {run.number: run.extent for run in sorted_runs}
         runs = self.runs()
-        gone = {run for run in runs if run.is_whole_in(extents.get(run.number, _NOTHING))}
+        whole = {run for run in runs if run.is_whole_in(extents.get(run.number, _NOTHING))}
         begun = {run for run in runs if run.begins_with(unsorted.get(run.number, _NOTHING))}
         with self._lock:
-            self.file, self.shelf = file, shelf
-            self._closed = [run for run in self._closed if run not in gone]
+            self.file, self.sorted_runs = file, sorted_runs
+            self._closed = [run for run in self._closed if run not in whole]
             for run in runs:
                 if run in begun:
                     self._stored(run, unsorted[run.number].samples)
-                elif run not in gone:
+                elif run not in whole:
                     self._stored(run, 0)
                     run.number = 0
 
@@ -180,10 +180,10 @@ class Recent:
     def _runs(self) -> list[Run]:
         return [*self._closed, self._newest]
 
-    def _stored(self, run: Run, upto: int) -> None:
+    def _stored(self, run: Run, count: int) -> None:
         if run.dropped:
-            self.lost -= upto - run.stored
-        run.stored = upto
+            self.lost -= count - run.stored
+        run.stored = count
 
     def _begin(self) -> Run:
         self._newest.closed = True

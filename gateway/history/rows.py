@@ -1,7 +1,7 @@
-"""Samples <-> rows of the file, so that every value comes back as exactly what it was.
+"""Samples <-> rows of the file, without any change of value or type.
 
-The columns are meant to be read with any SQLite tool: `value` is the number or text itself, `kind`
-says what SQLite cannot (see `Kind`), `bad` is empty for a good sample and holds the reason else.
+The columns are readable with any SQLite tool: `value` is the number or text itself, `kind` marks
+types that SQLite lacks (see `Kind`), `bad` is NULL for a good sample and otherwise the reason.
 """
 
 import math
@@ -15,12 +15,12 @@ Stored = int | float | str | bytes | None
 
 
 class Kind(IntEnum):
-    """What a value is, where the column `kind` is not empty."""
+    """The type of a value, where the column `kind` is not NULL."""
 
     BOOL = 0  # written as 0 or 1
     LONG = 1  # a whole number beyond 64 bits with sign, written in decimal
-    NOT_A_NUMBER = 2  # which SQLite would make NULL
-    ODD_TEXT = 3  # text that is no UTF-8, as bytes
+    NOT_A_NUMBER = 2  # SQLite would store NULL
+    ODD_TEXT = 3  # text with surrogates, which is no valid UTF-8, as bytes
 
 
 class Row(NamedTuple):

@@ -1,7 +1,8 @@
-"""What was learned of the devices, kept in a small file across restarts.
+"""The state file: what a gateway has learned of its devices, kept across restarts.
 
-The file says which addresses each device refuses and where its requests must be cut, so that a
-search is made once and not after every start. Lost or spoilt it costs nothing but a new search.
+It holds the addresses that each device refuses and the places where its requests must be split, so
+that the search for them is made once and not after every start. Without the file, or with a
+damaged one, the search is made again.
 """
 
 import os
@@ -19,56 +20,56 @@ from gateway.planning.bad_addresses import KnownBad
 from gateway.protocols.driver import Span
 
 log = structlog.get_logger("gateway")
-FORM = 1
+FORMAT = 1
 LATEST = 2**63 - 1  # ns since 1970: the year 2262
 
 
-class Notebook:
-    """One file, and a thread that writes it: a disk that stands still holds up nobody."""
+class StateFile:
+    """One file, and a thread that writes it, so that a stalled disk delays nothing else."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._written: bytes | None = None
+        self._saved: bytes | None = None
         self._trouble: str | None = None
-        self._pages: SimpleQueue[bytes | None] = SimpleQueue()  # None: the last was before
+        self._queue: SimpleQueue[bytes | None] = SimpleQueue()  # None ends the thread
         self._thread = threading.Thread(target=self._save_all, name="state", daemon=True)
 
     # -- any thread --
 
-    def recall(self, devices: Iterable[Device]) -> None:
-        """Plan the devices around what is known. A file that cannot be read is moved aside."""
-        known = self._read()
+    def restore(self, devices: Iterable[Device]) -> None:
+        """Plans the devices by the file. Moves a file aside that cannot be parsed."""
+        learned_by_name = self._load()
         for device in devices:
-            if (learned := known.get(device.name)) is not None:
-                device.refusals.restore(learned, device.tags)
+            if (learned := learned_by_name.get(device.name)) is not None:
+                device.bad_addresses.restore(learned, device.tags)
                 device.plan()
 
-    def page(self, devices: Iterable[Device]) -> bytes:
-        """What there is to keep now."""
+    def snapshot(self, devices: Iterable[Device]) -> bytes:
+        """Returns the content of the file for the present state of the devices."""
         return orjson.dumps(
             {
-                "form": FORM,
-                "devices": {d.name: _written(d.refusals.known()) for d in devices},
+                "form": FORMAT,
+                "devices": {d.name: _to_json(d.bad_addresses.known()) for d in devices},
             },
             option=orjson.OPT_INDENT_2 | orjson.OPT_SORT_KEYS,
         )
 
     def start(self) -> None:
-        """Begins to write what `keep` and `end` are given."""
+        """Starts the thread that saves."""
         self._thread.start()
 
-    def keep(self, page: bytes) -> None:
-        """Never waits. While a page waits for the disk none is added: a later one says it all."""
-        if self._pages.empty():
-            self._pages.put(page)
+    def save_soon(self, snapshot: bytes) -> None:
+        """Never waits. Ignored while another snapshot waits: a later one holds everything."""
+        if self._queue.empty():
+            self._queue.put(snapshot)
 
-    def end(self, page: bytes) -> None:
-        """Never waits: the last page, which `close` waits for."""
-        self._pages.put(page)
-        self._pages.put(None)
+    def save_last(self, snapshot: bytes) -> None:
+        """Never waits: `close` waits for this snapshot."""
+        self._queue.put(snapshot)
+        self._queue.put(None)
 
     def close(self, within: float) -> bool:
-        """Blocks, at most so many seconds; whether the thread has come to its end."""
+        """Blocks for at most `within` seconds; True if the thread has ended."""
         if self._thread.ident is None:  # never started
             return True
         self._thread.join(max(0.0, within))
@@ -77,39 +78,39 @@ class Notebook:
     # -- its own thread --
 
     def _save_all(self) -> None:
-        while (page := self._pages.get()) is not None:
-            self.save(page)
+        while (snapshot := self._queue.get()) is not None:
+            self.save(snapshot)
 
-    def save(self, page: bytes) -> None:
-        """Put the page in the file's place, whole or not at all. Trouble is logged, once."""
-        if page == self._written:
+    def save(self, snapshot: bytes) -> None:
+        """Replaces the file, completely or not at all. Logs each kind of trouble once."""
+        if snapshot == self._saved:
             return
-        beside = self._path.with_name(self._path.name + ".new")
+        temporary = self._path.with_name(self._path.name + ".new")
         try:
-            with beside.open("wb") as file:
-                file.write(page)
+            with temporary.open("wb") as file:
+                file.write(snapshot)
                 file.flush()
                 os.fsync(file.fileno())
-            beside.replace(self._path)
+            temporary.replace(self._path)
         except OSError as error:
             if self._trouble != str(error):
                 self._trouble = str(error)
-                log.warning("nothing kept for a restart", file=str(self._path), why=str(error))
+                log.warning("state file not saved", file=str(self._path), why=str(error))
             return
-        self._written, self._trouble = page, None
+        self._saved, self._trouble = snapshot, None
 
-    # -- when it is read --
+    # -- loading --
 
-    def _read(self) -> Mapping[str, KnownBad]:
+    def _load(self) -> Mapping[str, KnownBad]:
         try:
             data = self._path.read_bytes()
         except FileNotFoundError:
             return {}
         except OSError as error:
-            log.warning("nothing known from before", file=str(self._path), why=str(error))
+            log.warning("state file not read", file=str(self._path), why=str(error))
             return {}
         try:
-            return _pages(orjson.loads(data))
+            return _parse(orjson.loads(data))
         except (ValueError, TypeError, KeyError, AttributeError) as error:
             self._move_aside(repr(error))
             return {}
@@ -119,18 +120,18 @@ class Notebook:
         try:
             self._path.replace(aside)
         except OSError as error:
-            log.warning("spoilt", file=str(self._path), why=why, not_moved_aside=str(error))
+            log.warning("state file damaged", file=str(self._path), why=why, not_moved=str(error))
         else:
-            log.warning("spoilt, moved aside", file=str(self._path), to=str(aside), why=why)
+            log.warning("state file damaged", file=str(self._path), why=why, moved_to=str(aside))
 
 
-def _pages(document: Mapping[str, Any]) -> dict[str, KnownBad]:
-    if document["form"] != FORM:
-        raise ValueError(f"form {document['form']} is not {FORM}")
-    return {name: _learned(page) for name, page in document["devices"].items()}
+def _parse(document: Mapping[str, Any]) -> dict[str, KnownBad]:
+    if document["form"] != FORMAT:
+        raise ValueError(f"form {document['form']} is not {FORMAT}")
+    return {name: _from_json(entry) for name, entry in document["devices"].items()}
 
 
-def _written(learned: KnownBad) -> dict[str, object]:
+def _to_json(learned: KnownBad) -> dict[str, object]:
     return {
         "refused": [
             {"area": area, "start": start, "size": size, "since": since, "code": code}
@@ -140,22 +141,22 @@ def _written(learned: KnownBad) -> dict[str, object]:
     }
 
 
-def _learned(page: Mapping[str, list[Mapping[str, object]]]) -> KnownBad:
-    """Raises ValueError, TypeError, KeyError for what is no page of ours."""
+def _from_json(entry: Mapping[str, list[Mapping[str, object]]]) -> KnownBad:
+    """Raises ValueError, TypeError, KeyError if the entry is damaged."""
     refused = tuple(
         (
             Span(str(row["area"]), int(str(row["start"])), int(str(row["size"]))),
             _time(str(row["since"])),
             str(row["code"]),
         )
-        for row in page["refused"]
+        for row in entry["refused"]
     )
-    cuts = tuple((str(area), int(number)) for area, number in page["cuts"])
+    cuts = tuple((str(area), int(number)) for area, number in entry["cuts"])
     return KnownBad(refused, cuts)
 
 
 def _time(text: str) -> int:
-    """ns since 1970. Raises ValueError for what could not be shown."""
+    """Parses ns since 1970. Raises ValueError outside the years that can be shown."""
     time = int(text)
     if not 0 <= time <= LATEST:
         raise ValueError(f"{text} is no time")

@@ -1,8 +1,8 @@
 """Zenoh's `_time` ranges: `[now(-1h)..]`, `[2026-11-20T12:00:00Z..now()]`, `]a..b[`, `[..]`.
 
-A bracket that opens inwards includes its bound, one that opens outwards does not; a bound left out
-is open. A bound is RFC 3339 (UTC unless it says otherwise), `now()` or `now(-1h)`, with durations
-in u, ms, s, m, h, d, w; seconds when there is no unit.
+`[a` and `b]` include the bound, `]a` and `b[` exclude it; a missing bound is open. A bound is
+RFC 3339 (UTC without a zone), `now()` or `now(-1h)`, with durations in u, ms, s, m, h, d, w;
+seconds without a unit.
 """
 
 import re
@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from gateway.errors import BadValue
 
-EARLIEST, LATEST = -(2**63), 2**63 - 1  # what the disk holds: the years 1677 to 2262
+EARLIEST, LATEST = -(2**63), 2**63 - 1  # of a 64-bit column: the years 1677 to 2262
 
 _UNITS = {
     "u": 10**3,
@@ -39,7 +39,7 @@ class TimeRange(NamedTuple):
 
 
 def time_range(text: str, now: int) -> TimeRange:
-    """What `_time=text` asks for; `now`: ns since 1970. Raises `BadValue`."""
+    """Parses the text of `_time=`; `now`: ns since 1970. Raises `BadValue`."""
     if len(text) < 4 or text[0] not in "[]" or text[-1] not in "[]" or ".." not in text:
         raise BadValue(f"_time={_short(text)} is no range such as [now(-1h)..] or [start..end]")
     start, _, end = text[1:-1].partition("..")

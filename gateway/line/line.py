@@ -1,292 +1,238 @@
-"""One wire, one task: whatever is said on a wire is said from here."""
+"""A line: one port, the devices behind it, and the one task that drives it.
+
+The line decides nothing. It asks its engine for the next job, performs it, and passes the result
+back; the engine's effects go to the clients, the sample sink and the log.
+"""
 
 import asyncio
 import random
-from collections.abc import Awaitable, Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+import time
+from collections.abc import Awaitable, Callable, Sequence
+from contextlib import suppress
+from typing import Any, NoReturn, Protocol
 
 import structlog
 
-from gateway.engine.device import Device, LineRecord, Standing
-from gateway.engine.jobs import Idle, Poll, Probe
-from gateway.engine.requests import Command, Done, Order, Told, Write
-from gateway.engine.results import Consequences, Upstairs
-from gateway.engine.schedule import Schedule
-from gateway.engine.stray import Overheard
-from gateway.engine.unsolicited import Answer, Listening
-from gateway.errors import Busy, LineDown, Offline, Unclear
-from gateway.line.clock import NEVER, Alarm, Clock
-from gateway.line.echo import Adapter
-from gateway.line.polling import Poller
-from gateway.line.transaction import Turn
-from gateway.line.wire_log import Recorder
-from gateway.line.writing import Writer, together
-from gateway.planning.wire_timing import WireTiming
-from gateway.protocols.driver import Span
-from gateway.tags import Tag
+from gateway.engine.device import Device
+from gateway.engine.effects import Effect, LogEvent, OnlineChange, Pause, RequestEnded, Samples
+from gateway.engine.engine import Engine
+from gateway.engine.jobs import Idle, Poll, Settle, Transacted
+from gateway.engine.requests import Command, Outcome, Request, Write
+from gateway.errors import GatewayError, LineDown
+from gateway.line.channel import NEVER, Alarm, Channel
+from gateway.line.perform import perform
+from gateway.line.transaction import Transaction
+from gateway.line.wire_log import WireLog
+from gateway.tags import Sample, Tag, WriteResult
 from gateway.transport import Port, Receiver
 
 log = structlog.get_logger("gateway.line")
-REOPEN_FIRST, REOPEN_LONGEST = 0.2, 10.0
-PATIENCE = 5.0  # a write that waited so long is not sent any more
-FAST = 19200  # above this baud rate the millisecond of an event loop counts
-GAP = 0.02  # quiet that ends a run of bytes nobody understood
-BROADCAST_PAUSE = 0.1
+REOPEN_FIRST, REOPEN_LONGEST = 0.2, 10.0  # seconds
+
+
+class SampleSink(Protocol):
+    """Receives the line's samples and device state changes, on the event loop."""
+
+    def samples(self, samples: Sequence[Sample]) -> None: ...
+
+    def online(self, device: Device, online: bool) -> None: ...
 
 
 class Line:
-    """A port, the devices behind it, and the one task that talks to them."""
+    """The task of one line, and the entries for its clients."""
 
     def __init__(
         self,
-        name: str,
-        devices: Sequence[Device],
-        wire: WireTiming,
+        engine: Engine,
         open_port: Callable[[Receiver], Awaitable[Port]],
-        upstairs: Upstairs,
-        wall: Callable[[], int],
+        sink: SampleSink,
         *,
         echo: bool | None = None,
+        wall: Callable[[], int] = time.time_ns,
         seed: int = 0,
     ) -> None:
-        """`wall`: nanoseconds since 1970, for the samples' time stamps. `echo`: whether the port
-        hears what it says; None: to be found out."""
-        self.name = name
-        self.devices = devices
-        self.wire = wire
-        self.record = LineRecord()
-        self.recorder = Recorder(name)
-        self.is_open = False
+        """`echo`: the port hears what it sends; None: not known. `wall`: ns since 1970."""
+        self.engine = engine
         self._open_port = open_port
-        self._wall = wall
+        self._sink = sink
         self._echo = echo
-        self._adapter = Adapter(echo)
-        self._echoed = False  # and that has been told
+        self._wall = wall
         self._random = random.Random(seed)  # noqa: S311  (jitter, not a secret)
-        self._clock = Clock(spin=0.001 if wire.baudrate > FAST else 0.0)
-        self._schedule = Schedule(devices, 0.0, seed)
-        self._then = Consequences(name, self._schedule, upstairs, wall)
-        self._poller = Poller(self, self._then)
-        self._writer = Writer(self, self._then, wall)
-        self._listening = Listening(devices, self._then)
-        self._overheard = Overheard(name, devices)
-        self._port: Port | None = None
-        self._turn: Turn | None = None
-        self._down: LineDown | None = None
+        self._channel: Channel | None = None
+        self._transaction: Transaction | None = None
+        self._lost: LineDown | None = None
+        self._outcomes: dict[Request, asyncio.Future[Any]] = {}
         self._wake = asyncio.Event()
         self._expiry = Alarm()
+        self._armed = NEVER  # the engine's deadline when the alarm was set last
+        self.tried = asyncio.Event()  # set once the port was opened, or could not be
 
-    # What others may ask of it
+    # Clients
 
-    def submit(self, device: Device, tag: Tag, units: Sequence[int], done: Done) -> None:
-        """Write as soon as the current exchange ends. `done` gets the outcome, exactly once."""
-        now = self._clock.now()
-        write = Write(device, tag, units, now, now + PATIENCE, done)
-        for older in self._schedule.orders.superseded(write):
-            older.done(Busy("a newer value took its place; not sent"))
-        self._accept(write)
+    def write(self, device: Device, tag: Tag, units: Sequence[int]) -> asyncio.Future[WriteResult]:
+        """Writes as soon as the current transaction ends.
 
-    def command(self, device: Device, name: str, argument: str, done: Told) -> None:
-        """Have the device run, stop, ...: one of its driver's controls. `done` as in `submit`."""
-        now = self._clock.now()
-        self._accept(Command(device, name, argument, now, now + PATIENCE, done))
-
-    def _accept(self, order: Order) -> None:
-        if not self.is_open:
-            order.done(LineDown(self.record.trouble or f"line {self.name} is not open"))
-        elif not self._schedule.reachable(order.device, self._clock.now()):
-            order.done(_offline(order.device))
-        elif not self._schedule.orders.submit(order):
-            order.done(Busy(f"line {self.name}: too many orders are waiting; not sent"))
-        else:
-            self._expiry.by(order.expires, self._expire)
-            self._wake.set()
-
-    def _expire(self) -> float:
-        """What waited too long is not sent any more, also while one conversation takes long.
-
-        Returns when to look again.
+        The future ends when the device has acknowledged, or raises `GatewayError`.
         """
-        orders, now = self._schedule.orders, self._clock.now()
-        for order in orders.expired(now):
-            waited = f"waited {now - order.submitted:.1f} s for the line"
-            refused = isinstance(order, Write) and order.alone
-            sent = "refused together with others, and not sent alone" if refused else "not sent"
-            order.done(Busy(f"{waited}; {sent}"))
-        return orders.first.expires if orders else NEVER
+        return self._submit(Write(device, tag, units, _now()))
 
-    def refresh(self, device: Device, tag: Tag) -> None:
-        """Poll the tag's block before all other polls."""
-        self._then.hasten(device, tag)
+    def command(self, device: Device, name: str, argument: str) -> asyncio.Future[str]:
+        """Has the device run, stop, ...: one of its driver's controls. As `write`."""
+        return self._submit(Command(device, name, argument, _now()))
+
+    def _submit(self, request: Request) -> asyncio.Future[Any]:
+        outcome = self._outcomes[request] = asyncio.get_running_loop().create_future()
+        self._deliver(self.engine.submit(request, _now()))
+        self._wake.set()
+        return outcome
+
+    def expedite(self, device: Device, tag: Tag) -> None:
+        """Polls the tag's block before all other polls."""
+        self.engine.expedite(device, tag)
         self._wake.set()
 
-    def polls(self, device: Device) -> Sequence[Poll]:
-        """What is asked of it, with what was measured."""
-        return self._schedule.polls(device)
-
-    def reader(self, device: Device, tag: Tag) -> Poll | None:
-        """What reads the tag; None where its value comes unasked."""
-        return self._schedule.reader(device, tag)
-
-    # The ear of the port
+    # The receiver of the port
 
     def received(self, data: bytes) -> None:
-        self.recorder.heard(data)
-        if self._turn is not None and self._turn.sent:
-            self._turn.received(data)
-        else:  # before the first question there is nothing to answer
-            now = self._clock.now()
-            # No less quiet than is kept after a broadcast, whose echo this may be.
-            self._clock.quiet_since = max(self._clock.quiet_since, now)
-            self.record.unasked += len(data)
-            self._overheard.idle(data)
-            self._listening.received(data, now)
+        channel, transaction = self._channel, self._transaction
+        if channel is None:  # still opening: no listener has begun
+            return
+        if transaction is not None and transaction.has_sent:
+            transaction.received(data)
+            return
+        if channel.wire_log.active:
+            channel.wire_log.heard(data)
+        now = channel.now()
+        # No less quiet than is kept after a broadcast, whose echo this may be.
+        channel.quiet_since = max(channel.quiet_since, now)
+        if channel.echo.strip:
+            data = channel.echo.without_rest(data)
+        if data:
+            self._deliver(self.engine.received(data, now, self._wall()))
             self._wake.set()
 
     def lost(self, error: Exception) -> None:
-        self._down = error if isinstance(error, LineDown) else LineDown(str(error))
-        if self._turn is not None:
-            self._turn.lost(self._down)
+        self._lost = error if isinstance(error, LineDown) else LineDown(str(error))
+        if self._channel is not None:
+            self._channel.lost_by = self._lost
+        if self._transaction is not None:
+            self._transaction.lost(self._lost)
         self._wake.set()
+
+    def _unmatched(self, device: Device, frame: Any) -> None:
+        self._deliver(self.engine.unmatched(device, frame, _now(), self._wall()))
 
     # The task
 
     async def run(self) -> None:
-        """Serve the line until cancelled; what goes wrong on it stays on it."""
-        self._clock.now = asyncio.get_running_loop().time
+        """Serves the line until cancelled; its errors stay on it."""
         pause = REOPEN_FIRST
         while True:
+            served = 0.0
             try:
-                trouble = await self._open_and_serve()
-                served = self._clock.now() - self.record.since if self.is_open else 0.0
-                self.record.went_down(trouble, served)
-                self._then.line_down(trouble)  # told before closing, which may take a while
+                why = await self._open_and_serve()
+                if self.engine.is_open:
+                    served = _now() - self.engine.record.since
+                self._deliver(self.engine.lost(LineDown(why), _now(), self._wall()))
+                self.tried.set()
             finally:
-                await self._close()
+                self._deliver(self.engine.stopped(_now()))
+                await self._close()  # last, as it may take a while
             if served > REOPEN_LONGEST:
                 pause = REOPEN_FIRST
             await asyncio.sleep(pause * self._random.uniform(0.8, 1.2))
             pause = min(2 * pause, REOPEN_LONGEST)
 
     async def _open_and_serve(self) -> str:
-        """Why it ended."""
-        self._down = None
+        """Returns why it ended."""
+        name, self._lost = self.engine.name, None
         try:
-            self._port = await self._open_port(self)
-            self.is_open = True
-            self.record.came_up(self._clock.now())
-            self._adapter.echoes = self._echo
-            log.info("line open", line=self.name)
-            self._then.line_up()
-            self._listening.opened(self._clock.now())
-            await self._serve()
+            port = await self._open_port(self)
+            self._channel = Channel(port, self.engine.wire, WireLog(name), self._echo)
+            log.info("line open", line=name)
+            self._deliver(self.engine.opened(_now()))
+            self.tried.set()
+            await self._serve(self._channel)
         except LineDown as error:
-            tell = log.debug if str(error) == self.record.trouble else log.warning
-            tell("line down", line=self.name, why=str(error))  # once, not at every new try
+            known = str(error) == self.engine.record.trouble
+            (log.debug if known else log.warning)("line down", line=name, why=str(error))
             return str(error)
-        except Exception as error:  # the bulkhead: lines must not sink together
-            log.exception("line failed", line=self.name)
+        except Exception as error:  # the bulkhead: an error ends one line, not all
+            log.exception("line failed", line=name)
             return f"internal error: {error!r}"
-        return "closed"
 
     async def _close(self) -> None:
-        self.is_open = False
-        self._then.overdue.stop()
-        for write in self._schedule.orders.withdraw():
-            write.done(LineDown(f"line {self.name} went down; not sent"))
-        port, self._port = self._port, None
-        if port is not None:
-            await port.close()
+        channel, self._channel = self._channel, None
+        self._transaction = None
+        if channel is not None:
+            await channel.close()
 
-    async def _serve(self) -> None:
-        while self._down is None:
-            now = self._clock.now()
-            self._expire()
-            match self._listening.next(now) or self._schedule.next(now):
-                case Poll() as poll:
-                    await self._poller.poll(poll, now)
-                case Answer() as answer:
-                    with self.turn_with(answer.device) as turn:
-                        await answer.give(turn)
-                case Write() as write:
-                    others = self._schedule.orders.companions(write, together)
-                    await self._writer.write(write, others)
-                    if self._schedule.orders:  # some may be back, refused together
-                        self._expiry.by(self._schedule.orders.first.expires, self._expire)
-                case Command() as command:
-                    await self._writer.command(command)
-                case Probe(device):
-                    await self._poller.probe(device, now)
-                case Idle(until):
-                    await self._idle(until)
-        raise self._down
+    async def _serve(self, channel: Channel) -> NoReturn:
+        engine, now = self.engine, channel.now
+        while self._lost is None:
+            begun = now()
+            if engine.deadline <= begun:
+                self._expire()
+            job = engine.next(begun)
+            if isinstance(job, Idle):
+                self._transaction = None
+                await self._idle(job.until)
+                continue
+            if self._transaction is None or not isinstance(job, Settle):
+                self._transaction = Transaction(channel, job.device, self._unmatched)
+            if isinstance(job, Poll) and job.device.window > 1:
+                jobs = (job, *engine.alongside(job, begun))
+                await asyncio.gather(*(self._perform(each, self._transaction) for each in jobs))
+            else:
+                await self._perform(job, self._transaction)
+        raise self._lost
+
+    async def _perform(self, job: Transacted, transaction: Transaction) -> None:
+        result = await perform(job, transaction)
+        traffic = transaction.take_traffic()
+        self._deliver(self.engine.conclude(job, result, traffic, _now(), self._wall()))
 
     async def _idle(self, until: float) -> None:
         self._wake.clear()
-        until = min(until, self._listening.due)
         with suppress(TimeoutError):
-            async with asyncio.timeout_at(None if until == float("inf") else until):
+            async with asyncio.timeout_at(None if until == NEVER else until):
                 await self._wake.wait()
 
-    # Conversations
+    # Effects
 
-    @contextmanager
-    def turn_with(self, device: Device) -> Iterator[Turn]:
-        turn = self.begin(device)
-        try:
-            yield turn
-        finally:
-            self.end(device, turn)
+    def _deliver(self, effects: Sequence[Effect]) -> None:
+        for effect in effects:
+            match effect:
+                case Samples(samples):
+                    self._sink.samples(samples)
+                case OnlineChange(device, online):
+                    self._sink.online(device, online)
+                case RequestEnded(request, outcome):
+                    self._end(request, outcome)
+                case Pause(seconds):
+                    if self._channel is not None:
+                        self._channel.pause(seconds)
+                case LogEvent(level, event, fields):
+                    getattr(log, level)(event, **fields)
+        if self.engine.deadline != self._armed:
+            self._armed = self.engine.deadline
+            self._expiry.by(self._armed, self._expire)
 
-    def begin(self, device: Device) -> Turn:
-        """A conversation; `end` must follow."""
-        if self._port is None or self._down is not None:
-            raise self._down or LineDown(f"line {self.name} is not open")
-        turn = self._turn = Turn(
-            self._port,
-            device.driver.codec,
-            self.wire,
-            self.wire.silence(device.timing),
-            device.timing.reply_timeout,
-            self._clock,
-            self.recorder,
-            device.driver.station,
-            bool(self._echo),
-            self._adapter,
-            self._listening.beside(device),
-            device.doubtful,
-        )
-        return turn
+    def _end(self, request: Request, outcome: Outcome) -> None:
+        waiting = self._outcomes.pop(request)
+        if waiting.done():  # its client has gone
+            return
+        if isinstance(outcome, GatewayError):
+            waiting.set_exception(outcome)
+        else:
+            waiting.set_result(outcome)
 
-    def end(self, device: Device, turn: Turn) -> None:
-        """It is over: what it took is counted."""
-        self._turn = None
-        characters = (turn.sent + turn.heard) * self.wire.character
-        self.record.busy += characters
-        self.record.turnarounds += turn.turnaround
-        device.conversed(turn.exchanges, characters, turn.turnaround)
-        if turn.passed:
-            device.record.unasked += turn.passed
-            self._overheard.frames(device, turn.overheard)
-        self._listening.ended(device, turn)
-        if self._adapter.echoes and not self._echoed:
-            self._echoed = True
-            log.warning("the adapter echoes: set echo: true", line=self.name)
-
-    async def unclear(self, device: Device, turn: Turn, error: Unclear, asked: Span | None) -> None:
-        """Note what was heard and keep quiet until nothing of it can disturb what comes next."""
-        before = self._then.doubt(device, error, asked)
-        guard = 0.0 if before is Standing.SILENT else device.late_guard
-        late = await turn.settle(guard, max(GAP, 4 * self.wire.character))
-        self._then.unclear(device, before, self._clock.now() - turn.started, late)
-        if device.standing is Standing.SILENT:
-            for write in self._schedule.orders.withdraw(device):
-                write.done(_offline(device))
-
-    def hold(self, device: Device) -> None:
-        """After a broadcast: the stations need time to take it in, whatever one takes to answer."""
-        self._clock.quiet_since += device.turnaround or BROADCAST_PAUSE
+    def _expire(self) -> float:
+        """The engine's deadline has come. Returns the next."""
+        self._deliver(self.engine.expire(_now(), self._wall()))
+        self._wake.set()
+        return self.engine.deadline
 
 
-def _offline(device: Device) -> Offline:
-    return Offline(f"{device.name} does not answer; nothing was sent")
+def _now() -> float:
+    return asyncio.get_running_loop().time()

@@ -1,138 +1,159 @@
-"""One conversation on the wire: the `Talk` that drivers are given."""
+"""One transaction: requests to one device, their replies, their time-outs and late replies."""
 
 import asyncio
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
+from gateway.engine.device import Device
+from gateway.engine.jobs import Traffic
 from gateway.errors import DeviceError, Evidence, Garbled, LineDown, NoReply
-from gateway.line.clock import NEVER, Clock
-from gateway.line.echo import Adapter
-from gateway.line.wire_log import Recorder
-from gateway.planning.wire_timing import WireTiming
+from gateway.line.channel import KEPT, NEVER, Channel
 from gateway.protocols.driver import Codec, EndedByGap
-from gateway.transport import Port
 
 T = TypeVar("T")
-MOST_OVERHEARD = 32  # frames of one conversation
-LONGEST_WAIT = 1.0  # seconds for others to fall silent
-KEPT = 64  # bytes of a failed conversation kept for the log
+MOST_REMEMBERED = 4096  # bytes of one reply
 
 
 @dataclass(slots=True, eq=False)
-class _Question:
-    request: bytes
+class _Request:
+    data: bytes
     answers: Callable[[Any], Any]
-    until: float  # by the loop's clock
-    reply: int  # characters of the longest answer
+    until: float  # by the line's clock
+    reply: int  # characters of the longest reply
     future: "asyncio.Future[Any]"
-    heard: int = 0  # characters that came for it
+    heard: int = 0  # characters of its reply
 
 
 @dataclass(slots=True, eq=False)
-class Turn:
-    """What is said and heard between one request and its reply (or a few, one after another).
+class _LateReply:
+    """The reply to a request that timed out: it may still arrive."""
 
-    Bytes that arrive while the turn is open come in by `received`. After a time-out the turn
-    stays useful: `settle` goes on listening for the late answer.
+    answers: Callable[[Any], Any]
+    arrived: bool = False
+    awaited: "asyncio.Future[None] | None" = None
+
+    def wake(self) -> None:
+        if self.awaited is not None and not self.awaited.done():
+            self.awaited.set_result(None)
+
+
+class Transaction:
+    """The `Talk` that a driver gets.
+
+    Bytes that arrive while it is open are passed to `received`. After a time-out it stays open:
+    `settle` waits for the late reply.
     """
 
-    port: Port
-    new_codec: Callable[[], Codec[Any]]
-    wire: WireTiming
-    silence: float
-    reply_timeout: float
-    clock: Clock
-    recorder: Recorder
-    station: int
-    echo: bool = False
-    adapter: Adapter = field(default_factory=Adapter)
-    beside: Callable[[Any], None] | None = None  # gets what answers nothing, at once
-    in_doubt: bool = False  # an older question of another turn may still be answered
-    started: float = 0.0  # when the first question was sent
-    sent: int = 0  # characters, for the statistics
-    heard: int = 0
-    exchanges: int = 0  # questions answered
-    turnaround: float = 0.0  # of all of them together, beyond the characters' own time
-    passed: int = 0  # frames that answered nothing
-    overheard: list[Any] = field(default_factory=list)  # the first of them
-    _foreign: bool = False
-    _expired: Callable[[Any], Any] | None = None  # what the timed-out question takes for an answer
-    _late: "asyncio.Future[bool] | None" = None  # whether it came
-    _came_late: bool = False
-    _rest: bytes = b""  # what was heard since the last question or answer
-    _answered: float = 0.0  # when the last answer came
-    _echo: bytes = b""  # what must still come back
-    _unechoed: bytes = b""  # what came instead, so far
-    _open: list[_Question] = field(default_factory=list)
-    _broken: Garbled | None = None
-    _lost: LineDown | None = None
-    _codec: Codec[Any] = field(init=False)
-    _gap: asyncio.TimerHandle | None = None  # when a silence ends a frame
+    __slots__ = (
+        "_answered",
+        "_broken",
+        "_channel",
+        "_codec",
+        "_device",
+        "_gap",
+        "_heard",
+        "_late",
+        "_needs_resync",
+        "_on_unmatched_frame",
+        "_open",
+        "_stray",
+        "has_sent",
+        "traffic",
+    )
 
-    def __post_init__(self) -> None:
-        self._codec = self.new_codec()
+    def __init__(
+        self,
+        channel: Channel,
+        device: Device,
+        on_unmatched_frame: Callable[[Device, Any], None] | None = None,
+    ) -> None:
+        """`on_unmatched_frame` gets each frame that is no reply, at once."""
+        self.has_sent = False  # before, no byte that arrives belongs to it
+        self.traffic = Traffic()
+        self._channel = channel
+        self._device = device
+        self._on_unmatched_frame = on_unmatched_frame
+        # A request of an older transaction may still be answered.
+        self._needs_resync = device.health.needs_resync
+        self._codec: Codec[Any] = device.driver.codec()
+        self._open: list[_Request] = []
+        self._broken: Garbled | None = None
+        self._heard = b""  # since the last request or reply
+        self._answered = 0.0  # when the last reply arrived
+        self._stray: Evidence | None = None  # of frames that were no reply
+        self._late: _LateReply | None = None
+        self._gap: asyncio.TimerHandle | None = None  # when a silence ends a frame
 
     @property
     def may_echo(self) -> bool:
-        """As in `Talk`. With `echo: true` our own words are dropped before anybody sees them."""
-        return not self.echo and self.adapter.echoes is not False
+        """As in `Talk`. With `echo: true` no driver sees our own requests."""
+        echo = self._channel.echo
+        return not echo.strip and echo.found is not False
 
-    @property
-    def unreturned(self) -> bytes:
-        """What an echo has still to bring back."""
-        return self._echo
+    def take_traffic(self) -> Traffic:
+        """What passed since the last call."""
+        traffic, self.traffic = self.traffic, Traffic()
+        return traffic
 
     async def tell(self, frame: Any) -> None:
         data = self._codec.encode(frame)
-        await self._quiet()
+        channel = self._channel
+        await channel.quiet(self._device.silence)
         self._send(data)
-        # Nobody answers; the line is ours until the last character is out.
-        self.clock.quiet_since += len(data) * self.wire.character
+        # No reply follows; the wire is busy until the last character is out.
+        channel.pause(len(data) * channel.wire.character)
 
     async def ask(self, frame: Any, reply: int, answers: Callable[[Any], T | None]) -> T:
-        clock = self.clock
+        channel, device = self._channel, self._device
         if not self._open:
-            if clock.quiet_since + self.silence > clock.now():
-                await self._quiet()
-            if self.heard:
-                # It answers nothing: not a byte of it may be read as an answer.
-                self._codec = self.new_codec()
-                self._broken = None
-            if self._gap is not None:
-                self._gap.cancel()
-            self._rest = b""
+            if channel.quiet_since + device.silence > channel.now():
+                await channel.quiet(device.silence)
+            self._begin_hearing()
         data = self._codec.encode(frame)
         self._send(data)
-        started, character = clock.quiet_since, self.wire.character
-        spoken = (len(data) * (2 if self.echo else 1) + reply) * character
-        until = started + spoken + self.reply_timeout
+        started, character = channel.quiet_since, channel.wire.character
+        spoken = (len(data) * (2 if channel.echo.strip else 1) + reply) * character
+        until = started + spoken + device.timing.reply_timeout
         future: asyncio.Future[T] = asyncio.get_running_loop().create_future()
-        question = _Question(data, answers, until, reply, future)
-        self._open.append(question)
-        clock.alarm.by(until, self._look)
+        request = _Request(data, answers, until, reply, future)
+        self._open.append(request)
+        channel.alarm.by(until, self._expire)
         try:
             answer = await future
         finally:
-            self._open.remove(question)
-        busy = (len(data) + question.heard) * character
+            self._open.remove(request)
+        busy = (len(data) + request.heard) * character
         # Where several are open, each has its own part.
         alone = max(started, self._answered)
-        self._answered = clock.quiet_since
-        self.exchanges += 1
+        self._answered = channel.quiet_since
+        traffic = self.traffic
+        traffic.exchanges += 1
         own = self._answered - alone - busy
         if own > 0.0:
-            self.turnaround += own
+            traffic.turnaround += own
         return answer
 
+    def _begin_hearing(self) -> None:
+        """No byte that arrived before the request may be read as its reply."""
+        if self._heard or self.traffic.heard or self._broken is not None:
+            self._codec = self._device.driver.codec()
+            self._broken = None
+        if self._gap is not None:
+            self._gap.cancel()
+        self._heard = b""
+
     def received(self, data: bytes) -> None:
-        """Bytes from the wire while this turn is open."""
-        self.clock.quiet_since = self.clock.now()
-        self.heard += len(data)
-        if self._echo and not (data := self._strip_echo(data)):
+        """Bytes that arrived at the port."""
+        channel = self._channel
+        if channel.wire_log.active:
+            channel.wire_log.heard(data)
+        channel.quiet_since = channel.now()
+        self.traffic.heard += len(data)
+        if channel.echo.strip and not (data := channel.echo.without(data)):
             return
-        if len(self._rest) < 4096:
-            self._rest += data
+        if len(self._heard) < MOST_REMEMBERED:
+            self._heard += data
         if self._broken is not None:
             return
         if self._gap is not None:
@@ -150,155 +171,120 @@ class Turn:
                 self._offer(frame)
         except Garbled as error:
             self._broken = error
-            for question in self._open:
-                _fail(question, error)
+            for request in self._open:
+                _fail(request, error)
 
     def lost(self, error: LineDown) -> None:
         """The port is gone."""
-        self._lost = error
-        if self._late is not None and not self._late.done():
-            self._late.set_result(False)
-        for question in self._open:
-            _fail(question, error)
+        self._channel.lost_by = error
+        if self._late is not None:
+            self._late.wake()
+        for request in self._open:
+            _fail(request, error)
 
     async def settle(self, guard: float, gap: float) -> float | None:
-        """Keep quiet until nothing of this conversation can disturb the next.
+        """Keeps quiet until nothing of this transaction can disturb the next.
 
-        After a time-out: until the late answer has passed, or for `guard` seconds. After bytes
-        that made no sense: until `gap` seconds have passed without one, at most `guard`.
-        Returns how late the answer was, or None when it did not come.
+        After a time-out: until the late reply has arrived, or for `guard` seconds. After noise:
+        until `gap` seconds have passed without a byte, at most `guard`. Returns how late the
+        reply was in seconds, or None when it did not arrive.
         """
-        loop = asyncio.get_running_loop()
-        start = loop.time()
-        if self._came_late:
-            return 0.0
+        channel, late = self._channel, self._late
+        start = channel.now()
         until = start + guard
-        if self._expired is None:
-            while self._lost is None:
-                quiet = min(self.clock.quiet_since + gap, until)
-                if quiet <= loop.time():
+        if late is None:
+            late = _LateReply(lambda frame: None)
+            while channel.lost_by is None:
+                quiet = min(channel.quiet_since + gap, until)
+                if quiet <= channel.now():
                     break
-                await self._late_until(quiet)
+                await self._wait(late, quiet)
             return None
-        if self._lost is not None or not await self._late_until(until):
-            return None
-        return loop.time() - start
+        if late.arrived:
+            return 0.0
+        if channel.lost_by is None:
+            await self._wait(late, until)
+        return channel.now() - start if late.arrived else None
 
-    async def _late_until(self, end: float) -> bool:
-        """Whether the late answer came before `end`; sooner, where the port is lost."""
+    async def _wait(self, late: _LateReply, end: float) -> None:
+        """Until the late reply has arrived, the port is lost, or it is `end`."""
         loop = asyncio.get_running_loop()
-        self._late = loop.create_future()
-        timer = loop.call_at(end, _give_up, self._late)
+        self._late, late.awaited = late, loop.create_future()
+        timer = loop.call_at(end, late.wake)
         try:
-            return await self._late
+            await late.awaited
         finally:
             timer.cancel()
 
     def _offer(self, frame: Any) -> None:
-        for question in self._open:
-            if question.future.done():
+        for request in self._open:
+            if request.future.done():
                 continue
             try:
-                answer = question.answers(frame)
+                answer = request.answers(frame)
             except DeviceError as error:
-                _fail(question, error)
+                _fail(request, error)
                 return
             if answer is not None:
-                if not self.echo:
-                    self.adapter.heard(question.request, self._rest, question.reply)
-                question.heard, self._rest = len(self._rest), b""
-                question.future.set_result(answer)
+                echo = self._channel.echo
+                if echo.found is None:
+                    echo.learn(request.data, self._heard, request.reply)
+                request.heard, self._heard = len(self._heard), b""
+                request.future.set_result(answer)
                 return
-        if self._expired is not None and self._accepts(self._expired, frame):
-            self._expired = None
-            self._came_late = True
-            if self._late is not None and not self._late.done():
-                self._late.set_result(True)
+        late = self._late
+        if late is not None and not late.arrived and self._is_late_reply(late, frame):
+            late.arrived = True
+            late.wake()
             return
-        self.passed += 1
-        if self.beside is not None:
-            self.beside(frame)
-        if len(self.overheard) < MOST_OVERHEARD:
-            self.overheard.append(frame)
-        self._foreign = self._foreign or getattr(frame, "station", self.station) != self.station
+        station = self._device.driver.station
+        foreign = getattr(frame, "station", station) != station
+        if self._stray is not Evidence.STATION:
+            self._stray = Evidence.STATION if foreign else Evidence.SHAPE
+        if self._on_unmatched_frame is not None:
+            self._on_unmatched_frame(self._device, frame)
 
-    def _accepts(self, answers: Callable[[Any], Any], frame: Any) -> bool:
+    def _is_late_reply(self, late: _LateReply, frame: Any) -> bool:
         try:
-            return answers(frame) is not None
+            return late.answers(frame) is not None
         except DeviceError:
-            return not self.in_doubt  # a refusal names no question
+            return not self._needs_resync  # a refusal names no request
 
     def _send(self, data: bytes) -> None:
-        if self._lost is not None:
-            raise self._lost
-        if self.echo:
-            self._echo, self._unechoed = data, b""
-        self.recorder.sent(data)
-        self.clock.quiet_since = self.clock.now()
-        self.started = self.started or self.clock.quiet_since
-        self.sent += len(data)
-        self.port.write(data)
+        self._channel.send(data)
+        self.has_sent = True
+        self.traffic.sent += len(data)
 
-    async def _quiet(self) -> None:
-        """Keep the silence before a request, by the clock: loops may wake early or late.
-
-        Raises `Garbled` where it never comes.
-        """
-        loop = asyncio.get_running_loop()
-        until = max(self.clock.quiet_since, loop.time()) + self.silence + LONGEST_WAIT
-        while (wait := self.clock.quiet_since + self.silence - loop.time()) > 0:
-            if self.clock.quiet_since + self.silence > until:
-                raise Garbled("the line is never quiet, nothing was sent: noise, or another master")
-            await asyncio.sleep(wait - self.clock.spin if wait > self.clock.spin else 0)
-
-    def _strip_echo(self, data: bytes) -> bytes:
-        """Drop our own request, which a two-wire adapter hands back, and all that came before it.
-
-        Until it has come back whole nothing is believed: some acknowledgements look like it.
-        """
-        self._unechoed += data
-        place = self._unechoed.find(self._echo)
-        if place < 0:
-            self._unechoed = self._unechoed[-KEPT - len(self._echo) :]
-            return b""
-        rest = self._unechoed[place + len(self._echo) :]
-        self._echo = self._unechoed = b""
-        return rest
-
-    def _look(self) -> float:
-        """End the questions whose time is over. Returns when to look again."""
-        now, again = self.clock.now(), NEVER
-        for question in self._open:
-            if question.future.done():
+    def _expire(self) -> float:
+        """Ends the requests whose time is over. Returns when to look again."""
+        now, again = self._channel.now(), NEVER
+        for request in self._open:
+            if request.future.done():
                 continue
-            if question.until > now:
-                again = min(again, question.until)
+            if request.until > now:
+                again = min(again, request.until)
             else:
-                self._expired = question.answers
-                question.future.set_exception(self._verdict(question.request))
+                self._late = _LateReply(request.answers)
+                request.future.set_exception(self._verdict(request.data))
         return again
 
     def _verdict(self, request: bytes) -> DeviceError:
-        heard = self._rest or self._unechoed
+        early = self._channel.echo.early
+        heard = self._heard or early
         shown = f"heard {heard[:KEPT].hex(' ')}"
         if not heard:
             return NoReply("no reply")
-        if self._unechoed:
+        if early:
             return Garbled(f"our own request did not come back: {shown}", heard)
         if heard == request:
             return Garbled("heard only our own request", heard, evidence=Evidence.ECHO)
-        if self.passed and self._foreign:
+        if self._stray is Evidence.STATION:
             return Garbled(f"another station spoke: {shown}", heard, evidence=Evidence.STATION)
-        if self.passed:
+        if self._stray is Evidence.SHAPE:
             return Garbled(f"no answer to this: {shown}", heard, evidence=Evidence.SHAPE)
         return Garbled(f"no whole frame: {shown}", heard, evidence=Evidence.NOISE)
 
 
-def _give_up(waiting: "asyncio.Future[bool]") -> None:
-    if not waiting.done():
-        waiting.set_result(False)
-
-
-def _fail(question: _Question, error: Exception) -> None:
-    if not question.future.done():
-        question.future.set_exception(error)
+def _fail(request: _Request, error: Exception) -> None:
+    if not request.future.done():
+        request.future.set_exception(error)

@@ -1,33 +1,38 @@
 """The wire log: every byte on a line with its time, for the log, for traces and for tests.
 
 A line of it reads `12.345678 > 02 30 30 ...` (sent) or `<` (heard); times are seconds of the
-loop's clock.
+line's clock.
 """
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass, field
 
 log = logging.getLogger("gateway.wire")
 Listener = Callable[[str, bytes], None]
 
 
-@dataclass(slots=True, eq=False)
-class Recorder:
-    """Tells whoever listens what passes on one line. Costs nothing while nobody does."""
+class WireLog:
+    """Passes the bytes of one line to its listeners and to the debug log."""
 
-    line: str
-    listeners: list[Listener] = field(default_factory=list)
+    __slots__ = ("_listeners", "active", "line")
+
+    def __init__(self, line: str) -> None:
+        self.line = line
+        self._listeners: list[Listener] = []
+        self.active = log.isEnabledFor(logging.DEBUG)  # else it costs nothing
+
+    def listen(self, listener: Listener) -> None:
+        """`listener` gets `>` or `<` and the bytes, from now on."""
+        self._listeners.append(listener)
+        self.active = True
 
     def sent(self, data: bytes) -> None:
-        if self.listeners or log.isEnabledFor(logging.DEBUG):
-            self._tell(">", data)
+        self._pass_on(">", data)
 
     def heard(self, data: bytes) -> None:
-        if self.listeners or log.isEnabledFor(logging.DEBUG):
-            self._tell("<", data)
+        self._pass_on("<", data)
 
-    def _tell(self, way: str, data: bytes) -> None:
-        log.debug("%s %s %s", self.line, way, data.hex(" "))
-        for listener in self.listeners:
-            listener(way, data)
+    def _pass_on(self, direction: str, data: bytes) -> None:
+        log.debug("%s %s %s", self.line, direction, data.hex(" "))
+        for listener in self._listeners:
+            listener(direction, data)

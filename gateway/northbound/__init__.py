@@ -1,13 +1,12 @@
 """The Zenoh side of the gateway: one session, one publishing thread, bounded queues.
 
-`Northbound` is made with `ZenohConfig` and the `Plant` it speaks for, and `run`s until it is
-cancelled. Nothing it does holds the event loop, and nothing below it knows Zenoh.
+`Northbound` is made with `ZenohConfig` and the `Plant` it publishes, and `run`s until it is
+cancelled. It never blocks the event loop, and no package below it imports Zenoh.
 """
 
-from gateway.northbound.check import check
-from gateway.northbound.duty import StandbySettings
-from gateway.northbound.northbound import Northbound
-from gateway.northbound.plant import Device, History, Plant
+from gateway.northbound.interfaces import Device, History, Plant
+from gateway.northbound.northbound import Northbound, check
+from gateway.northbound.standby import StandbySettings
 
 __all__ = [
     "Device",

@@ -1,8 +1,8 @@
-"""Every write and command and what became of it: in the log, on the `writes` key, in history.
+"""Every write and command with its outcome: in the log, on the `writes` key, in history.
 
-What has reached a device, or may have, is always told: the wire itself bounds how often that
-happens. What was refused before anything was sent comes as fast as anybody likes, so beyond
-a burst it is counted, and told by its number.
+A write or command that reached a device, or may have, is always reported: the line limits how
+often that happens. Refusals before anything was sent come as fast as a client can send, so beyond
+a burst they are only counted.
 """
 
 import time
@@ -12,76 +12,77 @@ import structlog
 
 from gateway.engine.requests import CommandResult
 from gateway.northbound import payload
-from gateway.northbound.limiter import Limiter
 from gateway.northbound.payload import Failure, Problem, WriteOutcome
+from gateway.northbound.rate_limit import RateLimit
 from gateway.tags import WriteResult
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 
-BURST = 300  # refusals told one by one at once
-EVERY = 1.0  # seconds for each that follows: 20 MB of log a day at most
-_ENDINGS = {
-    (False, False): "not written",
-    (False, True): "perhaps written",
-    (True, False): "command not obeyed",
-    (True, True): "command perhaps obeyed",
+BURST = 300  # refusals reported one by one
+EVERY = 1.0  # seconds between further ones: 20 MB of log a day at most
+_FAILURE_EVENTS = {
+    (False, False): "write failed",
+    (False, True): "write unclear",
+    (True, False): "command failed",
+    (True, True): "command unclear",
 }
-_ON_THE_WIRE = frozenset({Problem.UNCLEAR, Problem.REFUSED})
+_SENT = frozenset({Problem.UNCLEAR, Problem.REFUSED})
 
 
 class Audit:
-    """Called with every outcome, on the event loop. `publish` and `record` must not block."""
+    """Called with every outcome, on the event loop."""
 
     def __init__(
         self,
         publish: Callable[[bytes], None],
-        record: Callable[[WriteOutcome], None] | None = None,
+        record: Callable[[int, str], None] | None = None,
     ) -> None:
+        """`publish` and `record` get the outcome as JSON, `record` also the time it ended (ns
+        since 1970). They must not block."""
         self._publish = publish
         self._record = record
-        self._refusals = Limiter(BURST, EVERY)
+        self._refusals = RateLimit(BURST, EVERY)
 
     @property
-    def untold(self) -> int:
+    def suppressed(self) -> int:
         """Refusals that were only counted, since the start."""
-        return self._refusals.held
+        return self._refusals.suppressed
 
     def __call__(self, outcome: WriteOutcome) -> None:
         result = outcome.result
-        on_the_wire = not isinstance(result, Failure) or result.problem in _ON_THE_WIRE
-        if not on_the_wire and not self._refusals.allows(time.monotonic()):
+        was_sent = not isinstance(result, Failure) or result.problem in _SENT
+        if not was_sent and not self._refusals.allows(time.monotonic()):
             return
         _log(outcome)
-        self._publish(payload.write_outcome(outcome))
+        data = payload.write_outcome(outcome)
+        self._publish(data)
         if self._record is not None:
-            self._record(outcome)
+            self._record(outcome.time, data.decode())
 
-    def tell_rest(self) -> None:
-        """To be called now and again."""
-        if count := self._refusals.untold():
-            log.warning(
-                "more writes and commands were refused than are told one by one", count=count
-            )
+    def report_suppressed(self) -> None:
+        """Logs the number of refusals suppressed since the previous call, if there are any."""
+        if count := self._refusals.newly_suppressed():
+            log.warning("refusals suppressed", count=count)
 
 
 def _log(outcome: WriteOutcome) -> None:
-    shown = {
-        # Both come from outside, and may be as long as they like.
+    fields = {
+        # Key and value come from the client, and may be of any length.
         "key": payload.short(outcome.key),
-        "value": payload.shown(outcome.value),
+        "value": payload.loggable(outcome.value),
         "took": round(outcome.took, 4),
         "by": outcome.by,
     }
     match outcome.result:
         case WriteResult(verified=verified):
-            log.info("written", verified=verified, **shown)
+            log.info("tag written", verified=verified, **fields)
         case CommandResult(answer):
-            log.info("command obeyed", answer=answer, **shown)
+            log.info("command executed", answer=answer, **fields)
         case Failure(problem, reason, code):
             log.warning(
-                _ENDINGS[outcome.command, problem is Problem.UNCLEAR],
+                _FAILURE_EVENTS[outcome.command, problem is Problem.UNCLEAR],
                 error=problem.value,
                 code=code,
                 reason=payload.short(reason),
-                **shown,
+                **fields,
             )

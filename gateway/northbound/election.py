@@ -1,53 +1,89 @@
-"""Two gateways on one line: which of them may speak, decided from signs of life alone.
+"""The rules of a standby group: which of its gateways may open the lines.
 
-Each gateway of a group shows a *claim* before it goes on the wire and an *active* sign while it is
-there, and sees those of the others a moment later. One that sees no other active sign claims,
-keeps looking for `CLAIM` seconds, and only then goes on the wire. Of two claims the one that comes
-first by name stays. This holds as long as signs travel in less than half of `CLAIM`; what a
-network split does is in docs/standby.md.
+Each gateway declares a liveliness token in the role *claim* before it becomes active, and one in
+the role *active* while it is; the others see these tokens a moment later. A gateway that sees no
+other active token claims, waits for `CLAIM_TIME`, and only then becomes active. If two claim, the
+first by name continues. This holds as long as a token travels in less than half of `CLAIM_TIME`;
+docs/standby.md says what happens when the network is split.
+
+Synchronous; does no I/O. All times are seconds of one monotonic clock.
 """
 
 from enum import StrEnum
 from typing import NamedTuple
 
 # Longer than Zenoh takes to link up again after a connection was cut once (0.5 s), and short
-# enough for the line to be served again within 3 s of a crash.
-CLAIM = 1.5
-# After the network itself went or came back the others may take so long to be seen again.
-HOLD = 10.0
-# A look that found a sign counts for so long; the sign itself may have gone since.
-GLIMPSE = 0.8
-# One that was held still for so long may have been taken for dead (the lease is 3 s).
-FROZEN = 2.0
+# enough that another gateway is active within 3 s of a crash.
+CLAIM_TIME = 1.5
+# After the network itself was lost or restored, other tokens may take this long to arrive.
+SETTLE_TIME = 10.0
+# A token found by a query counts for this long; it may have been undeclared since.
+QUERY_VALIDITY = 0.8
+# After a longer pause of its process, a gateway may have lost its tokens (the lease is 3 s).
+LONGEST_PAUSE = 2.0
 
 
 class Role(StrEnum):
-    """What a gateway shows to the others of its group."""
+    """The roles of liveliness tokens."""
 
     CLAIM = "claim"
     ACTIVE = "active"
 
 
-class Stand(StrEnum):
-    WAITING = "waiting"  # passive: ports closed, nothing served
-    CLAIMING = "claiming"  # still passive, about to go on the wire
+class State(StrEnum):
+    """The states of a gateway; the values stand in its status document."""
+
+    STANDBY = "waiting"  # ports closed, the plant not served
+    CLAIMING = "claiming"  # still passive, about to become active
     ACTIVE = "active"
-    RELIEVED = "relieved"  # another is active: leave the wire, then start over
+    REPLACED = "relieved"  # another gateway is active: close the ports, then start over
 
 
-class Sign(NamedTuple):
-    """A sign of life. Those of equal role are ordered by name, then by session."""
+class RoleToken(NamedTuple):
+    """A liveliness token. Tokens of one role are ordered by name, then by session."""
 
     role: Role
     name: str
     session: str
 
 
-class Standby:
-    """One gateway's view of its group. All times are seconds of one monotonic clock.
+class _Links:
+    """The links of a gateway, as far as they tell whether it can see the others."""
 
-    `needs_link`: it is configured to connect to somebody, so without any link it sees nothing
-    and does not claim; after `alone` seconds without a link it does all the same.
+    def __init__(self, now: float, *, needed: bool) -> None:
+        self.changed = now  # the network itself was lost or restored
+        self.lost = now  # no link since
+        self._needed = needed
+        self._all: set[str] = set()
+        self._routers: set[str] = set()
+        self._had_link = self._had_router = False
+
+    def update(self, session: str, up: bool, router: bool, now: float) -> None:
+        for linked in (self._all, self._routers) if router else (self._all,):
+            if up:
+                linked.add(session)
+            else:
+                linked.discard(session)
+        if router or (up and not self._had_link):
+            self.changed = now
+        self._had_link |= up
+        self._had_router |= up and router
+        if not self._all:
+            self.lost = now
+
+    @property
+    def are_up(self) -> bool:
+        if self._had_router:
+            return bool(self._routers)
+        # Without routers the other gateway's link may be the only one, and ends with it.
+        return self._had_link or not self._needed
+
+
+class Election:
+    """One gateway's view of its group, and its own state in it.
+
+    `needs_link`: the gateway connects to other sessions, so without a link it sees nothing and
+    does not claim. `alone`: after this many seconds without a link it claims nevertheless.
     """
 
     def __init__(
@@ -59,98 +95,77 @@ class Standby:
         needs_link: bool,
         alone: float | None = None,
     ) -> None:
-        self.stand = Stand.WAITING
+        self.state = State.STANDBY
         self.name = name
         self.session = session
-        self._needs_link = needs_link
         self._alone = alone
-        self._signs: set[Sign] = set()
-        self._glimpses: dict[Sign, float] = {}
-        self._links: set[str] = set()
-        self._routers: set[str] = set()
-        self._saw_link = self._saw_router = False
-        self._disturbed = self._unlinked = self._claimed = self._looked = now
+        self._tokens: set[RoleToken] = set()
+        self._found: dict[RoleToken, float] = {}  # by queries, with the time
+        self._links = _Links(now, needed=needs_link)
+        self._claimed = self._decided = now
 
-    def heard(self, sign: Sign, shown: bool) -> None:
-        """Another's sign came or went."""
-        if sign.session == self.session:
+    def token_changed(self, token: RoleToken, present: bool) -> None:
+        """Another gateway has declared or undeclared a token."""
+        if token.session == self.session:
             return
-        if shown:
-            self._signs.add(sign)
+        if present:
+            self._tokens.add(token)
         else:
-            self._signs.discard(sign)
-            self._glimpses.pop(sign, None)
+            self._tokens.discard(token)
+            self._found.pop(token, None)
 
-    def glimpsed(self, sign: Sign, now: float) -> None:
-        """Another's sign was found by a look at what is there now."""
-        if sign.session != self.session:
-            self._glimpses[sign] = now
+    def token_found(self, token: RoleToken, now: float) -> None:
+        """A query has found a token of another gateway."""
+        if token.session != self.session:
+            self._found[token] = now
 
-    def link(self, session: str, up: bool, router: bool, now: float) -> None:
-        """A link to a session came or went. `router`: others are seen through it."""
-        links = (self._links, self._routers) if router else (self._links,)
-        for known in links:
-            if up:
-                known.add(session)
-            else:
-                known.discard(session)
-        if router or (up and not self._saw_link):
-            self._disturbed = now
-        self._saw_link |= up
-        self._saw_router |= up and router
-        if not self._links:
-            self._unlinked = now
+    def link_changed(self, session: str, up: bool, router: bool, now: float) -> None:
+        """A link has come up or gone down. `router`: other gateways are seen through it."""
+        self._links.update(session, up, router, now)
 
-    def decide(self, now: float) -> Stand:
-        """To be called several times a second, and after everything that was heard."""
-        paused = now - self._looked > FROZEN
-        self._looked = now
-        match self.stand:
-            case Stand.RELIEVED:
+    def decide(self, now: float) -> State:
+        """Updates the state. Call it several times a second, and after every change."""
+        paused = now - self._decided > LONGEST_PAUSE
+        self._decided = now
+        match self.state:
+            case State.REPLACED:
                 pass
-            case Stand.ACTIVE:
+            case State.ACTIVE:
                 if paused or self._sees(Role.ACTIVE, now, before_me=True):
-                    self.stand = Stand.RELIEVED
+                    self.state = State.REPLACED
             case _ if not self._may_claim(now):
-                self.stand = Stand.WAITING
-            case _ if self.stand is Stand.WAITING or paused:
-                self.stand = Stand.CLAIMING
+                self.state = State.STANDBY
+            case _ if self.state is State.STANDBY or paused:
+                self.state = State.CLAIMING
                 self._claimed = now
-            case _ if now - self._claimed >= CLAIM:
-                self.stand = Stand.ACTIVE
-        return self.stand
+            case _ if now - self._claimed >= CLAIM_TIME:
+                self.state = State.ACTIVE
+        return self.state
 
     @property
-    def is_looking(self) -> bool:
-        """Whether a look at what is there could change anything: no active one is known."""
-        active = any(sign.role is Role.ACTIVE for sign in self._signs)
-        return self.stand in (Stand.WAITING, Stand.CLAIMING) and not active
-
-    def others(self) -> list[str]:
-        """Names of the others whose active sign is known."""
-        return sorted(sign.name for sign in self._signs if sign.role is Role.ACTIVE)
+    def needs_query(self) -> bool:
+        """True while a query for tokens could change the state: no active gateway is known."""
+        active = any(token.role is Role.ACTIVE for token in self._tokens)
+        return self.state in (State.STANDBY, State.CLAIMING) and not active
 
     @property
-    def is_blind(self) -> bool:
-        """It waits because it cannot see the network."""
-        return self.stand is Stand.WAITING and not self._is_linked()
+    def waits_for_link(self) -> bool:
+        return self.state is State.STANDBY and not self._links.are_up
+
+    def others_active(self) -> list[str]:
+        """Names of the other gateways with an active token."""
+        return sorted(token.name for token in self._tokens if token.role is Role.ACTIVE)
 
     def _may_claim(self, now: float) -> bool:
         if self._sees(Role.ACTIVE, now) or self._sees(Role.CLAIM, now, before_me=True):
             return False
-        if self._is_linked():
-            return now - self._disturbed >= HOLD
-        return self._alone is not None and now - self._unlinked >= max(self._alone, HOLD)
+        if self._links.are_up:
+            return now - self._links.changed >= SETTLE_TIME
+        return self._alone is not None and now - self._links.lost >= max(self._alone, SETTLE_TIME)
 
     def _sees(self, role: Role, now: float, *, before_me: bool = False) -> bool:
-        seen = self._signs | {
-            sign for sign, when in self._glimpses.items() if now - when <= GLIMPSE
+        seen = self._tokens | {
+            token for token, found in self._found.items() if now - found <= QUERY_VALIDITY
         }
-        mine = Sign(role, self.name, self.session)
-        return any(sign.role is role and (not before_me or sign < mine) for sign in seen)
-
-    def _is_linked(self) -> bool:
-        if self._saw_router:
-            return bool(self._routers)
-        # Without routers the other gateway's own link is all there is, and goes with it.
-        return self._saw_link or not self._needs_link
+        mine = RoleToken(role, self.name, self.session)
+        return any(token.role is role and (not before_me or token < mine) for token in seen)

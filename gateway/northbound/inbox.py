@@ -1,7 +1,7 @@
 """The only way from Zenoh's threads to the event loop: a bounded queue and one wake-up.
 
-Zenoh calls on the thread that receives everything for the session, so the call does nothing but
-append. What finds no room is handed back at once.
+Zenoh calls on the thread that receives everything for the session, so the call only appends. An
+arrival that finds the queue full is refused at once.
 """
 
 import asyncio
@@ -13,7 +13,7 @@ from typing import Generic, TypeVar
 T = TypeVar("T")
 
 LIMIT = 1024  # arrivals that wait for the loop
-_AT_ONCE = 16  # taken in one turn of the loop, so that everything else has its turn
+_BATCH_SIZE = 16  # taken in one turn of the loop, so that other tasks get their turn
 
 
 class Inbox(Generic[T]):
@@ -24,25 +24,25 @@ class Inbox(Generic[T]):
         self._sink = sink
         self._refuse = refuse
         self._queue: deque[T] = deque()
-        self._woken = False
+        self._drain_scheduled = False
 
     def __call__(self, arrival: T) -> None:
-        """From Zenoh's thread."""
+        """Called on Zenoh's thread."""
         if len(self._queue) >= LIMIT:
             self._refuse(arrival)
             return
         self._queue.append(arrival)
-        if not self._woken:
-            self._woken = True
-            with suppress(RuntimeError):  # the loop is closed: so will be the session
+        if not self._drain_scheduled:
+            self._drain_scheduled = True
+            with suppress(RuntimeError):  # the loop is closed, and the session will be
                 self._loop.call_soon_threadsafe(self._drain)
 
     def _drain(self) -> None:
-        self._woken = False  # before anything is taken: what comes from now on wakes again
-        for _ in range(_AT_ONCE):
+        self._drain_scheduled = False  # first: an arrival from now on schedules the next drain
+        for _ in range(_BATCH_SIZE):
             if not self._queue:
                 return
             self._sink(self._queue.popleft())
-        if self._queue and not self._woken:
-            self._woken = True
+        if self._queue and not self._drain_scheduled:
+            self._drain_scheduled = True
             self._loop.call_soon(self._drain)

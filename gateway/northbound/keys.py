@@ -1,16 +1,15 @@
-"""Tag <-> key expression: where every value, write, description and status lies on Zenoh.
+"""Tag <-> key expression: the Zenoh keys of values, writes, descriptions and status.
 
-Chunks that begin with `@` are matched by no wildcard, so each family of keys below is asked for
-by name:
+No wildcard matches a chunk that begins with `@`, so each family of keys below is queried by name:
 
     <prefix>/<device>/<tag>             the value
-    <prefix>/<device>/<tag>/@set        write it
-    <prefix>/<device>/<tag>/@meta       what it is
-    <prefix>/<device>/@run              have it run; so @stop, @loopback, @model
+    <prefix>/<device>/<tag>/@set        a write
+    <prefix>/<device>/<tag>/@meta       its description
+    <prefix>/<device>/@run              a command; also @stop, @loopback, @model
     <prefix>/<device>/@block            all tags of the device that changed in one scan
     <prefix>/@gateway/<name>/…          state and statistics, the outcome of every write
-    <prefix>/@standby/<group>/…         tokens of the gateways that stand in for one another
-    …/@adv/**                           what a Zenoh AdvancedSubscriber asks late
+    <prefix>/@standby/<group>/…         liveliness tokens of the gateways of a standby group
+    …/@adv/**                           queries of a Zenoh AdvancedSubscriber that starts late
 """
 
 import re
@@ -26,10 +25,10 @@ _SECONDS = {"ms": 0.001, "s": 1.0, "": 1.0, "min": 60.0, "m": 60.0, "h": 3600.0,
 
 
 class Family(StrEnum):
-    """What is wanted of the tags a key names."""
+    """The kinds of keys."""
 
     VALUE = "value"
-    LAST = "last"  # the last value, as an AdvancedSubscriber asks for it
+    LAST = "last"  # the last value, as an AdvancedSubscriber queries it
     SET = "set"
     META = "meta"
     BLOCK = "block"
@@ -41,30 +40,29 @@ _BY_LAST_CHUNK = {"@set": Family.SET, "@meta": Family.META, "@block": Family.BLO
 _BY_LAST_CHUNK |= dict.fromkeys(("@run", "@stop", "@loopback", "@model"), Family.COMMAND)
 
 
-class Asked(NamedTuple):
-    """A key taken apart: `of` is the key expression of the values (or devices, or status) meant."""
+class ParsedKey(NamedTuple):
+    """A received key; `target` is the key expression of its values, devices or status."""
 
     family: Family
-    of: str
+    target: str
 
     @property
-    def is_wild(self) -> bool:
-        """More than one key may be meant."""
-        return "*" in self.of
+    def has_wildcard(self) -> bool:
+        return "*" in self.target
 
 
-def asked(key: str) -> Asked:
-    """What a key expression that arrived asks for."""
+def parse_key(key: str) -> ParsedKey:
+    """Splits a received key expression into family and target."""
     stem, _, last = key.rpartition("/")
     if family := _BY_LAST_CHUNK.get(last):
-        return Asked(family, stem)
+        return ParsedKey(family, stem)
     stem, late, _ = key.partition("/@adv")
     if late:
-        return Asked(Family.LAST, stem)
+        return ParsedKey(Family.LAST, stem)
     if "@gateway" in (chunks := key.split("/")):
-        tells = chunks[-3:-2] == ["lines"] and chunks[-1] == "global"
-        return Asked(Family.COMMAND if tells else Family.STATUS, key)
-    return Asked(Family.VALUE, key)
+        is_command = chunks[-3:-2] == ["lines"] and chunks[-1] == "global"
+        return ParsedKey(Family.COMMAND if is_command else Family.STATUS, key)
+    return ParsedKey(Family.VALUE, key)
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +84,7 @@ class Keys:
 
     @property
     def late(self) -> str:
-        """What AdvancedSubscribers ask for when they come late."""
+        """Every key that an AdvancedSubscriber queries when it starts late."""
         return f"{self.prefix}/**/@adv/**"
 
     @property
@@ -99,7 +97,7 @@ class Keys:
 
     @property
     def own(self) -> str:
-        """The liveliness token of the gateway; all that is its own lies below."""
+        """The liveliness token of the gateway; its status and writes lie below."""
         return f"{self.prefix}/@gateway/{self.gateway}"
 
     @property
@@ -108,15 +106,15 @@ class Keys:
 
     @property
     def writes(self) -> str:
-        """Where the outcome of every write is published."""
+        """The outcome of every write."""
         return f"{self.own}/writes"
 
     def group(self, group: str) -> str:
-        """What gateways of one standby group show lies below."""
+        """The liveliness tokens of one standby group lie below."""
         return f"{self.prefix}/@standby/{group}"
 
-    def sign(self, group: str, role: str, gateway: str, session: str) -> str:
-        """The liveliness token of a role in a standby group."""
+    def role_token(self, group: str, role: str, gateway: str, session: str) -> str:
+        """The liveliness token of one gateway's role in a standby group."""
         return f"{self.group(group)}/{role}/{gateway}/{session}"
 
     def status(self, path: str) -> str:
@@ -147,11 +145,11 @@ class Keys:
         return f"{self.prefix}/{tag}/@meta"
 
     def command(self, device: str, command: str) -> str:
-        """Have a device run, stop ..."""
+        """A command to one device: run, stop ..."""
         return f"{self.prefix}/{device}/@{command}"
 
     def to_all(self, line: str) -> str:
-        """What every station of a line is told."""
+        """A command to every station of a line."""
         return f"{self.own}/lines/{line}/global"
 
     def block(self, device: str) -> str:

@@ -1,18 +1,16 @@
 """Samples, descriptions and outcomes <-> the JSON that travels on Zenoh.
 
-A value is `{"value": 12.5, "quality": "good", "time": "2026-11-20T12:00:00.123456Z"}`; one that is
-not known has `"value": null, "quality": "bad"` and a `reason`, where there is one with a sentence
-for people in `detail`. Integers stay JSON integers whatever their size: beyond 2**53 a reader in
-JavaScript must parse them itself.
+A value is `{"value": 12.5, "quality": "good", "time": "2026-11-20T12:00:00.123456Z"}`. An unknown
+value has `"value": null, "quality": "bad"` and a `reason`, in some cases with a sentence for people
+in `detail`. Integers stay JSON integers whatever their size: beyond 2**53 a reader in JavaScript
+must parse them itself.
 """
 
 import json
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from enum import StrEnum
-from functools import lru_cache
 from typing import Never
 
 import orjson
@@ -20,31 +18,32 @@ import orjson
 from gateway.engine.requests import CommandResult
 from gateway.errors import BadValue, Busy, GatewayError, LineDown, Offline, Refused
 from gateway.tags import Quality, Reason, Sample, Tag, WriteResult
+from gateway.tags.timestamps import rfc3339
 from gateway.values import Value
 
-LONGEST_WRITE = 64 * 1024  # bytes: a tag holds 250 characters at most, the rest is room
+LONGEST_WRITE = 64 * 1024  # bytes; a tag holds 250 characters at most
 _LONGEST_REASON = 300
 
 
 class Problem(StrEnum):
-    """The words of the contract for what did not work."""
+    """The error words of the contract."""
 
     NOT_WRITABLE = "not-writable"
     BAD_VALUE = "bad-value"
     REFUSED = "refused"  # by the device; `code` is its own
-    UNCLEAR = "unclear"  # it may or may not have been done
+    UNCLEAR = "unclear"  # the device may or may not have executed it
     LINE_DOWN = "line-down"
     NO_REPLY = "no-reply"  # the device is silent; nothing was sent
-    BUSY = "busy"  # too much is waiting; nothing was done
+    BUSY = "busy"  # too many requests are waiting; nothing was done
     UNKNOWN_TAG = "unknown-tag"
-    NOT_ALLOWED = "not-allowed"  # not to this asker: the token is missing or nobody's
-    BAD_QUERY = "bad-query"  # a read that cannot be understood
-    NO_HISTORY = "no-history"  # a read of the past, where none is kept
+    NOT_ALLOWED = "not-allowed"  # the client's token is missing or unknown
+    BAD_QUERY = "bad-query"  # a read with parameters that cannot be parsed
+    NO_HISTORY = "no-history"  # a read of the past from a gateway without history
 
 
 @dataclass(frozen=True, slots=True)
 class Failure:
-    """It did not work, or nobody can say whether it did."""
+    """A request that was not done, or whose result is unclear."""
 
     problem: Problem
     reason: str
@@ -53,11 +52,11 @@ class Failure:
 
 @dataclass(frozen=True, slots=True)
 class WriteOutcome:
-    """One write or command and what became of it, for log, history and the `writes` key.
+    """One write or command with its result, for log, history and the `writes` key.
 
-    `key` is that of the value that was written, or the command's own; `value` what was asked for
-    (None if it could not be understood), or the command's argument; `time` when it ended (ns
-    since 1970), `by` the asker, where Zenoh tells.
+    `key` is the key of the written value, or of the command; `value` the requested value (None if
+    it could not be parsed), or the command's argument; `time` is when it ended (ns since 1970),
+    `took` is in seconds, `by` names the client, if Zenoh or a token does.
     """
 
     key: str
@@ -70,7 +69,8 @@ class WriteOutcome:
 
 
 def failure(error: GatewayError) -> Failure:
-    """What an error means to the one who asked. Whatever is not known to be undone is unclear."""
+    """Translates an error for the client. An error after which the request may have been done is
+    unclear."""
     reason = str(error) or type(error).__name__
     match error:
         case BadValue():
@@ -94,8 +94,8 @@ def value(sample: Sample) -> bytes:
     return orjson.dumps(_sample(sample))
 
 
-def bare(sample: Sample) -> bytes | None:
-    """The value alone, as text; None when it is not known. `about` is the rest."""
+def value_text(sample: Sample) -> bytes | None:
+    """The value alone, as text; None if it is unknown. `attachment` holds the rest."""
     known = _sample(sample)["value"]
     match known:
         case None:
@@ -106,9 +106,9 @@ def bare(sample: Sample) -> bytes | None:
             return orjson.dumps(known)
 
 
-def about(sample: Sample) -> bytes:
+def attachment(sample: Sample) -> bytes:
     """`{"quality": "good", "time": …}`, and a `reason` when bad."""
-    return orjson.dumps({name: what for name, what in _sample(sample).items() if name != "value"})
+    return orjson.dumps({name: item for name, item in _sample(sample).items() if name != "value"})
 
 
 def block(samples: Iterable[Sample]) -> bytes:
@@ -117,7 +117,7 @@ def block(samples: Iterable[Sample]) -> bytes:
 
 
 def meta(tag: Tag) -> bytes:
-    """What a tag is: type, address, unit, interval, limits."""
+    """The description of a tag: type, address, unit, interval, limits."""
     rule, deadband = tag.write, tag.deadband
     fields = {
         "type": str(tag.layout.type),
@@ -143,21 +143,20 @@ def meta(tag: Tag) -> bytes:
 
 
 def outcome(result: WriteResult | Failure) -> bytes:
-    """The answer to one write, or the error of any query."""
+    """The reply to one write, or the error reply to any query."""
     return orjson.dumps(_result(result))
 
 
-def write_outcome(done: WriteOutcome) -> bytes:
-    """The line of the audit trail; `outcome` is `written`, `obeyed` or the word for what went
-    wrong."""
+def write_outcome(ended: WriteOutcome) -> bytes:
+    """One line of the audit trail; `outcome` is `written`, `obeyed` or a `Problem`."""
     line: dict[str, object] = {
-        "key": short(done.key),
-        "value": shown(done.value),
-        "time": rfc3339(done.time),
-        "took": round(done.took, 6),
-        "by": done.by,
+        "key": short(ended.key),
+        "value": loggable(ended.value),
+        "time": rfc3339(ended.time),
+        "took": round(ended.took, 6),
+        "by": ended.by,
     }
-    match done.result:
+    match ended.result:
         case WriteResult(verified=verified):
             line |= {"outcome": "written", "verified": verified}
         case CommandResult(answer):
@@ -168,14 +167,8 @@ def write_outcome(done: WriteOutcome) -> bytes:
 
 
 def document(fields: Mapping[str, object]) -> bytes:
-    """A status document; what JSON does not know is written as text."""
+    """A status document; values of types that JSON lacks are written as text."""
     return orjson.dumps(fields, default=str, option=orjson.OPT_NON_STR_KEYS)
-
-
-@lru_cache(maxsize=256)  # samples of one scan have one time
-def rfc3339(time: int) -> str:
-    """Nanoseconds since 1970 as `2026-11-20T12:00:00.123456Z`."""
-    return f"{_second(time // 1_000_000_000)}.{time // 1000 % 1_000_000:06}Z"
 
 
 def _sample(sample: Sample) -> dict[str, Value | None]:
@@ -187,15 +180,15 @@ def _sample(sample: Sample) -> dict[str, Value | None]:
         if known is not None and not (isinstance(known, float) and not math.isfinite(known)):
             return {"value": known, "quality": "good", "time": time}
         reason = Reason.NOT_A_NUMBER
-    told: dict[str, Value | None] = {
+    fields: dict[str, Value | None] = {
         "value": None,
         "quality": "bad",
         "reason": None if reason is None else reason.value,
         "time": time,
     }
     if sample.detail:
-        told["detail"] = short(sample.detail)
-    return told
+        fields["detail"] = short(sample.detail)
+    return fields
 
 
 def _result(result: WriteResult | Failure) -> dict[str, Value | None]:
@@ -212,33 +205,28 @@ def _result(result: WriteResult | Failure) -> dict[str, Value | None]:
             return {"error": problem.value, "code": code, "reason": short(reason)}
 
 
-def shown(asked: Value | None) -> Value | None:
-    """What was asked for, if it is of a size to be shown; 64 bits are all that orjson writes."""
-    match asked:
+def loggable(requested: Value | None) -> Value | None:
+    """Limits a requested value to a printable size; orjson writes at most 64 bits."""
+    match requested:
         case str():
-            return short(asked)
-        case int() if not -(2**63) <= asked < 2**64:
-            return short(str(asked))
+            return short(requested)
+        case int() if not -(2**63) <= requested < 2**64:
+            return short(str(requested))
         case _:
-            return asked
+            return requested
 
 
 def short(text: str) -> str:
-    """Never an endless answer, and nothing that is no UTF-8, whatever the asker sent."""
+    """Limits a text from a client to a printable length, and to valid UTF-8."""
     text = text if len(text) <= _LONGEST_REASON else f"{text[:_LONGEST_REASON]}…"
     return text.encode("utf-8", "replace").decode()
-
-
-@lru_cache(maxsize=256)
-def _second(seconds: int) -> str:
-    return datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%dT%H:%M:%S")
 
 
 # -- in ----------------------------------------------------------------------------------------
 
 
-def wanted(payload: bytes) -> Value:
-    """The value a write asks for: a JSON scalar, or `{"value": scalar}`. Raises `BadValue`."""
+def parse_write(payload: bytes) -> Value:
+    """Returns the value of a write: a JSON scalar, or `{"value": scalar}`. Raises `BadValue`."""
     if not payload.strip():
         raise BadValue("the payload is empty: send a JSON value such as 12.5")
     if len(payload) > LONGEST_WRITE:

@@ -1,15 +1,14 @@
 """The one thread that puts on Zenoh, fed by a map that holds only the last value of each tag.
 
-A put can block for as long as the network is congested, so the event loop never does one. What
-waits is bounded by the number of tags: a newer value replaces one that has not gone out yet.
-Every entry is stamped when it is queued and leaves in that order, for Zenoh's
-AdvancedSubscriber discards whatever carries an older stamp than what it has seen of us.
+A put can block for as long as the network is congested, so the event loop never does one. The
+queue is bounded by the number of tags: a newer value replaces one that has not gone out yet.
+Every entry gets its time stamp when it is queued and leaves in that order, because Zenoh's
+AdvancedSubscriber discards a sample with an older stamp than the last one of the same session.
 
-Keys are not declared to Zenoh. A put on a plain key is matched against all that is declared beside
-it (of this thread alone: 13 µs with 100 devices, 80 µs with 1,000), and one on a declared key is
-not (2 µs). But with 50,000 of them the session takes 14 s to close, questions take three times as
-long, and for a moment after a link has returned what is put on them goes nowhere, so that a
-consumer that has just caught up misses it.
+Keys are not declared to Zenoh. A put on a plain key is matched against all declarations (13 µs of
+this thread with 100 devices, 80 µs with 1,000); a put on a declared key is not (2 µs). But with
+50,000 declared keys the session takes 14 s to close, queries take three times as long, and for a
+moment after a link has returned puts on declared keys reach no subscriber.
 """
 
 import asyncio
@@ -22,13 +21,14 @@ from itertools import count
 import structlog
 import zenoh
 
-from gateway.northbound import forms, payload
+from gateway.northbound import encoding, payload
+from gateway.northbound.interfaces import Device
 from gateway.northbound.keys import Keys
 from gateway.tags import Sample, Tag
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 
-EVENTS_LIMIT = 10_000  # waiting puts that must all go out
+EVENTS_LIMIT = 10_000  # waiting puts that no newer one may replace
 
 
 @dataclass(slots=True)
@@ -37,11 +37,11 @@ class Published:
 
     published: int = 0  # handed to Zenoh
     superseded: int = 0  # replaced by a newer value before they went out
-    dropped: int = 0  # events and documents for which there was no room, or no session yet
+    dropped: int = 0  # events and documents: the queue was full, or no session was open yet
 
 
-# What goes out on one key. A bool is its liveliness token, a dict the samples of a block. A plain
-# tuple, for making a named one takes as long as queueing it.
+# One put. A bool declares or undeclares the liveliness token, a dict holds the samples of a block.
+# A plain tuple: creating a named tuple takes as long as queueing it.
 _Entry = tuple[zenoh.Timestamp | None, str, Sample | bytes | bool | dict[str, Sample]]
 
 
@@ -50,15 +50,15 @@ class Publisher:
 
     def __init__(self, keys: Keys) -> None:
         self.counters = Published()
-        self.ended = asyncio.Event()  # the thread is gone, expected or not
+        self.ended = asyncio.Event()  # the thread has ended, expected or not
         self._keys = keys
-        self._alive: dict[str, bool] = {}  # as last said, by device
+        self._online: dict[str, bool] = {}  # by device
         self._session: zenoh.Session | None = None
         self._tokens: dict[str, zenoh.LivelinessToken] = {}
         self._waiting: dict[Hashable, _Entry] = {}
         self._serial = count()
-        self._value_keys: dict[Tag, str] = {}  # making one takes as long as queueing it
-        self._events = 0
+        self._value_keys: dict[Tag, str] = {}  # cached: building one takes as long as queueing it
+        self._waiting_events = 0
         self._closing = False
         self._filled = threading.Condition()
         self._thread: threading.Thread | None = None
@@ -68,17 +68,17 @@ class Publisher:
     def start(self, session: zenoh.Session) -> None:
         self._session = session
         self._loop = asyncio.get_running_loop()
-        for device, alive in self._alive.items():
-            self.alive(device, alive)
+        for device, online in self._online.items():
+            self.set_online(device, online)
         self._thread = threading.Thread(
             target=self._run, args=(session,), name="zenoh publisher", daemon=True
         )
         self._thread.start()
 
     def values(self, samples: Iterable[Sample]) -> None:
-        """To be published unless a newer sample of the same tag comes first.
+        """Queues samples; each is published unless a newer sample of its tag replaces it.
 
-        Before the session is open nothing is kept: opening publishes all current values.
+        Before the session is open samples are dropped: opening publishes all current values.
         """
         if self._session is None or self._closing:
             return
@@ -86,7 +86,7 @@ class Publisher:
         with self._filled:
             for sample in samples:
                 key = self._value_keys.get(sample.tag) or self._value_key(sample.tag)
-                # Taken out first, so that it goes to the end: stamps leave in order.
+                # Removed first, so that the entry moves to the end: stamps leave in order.
                 if self._waiting.pop(key, None) is not None:
                     self.counters.superseded += 1
                 self._waiting[key] = (stamp(), key, sample)
@@ -97,7 +97,7 @@ class Publisher:
         return key
 
     def block(self, device: str, samples: Sequence[Sample]) -> None:
-        """All that changed in one scan of a device; merged with a block that still waits."""
+        """Queues the changed samples of one scan of a device, merged with a waiting block."""
         if self._session is None or self._closing:
             return
         key = self._keys.block(device)
@@ -109,37 +109,37 @@ class Publisher:
             self._filled.notify()
 
     def events(self, samples: Iterable[Sample]) -> None:
-        """Samples that must all go out, in order (bar codes). Beyond the limit they are dropped."""
+        """Queues samples that all go out, in order (bar codes). Drops those beyond the limit."""
         for sample in samples:
-            self._event(self._keys.value(sample.tag.key), sample)
+            self._queue_event(self._keys.value(sample.tag.key), sample)
 
     def document(self, key: str, document: bytes) -> None:
-        """A status document or the outcome of a write, in order with everything else."""
-        self._event(key, document)
+        """Queues a status document or the outcome of a write."""
+        self._queue_event(key, document)
 
-    def alive(self, device: str, alive: bool) -> None:
-        """Shows or takes back the device's liveliness token."""
-        self._alive[device] = alive
+    def set_online(self, device: str, online: bool) -> None:
+        """Declares or undeclares the device's liveliness token."""
+        self._online[device] = online
         if self._session is None:
             return
         key = self._keys.device(device)
         with self._filled:
-            self._waiting[("alive", device)] = (None, key, alive)
+            self._waiting[("token", device)] = (None, key, online)
             self._filled.notify()
 
-    def _event(self, key: str, what: Sample | bytes) -> None:
+    def _queue_event(self, key: str, data: Sample | bytes) -> None:
         with self._filled:
-            if self._session is None or self._closing or self._events >= EVENTS_LIMIT:
+            if self._session is None or self._closing or self._waiting_events >= EVENTS_LIMIT:
                 self.counters.dropped += 1
                 return
-            self._events += 1
-            self._waiting[next(self._serial)] = (self._session.new_timestamp(), key, what)
+            self._waiting_events += 1
+            self._waiting[next(self._serial)] = (self._session.new_timestamp(), key, data)
             self._filled.notify()
 
     # -- any thread --
 
     def stop(self, within: float) -> None:
-        """Lets what waits go out for `within` seconds, then ends the thread."""
+        """Ends the thread once the queue is empty; waits at most `within` seconds for that."""
         with self._filled:
             self._closing = True
             self._filled.notify()
@@ -150,32 +150,32 @@ class Publisher:
 
     def _run(self, session: zenoh.Session) -> None:
         try:
-            self._empty(session)
+            self._send_all(session)
         finally:
             with suppress(RuntimeError):  # the loop is closed already
                 self._loop.call_soon_threadsafe(self.ended.set)
 
-    def _empty(self, session: zenoh.Session) -> None:
+    def _send_all(self, session: zenoh.Session) -> None:
         while batch := self._next_batch():
             while batch:
-                stamp, key, what = batch.pop()
+                stamp, key, data = batch.pop()
                 try:
-                    self._send(session, stamp, key, what)
+                    self._send(session, stamp, key, data)
                 except zenoh.ZError as error:
                     if session.is_closed():
                         return
-                    log.warning("not published", key=key, error=str(error))
+                    log.warning("Zenoh put failed", key=key, error=str(error))
 
     def _next_batch(self) -> list[_Entry]:
-        """All that waits, the first last; empty only when the publisher is to end.
+        """Returns all waiting entries, the first at the end; empty only when the publisher ends.
 
-        A list, to be let go of one by one: 50,000 entries at once hold up the loop for 5 ms.
+        The caller frees the entries one by one: freeing 50,000 at once holds up the loop for 5 ms.
         """
         with self._filled:
             while not self._waiting and not self._closing:
                 self._filled.wait()
             waiting, self._waiting = self._waiting, {}
-            self._events = 0
+            self._waiting_events = 0
         batch = list(waiting.values())
         batch.reverse()
         return batch
@@ -185,22 +185,50 @@ class Publisher:
         session: zenoh.Session,
         stamp: zenoh.Timestamp | None,
         key: str,
-        what: Sample | bytes | bool | dict[str, Sample],
+        data: Sample | bytes | bool | dict[str, Sample],
     ) -> None:
-        if isinstance(what, Sample):
-            forms.put(session, key, what, stamp)
-        elif isinstance(what, bytes):
-            forms.put_json(session, key, what, stamp)
-        elif isinstance(what, dict):
-            forms.put_json(session, key, payload.block(what.values()), stamp)
+        if isinstance(data, Sample):
+            encoding.put(session, key, data, stamp)
+        elif isinstance(data, bytes):
+            encoding.put_json(session, key, data, stamp)
+        elif isinstance(data, dict):
+            encoding.put_json(session, key, payload.block(data.values()), stamp)
         else:
-            self._token(session, key, declared=what)
+            self._set_token(session, key, declared=data)
             return
         self.counters.published += 1
 
-    def _token(self, session: zenoh.Session, key: str, *, declared: bool) -> None:
+    def _set_token(self, session: zenoh.Session, key: str, *, declared: bool) -> None:
         if not declared:
             if token := self._tokens.pop(key, None):
                 token.undeclare()  # type: ignore[no-untyped-call]  # Zenoh's stub lacks it
         elif key not in self._tokens:
             self._tokens[key] = session.liveliness().declare_token(key)
+
+
+class ScanBatches:
+    """Sorts the samples of a scan by how they are published. Event loop only; never blocks."""
+
+    def __init__(self, publisher: Publisher, devices: Iterable[Device]) -> None:
+        self._publisher = publisher
+        blocks = {device.name: device.blocks for device in devices}
+        self._with_blocks = frozenset(name for name, mode in blocks.items() if mode)
+        self._only_blocks = frozenset(name for name, mode in blocks.items() if mode == "only")
+
+    def publish(self, samples: Sequence[Sample]) -> None:
+        """One call is one scan. Samples of event tags all go out, in order, none replaced."""
+        values = samples
+        if any(sample.tag.event for sample in samples):
+            self._publisher.events(sample for sample in samples if sample.tag.event)
+            values = [sample for sample in samples if not sample.tag.event]
+        if self._only_blocks:
+            values = [sample for sample in values if sample.tag.device not in self._only_blocks]
+        self._publisher.values(values)
+        if not self._with_blocks:
+            return
+        scans: dict[str, list[Sample]] = {}
+        for sample in samples:
+            if sample.tag.device in self._with_blocks:
+                scans.setdefault(sample.tag.device, []).append(sample)
+        for device, changed in scans.items():
+            self._publisher.block(device, changed)

@@ -1,74 +1,74 @@
-"""What is said to a question, on an answering thread: values, descriptions, status, outcomes."""
+"""Replies to queries, made on an answering thread: values, descriptions, status, outcomes."""
 
 from collections.abc import Callable, Sequence
 
 import zenoh
 
 from gateway.errors import BadValue, Busy, GatewayError
-from gateway.northbound import forms, payload
-from gateway.northbound.directory import Directory
-from gateway.northbound.keys import Asked, Family, Keys
+from gateway.northbound import encoding, payload
+from gateway.northbound.interfaces import History, Plant
+from gateway.northbound.keys import Family, Keys, ParsedKey
 from gateway.northbound.payload import Failure, Problem
-from gateway.northbound.plant import History, Plant
+from gateway.northbound.tag_index import TagIndex
 from gateway.tags import Tag, WriteResult
 
-_NOT_ALL = "the gateway is ending: this is not all"
+_INCOMPLETE = "the gateway is ending: this is not all"
 _NO_HISTORY = Failure(Problem.NO_HISTORY, "no history is kept here: ask without _time")
 
 
 class Replies:
-    """Every method replies to one query and may block while the asker does not listen.
+    """Every method replies to one query and may block while the client does not receive.
 
-    `stamp` gives the session's time stamps. Each reply has its own, for an AdvancedSubscriber
-    keeps only one of those that are equal.
+    `stamp` makes the session's time stamps. Each reply has its own, because an AdvancedSubscriber
+    keeps only one of several samples with equal stamps.
     """
 
     def __init__(
         self,
         keys: Keys,
         plant: Plant,
-        directory: Directory,
+        index: TagIndex,
         stamp: Callable[[], zenoh.Timestamp],
         history: History | None = None,
     ) -> None:
         self._keys = keys
         self._plant = plant
-        self._directory = directory
+        self._index = index
         self._stamp = stamp
         self._history = history
         self._ended = False
-        self._only_blocks = {d.name for d in directory.devices if d.blocks == "only"}
+        self._only_blocks = {d.name for d in index.devices if d.blocks == "only"}
 
     def end(self) -> None:
-        """A long answer stops at the next tag."""
+        """Makes a long answer stop at the next tag."""
         self._ended = True
 
-    def current(self, wanted: Asked, query: zenoh.Query) -> None:
-        if wanted.family is Family.BLOCK:
-            for device in self._directory.devices_under(wanted.of):
+    def current(self, parsed: ParsedKey, query: zenoh.Query) -> None:
+        if parsed.family is Family.BLOCK:
+            for device in self._index.devices_at(parsed.target):
                 if device.blocks:
                     stamp = self._stamp()
                     block = payload.block(self._plant.sample(tag) for tag in device.tags)
                     self._reply(query, self._keys.block(device.name), block, stamp)
             return
-        for tag in self._directory.find(wanted.of):
+        for tag in self._index.tags_at(parsed.target):
             if self._ended:
                 return
-            if wanted.family is Family.LAST and tag.device in self._only_blocks:
-                continue  # whoever asks so waits for news on that key, and none will come
-            if wanted.family is Family.META:
+            if parsed.family is Family.LAST and tag.device in self._only_blocks:
+                continue  # a subscriber asks so before it waits for this key; none will come
+            if parsed.family is Family.META:
                 self._reply(query, self._keys.meta(tag.key), payload.meta(tag), self._stamp())
             else:
                 self._value(query, tag)
 
     def _value(self, query: zenoh.Query, tag: Tag) -> None:
-        # Stamped before it is looked up: a newer value that is put meanwhile has the newer stamp.
+        # Stamped before the look-up: a newer value that is put meanwhile has the newer stamp.
         stamp = self._stamp()
         sample = self._plant.sample(tag)
-        forms.reply(query, self._keys.value(tag.key), sample, stamp)
+        encoding.reply(query, self._keys.value(tag.key), sample, stamp)
 
     def fresh(self, tags: Sequence[Tag], unread: Sequence[Tag], query: zenoh.Query) -> None:
-        """As they are known now, but for those that could not be read: one error for them all."""
+        """Replies with current values, and with one error for all tags in `unread`."""
         for tag in tags:
             if tag not in unread:
                 self._value(query, tag)
@@ -77,29 +77,30 @@ class Replies:
             reason = f"{unread[0].key}{more} could not be read in time"
             self.outcome(Failure(Problem.BUSY, reason), query)
 
-    def history(self, wanted: Asked, now: int, query: zenoh.Query) -> None:
+    def history(self, parsed: ParsedKey, now: int, query: zenoh.Query) -> None:
         """`now`: ns since 1970, when the query was taken."""
-        tags = self._directory.find(wanted.of)
+        tags = self._index.tags_at(parsed.target)
         if self._history is None:
-            if tags:  # else another gateway's, which may keep one
+            if tags:  # otherwise they are another gateway's, which may have a history
                 self.outcome(_NO_HISTORY, query)
             return
         try:
             limit = _limit(query.parameters.get("limit"))
-            asked = query.parameters.get("_time") or ""
+            time_range = query.parameters.get("_time") or ""
             for tag in tags:
                 key = self._keys.value(tag.key)
-                for sample in self._history.samples(tag, asked, limit, now):
+                for sample in self._history.samples(tag, time_range, limit, now):
                     if self._ended:
-                        raise Busy(_NOT_ALL)
-                    forms.reply(query, key, sample, self._stamp())
+                        raise Busy(_INCOMPLETE)
+                    encoding.reply(query, key, sample, self._stamp())
         except BadValue as error:
             self.outcome(Failure(Problem.BAD_QUERY, str(error)), query)
         except GatewayError as error:
             self.outcome(payload.failure(error), query)
 
     def writes(self, now: int, query: zenoh.Query) -> None:
-        """Of the past; every reply is on the key on which it was published. `now` as there."""
+        """Replies with recorded outcomes, on the key of their publication. `now` as in
+        `history`."""
         if not query.key_expr.intersects(self._keys.writes):
             return
         if self._history is None:
@@ -107,11 +108,11 @@ class Replies:
             return
         try:
             limit = _limit(query.parameters.get("limit"))
-            asked = query.parameters.get("_time") or ""
-            for told in self._history.writes(asked, limit, now):
+            time_range = query.parameters.get("_time") or ""
+            for outcome in self._history.writes(time_range, limit, now):
                 if self._ended:
-                    raise Busy(_NOT_ALL)
-                self._reply(query, self._keys.writes, told.encode(), self._stamp())
+                    raise Busy(_INCOMPLETE)
+                self._reply(query, self._keys.writes, outcome.encode(), self._stamp())
         except BadValue as error:
             self.outcome(Failure(Problem.BAD_QUERY, str(error)), query)
         except GatewayError as error:
@@ -130,7 +131,7 @@ class Replies:
             self._reply(query, str(query.key_expr), data, self._stamp())
 
     def _reply(self, query: zenoh.Query, key: str, data: bytes, stamp: zenoh.Timestamp) -> None:
-        forms.reply_json(query, key, data, stamp)
+        encoding.reply_json(query, key, data, stamp)
 
 
 def _limit(text: str | None) -> int | None:

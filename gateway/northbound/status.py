@@ -1,17 +1,26 @@
-"""The state of lines and devices as documents: what status keys, status page and people read."""
+"""The state of lines and devices as documents, for status keys and the status page."""
 
 from collections.abc import Mapping, Sequence
 
 from gateway.engine.device import Device
+from gateway.engine.engine import Engine
 from gateway.engine.forecast import LineForecast
+from gateway.engine.health import State
 from gateway.engine.jobs import Poll
-from gateway.line.line import Line
-from gateway.northbound.payload import rfc3339
 from gateway.planning.bad_addresses import BadRange
 from gateway.planning.planner import describe
+from gateway.tags.timestamps import rfc3339
 
 MOST_REQUESTS = 200
+# The words of the status documents; users read them since the first version.
+_STANDING = {State.ONLINE: "up", State.OFFLINE: "silent"}
 Document = Mapping[str, object]
+
+
+def standing(device: Device) -> str:
+    """starting, up, failing or silent."""
+    state = device.health.state
+    return _STANDING.get(state, state.value)
 
 
 def device_document(device: Device, polls: Sequence[Poll]) -> Document:
@@ -20,7 +29,7 @@ def device_document(device: Device, polls: Sequence[Poll]) -> Document:
     return {
         "protocol": device.driver.protocol,
         "station": device.driver.station,
-        "standing": device.standing.value,
+        "standing": standing(device),
         "diagnosis": device.diagnosis(),
         "exchanges": record.exchanges,
         "writes": record.writes,
@@ -35,21 +44,22 @@ def device_document(device: Device, polls: Sequence[Poll]) -> Document:
         "failures": dict(record.failures),
         "refusals": dict(record.refusals),
         "refused_addresses": [
-            refused_sentence(device, bad) for bad in device.refusals.bad.values()
+            refused_sentence(device, bad) for bad in device.bad_addresses.bad.values()
         ],
         "requests": [_request(poll) for poll in polls[:MOST_REQUESTS]],
     }
 
 
 def _request(poll: Poll) -> Document:
-    """One block: how often it is wanted and how often it came."""
+    """One block: its configured interval and the measured one."""
+    record = poll.record
     return {
         "tags": describe(poll.block),
         "every": poll.block.every,
-        "measured_every": round(poll.mean_gap, 4) if poll.mean_gap else None,
-        "worst_age": round(poll.worst_gap, 4) if poll.worst_gap else None,
-        "reads": poll.reads,
-        "overruns": poll.overruns,
+        "measured_every": round(record.mean_gap, 4) if record.mean_gap else None,
+        "worst_age": round(record.worst_gap, 4) if record.worst_gap else None,
+        "reads": record.reads,
+        "overruns": record.overruns,
     }
 
 
@@ -60,21 +70,21 @@ def refused_sentence(device: Device, bad: BadRange) -> str:
     return f"{where} of {device.name}: refused with {bad.code} since {rfc3339(bad.since)}"
 
 
-def line_document(line: Line, expected: LineForecast, now: float) -> Document:
-    """One line: what was promised and what was measured. `now` by the loop's clock."""
-    record = line.record
-    open_for = now - record.since if line.is_open else 0.0
+def line_document(engine: Engine, expected: LineForecast, now: float) -> Document:
+    """One line: the forecast and the measured figures. `now` by the loop's clock."""
+    record = engine.record
+    open_for = now - record.since if engine.is_open else 0.0
     busy = record.busy + record.turnarounds
-    slowest = max((device.record.slowest_write for device in line.devices), default=0.0)
+    slowest = max((device.record.slowest_write for device in engine.devices), default=0.0)
     open_in_all = record.open_before + open_for
-    exchanges = sum(device.record.exchanges for device in line.devices)
+    exchanges = sum(device.record.exchanges for device in engine.devices)
     return {
-        "open": line.is_open,
+        "open": engine.is_open,
         "trouble": record.trouble,
         "opened": record.opened,
         "open_for": round(open_for, 1),
-        "baudrate": line.wire.baudrate,
-        "devices": {device.name: device.standing.value for device in line.devices},
+        "baudrate": engine.wire.baudrate,
+        "devices": {device.name: standing(device) for device in engine.devices},
         "busy_time": round(busy, 3),
         "measured": {
             "load": round(busy / open_in_all, 4) if open_in_all else None,

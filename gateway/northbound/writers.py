@@ -1,8 +1,8 @@
-"""Who may write, where Zenoh cannot say it: tokens, known only by their salted hashes.
+"""The writers file: clients that may write, known by the salted hashes of their tokens.
 
 A line of the file is `name:salt:hash`, where hash is SHA-256 of salt and token in hexadecimal. A
-token is made by a machine and long, so no slow hash is needed to guard it; a slow one would let
-anybody keep the gateway busy with wrong tokens.
+token is long and random, so it needs no slow hash; a slow hash would let any client keep the
+gateway busy with wrong tokens.
 """
 
 import hashlib
@@ -22,17 +22,17 @@ log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 SHORTEST_TOKEN, LONGEST_TOKEN = 20, 200  # characters
 _MOST = 100  # writers: each costs a hash for every write
 _LINE = re.compile(r"([\w.\-]{1,60}):([\w.\-]{8,100}):([0-9a-fA-F]{64})\Z")
-_LOOK_EVERY = 1.0  # seconds until the file is looked at again
+_CHECK_EVERY = 1.0  # seconds between two looks at the file
 
 
 class NotAllowed(GatewayError):
-    """The token is missing, or nobody's; nothing was done."""
+    """The token is missing or unknown; nothing was done."""
 
 
-class Asker(NamedTuple):
-    """What is known of who asks."""
+class Sender(NamedTuple):
+    """The client that sent a query or put."""
 
-    session: str | None = None  # Zenoh's id, where it is told
+    session: str | None = None  # Zenoh's id, if the client sends it
     token: bytes | None = None
 
 
@@ -43,44 +43,44 @@ class _Writer(NamedTuple):
 
 
 class Writers:
-    """The file, read again when it has changed. Raises `ConfigError` when made with a bad one."""
+    """The file, reloaded when it changes. Raises `ConfigError` if the first load fails."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._looked = time.monotonic()
+        self._checked = time.monotonic()
         self._version = self._stat()
-        self._known = _read(path)
+        self._writers = _load(path)
 
     def owner(self, token: bytes | None) -> str:
-        """The name of whoever holds the token. Raises `NotAllowed`."""
-        self._renew()
+        """Returns the name of the token's owner. Raises `NotAllowed`."""
+        self._reload()
         if token is None:
             raise NotAllowed("writing needs a token, as the attachment of the query or put")
         if len(token) < SHORTEST_TOKEN:
             raise NotAllowed(f"a token has at least {SHORTEST_TOKEN} characters")
         name = None
-        for writer in self._known:  # all of them, so that time tells nothing
+        for writer in self._writers:  # always all: the time must not tell which one matched
             if hmac.compare_digest(hashlib.sha256(writer.salt + token).digest(), writer.digest):
                 name = writer.name
         if name is None:
-            raise NotAllowed("nobody has this token")
+            raise NotAllowed("the token is unknown")
         return name
 
-    def _renew(self) -> None:
+    def _reload(self) -> None:
         now = time.monotonic()
-        if now - self._looked < _LOOK_EVERY:
+        if now - self._checked < _CHECK_EVERY:
             return
-        self._looked = now
+        self._checked = now
         version = self._stat()
         if version == self._version:
             return
         self._version = version
         try:
-            self._known = _read(self._path)
-            log.info("writers read again", count=len(self._known))
+            self._writers = _load(self._path)
+            log.info("writers file reloaded", count=len(self._writers))
         except ConfigError as error:
-            self._known = ()
-            log.error("nobody may write until this is mended", why=str(error))  # noqa: TRY400  (a sentence, no trace)
+            self._writers = ()
+            log.error("writers file rejected", why=str(error), so="every write is refused")  # noqa: TRY400  (a sentence, no trace)
 
     def _stat(self) -> tuple[int, ...] | None:
         try:
@@ -90,7 +90,7 @@ class Writers:
         return (found.st_mtime_ns, found.st_size, found.st_ino, found.st_mode)
 
 
-def _read(path: Path) -> tuple[_Writer, ...]:
+def _load(path: Path) -> tuple[_Writer, ...]:
     writers: dict[str, _Writer] = {}
     text = readable_secret(path, "writers.file")
     for number, line in enumerate(text.splitlines(), 1):

@@ -1,8 +1,7 @@
-"""Writes that come over Zenoh: checked, handed down, and every outcome told.
+"""Writes that come over Zenoh: checked, passed to the plant, answered and audited.
 
-Whatever happens between a request and the device's acknowledgement has one of three endings: it
-was acknowledged, it was certainly not done, or nobody can say (`unclear`). The last is what is
-answered whenever nothing better is known.
+A write has one of three endings: the device acknowledged it, it was certainly not done, or it is
+`unclear`. Unclear is the answer whenever neither of the others is certain.
 """
 
 import asyncio
@@ -14,42 +13,41 @@ import zenoh
 
 from gateway.errors import Busy, GatewayError
 from gateway.northbound import payload
-from gateway.northbound.directory import Directory
-from gateway.northbound.keys import Keys, asked
+from gateway.northbound.interfaces import Plant
+from gateway.northbound.keys import parse_key
 from gateway.northbound.payload import Failure, Problem, WriteOutcome
-from gateway.northbound.plant import Plant
-from gateway.northbound.writers import LONGEST_TOKEN, Asker, NotAllowed, Writers
+from gateway.northbound.tag_index import TagIndex
+from gateway.northbound.writers import LONGEST_TOKEN, NotAllowed, Sender, Writers
 from gateway.tags import Tag, WriteResult
 from gateway.values import Value
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 
-AT_ONCE = 256  # writes that wait for their lines; more are refused
-# Zenoh's clients wait 10 s if they say nothing else: they must hear before that.
+MOST_WAITING = 256  # writes that wait for their lines; more are refused
+# Zenoh's clients wait 10 s by default, so the answer must come earlier.
 ANSWER_WITHIN = 8.0
 
 
 class Writes:
-    """Bounded: beyond `AT_ONCE` waiting writes the next is refused as busy."""
+    """Bounded: with `MOST_WAITING` writes waiting, the next is refused as busy."""
 
     def __init__(
         self,
-        keys: Keys,
         plant: Plant,
-        directory: Directory,
-        wrote: Callable[[WriteOutcome], None],
+        index: TagIndex,
+        audit: Callable[[WriteOutcome], None],
         writers: Writers | None = None,
     ) -> None:
-        self._keys = keys
+        """`audit` gets every outcome. Without `writers`, Zenoh alone decides who may write."""
         self._plant = plant
-        self._directory = directory
-        self._wrote = wrote
+        self._index = index
+        self._audit = audit
         self._writers = writers
         self._waiting = 0
 
-    async def write(self, key: str, data: bytes | None, asker: Asker) -> WriteResult | Failure:
-        """`key` is the `@set` key as it came, wildcards and all; `data` its payload."""
-        by = asker.session
+    async def write(self, key: str, data: bytes | None, sender: Sender) -> WriteResult | Failure:
+        """`key` is the `@set` key as received, wildcards included; `data` its payload."""
+        by = sender.session
         started = time.monotonic()
         value: Value | None = None
         result: WriteResult | Failure = Failure(
@@ -58,13 +56,13 @@ class Writes:
         self._waiting += 1
         try:
             if self._writers is not None:
-                by = self._writers.owner(asker.token)
+                by = self._writers.owner(sender.token)
             target = self._target(key)
             if isinstance(target, Failure):
                 result = target
             else:
-                value = payload.wanted(data or b"")
-                result = await self._hand_down(target, value)
+                value = payload.parse_write(data or b"")
+                result = await self._write_tag(target, value)
         except TimeoutError:
             result = Failure(
                 Problem.UNCLEAR, f"not acknowledged within {ANSWER_WITHIN:g} s: it may yet be done"
@@ -76,22 +74,23 @@ class Writes:
         finally:
             self._waiting -= 1
             took = time.monotonic() - started
-            self._wrote(WriteOutcome(asked(key).of, value, result, time.time_ns(), took, by))
+            value_key = parse_key(key).target
+            self._audit(WriteOutcome(value_key, value, result, time.time_ns(), took, by))
         return result
 
-    async def _hand_down(self, tag: Tag, value: Value) -> WriteResult:
-        if self._waiting > AT_ONCE:
-            raise Busy(f"{AT_ONCE} writes are waiting already")
+    async def _write_tag(self, tag: Tag, value: Value) -> WriteResult:
+        if self._waiting > MOST_WAITING:
+            raise Busy(f"{MOST_WAITING} writes are waiting already")
         async with asyncio.timeout(ANSWER_WITHIN):
             return await self._plant.write(tag, value)
 
     def _target(self, key: str) -> Tag | Failure:
-        value_key = asked(key).of
+        value_key = parse_key(key).target
         if "*" in key:
             return Failure(
                 Problem.UNKNOWN_TAG, f"{key} has a wildcard: a write names one tag, in full"
             )
-        tag = self._directory.one(value_key)
+        tag = self._index.tag_at(value_key)
         if tag is None:
             return Failure(Problem.UNKNOWN_TAG, f"there is no tag at {value_key}")
         if tag.write is None:
@@ -102,26 +101,26 @@ class Writes:
 
 
 class PutWrites:
-    """Writes by a plain put: nobody can be answered, so the outcome is only told and logged."""
+    """Writes by a plain put. A put has no reply, so the outcome is only audited."""
 
-    def __init__(self, writes: Writes, directory: Directory) -> None:
-        self.refused = 0  # for want of room
+    def __init__(self, writes: Writes, index: TagIndex) -> None:
+        self.refused = 0  # because the inbox was full
         self._writes = writes
-        self._directory = directory
+        self._index = index
         self._tasks: set[asyncio.Task[object]] = set()
 
     def take(self, put: zenoh.Sample) -> None:
-        """On the event loop."""
+        """Called on the event loop."""
         key = str(put.key_expr)
-        if "*" not in key and not self._directory.owns(asked(key).of):
-            return  # another gateway's
-        work = self._writes.write(key, _payload(put), asker(put))
+        if "*" not in key and not self._index.owns(parse_key(key).target):
+            return  # for another gateway
+        work = self._writes.write(key, _payload(put), sender(put))
         task: asyncio.Task[object] = asyncio.get_running_loop().create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._ended)
 
     def refuse(self, _put: zenoh.Sample) -> None:
-        """On Zenoh's thread, for want of room."""
+        """Called on Zenoh's thread when the inbox is full."""
         self.refused += 1
 
     def close(self) -> None:
@@ -131,18 +130,18 @@ class PutWrites:
     def _ended(self, task: asyncio.Task[object]) -> None:
         self._tasks.discard(task)
         if not task.cancelled() and (error := task.exception()):
-            log.error("a write failed", exc_info=error)
+            log.error("write crashed", exc_info=error)
 
 
-def asker(asking: zenoh.Query | zenoh.Sample) -> Asker:
-    """Who asked, where Zenoh or a token tells: most clients do not say."""
-    source, token = asking.source_info, asking.attachment
-    return Asker(
+def sender(message: zenoh.Query | zenoh.Sample) -> Sender:
+    """Returns session and token of the client, as far as it sends them: most clients do not."""
+    source, token = message.source_info, message.attachment
+    return Sender(
         None if source is None else str(source.source_id.zid),
         None if token is None or len(token) > LONGEST_TOKEN else token.to_bytes(),
     )
 
 
 def _payload(put: zenoh.Sample) -> bytes | None:
-    """None for a delete, which is refused as a write of nothing."""
+    """None for a delete, which is refused as an empty write."""
     return None if put.kind == zenoh.SampleKind.DELETE else put.payload.to_bytes()

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 from gateway.protocols.driver import Cost, Timing
 
-# A network connection without a serial wire behind it (Modbus TCP): 10 bytes per microsecond.
+# A network connection without a serial line: 10 bytes per microsecond.
 NETWORK_BAUD = 100_000_000
 
 

@@ -1,12 +1,4 @@
-"""Every protocol the gateway speaks: a driver's fields are its settings in the file."""
+"""The asking side of every protocol.
 
-from gateway.protocols.computer_link import ComputerLink
-from gateway.protocols.frames import Frames
-from gateway.protocols.modbus import ModbusAscii, ModbusRtu, ModbusTcp
-from gateway.protocols.vigor import Vigor
-
-# One union is the whole registry; `protocol` tells its members apart. All are drivers but
-# `Frames`, whose settings `FrameDriver` makes one of.
-PlcDriver = Vigor | ComputerLink | ModbusRtu | ModbusAscii | ModbusTcp | Frames
-
-__all__ = ["ComputerLink", "Frames", "ModbusAscii", "ModbusRtu", "ModbusTcp", "PlcDriver", "Vigor"]
+`driver.py` is the contract; `registry.py` lists the protocols; each has a folder of its own.
+"""

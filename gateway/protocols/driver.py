@@ -1,18 +1,20 @@
-"""The driver contract: what a protocol must be able to do, and all it may do to the world.
+"""The driver contract: what a protocol must provide, and the only things it may do.
 
 Two levels, neither of which does I/O. A `Codec` turns bytes into frames and back,
-synchronously. A `Driver` turns frames into words with `async def`, but can do nothing
-except talk on the turn it is handed.
+synchronously. A `Driver` turns frames into words with `async def`; it can only send and
+receive frames of the transaction it is given.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
+from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar, runtime_checkable
+
+from gateway.values import Kind, Order
 
 
 class Unit(StrEnum):
-    """What one address of an area holds."""
+    """The contents of one address of an area."""
 
     BIT = "bit"
     WORD = "word"  # 16 bits
@@ -33,7 +35,7 @@ class Area:
 
 
 class Address(NamedTuple):
-    """Where a tag lives, in the maker's numbering. `bit` picks one bit of a word."""
+    """The place of a tag, in the maker's numbering. `bit` picks one bit of a word."""
 
     area: str
     number: int
@@ -41,7 +43,7 @@ class Address(NamedTuple):
 
 
 class Span(NamedTuple):
-    """`size` neighbouring addresses of one area: what one exchange reads or writes."""
+    """`size` neighbouring addresses of one area: what one request reads or writes."""
 
     area: str
     start: int
@@ -49,10 +51,37 @@ class Span(NamedTuple):
 
 
 class Cost(NamedTuple):
-    """The characters one exchange puts on the wire, there and back."""
+    """The characters of one request and its reply on the wire."""
 
     request: int
     reply: int
+
+
+@dataclass(frozen=True, slots=True)
+class Timing:
+    """A protocol's default times in seconds; each can be set per device in the file."""
+
+    reply_timeout: float = 0.5  # from the request to the reply, without the characters' own time
+    turnaround: float = 0.005  # expected from the request to the reply, until it is measured
+    silence: float = 0.005  # pause before a request
+    silence_chars: float = 0.0  # pause in characters; the longer of the two counts
+    retries: int = 2  # how often a read that ended unclear is repeated
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Traits:
+    """Properties of a protocol that the configuration needs; most can be set in the file."""
+
+    baudrate: int | None = 9600  # default of the line; None: spoken over TCP, without a serial line
+    format: str = "8N1"  # default of the line
+    binary: bool = False  # frames need 8 data bits
+    word_type: Kind = Kind.INT16  # default type of a word
+    string_order: Order = Order.LOW_FIRST  # default byte order of a text
+    numbered: bool = True  # devices have station numbers
+
+    @property
+    def over_network(self) -> bool:
+        return self.baudrate is None
 
 
 F = TypeVar("F")
@@ -60,15 +89,15 @@ T = TypeVar("T")
 
 
 class Codec(Protocol[F]):
-    """Bytes <-> frames for one turn on the line; a fresh one for each turn."""
+    """Bytes <-> frames of one transaction; each transaction has a fresh one."""
 
     def encode(self, frame: F) -> bytes: ...
 
     def feed(self, data: bytes) -> list[F]:
-        """The frames completed by `data`. Noise before a frame is skipped.
+        """Returns the frames completed by `data`. Noise before a frame is skipped.
 
         Raises `Garbled` when a frame is certainly damaged (a wrong sum, an endless frame).
-        After that the codec is used no more.
+        The codec is not used again after that.
         """
 
 
@@ -81,27 +110,27 @@ class EndedByGap(Protocol[F]):
         """None: no silence ends a frame."""
 
     def expire(self) -> list[F]:
-        """The frames that the silence has ended. Raises as `feed`."""
+        """Returns the frames that the silence has ended. Raises as `feed`."""
 
 
 class Talk(Protocol[F]):
-    """One turn on the line: all that a driver can do to the world."""
+    """One transaction: the only things that a driver can do to the outside."""
 
     @property
     def may_echo(self) -> bool:
-        """Whether a frame that equals our own may be its echo: nothing has shown the contrary."""
+        """True while a frame equal to the request may be its echo."""
 
     async def tell(self, frame: F) -> None:
-        """Send a frame that is not answered."""
+        """Sends a frame that has no reply."""
 
     async def ask(self, frame: F, reply: int, answers: Callable[[F], T | None]) -> T:
-        """Send `frame` and wait for its answer, of at most `reply` characters.
+        """Sends `frame` and waits for its reply, of at most `reply` characters.
 
-        Every frame heard is shown to `answers`, a pure function: it returns what the frame
-        says, or None when the frame is no answer to this question (another station's, an
-        echo, a late reply to something else), or raises `Refused`. Frames that are no
-        answer are counted and passed over until the time-out. Several questions may be open at
-        once on one turn (where answers carry a number); a frame goes to the first that takes it.
+        Every received frame is given to `answers`, a pure function: it returns the contents of
+        the frame, or None when the frame is not the reply to this request (another station's,
+        an echo, a late reply to an older request), or raises `Refused`. Frames that are not the
+        reply are counted and skipped until the time-out. Several requests may be outstanding in
+        one transaction (where replies carry a number); a frame goes to the first that takes it.
 
         Raises `NoReply`, `Garbled`, `LineDown`, and what `answers` raises.
         """
@@ -117,23 +146,26 @@ class Driver(Protocol[F]):
     def station(self) -> int: ...
 
     @property
+    def traits(self) -> Traits: ...
+
+    @property
+    def timing(self) -> Timing: ...
+
+    @property
     def areas(self) -> Mapping[str, Area]:
         """Every area of the device, by name."""
 
-    @property
-    def timing(self) -> "Timing": ...
-
     def address(self, text: str) -> Address:
-        """The address as its maker writes it. Raises `ConfigError` saying what would be right."""
+        """Parses an address as its maker writes it. Raises `ConfigError` with a correct example."""
 
     def spell(self, address: Address) -> str:
-        """The maker's spelling of an address: the inverse of `address`, for messages."""
+        """Writes an address as its maker does: the inverse of `address`."""
 
     def cost(self, span: Span) -> Cost | None:
-        """The characters that reading `span` in one exchange costs; None if that cannot be done.
+        """Returns the cost of reading `span` in one request; None if that is impossible.
 
-        Exact, including what must be read around the span (bits come in eights). Whenever a
-        span cannot be read in one exchange, no longer span around it can.
+        Exact, including what must be read around the span (bits are read in eights). If a span
+        cannot be read in one request, no longer span around it can.
         """
 
     def write_cost(self, span: Span) -> Cost | None:
@@ -142,34 +174,37 @@ class Driver(Protocol[F]):
     def codec(self) -> Codec[F]: ...
 
     async def read(self, talk: Talk[F], span: Span) -> Sequence[int]:
-        """The units of `span`: bits as 0 or 1, words as 0..65535, dwords as 0..2**32-1."""
+        """Returns the units of `span`: bits as 0 or 1, words 0..65535, dwords 0..2**32-1."""
 
     async def write(self, talk: Talk[F], span: Span, units: Sequence[int]) -> bool:
-        """True when the device acknowledged the write, False where nobody ever acknowledges
-        (a broadcast). Everything else raises."""
+        """Returns True when the device acknowledged the write, False where it never does
+        (a broadcast). Raises in every other case."""
 
-    async def resync(self, talk: Talk[F], doubt: Span | None, salt: int) -> int:
-        """Ask something harmless whose answer cannot be taken for the answer to `doubt`.
+    async def resync(self, talk: Talk[F], outstanding: Span | None, probe_token: int) -> int:
+        """Sends a harmless request whose reply cannot be the reply to the `outstanding` read.
 
-        Also the cheapest proof of life. `salt` counts up by two, and is then the question's mark;
-        a second question in the same resync has the mark after it. So the answers to earlier
-        resyncs are not taken for the answer to this one either, as far as the protocol lets a
-        question be marked: returned is from how many open questions, `doubt` among them, this
-        one can be told. The values read are thrown away.
+        It is also the cheapest way to see that the device is online. `probe_token` marks the
+        request and grows by two with each resync; a second request in the same resync is marked
+        with the number after it. So a reply to an earlier resync is not taken for the reply to
+        this one either, as far as the protocol can mark a request. Returns from how many
+        outstanding requests, `outstanding` included, this one can be told. Values are discarded.
 
-        Raises `Refused` where nothing but refusals came that may answer an older question.
+        Raises `Refused` where only error replies arrived that may belong to an older request.
         """
 
 
 AnyDriver = Driver[Any]
 
 
+# ---- Optional capabilities ---------------------------------------------------------------
+
+
 @runtime_checkable
 class ScatteredWriter(Protocol[F]):
-    """A driver that can write several unconnected spans in one exchange (BT, WT)."""
+    """A driver that can write several separate spans with one request (BT, WT)."""
 
     def scattered_write_cost(self, spans: Sequence[Span]) -> Cost | None:
-        """None when these spans cannot go out in one exchange."""
+        """Returns None when these spans do not fit one request."""
 
     async def write_scattered(
         self, talk: Talk[F], parts: Sequence[tuple[Span, Sequence[int]]]
@@ -178,13 +213,13 @@ class ScatteredWriter(Protocol[F]):
 
 @runtime_checkable
 class Monitor(Protocol[F]):
-    """A driver whose device remembers a list of addresses and reads it out cheaply (BM/MB, WM/MN).
+    """A driver whose device stores a list of addresses and reads it cheaply (BM/MB, WM/MN).
 
-    The device forgets its list at power-off: after any trouble, `register` again.
+    The device loses its list at power-off: after any error, `register` it again.
     """
 
     def monitor_cost(self, spans: Sequence[Span]) -> Cost | None:
-        """What one read-out of the registered list costs; None if these cannot be registered."""
+        """Returns the cost of reading the list; None if these spans cannot be registered."""
 
     async def register(self, talk: Talk[F], spans: Sequence[Span]) -> None: ...
 
@@ -195,11 +230,11 @@ class Monitor(Protocol[F]):
 
 @runtime_checkable
 class Windowed(Protocol):
-    """A driver whose answers carry a number, so that several questions may be open at once."""
+    """A driver whose replies carry a number: several requests may be outstanding."""
 
     @property
     def window(self) -> int:
-        """How many."""
+        """The most outstanding requests."""
 
 
 @runtime_checkable
@@ -216,29 +251,43 @@ class StrayFrames(Protocol):
     """A driver that can explain stray frames: frames that are no reply to any request."""
 
     def from_this_station(self, frame: Any) -> bool:
-        """True when the device itself sent the frame."""
+        """Returns True when the device itself sent the frame."""
 
     def describe_stray(self, frame: Any) -> str | None:
-        """A phrase for the log; None for a frame that needs no explanation."""
+        """Returns a phrase for the log; None for a frame that needs no explanation."""
 
 
 @runtime_checkable
 class Controllable(Protocol[F]):
-    """A driver whose device takes commands: run, stop, loopback, model."""
+    """A driver whose device accepts commands: run, stop, loopback, model."""
 
     @property
     def controls(self) -> frozenset[str]: ...
 
     async def control(self, talk: Talk[F], command: str, argument: str) -> str:
-        """What the device said. Raises `BadValue` for an argument that cannot be sent."""
+        """Returns the reply of the device. Raises `BadValue` for an argument it cannot send."""
 
 
-@dataclass(frozen=True, slots=True)
-class Timing:
-    """A protocol's customary times in seconds; each can be set per device in the file."""
+@runtime_checkable
+class EchoConflict(Protocol):
+    """A driver with a setting that does not work on a line that echoes."""
 
-    reply_timeout: float = 0.5  # how long a station may take beyond the characters' own time
-    turnaround: float = 0.005  # what a station usually takes, until it has been measured
-    silence: float = 0.005  # quiet kept before a request
-    silence_chars: float = 0.0  # quiet in characters; the longer of the two counts
-    retries: int = 2  # reads that ended unclear are asked again so often
+    @property
+    def echo_conflict(self) -> tuple[str, str] | None:
+        """The setting and the reason; None where the settings of this device work."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScanHints:
+    """How `scan` looks for stations of a protocol."""
+
+    formats: Sequence[str] = ("8N1",)  # of a serial line, the most likely first
+    stations: range = range(1, 32)  # that it asks unless told otherwise
+    variants: Sequence[Mapping[str, object]] = ({},)  # YAML settings to try at each station
+
+
+@runtime_checkable
+class Scannable(Protocol):
+    """A driver class whose stations `scan` can look for."""
+
+    scan_hints: ClassVar[ScanHints]

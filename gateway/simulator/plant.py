@@ -2,55 +2,21 @@
 
 import math
 from collections.abc import Callable, Iterable
-from typing import Literal
 
-from gateway.errors import BadValue, ConfigError
-from gateway.protocols.computer_link import ComputerLink
+from gateway.errors import BadValue
 from gateway.protocols.driver import AnyDriver
-from gateway.protocols.modbus import ModbusAscii, ModbusRtu, ModbusTcp
-from gateway.protocols.vigor import Vigor
-from gateway.stations.computer_link import ComputerLinkStation
-from gateway.stations.modbus import ModbusStation
+from gateway.stations.registry import station_of
 from gateway.stations.station import Memory, Station
-from gateway.stations.vigor import VigorStation
 from gateway.tags import Tag
 from gateway.values import Kind, Value
 
 
 def station_for(driver: AnyDriver, tags: Iterable[Tag]) -> Station:
     """A simulated PLC that the driver can talk to, whose tags move unless they can be written."""
-    station = _station(driver)
+    station = station_of(driver)
     for number, tag in enumerate(tags):
         _animate(station.memory, tag, number)
     return station
-
-
-def _station(driver: AnyDriver) -> Station:
-    match driver:
-        case Vigor():
-            return VigorStation(driver.station)
-        case ComputerLink():
-            return ComputerLinkStation(
-                driver.station, driver.profile, driver.frame_format, driver.sum_check
-            )
-        case ModbusRtu() | ModbusAscii() | ModbusTcp():
-            return _modbus(driver)
-    raise ConfigError(f"there is no simulated device for protocol {driver.protocol}")
-
-
-def _modbus(driver: ModbusRtu | ModbusAscii | ModbusTcp) -> Station:
-    framing: Literal["rtu", "ascii", "tcp"] = "rtu"
-    match driver:
-        case ModbusAscii():
-            framing = "ascii"
-        case ModbusTcp():
-            framing = "tcp"
-    return ModbusStation(
-        station=driver.station,
-        framing=framing,
-        dialect=driver.addressing,
-        counter_word_order=driver.counter_word_order,
-    )
 
 
 def _animate(memory: Memory, tag: Tag, number: int) -> None:

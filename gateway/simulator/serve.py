@@ -117,7 +117,7 @@ async def serve_on_tcp(
     """Stations on a TCP port; port 0 takes a free one. Raises `LineDown`.
 
     Paced, there is one wire behind the port as behind a device server: what a station says goes
-    to everybody connected. Not paced (Modbus TCP), every connection has its own.
+    to everybody connected. Not paced (a network protocol), every connection has its own.
     """
     served = _Tcp(stations, wire, turnaround, paced=paced)
     try:

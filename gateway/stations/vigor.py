@@ -8,6 +8,7 @@ from functools import cache
 from typing import NamedTuple
 
 from gateway.protocols.checksums import byte_sum
+from gateway.protocols.vigor import Vigor
 from gateway.protocols.vigor.codec import HEX_DIGITS, Reply, RequestReader, encode
 from gateway.stations.station import Memory
 
@@ -179,6 +180,11 @@ class VigorStation:
         register = self._memory.read(place.area, devices[0], 1, now)[0]
         kept = register & ~(0xFF << shift) & (1 << 8 * place.width) - 1
         self._memory.write(place.area, devices[0], [kept | value << shift])
+
+
+def vigor_station(driver: Vigor) -> VigorStation:
+    """Returns the station that the driver can talk to."""
+    return VigorStation(driver.station)
 
 
 @cache

@@ -1,7 +1,7 @@
 """Tags, their samples, and the latest sample of every tag."""
 
 from gateway.tags.sample import Quality, Reason, Sample, WriteResult, bad, good, of_field
-from gateway.tags.tag import Deadband, Form, Publish, Shape, Tag, WriteRule
+from gateway.tags.tag import Deadband, Form, Publish, Tag, WriteRule
 
 __all__ = [
     "Deadband",
@@ -10,7 +10,6 @@ __all__ = [
     "Quality",
     "Reason",
     "Sample",
-    "Shape",
     "Tag",
     "WriteResult",
     "WriteRule",

@@ -5,10 +5,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import lru_cache
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 from gateway.errors import BadValue, Garbled
 from gateway.protocols.driver import Address, Span, Unit
+from gateway.protocols.typed_fields import Shape
 from gateway.values import Kind, Layout, Value, from_words, to_words
 
 # Larger whole numbers are refused at once: as many bits as the largest float has.
@@ -43,16 +44,6 @@ class WriteRule:
     verify: bool = False  # read back after the acknowledgement and compare
     repeat: bool = False  # may be sent again after an unclear result
     latest: bool = False  # of several waiting writes only the latest is sent
-
-
-class Shape(Protocol):
-    """Converts a value to its bytes in a frame and back, for devices without words."""
-
-    def put(self, value: Value) -> bytes:
-        """Returns the bytes of the value. Raises `BadValue`."""
-
-    def take(self, raw: bytes) -> Value:
-        """Returns the value of the bytes. Raises `Garbled`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -35,7 +35,7 @@ class SerialPath:
 
 @dataclass(frozen=True, slots=True)
 class TcpAddress:
-    """A device server in raw mode, or a Modbus TCP device: `tcp://host:port`."""
+    """A device server in raw mode, or a device with a network port: `tcp://host:port`."""
 
     host: str
     port: int

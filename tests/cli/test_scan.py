@@ -191,8 +191,8 @@ async def test_a_port_that_goes_ends_it() -> None:
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"protocol": "frames"}, "frames cannot be sought: use one of vigor, "),
-        ({"protocol": "profibus"}, "profibus cannot be sought"),
+        ({"protocol": "frames"}, "scan cannot look for frames: use one of vigor, "),
+        ({"protocol": "profibus"}, "scan cannot look for profibus"),
         ({"port": "simulator"}, "need no scan"),
         ({"port": "udp://a:1"}, "is not a port"),
         ({"protocol": "modbus-tcp"}, "tcp://host:port"),

@@ -17,10 +17,10 @@ from gateway.engine.requests import CommandResult
 from gateway.errors import BadValue, ConfigError, LineDown
 from gateway.northbound import payload
 from gateway.northbound.audit import Audit
-from gateway.northbound.controls import Controls
+from gateway.northbound.commands import Commands
 from gateway.northbound.keys import Family, Keys, asked
 from gateway.northbound.payload import Failure, Problem, WriteOutcome
-from gateway.northbound.writers import Asker
+from gateway.northbound.writers import Sender
 from tests.e2e.processes import plc_gateway, started, write_config
 from tests.zenoh_peer import ZenohPeer, free_endpoint
 
@@ -146,8 +146,8 @@ def obey(below: Below, key: str, data: bytes | None = None) -> tuple[Any, list[A
     recorded: list[WriteOutcome] = []
     with capture_logs() as logs:
         audit = Audit(published.append, recorded.append)
-        controls = Controls(KEYS, below, lambda: None, audit)  # type: ignore[arg-type,return-value]
-        result = asyncio.run(controls.obey(key, data, Asker("client")))
+        controls = Commands(KEYS, below, lambda: None, audit)  # type: ignore[arg-type,return-value]
+        result = asyncio.run(controls.obey(key, data, Sender("client")))
     assert [payload.write_outcome(outcome) for outcome in recorded] == published
     return result, logs + [json.loads(line) for line in published]
 
@@ -160,7 +160,7 @@ def test_a_command_is_handed_down_and_told_as_a_write_is() -> None:
     assert (told["outcome"], told["answer"]) == ("obeyed", "acknowledged")
     assert {"time", "took"} <= told.keys()
     assert below.told == [("oven", "stop", "")]
-    assert line["event"] == "command obeyed"
+    assert line["event"] == "command executed"
     assert (line["key"], line["by"], line["log_level"]) == ("plant/oven/@stop", "client", "info")
     _, [_, told] = obey(below, "plant/@gateway/demo/lines/hall/global", b"on")
     assert told["value"] == "on"

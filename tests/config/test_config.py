@@ -24,8 +24,10 @@ from gateway.config.model import (
 from gateway.config.yaml_file import read_yaml
 from gateway.errors import ConfigError
 from gateway.planning.wire_timing import NETWORK_BAUD
-from gateway.protocols import ComputerLink, ModbusRtu, ModbusTcp, Vigor
+from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.driver import Address, Span, Unit
+from gateway.protocols.modbus import ModbusRtu, ModbusTcp
+from gateway.protocols.vigor import Vigor
 from gateway.tags import Deadband, Form, Publish, Tag, WriteRule
 from gateway.transport.port import Rfc2217Address, SerialPath, SimulatorAddress, TcpAddress
 from gateway.values import Kind, Order, ValueType
@@ -352,7 +354,7 @@ LINES = [
         "which needs 8, such as 8E1",
     ),
     bad(
-        "customs that differ",
+        "defaults that differ",
         on_line("port: COM3\ndevices:\n  a: {protocol: vigor, station: 1}\n"
                 "  b: {protocol: modbus-rtu, station: 2}"),
         "2: lines.hall.baudrate: missing: the devices of this line differ in it "
@@ -363,8 +365,8 @@ LINES = [
     bad(
         "modbus-tcp on a wire",
         on_line("port: COM3\ndevices:\n  a: {protocol: modbus-tcp, station: 1}"),
-        "5: lines.hall.devices.a.protocol: modbus-tcp needs a port tcp://host:port, "
-        "it has no wire",
+        "5: lines.hall.devices.a.protocol: modbus-tcp needs a port tcp://host:port: "
+        "it does not run on a serial line",
     ),
     bad(
         "modbus-tcp beside a serial protocol",
@@ -783,7 +785,7 @@ def test_the_file_of_the_contract(file: Callable[[str], Config], tmp_path: Path)
     assert power.layout.word_order is Order.HIGH_FIRST
 
 
-def test_settings_left_out_are_the_protocols_customs(file: Callable[[str], Config]) -> None:
+def test_settings_left_out_are_the_defaults_of_the_protocol(file: Callable[[str], Config]) -> None:
     (line,) = file(tags("a: {address: D1}")).lines
     (device,) = line.devices
     assert (line.serial.baudrate, line.serial.format) == (19200, "7E1")
@@ -1218,7 +1220,7 @@ def test_the_schema_offers_the_settings_of_each_protocol_alone() -> None:
     assert "frame_format" not in shapes["vigor"]["properties"]
     assert shapes["computer-link"]["properties"]["frame_format"]["enum"] == [1, 4]
     assert "ms" in shapes["computer-link"]["properties"]["message_wait"]["pattern"]
-    assert "_dialogue" not in shapes["modbus-rtu"]["properties"]
+    assert "_master" not in shapes["modbus-rtu"]["properties"]
 
 
 def as_editors_see_it(path: Path) -> Any:

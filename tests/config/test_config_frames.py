@@ -125,8 +125,8 @@ MISTAKES = {
     ),
     "what the field says already": (
         scale("a: {address: weight, type: int16, byte_order: low_first}"),
-        f"21: {M}.tags.a.type: what weight is, its field says: no type here",
-        f"21: {M}.tags.a.byte_order: what weight is, its field says: no byte_order here",
+        f"21: {M}.tags.a.type: the field weight has its own type: remove type here",
+        f"21: {M}.tags.a.byte_order: the field weight has its own type: remove byte_order here",
     ),
     "a text has no scale": (
         scale("a: {address: state, scale: 2}"),
@@ -141,11 +141,11 @@ MISTAKES = {
     ),
     "only written": (
         scale("a: {address: tare}"),
-        f"21: {M}.tags.a.write: tare is only written: it needs write: true",
+        f"21: {M}.tags.a.write: tare can only be written: it needs write: true",
     ),
     "nothing to read it back with": (
         scale("a: {address: tare, write: {verify: true}}"),
-        f"21: {M}.tags.a.write: tare cannot be read back, no question asks for it: no verify",
+        f"21: {M}.tags.a.write: tare cannot be read back, no request reads it: remove verify",
     ),
     "a bound that does not fit": (
         scale("a: {address: tare, write: {max: 10000}}"),
@@ -153,11 +153,11 @@ MISTAKES = {
     ),
     "an event that is polled": (
         scale("a: {address: hours, event: true}"),
-        f"21: {M}.tags.a.event: hours never comes unasked: events are fields under `listen`",
+        f"21: {M}.tags.a.event: hours never arrives unsolicited: events are fields under `listen`",
     ),
     "an interval for what comes by itself": (
         scale("a: {address: weight, every: 1s}"),
-        f"21: {M}.tags.a.every: weight is never asked for: it has no interval",
+        f"21: {M}.tags.a.every: weight is never polled: it has no interval",
     ),
     "an event of a PLC": (
         on_line("plc: {protocol: vigor, station: 1, tags: {a: {address: D1, event: true}}}"),
@@ -210,9 +210,9 @@ MISTAKES = {
     ),
     "a simulated one": (
         scale("a: {address: weight}").replace("COM1", "simulator"),
-        "3: lines.hall.port: scale cannot be simulated: it has no protocol",
+        "3: lines.hall.port: scale cannot be simulated: there is no station for frames",
     ),
-    "two that speak unasked": (
+    "two that send unsolicited frames": (
         on_line(
             """\
             one: {protocol: frames, framing: {ending: CR}, listen: {a: {}}}
@@ -220,11 +220,12 @@ MISTAKES = {
             """
         ),
         (
-            "6: lines.hall.devices.two.listen: one on this line speaks unasked already, and nobody "
-            "could tell which of them did: give it a line of its own, or write both as one device"
+            "6: lines.hall.devices.two.listen: one on this line sends unsolicited frames already, "
+            "and a frame does not say which device sent it: give this device a line of its own, "
+            "or write both as one device"
         ),
     ),
-    "customs that differ": (
+    "defaults that differ": (
         on_line(
             """\
             a: {protocol: vigor, station: 1}

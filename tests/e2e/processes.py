@@ -146,13 +146,13 @@ class Program:
 
 
 def gateway(*arguments: object, merged: bool = True) -> Program:
-    """`plc-gateway …` as a process; for `run` wait with `.says("on Zenoh")`."""
+    """`plc-gateway …` as a process; for `run` wait with `.says("Zenoh session ready")`."""
     return Program(sys.executable, "-m", "gateway", *arguments, merged=merged)
 
 
 def started(config: Path) -> Program:
     """A gateway that is on Zenoh."""
-    return _ready(gateway("run", config), "on Zenoh")
+    return _ready(gateway("run", config), "Zenoh session ready")
 
 
 def station(*where: str, stations: tuple[int, ...] = (1,), by: tuple[str, ...] = ()) -> Program:

@@ -141,7 +141,7 @@ async def test_control(oven: Oven) -> None:
         [sent] = await client.get("plant/@gateway/demo/lines/hall/global", b"on")
         assert "none answers" in sent.json["answer"]
         until(lambda: oven.plc.tell("get M8126") == "1", "the flag is heard")
-    oven.gateway.says("command obeyed", "@stop")
+    oven.gateway.says("command executed", "@stop")
     done = plc_gateway("control", oven.config, "oven", "loopback", "HI")
     assert (done.code, done.out) == (0, "HI\n")
     done = plc_gateway("control", oven.config, "oven", "global", "off")

@@ -156,7 +156,7 @@ async def test_a_second_gateway_at_the_same_port_reports_it_and_waits(
         with gateway("run", other) as second:
             why = second.says("line down")
             assert f"{tty}: in use by another program" in why
-            second.says("on Zenoh")
+            second.says("Zenoh session ready")
             async with ZenohPeer("client", connect=[endpoint]) as client:
                 heard = await client.subscribe("plant/**")
                 [value] = await client.get("plant/mixer/speed")

@@ -102,7 +102,7 @@ def test_a_client_keeps_history_while_it_waits_for_its_router(tmp_path: Path) ->
     )
     with gateway("run", path) as program:
         program.says("no Zenoh router yet")
-        program.says("history is written")
+        program.says("history ready")
         program.says("device answers")
         assert program.end() == 0
 
@@ -158,7 +158,7 @@ async def test_the_state_file_is_written_while_the_gateway_runs(tmp_path: Path) 
     with station("pty", str(tmp_path / "tty")) as plc:
         plc.tell("hole 1 D 703")
         with Program(sys.executable, "-c", SOON, "run", path) as program:
-            program.says("on Zenoh")
+            program.says("Zenoh session ready")
             until(lambda: _refused(state) == [703], "the file knows D703")
             assert program.running
 
@@ -173,7 +173,7 @@ async def test_a_failing_history_does_not_stop_publishing(tmp_path: Path) -> Non
         history={"path": str(tmp_path / "history.db")},
     )
     with Program(sys.executable, "-c", BROKEN, "run", path) as program:
-        program.says("on Zenoh")
+        program.says("Zenoh session ready")
         program.says("history has failed")
         async with ZenohPeer("client", connect=[endpoint]) as client:
             heard = await client.subscribe("plant/mixer/speed")
@@ -214,7 +214,7 @@ def test_a_stalled_disk_does_not_delay_the_end(tmp_path: Path) -> None:
     path, _, _ = _plant(tmp_path)
     os.mkfifo(tmp_path / "state.json.new")  # whose writer waits for a reader
     with Program(sys.executable, "-c", SOON, "run", path) as program:
-        program.says("on Zenoh")
+        program.says("Zenoh session ready")
         assert program.end() == 0
         assert program.has_said("did not take in time what was learned")
         assert not program.has_said("Traceback")

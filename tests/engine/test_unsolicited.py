@@ -19,7 +19,7 @@ from gateway.engine.unsolicited import ANSWER_WITHIN
 from gateway.errors import GatewayError, LineDown, Refused
 from gateway.line.line import Line
 from gateway.line.writing import Differs
-from gateway.northbound.repeater import Repeater
+from gateway.northbound.republish import Republisher
 from gateway.stations.vigor import VigorStation
 from gateway.tags import Quality, Reason, Sample, Tag, WriteResult, good
 from gateway.transport import Port, Receiver
@@ -255,7 +255,7 @@ async def test_an_event_is_not_published_again_when_the_network_comes_back() -> 
             pass
 
     everything: Any = Everything()
-    await Repeater(repeated.extend, everything, everything, everything).publish_all()
+    await Republisher(repeated.extend, everything, everything, everything).publish_all()
     assert [sample.tag.key for sample in repeated] == ["scale/weight", "scale/state"]
 
 

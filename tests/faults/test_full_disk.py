@@ -35,10 +35,10 @@ async def test_a_file_that_may_not_grow_stops_the_history_and_nothing_else(tmp_p
     config = _config(tmp_path, endpoint, tmp_path / "history.db")
     run = f"ulimit -f 200; exec {sys.executable} -m gateway run {config}"
     with Program("bash", "-c", run) as service:
-        await asyncio.to_thread(service.says, "on Zenoh")
+        await asyncio.to_thread(service.says, "Zenoh session ready")
         async with ZenohPeer("client", connect=[endpoint]) as client:
             heard = await client.subscribe(KEY)
-            why = await asyncio.to_thread(service.says, "history cannot be written")
+            why = await asyncio.to_thread(service.says, "history failed")
             assert "disk" in why
             heard.forget()
             await heard.next(_good)
@@ -71,14 +71,14 @@ async def test_a_disk_that_is_full_is_said_and_history_goes_on_when_there_is_roo
     config = _config(tmp_path, endpoint, place / "history.db")
     run = mounted.format(f"{sys.executable} -m gateway run {config}")
     with Program("bash", "-c", run) as service:
-        await asyncio.to_thread(service.says, "on Zenoh")
+        await asyncio.to_thread(service.says, "Zenoh session ready")
         async with ZenohPeer("client", connect=[endpoint]) as client:
             heard = await client.subscribe(KEY)
             await heard.next(_good)
             heard.forget()
             ballast = Path(f"/proc/{service.pid}/root{place}/ballast")
             _fill(ballast)
-            why = await asyncio.to_thread(service.says, "history cannot be written")
+            why = await asyncio.to_thread(service.says, "history failed")
             assert "the disk is full" in why
 
             # Twenty readings wait, and nothing else notices.
@@ -89,7 +89,7 @@ async def test_a_disk_that_is_full_is_said_and_history_goes_on_when_there_is_roo
             assert not any(found.json["failures"].values())
 
             ballast.unlink()
-            await asyncio.to_thread(service.says, "history is written")
+            await asyncio.to_thread(service.says, "history ready")
             while (now := await _history(client))["waiting"] > 40 or now["state"] != "ok":
                 pass  # two readings of twenty tags may be on their way
             assert now["lost"] == 0

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from gateway.config import ZenohMode
-from gateway.northbound.payload import rfc3339
+from gateway.tags.timestamps import rfc3339
 from tests.e2e.processes import ROOT, Program, started, station, until, vigor_line, write_config
 from tests.zenoh_peer import ZenohPeer, free_endpoint
 

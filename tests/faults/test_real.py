@@ -169,7 +169,7 @@ def test_restarts_leave_nothing_behind(tmp_path: Path) -> None:
             with started(config) as service:
                 service.says("device answers")
                 assert not service.has_said("line down")
-                assert not service.has_said("history cannot be written")
+                assert not service.has_said("history failed")
                 pid = service.pid
                 by = signal.SIGTERM if kindly else signal.SIGKILL
                 assert service.end(by) == (0 if kindly else -signal.SIGKILL)

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from gateway.config import ConfigErrors, load
 from gateway.errors import BadValue, GatewayError
-from gateway.northbound.payload import wanted
+from gateway.northbound.payload import parse_write
 from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.driver import AnyDriver, Span
 from gateway.protocols.modbus import ModbusAscii, ModbusRtu, ModbusTcp
@@ -129,7 +129,7 @@ def test_a_simulated_station_survives_any_bytes(name: str, heard: bytes) -> None
 @given(st.one_of(st.binary(max_size=60), st.text(max_size=40).map(str.encode)))
 def test_any_payload_is_a_value_or_is_refused(payload: bytes) -> None:
     with suppress(BadValue):
-        assert isinstance(wanted(payload), (bool, int, float, str))
+        assert isinstance(parse_write(payload), (bool, int, float, str))
 
 
 WORDS = (

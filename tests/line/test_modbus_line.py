@@ -15,7 +15,14 @@ from gateway.engine.device import Device, Standing
 from gateway.errors import Evidence, LineDown, Unclear
 from gateway.planning.wire_timing import NETWORK_BAUD, WireTiming
 from gateway.protocols.driver import AnyDriver
-from gateway.protocols.modbus import Frame, MbapCodec, ModbusAscii, ModbusRtu, ModbusTcp, RtuEar
+from gateway.protocols.modbus import (
+    Frame,
+    MbapCodec,
+    ModbusAscii,
+    ModbusRtu,
+    ModbusTcp,
+    RtuSlaveCodec,
+)
 from gateway.stations.modbus import ModbusStation
 from gateway.tags import Quality, Reason, Tag, WriteResult, WriteRule
 from gateway.transport import Receiver
@@ -199,7 +206,7 @@ class Twisted:
     def hear(self, data: bytes, at: float) -> list[bytes]:
         pdus = [reply[1:-2] for reply in self.inner.hear(data, at)]
         self.answered += [at] * len(pdus)
-        ear = RtuEar(self.station)
+        ear = RtuSlaveCodec(self.station)
         return [ear.encode(Frame(self.station, self.twist(pdu))) for pdu in pdus]
 
 

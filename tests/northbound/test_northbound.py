@@ -28,14 +28,14 @@ from gateway.errors import (
     Refused,
 )
 from gateway.northbound import Northbound, payload
-from gateway.northbound.directory import Directory
+from gateway.northbound.tag_index import TagIndex
 from gateway.northbound.inbox import LIMIT, Inbox
 from gateway.northbound.keys import Keys
-from gateway.northbound.links import Links
+from gateway.northbound.link_monitor import LinkMonitor
 from gateway.northbound.publisher import EVENTS_LIMIT, Publisher
-from gateway.northbound.repeater import Repeater
+from gateway.northbound.republish import Republisher
 from gateway.northbound.session import configure
-from gateway.northbound.writes import AT_ONCE
+from gateway.northbound.writes import MOST_WAITING
 from gateway.protocols.driver import Address, Span, Unit
 from gateway.tags import Form, Reason, Sample, Tag, WriteResult, WriteRule, bad, good
 from gateway.values import Layout, Value, parse_type
@@ -301,9 +301,9 @@ async def test_events_all_arrive_in_order() -> None:
 async def test_an_event_is_told_once_and_that_nothing_is_known_of_it_as_often_as_all_else() -> None:
     code, weight = tag("reader", "code", event=True), tag("reader", "weight")
     plant = PlainPlant(PlainDevice("reader", (code, weight)))
-    directory = Directory(Keys("plant", "demo"), plant.devices())
+    directory = TagIndex(Keys("plant", "demo"), plant.devices())
     told: list[Sample] = []
-    repeater = Repeater(told.extend, plant, directory, Links())
+    repeater = Republisher(told.extend, plant, directory, LinkMonitor())
     await repeater.publish_all()  # as at a start
     assert told == [bad(of, Reason.STARTING, plant.sample(of).time) for of in (code, weight)]
     told.clear()
@@ -324,8 +324,8 @@ async def test_the_plant_is_told_what_is_published_again_before_it_is() -> None:
         told.extend(samples)
         assert plant.repeated == told
 
-    directory = Directory(Keys("plant", "demo"), plant.devices())
-    await Repeater(publish, plant, directory, Links()).publish_all()
+    directory = TagIndex(Keys("plant", "demo"), plant.devices())
+    await Republisher(publish, plant, directory, LinkMonitor()).publish_all()
     assert len(told) == 4
 
 
@@ -403,8 +403,8 @@ async def test_a_raw_value_travels_bare_and_its_quality_beside_it() -> None:
 )  # fmt: skip
 def test_raw_texts(value: Any, text: bytes | None) -> None:
     sample = good(tag("mixer", "speed"), value, 0)
-    assert payload.bare(sample) == text
-    assert (json.loads(payload.about(sample))["quality"] == "good") == (text is not None)
+    assert payload.value_text(sample) == text
+    assert (json.loads(payload.attachment(sample))["quality"] == "good") == (text is not None)
 
 
 # -- questions ---------------------------------------------------------------------------------
@@ -662,7 +662,7 @@ async def test_a_thousand_writes_at_once_are_bounded_and_each_is_answered() -> N
         done = [replies[0] for replies in answers if replies[0].ok]
         words = {replies[0].json["error"] for replies in answers if not replies[0].ok}
         assert words == {"busy"}
-        assert len(plant.written) == len(done) == AT_ONCE
+        assert len(plant.written) == len(done) == MOST_WAITING
 
 
 async def client_of_its_own(client: ZenohPeer) -> Sequence[Any]:
@@ -764,11 +764,11 @@ async def test_liveliness_shows_gateway_and_devices() -> None:
     plant = mixer()
     async with together(plant) as (northbound, client):
         live = await client.liveliness("plant/**")
-        northbound.alive("mixer", True)
+        northbound.set_online("mixer", True)
         await live.next(lambda token: (token.key, token.kind) == ("plant/mixer", "PUT"))
         await client.until_alive("plant/@gateway/*", ["plant/@gateway/demo"])
         await client.until_alive("plant/*", ["plant/mixer"])
-        northbound.alive("mixer", False)
+        northbound.set_online("mixer", False)
         await live.next(lambda token: (token.key, token.kind) == ("plant/mixer", "DELETE"))
         await client.until_alive("plant/*", [])
 

@@ -120,7 +120,7 @@ def test_meta_says_type_address_interval_and_limits() -> None:
     ],
 )
 def test_a_write_is_a_scalar_or_an_object_with_the_value(sent: bytes, value: Value) -> None:
-    found = payload.wanted(sent)
+    found = payload.parse_write(sent)
     assert found == value
     assert type(found) is type(value)
 
@@ -156,14 +156,14 @@ def test_a_write_is_a_scalar_or_an_object_with_the_value(sent: bytes, value: Val
 )
 def test_whatever_else_is_sent_is_a_bad_value(sent: bytes) -> None:
     with pytest.raises(BadValue):
-        payload.wanted(sent)
+        payload.parse_write(sent)
 
 
 @given(st.binary(max_size=64))
 @settings(max_examples=300)
 def test_any_bytes_are_a_value_or_a_bad_value(sent: bytes) -> None:
     try:
-        found = payload.wanted(sent)
+        found = payload.parse_write(sent)
     except BadValue:
         return
     assert isinstance(found, (bool, int, float, str))

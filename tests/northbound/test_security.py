@@ -23,7 +23,7 @@ from gateway.engine.requests import CommandResult
 from gateway.errors import ConfigError
 from gateway.northbound import Northbound, secrets
 from gateway.northbound.audit import BURST, Audit
-from gateway.northbound.limiter import Limiter
+from gateway.northbound.rate_limit import RateLimit
 from gateway.northbound.payload import Failure, Problem, WriteOutcome
 from gateway.northbound.session import configure
 from gateway.northbound.writers import NotAllowed, Writers
@@ -543,7 +543,7 @@ def test_a_flood_of_refusals_is_counted_and_what_was_written_is_told_meanwhile()
 
 
 def test_a_limiter_lets_a_burst_through_and_then_one_now_and_again() -> None:
-    limiter = Limiter(burst=3, every=2.0)
+    limiter = RateLimit(burst=3, every=2.0)
     passed = [now for now in range(20) if limiter.allows(float(now) / 2)]
     assert passed == [0, 1, 2, 4, 8, 12, 16]
     assert limiter.untold() == limiter.held == 20 - len(passed)
@@ -663,7 +663,7 @@ async def test_nothing_the_gateway_prints_or_serves_holds_a_secret(tmp_path: Pat
     served: list[bytes] = []
     command = (sys.executable, "-m", "gateway", "run", file, "--log-level", "debug")
     with Program(*command) as program:
-        await asyncio.to_thread(program.says, "on Zenoh")
+        await asyncio.to_thread(program.says, "Zenoh session ready")
         async with as_user("operator", endpoint) as client:
             heard = await client.subscribe("plant/@gateway/**")
             for token in (None, b"wrong-token-of-somebody", TOKEN.encode()):

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from gateway.errors import Evidence, Garbled
 from gateway.protocols.checksums import crc16, lrc
-from gateway.protocols.modbus import AsciiCodec, Frame, MbapCodec, RtuCodec, RtuEar
+from gateway.protocols.modbus import AsciiCodec, Frame, MbapCodec, RtuCodec, RtuSlaveCodec
 from tests.vectors import Vector, vectors
 
 MODERATE = settings(max_examples=150, deadline=None)
@@ -34,7 +34,9 @@ def chopped(data: bytes, sizes: list[int]) -> list[bytes]:
     return [piece for piece in [*pieces, data] if piece]
 
 
-def feed_all(codec: RtuCodec | RtuEar | AsciiCodec | MbapCodec, pieces: list[bytes]) -> list[Frame]:
+def feed_all(
+    codec: RtuCodec | RtuSlaveCodec | AsciiCodec | MbapCodec, pieces: list[bytes]
+) -> list[Frame]:
     return [frame for piece in pieces for frame in codec.feed(piece)]
 
 
@@ -74,16 +76,16 @@ def test_a_request_survives_any_chopping(station: int, values: list[int], sizes:
         Frame(0, bytes((15, 0, 0, 0, 8, 1, 0x55))),
         Frame(station, bytes((6, 0, 1, 2, 3))),
     ]
-    wire = b"".join(RtuEar(station).encode(frame) for frame in frames)
-    assert feed_all(RtuEar(station), chopped(wire, sizes)) == frames
+    wire = b"".join(RtuSlaveCodec(station).encode(frame) for frame in frames)
+    assert feed_all(RtuSlaveCodec(station), chopped(wire, sizes)) == frames
 
 
 @MODERATE
 @given(st.lists(st.binary(max_size=40), max_size=8), stations)
 def test_any_bytes_give_frames_garbled_or_silence(pieces: list[bytes], station: int) -> None:
-    codecs = (RtuCodec(), RtuEar(station), AsciiCodec(), MbapCodec())
+    codecs = (RtuCodec(), RtuSlaveCodec(station), AsciiCodec(), MbapCodec())
     for codec in codecs:
-        if not isinstance(codec, RtuEar):
+        if not isinstance(codec, RtuSlaveCodec):
             codec.encode(read_words(station, 2))
         with suppress(Garbled):
             assert all(frame.pdu for frame in feed_all(codec, pieces))
@@ -207,15 +209,15 @@ def test_rtu_a_slave_hears_requests_between_others_answers(written: int) -> None
         words_answer(2, [1, 2]),
         Frame(2, bytes((16, 0, 0, 0, written))),
     ]
-    stream = b"".join(RtuEar(2).encode(frame) for frame in [*others, request])
-    frames = feed_all(RtuEar(1), [stream])
+    stream = b"".join(RtuSlaveCodec(2).encode(frame) for frame in [*others, request])
+    frames = feed_all(RtuSlaveCodec(1), [stream])
     assert [frame for frame in frames if frame.station == 1] == [request]
 
 
 def test_rtu_an_unknown_function_is_heard_when_its_crc_closes_what_was_heard() -> None:
     body = bytes((1, 0x2B, 0x0E, 1, 0))
-    ear = RtuEar(1)
-    assert feed_all(ear, [body[:3], body[3:] + crc16(body)]) == [Frame(1, body[1:])]
+    codec = RtuSlaveCodec(1)
+    assert feed_all(codec, [body[:3], body[3:] + crc16(body)]) == [Frame(1, body[1:])]
 
 
 # ---- ASCII -----------------------------------------------------------------------------

@@ -12,7 +12,7 @@ from gateway.protocols.modbus import (
     ModbusAscii,
     ModbusRtu,
     RtuCodec,
-    RtuEar,
+    RtuSlaveCodec,
 )
 from tests.doubles import Script
 from tests.protocols.modbus_peer import Hearing
@@ -62,16 +62,20 @@ def test_the_codec_reads_and_writes_the_frame(vector: Vector) -> None:
         assert AsciiCodec().feed(vector.frame.lower()) == [frame]
         assert AsciiCodec().encode(frame) == vector.frame
     else:
-        ear = RtuCodec() if vector.direction == "response" else RtuEar(frame.station)
-        assert ear.feed(vector.frame) == [frame]
-        assert RtuCodec().encode(frame) == RtuEar(1).encode(frame) == vector.frame
+        codec = RtuCodec() if vector.direction == "response" else RtuSlaveCodec(frame.station)
+        assert codec.feed(vector.frame) == [frame]
+        assert RtuCodec().encode(frame) == RtuSlaveCodec(1).encode(frame) == vector.frame
 
 
 @pytest.mark.parametrize("vector", [v for v in ALL if not v.valid], ids=repr)
 def test_a_bad_frame_is_not_heard(vector: Vector) -> None:
-    ears = [AsciiCodec()] if vector.protocol == "modbus-ascii" else [RtuEar(0), RtuEar(1)]
-    for ear in ears:
-        assert ear.feed(vector.frame) == []
+    codecs = (
+        [AsciiCodec()]
+        if vector.protocol == "modbus-ascii"
+        else [RtuSlaveCodec(0), RtuSlaveCodec(1)]
+    )
+    for codec in codecs:
+        assert codec.feed(vector.frame) == []
 
 
 @pytest.mark.parametrize("vector", REQUESTS, ids=repr)

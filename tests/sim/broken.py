@@ -89,7 +89,7 @@ MUTANTS = (
     ),
     Mutant(
         "Modbus: any station's answer is taken",
-        "protocols/modbus/dialogue.py",
+        "protocols/modbus/master.py",
         "            if frame.station != station or frame.transaction != number:",
         "            if frame.transaction != number:",
         "tests/protocols/test_modbus.py",
@@ -97,7 +97,7 @@ MUTANTS = (
     ),
     Mutant(
         "Modbus TCP: any number's answer is taken",
-        "protocols/modbus/dialogue.py",
+        "protocols/modbus/master.py",
         "            if frame.station != station or frame.transaction != number:",
         "            if frame.station != station:",
         "tests/protocols/test_modbus.py tests/line/test_modbus_line.py",
@@ -213,7 +213,7 @@ MUTANTS = (
     ),
     Mutant(
         "an echo that the file does not speak of acknowledges a write",
-        "protocols/modbus/dialogue.py",
+        "protocols/modbus/master.py",
         "        echo = None if self.numbered or not talk.may_echo else request\n",
         "        echo = None\n",
         "tests/line/test_modbus_line.py",

@@ -9,7 +9,7 @@ from gateway.protocols.computer_link import ComputerLink, Enquiry, Frame, LinkCo
 from gateway.protocols.driver import Span
 from gateway.stations.computer_link import ComputerLinkStation
 from gateway.stations.station import Station
-from tests.protocols.computer_link_peer import Peer, Wire
+from tests.protocols.computer_link_peer import Peer, PeerTalk
 from tests.vectors import Vector, vectors
 
 LINK = vectors("fxlink")
@@ -366,7 +366,7 @@ async def test_the_driver_and_the_station_agree(procedure: tuple[int, bool]) -> 
         if station.memory.holds(name, first, last - first + 1)
         and not station.memory.holds(name, first, last - first + 2)
     }
-    wire = Wire(driver, lambda data: b"".join(station.hear(data, 0.0)))
+    wire = PeerTalk(driver, lambda data: b"".join(station.hear(data, 0.0)))
     for area in driver.areas.values():
         span = Span(area.name, area.last - 15, 16)
         units = [i % 2 for i in range(16)]

@@ -18,8 +18,8 @@ from gateway.config import Config
 from gateway.config.commands import TO_ALL
 from gateway.errors import GatewayError
 from gateway.northbound.keys import Keys
-from gateway.northbound.payload import rfc3339
 from gateway.tags import Tag
+from gateway.tags.timestamps import rfc3339
 from gateway.values import Kind, Value
 
 TOKEN_VARIABLE = "PLC_GATEWAY_WRITE_TOKEN"  # noqa: S105  (the name of a variable)

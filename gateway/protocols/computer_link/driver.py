@@ -5,7 +5,7 @@ Liyan Computer Link manual (Lylink-edoc0307), section numbers below are its own.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, TypeVar
+from typing import ClassVar, Literal, TypeVar
 
 from gateway.errors import BadValue, ConfigError
 from gateway.protocols.computer_link.codec import (
@@ -31,12 +31,13 @@ from gateway.protocols.computer_link.lists import (
 from gateway.protocols.computer_link.refusals import NO_REPLY_CAUSES, model_name, refused
 from gateway.protocols.computer_link.ways import Way, read_way, write_way
 from gateway.protocols.devices import parse_device, spell_device
-from gateway.protocols.driver import Address, Area, Cost, Span, Talk, Timing
+from gateway.protocols.driver import Address, Area, Cost, ScanHints, Span, Talk, Timing, Traits
 
 LinkTalk = Talk[Frame]
 T = TypeVar("T")
 W = TypeVar("W")
 
+_TRAITS = Traits(baudrate=9600, format="7E1")
 _COUNT, _CODE = 2, 2  # characters of a count, of an error code
 _SWITCH = {"1": "1", "on": "1", "true": "1", "0": "0", "off": "0", "false": "0"}
 
@@ -59,6 +60,17 @@ class ComputerLink:
     monitor: bool = False
     monitor_word_command: Literal["MN", "MW"] = "MN"
 
+    scan_hints: ClassVar = ScanHints(
+        formats=("7E1", "8N1", "8E1", "7O1"),
+        stations=range(32),
+        variants=tuple(
+            {"frame_format": form, "sum_check": checked}
+            for form in (1, 4)
+            for checked in (True, False)
+        ),
+    )
+    no_reply_causes: ClassVar = NO_REPLY_CAUSES
+
     def __post_init__(self) -> None:
         if self.profile not in PROFILES:
             raise ConfigError(f"profile {self.profile!r} is not one of {', '.join(PROFILES)}")
@@ -80,6 +92,20 @@ class ComputerLink:
     @property
     def areas(self) -> Mapping[str, Area]:
         return self._limits.areas
+
+    @property
+    def traits(self) -> Traits:
+        return _TRAITS
+
+    @property
+    def echo_conflict(self) -> tuple[str, str] | None:
+        if not self.send_area_c:
+            return None
+        reason = (
+            "the echo of this acknowledgement is equal to the acknowledgement of a write by the "
+            "PLC: leave it out, no known PLC needs it"
+        )
+        return "send_area_c", reason
 
     @property
     def timing(self) -> Timing:
@@ -200,12 +226,10 @@ class ComputerLink:
         await talk.tell(self._enquiry("GW", _SWITCH[argument.lower()], ALL_STATIONS))
         return "sent to all stations, none answers"
 
-    async def resync(self, talk: LinkTalk, doubt: Span | None, salt: int) -> int:
-        """A loopback: its text has a letter that no data reply has, and changes with `salt`."""
-        await self._loopback(talk, f"Z{salt & 0xFFFF:04X}")
+    async def resync(self, talk: LinkTalk, outstanding: Span | None, probe_token: int) -> int:
+        """Sends a loopback. No data reply has its letter Z; the rest is the `probe_token`."""
+        await self._loopback(talk, f"Z{probe_token & 0xFFFF:04X}")
         return 0xFFFF
-
-    no_reply_causes = NO_REPLY_CAUSES
 
     def from_this_station(self, frame: Frame) -> bool:
         return frame.station == self.station

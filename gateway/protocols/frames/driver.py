@@ -4,14 +4,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from gateway.protocols.driver import Address, Area, Cost, Span, Talk, Timing, Unit
+from gateway.protocols.driver import Address, Area, Cost, Span, Talk, Timing, Traits, Unit
 from gateway.protocols.frames.codec import FrameCodec
 from gateway.protocols.frames.device import Frames
-from gateway.protocols.frames.fields import Field
 from gateway.protocols.frames.listener import Listener
+from gateway.protocols.typed_fields import TypedField
 from gateway.values import Value
 
 LISTENED, WRITTEN = "listened", "written"
+_TRAITS = Traits(baudrate=9600, format="8N1", numbered=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,6 +82,10 @@ class FrameDriver:
         return 0
 
     @property
+    def traits(self) -> Traits:
+        return _TRAITS
+
+    @property
     def timing(self) -> Timing:
         return self.settings.timing
 
@@ -106,15 +111,18 @@ class FrameDriver:
     def spell(self, address: Address) -> str:
         return self._names[address.area][address.number]
 
-    def shape(self, address: Address) -> Field | WrittenField:
-        """How the value of a tag at this address lies in its frame."""
+    def typed_field(self, address: Address) -> TypedField:
         name = self.spell(address)
-        if name in self.settings.write:
-            return WrittenField(self.settings, name)
-        return self.settings.field_of(name)
-
-    def writable(self, address: Address) -> bool:
-        return self.spell(address) in self.settings.write
+        found, writable = self.settings.field_of(name), name in self.settings.write
+        return TypedField(
+            type=found.value_type,
+            shape=WrittenField(self.settings, name) if writable else found,
+            polled=name in self.settings.asked,
+            unsolicited=name in self.settings.listened,
+            writable=writable,
+            event_hint="events are fields under `listen`",
+            write_hint=f"`write: {{{name}: ...}}`",
+        )
 
     def cost(self, span: Span) -> Cost | None:
         """That of the whole question, however few of its fields are wanted."""

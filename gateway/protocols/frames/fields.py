@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from gateway.errors import BadValue, ConfigError, Evidence, Garbled
-from gateway.values import Value, real, shortest, whole
+from gateway.values import LONGEST_STRING, Kind, Value, ValueType, real, shortest, whole
 
 FieldType = Literal[
     "uint8",
@@ -42,6 +42,13 @@ _STRUCT = {
 }
 _BCD = {"bcd8": 1, "bcd16": 2, "bcd32": 4}
 _FLOATS = ("float32", "float64")
+_WIDER = {
+    "uint8": Kind.UINT16,
+    "int8": Kind.INT16,
+    "bcd8": Kind.BCD16,
+    "integer": Kind.INT64,
+    "decimal": Kind.FLOAT64,
+}
 
 _COLUMNS = re.compile(r"([1-9][0-9]{0,2})-([1-9][0-9]{0,2})\Z")
 _FORMAT = re.compile(r"[+ ]?0?(?P<width>[1-9][0-9]?)?(?:\.[0-9]{1,2}f|d)\Z")
@@ -135,6 +142,16 @@ class Field:
         if self.type in ("decimal", *_FLOATS):
             return "number"
         return "text" if self.type == "text" else "integer"
+
+    @property
+    def value_type(self) -> ValueType:
+        """The type of its values, or the next wider one that tags have."""
+        if self.bit is not None:
+            return ValueType(Kind.BOOL)
+        if self.type == "text":
+            first, _, last = (self.columns or "").partition("-")
+            return ValueType(Kind.STRING, int(last) - int(first) + 1 if last else LONGEST_STRING)
+        return ValueType(_WIDER.get(self.type) or Kind(self.type))
 
     @property
     def _octets(self) -> int:

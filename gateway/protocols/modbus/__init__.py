@@ -4,7 +4,7 @@ from gateway.protocols.modbus.ascii import AsciiCodec
 from gateway.protocols.modbus.drivers import ModbusAscii, ModbusRtu, ModbusTcp
 from gateway.protocols.modbus.frame import Frame
 from gateway.protocols.modbus.mbap import MbapCodec
-from gateway.protocols.modbus.rtu import RtuCodec, RtuEar
+from gateway.protocols.modbus.rtu import RtuCodec, RtuSlaveCodec
 
 __all__ = [
     "AsciiCodec",
@@ -14,5 +14,5 @@ __all__ = [
     "ModbusRtu",
     "ModbusTcp",
     "RtuCodec",
-    "RtuEar",
+    "RtuSlaveCodec",
 ]

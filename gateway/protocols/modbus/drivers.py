@@ -1,11 +1,21 @@
-"""The Modbus drivers: RTU, ASCII and TCP, each a list of settings over the same dialogue."""
+"""The Modbus drivers: RTU, ASCII and TCP, each a list of settings over the same master."""
 
 from collections.abc import Coroutine, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any, Literal
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar, Literal
 
 from gateway.errors import ConfigError
-from gateway.protocols.driver import Address, Area, Codec, Cost, Span, Talk, Timing
+from gateway.protocols.driver import (
+    Address,
+    Area,
+    Codec,
+    Cost,
+    ScanHints,
+    Span,
+    Talk,
+    Timing,
+    Traits,
+)
 from gateway.protocols.modbus import ascii as ascii_
 from gateway.protocols.modbus import mbap, rtu
 from gateway.protocols.modbus.addressing import (
@@ -17,10 +27,11 @@ from gateway.protocols.modbus.addressing import (
     Limits,
 )
 from gateway.protocols.modbus.ascii import AsciiCodec
-from gateway.protocols.modbus.dialogue import Dialogue
 from gateway.protocols.modbus.frame import Frame
+from gateway.protocols.modbus.master import Master
 from gateway.protocols.modbus.mbap import MbapCodec
 from gateway.protocols.modbus.rtu import RtuCodec
+from gateway.values import Kind, Order
 
 Addressing = Literal["plain", "vigor", "k120s", "ex485lnk"]
 Numbering = Literal["zero_based", "modicon"]
@@ -32,7 +43,7 @@ _FASTEST_SILENCE = 0.00175  # seconds; above 19200 baud 3.5 characters would be 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Modbus:
-    """The settings that all kinds share, and the dialogue they come to."""
+    """The settings that all kinds share."""
 
     protocol: str
     station: int
@@ -45,48 +56,59 @@ class _Modbus:
     max_read_bits: int | None = None
     max_write_words: int | None = None
     max_write_bits: int | None = None
-    _dialogue: Dialogue = field(init=False, repr=False, compare=False)
+    _traits: ClassVar[Traits]
+    _master: Master = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "_dialogue", _dialogue(self))
+        object.__setattr__(self, "_master", _master(self))
+
+    @property
+    def traits(self) -> Traits:
+        order = Order.HIGH_FIRST if self.addressing == "plain" else Order.LOW_FIRST
+        return replace(self._traits, string_order=order)
 
     @property
     def areas(self) -> Mapping[str, Area]:
-        return self._dialogue.areas
+        return self._master.areas
 
     def address(self, text: str) -> Address:
-        return self._dialogue.dialect.address(text)
+        return self._master.dialect.address(text)
 
     def spell(self, address: Address) -> str:
-        return self._dialogue.dialect.spell(address)
+        return self._master.dialect.spell(address)
 
     def cost(self, span: Span) -> Cost | None:
-        return self._dialogue.cost(span)
+        return self._master.cost(span)
 
     def write_cost(self, span: Span) -> Cost | None:
-        return self._dialogue.write_cost(span)
+        return self._master.write_cost(span)
 
     def read(self, talk: Talk[Frame], span: Span) -> Coroutine[Any, Any, Sequence[int]]:
-        return self._dialogue.read(talk, span)
+        return self._master.read(talk, span)
 
     def write(
         self, talk: Talk[Frame], span: Span, units: Sequence[int]
     ) -> Coroutine[Any, Any, bool]:
-        return self._dialogue.write(talk, span, units)
+        return self._master.write(talk, span, units)
 
-    def resync(self, talk: Talk[Frame], doubt: Span | None, salt: int) -> Coroutine[Any, Any, int]:
-        return self._dialogue.resync(talk, doubt, salt)
+    def resync(
+        self, talk: Talk[Frame], outstanding: Span | None, probe_token: int
+    ) -> Coroutine[Any, Any, int]:
+        return self._master.resync(talk, outstanding, probe_token)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ModbusRtu(_Modbus):
-    """Modbus RTU (serial line guide V1.02). Station 0 is everybody: written to, never read."""
+    """Modbus RTU (serial line guide V1.02). Station 0 is a broadcast: written, never read."""
 
     protocol: Literal["modbus-rtu"] = "modbus-rtu"
 
+    scan_hints: ClassVar = ScanHints(formats=("8N1", "8E1", "8O1", "8N2"))
+    _traits: ClassVar = Traits(baudrate=9600, format="8E1", binary=True, word_type=Kind.UINT16)
+
     @property
     def timing(self) -> Timing:
-        silence = max(_FASTEST_SILENCE, self._dialogue.dialect.rtu_silence)
+        silence = max(_FASTEST_SILENCE, self._master.dialect.rtu_silence)
         return Timing(silence=silence, silence_chars=3.5)
 
     def codec(self) -> Codec[Frame]:
@@ -95,9 +117,12 @@ class ModbusRtu(_Modbus):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ModbusAscii(_Modbus):
-    """Modbus ASCII (serial line guide V1.02). Station 0 is everybody: written to, never read."""
+    """Modbus ASCII (serial line guide V1.02). Station 0 is a broadcast: written, never read."""
 
     protocol: Literal["modbus-ascii"] = "modbus-ascii"
+
+    scan_hints: ClassVar = ScanHints(formats=("7E1", "8N1", "7O1", "7N2"))
+    _traits: ClassVar = Traits(baudrate=9600, format="7E1", word_type=Kind.UINT16)
 
     @property
     def timing(self) -> Timing:
@@ -109,11 +134,14 @@ class ModbusAscii(_Modbus):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ModbusTcp(_Modbus):
-    """Modbus TCP (messaging guide V1.0b). `station` is the unit identifier, 0 as good as any."""
+    """Modbus TCP (messaging guide V1.0b). `station` is the unit identifier; 0 is valid."""
 
     protocol: Literal["modbus-tcp"] = "modbus-tcp"
     station: int = 1
-    window: int = 1  # questions the device lets be open at once
+    window: int = 1  # the most outstanding requests that the device accepts
+
+    scan_hints: ClassVar = ScanHints(formats=())
+    _traits: ClassVar = Traits(baudrate=None, word_type=Kind.UINT16)
 
     @property
     def timing(self) -> Timing:
@@ -123,8 +151,8 @@ class ModbusTcp(_Modbus):
         return MbapCodec()
 
 
-def _dialogue(device: _Modbus) -> Dialogue:
-    """What the settings come to. Raises `ConfigError`."""
+def _master(device: _Modbus) -> Master:
+    """Checks the settings. Raises `ConfigError`."""
     dialect = _DIALECTS[device.addressing]
     if device.numbering == "modicon":
         if dialect is not PLAIN:
@@ -142,7 +170,7 @@ def _dialogue(device: _Modbus) -> Dialogue:
                 raise ConfigError(f"window {device.window} is not 1..16")
     if device.station not in stations:
         raise ConfigError(f"station {device.station} is not {stations[0]}..{stations[-1]}")
-    return Dialogue(
+    return Master(
         station=device.station,
         chars=chars,
         dialect=dialect,
@@ -156,15 +184,15 @@ def _dialogue(device: _Modbus) -> Dialogue:
 
 
 def _limits(device: _Modbus, usual: Limits) -> Limits:
-    """The dialect's limits, where the file does not say otherwise."""
-    said = (
+    """Returns the limits of the file, and those of the dialect where the file has none."""
+    own = (
         device.max_read_words,
         device.max_read_bits,
         device.max_write_words,
         device.max_write_bits,
     )
     wanted = Limits(
-        *(own if limit is None else limit for limit, own in zip(said, usual, strict=True))
+        *(most if limit is None else limit for limit, most in zip(own, usual, strict=True))
     )
     for name, limit, most in zip(Limits._fields, wanted, Limits(), strict=True):
         if not 1 <= limit <= most:

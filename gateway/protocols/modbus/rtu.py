@@ -117,7 +117,7 @@ def _reply_size(heard: bytes | bytearray, start: int) -> int:
     return _SHORTEST if function & EXCEPTION and function - EXCEPTION in _KNOWN else 0
 
 
-class RtuEar:
+class RtuSlaveCodec:
     """What a slave hears: the requests on the line.
 
     A request to this station (or to all) that is not whole yet is waited for; whoever has a

@@ -3,11 +3,21 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal
+from typing import ClassVar, Literal
 
 from gateway.errors import BadValue, ConfigError, Refusal, Refused
 from gateway.protocols.devices import parse_device, spell_device
-from gateway.protocols.driver import Address, Area, Cost, Span, Talk, Timing, Unit
+from gateway.protocols.driver import (
+    Address,
+    Area,
+    Cost,
+    ScanHints,
+    Span,
+    Talk,
+    Timing,
+    Traits,
+    Unit,
+)
 from gateway.protocols.vigor.codec import (
     FORCE_OFF,
     FORCE_ON,
@@ -43,8 +53,9 @@ _REFUSALS = {
     "14": (Refusal.DAMAGED, "stop bit, parity, frame or overrun error: line settings or noise"),
     "28": (Refusal.ADDRESS, "data address out of range"),
 }
+_TRAITS = Traits(baudrate=19200, format="7E1")
 _TIMING = Timing(reply_timeout=0.5, turnaround=0.005, silence=0.005, retries=2)
-_MARKS = (1, 3, 5, 7, 9, 11, 13, 15)  # odd byte counts: words are never read in these
+_PROBE_SIZES = (1, 3, 5, 7, 9, 11, 13, 15)  # odd byte counts: no read of words has these
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,6 +65,8 @@ class Vigor:
     protocol: Literal["vigor"] = "vigor"
     station: int = 0
 
+    scan_hints: ClassVar = ScanHints(formats=("7E1", "8N1"), stations=range(32))
+
     def __post_init__(self) -> None:
         if not 0 <= self.station <= 255:
             raise ConfigError(f"station {self.station} is not 0..255")
@@ -61,6 +74,10 @@ class Vigor:
     @property
     def areas(self) -> Mapping[str, Area]:
         return AREAS
+
+    @property
+    def traits(self) -> Traits:
+        return _TRAITS
 
     @property
     def timing(self) -> Timing:
@@ -131,19 +148,19 @@ class Vigor:
         await self._write_body(talk, WRITE, body)
         return True
 
-    async def resync(self, talk: Talk[Frame], doubt: Span | None, salt: int) -> int:
-        """Read M0 and up, in a number of bytes that no open question asks for.
+    async def resync(self, talk: Talk[Frame], outstanding: Span | None, probe_token: int) -> int:
+        """Reads M0 and up, in a number of bytes that no outstanding request reads.
 
-        A refusal names no question: it may be the late answer to `doubt`, so another mark is
-        asked for once.
+        An error reply names no request: it may be the late reply to the `outstanding` read, so
+        one more read with another number of bytes follows it.
         """
-        doubted = cover(doubt) if doubt is not None else None
-        marks = [mark for mark in _MARKS if doubted is None or mark != doubted.size]
+        late = cover(outstanding) if outstanding is not None else None
+        sizes = [size for size in _PROBE_SIZES if late is None or size != late.size]
         try:
-            await self._read_bytes(talk, 0x0080, marks[salt % len(marks)])
+            await self._read_bytes(talk, 0x0080, sizes[probe_token % len(sizes)])
         except Refused:
-            await self._read_bytes(talk, 0x0080, marks[(salt + 1) % len(marks)])
-        return len(marks) // 2
+            await self._read_bytes(talk, 0x0080, sizes[(probe_token + 1) % len(sizes)])
+        return len(sizes) // 2
 
     async def _read_bytes(self, talk: Talk[Frame], address: int, count: int) -> bytes:
         request = _read_request(self.station, address, count)

@@ -1,5 +1,5 @@
-"""A simulated Modbus slave, RTU, ASCII or TCP: plain, Vigor, LS K120S, or one EX485LNK calls."""
+"""A simulated Modbus slave, RTU, ASCII or TCP: plain, Vigor, LS K120S, or as the EX485LNK reads."""
 
-from gateway.stations.modbus.station import ModbusStation
+from gateway.stations.modbus.station import ModbusStation, modbus_station
 
-__all__ = ["ModbusStation"]
+__all__ = ["ModbusStation", "modbus_station"]

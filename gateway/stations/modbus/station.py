@@ -31,9 +31,19 @@ from pymodbus.pdu.register_message import (
 )
 
 from gateway.errors import Garbled
-from gateway.protocols.modbus import AsciiCodec, Frame, MbapCodec, RtuEar
+from gateway.protocols.modbus import (
+    AsciiCodec,
+    Frame,
+    MbapCodec,
+    ModbusAscii,
+    ModbusRtu,
+    ModbusTcp,
+    RtuSlaveCodec,
+)
 from gateway.stations.modbus.store import Store
 from gateway.stations.station import Memory
+
+Framing = Literal["rtu", "ascii", "tcp"]
 
 _ILLEGAL_FUNCTION, _ILLEGAL_ADDRESS, _ILLEGAL_VALUE = 1, 2, 3
 _LOOPBACK = b"\x08\x00\x00"
@@ -72,7 +82,7 @@ class ModbusStation:
     """
 
     station: int = 1
-    framing: Literal["rtu", "ascii", "tcp"] = "rtu"
+    framing: Framing = "rtu"
     dialect: Literal["plain", "vigor", "k120s", "ex485lnk"] = "plain"
     counter_word_order: Literal["low_first", "high_first"] = "low_first"
     holes: Sequence[tuple[str, int, int]] = ()
@@ -80,7 +90,7 @@ class ModbusStation:
     mute: bool = False
     gap: float = 0.1
     _store: Store = field(init=False, repr=False)
-    _codec: RtuEar | AsciiCodec | MbapCodec = field(init=False, repr=False)
+    _codec: RtuSlaveCodec | AsciiCodec | MbapCodec = field(init=False, repr=False)
     _heard_at: float = field(init=False, default=0.0, repr=False)
 
     def __post_init__(self) -> None:
@@ -107,10 +117,10 @@ class ModbusStation:
         answers = [self._answer(frame, now) for frame in frames]
         return [self._codec.encode(answer) for answer in answers if answer is not None]
 
-    def _new_codec(self) -> RtuEar | AsciiCodec | MbapCodec:
+    def _new_codec(self) -> RtuSlaveCodec | AsciiCodec | MbapCodec:
         match self.framing:
             case "rtu":
-                return RtuEar(self.station)
+                return RtuSlaveCodec(self.station)
             case "ascii":
                 return AsciiCodec()
             case "tcp":
@@ -179,6 +189,17 @@ class ModbusStation:
             case 16:
                 return _encode(WriteMultipleRegistersResponse(address=address, count=count))
         return _encode(request)  # 05 and 06 are answered with themselves
+
+
+def modbus_station(driver: ModbusRtu | ModbusAscii | ModbusTcp) -> ModbusStation:
+    """Returns the station that the driver can talk to."""
+    framings: dict[str, Framing] = {"modbus-ascii": "ascii", "modbus-tcp": "tcp"}
+    return ModbusStation(
+        station=driver.station,
+        framing=framings.get(driver.protocol, "rtu"),
+        dialect=driver.addressing,
+        counter_word_order=driver.counter_word_order,
+    )
 
 
 def _count(function: int, request: ModbusPDU) -> int:

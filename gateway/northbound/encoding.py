@@ -1,8 +1,8 @@
-"""A sample on its way out: the JSON of the contract, or the bare value (`payload: raw`).
+"""Samples on Zenoh: the JSON of the contract, or the bare value (`payload: raw`).
 
 Raw is the value as UTF-8 text, `text/plain`: `12.5`, `true`, `AB`. Quality and time are in the
-attachment. A value that is not known is no text that somebody could take for one: it is a
-DELETE of the key, with the reason in the attachment.
+attachment. An unknown value has no text that a reader could mistake for a value: it is a DELETE of
+the key, with the reason in the attachment.
 """
 
 import zenoh
@@ -20,17 +20,17 @@ def put(session: zenoh.Session, key: str, sample: Sample, stamp: zenoh.Timestamp
     if sample.tag.payload is Form.JSON:
         put_json(session, key, payload.value(sample), stamp)
         return
-    bare, about = payload.bare(sample), payload.about(sample)
-    if bare is None:
-        session.delete(key, congestion_control=_DROP, timestamp=stamp, attachment=about)
+    text, attachment = payload.value_text(sample), payload.attachment(sample)
+    if text is None:
+        session.delete(key, congestion_control=_DROP, timestamp=stamp, attachment=attachment)
         return
     session.put(
         key,
-        bare,
+        text,
         encoding=_TEXT,
         congestion_control=_DROP,
         timestamp=stamp,
-        attachment=about,
+        attachment=attachment,
     )
 
 
@@ -50,11 +50,11 @@ def reply(query: zenoh.Query, key: str, sample: Sample, stamp: zenoh.Timestamp) 
     if sample.tag.payload is Form.JSON:
         reply_json(query, key, payload.value(sample), stamp)
         return
-    bare, about = payload.bare(sample), payload.about(sample)
-    if bare is None:
-        query.reply_del(key, timestamp=stamp, attachment=about)
+    text, attachment = payload.value_text(sample), payload.attachment(sample)
+    if text is None:
+        query.reply_del(key, timestamp=stamp, attachment=attachment)
         return
-    query.reply(key, bare, encoding=_TEXT, timestamp=stamp, attachment=about)
+    query.reply(key, text, encoding=_TEXT, timestamp=stamp, attachment=attachment)
 
 
 def reply_json(query: zenoh.Query, key: str, data: bytes, stamp: zenoh.Timestamp) -> None:

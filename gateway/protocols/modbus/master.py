@@ -1,4 +1,4 @@
-"""What is said between the gateway and one Modbus device, whatever the frames are wrapped in."""
+"""The master's side of Modbus: requests to one device and their replies, without framing."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -11,24 +11,24 @@ from gateway.protocols.modbus import pdu
 from gateway.protocols.modbus.addressing import Dialect, Limits, Place
 from gateway.protocols.modbus.frame import READ_BITS, Frame, answer_length
 
-_REMEMBERED = 1024  # spans whose question is kept ready
-_FEWEST_SIZES, _MOST_SIZES = 4, 16  # of the reads that a resync may ask
+_REMEMBERED = 1024  # spans whose request is kept ready
+_FEWEST_SIZES, _MOST_SIZES = 4, 16  # of the reads that a resync may send
 _NUMBERS = 0xFFFF
 
 
-class Question(NamedTuple):
-    """A read, ready to be asked."""
+class ReadRequest(NamedTuple):
+    """A read, ready to be sent, and the reply that it expects."""
 
     request: bytes
-    head: bytes  # function and byte count of the answer
-    length: int  # of the answer's PDU
-    chars: int  # of the whole answer
+    head: bytes  # function and byte count of the reply
+    length: int  # of the reply's PDU
+    chars: int  # of the whole reply
     units: Callable[[bytes], Sequence[int]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Dialogue:
-    """One device as its settings describe it. Everything but the conversation is decided."""
+class Master:
+    """One device as its settings describe it."""
 
     station: int
     chars: Callable[[int], int]  # of a frame, by the length of its PDU
@@ -37,11 +37,11 @@ class Dialogue:
     write_single: bool
     diagnostics: bool
     low_first: bool
-    broadcast: bool = False  # everybody listens, nobody answers
-    numbered: bool = False  # questions carry a number
+    broadcast: bool = False  # every device listens, none replies
+    numbered: bool = False  # requests carry a number
     areas: Mapping[str, Area] = field(init=False)
     _numbers: Iterator[int] = field(init=False)
-    _questions: dict[Span, Question] = field(init=False, default_factory=dict)
+    _prepared: dict[Span, ReadRequest] = field(init=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         numbers = count(1) if self.numbered else repeat(0)
@@ -88,8 +88,7 @@ class Dialogue:
         return self.write_single and span.size == 1 and place.registers == 1
 
     async def read(self, talk: Talk[Frame], span: Span) -> Sequence[int]:
-        question = self._questions.get(span) or self._prepare(span)
-        request, head, length, chars, units = question
+        request, head, length, chars, units = self._prepared.get(span) or self._prepare(span)
         station, number = self.station, next(self._numbers) & 0xFFFF
         function = head[0]
 
@@ -105,16 +104,16 @@ class Dialogue:
         said = await talk.ask(Frame(station, request, number), chars, answers)
         if said:
             return said
-        # 17 to 24 coils from wire address 03xxh: the answer may be the question letter for letter,
-        # and what was heard may be its echo. Two shorter answers cannot.
+        # 17 to 24 coils from wire address 03xxh: the reply may be equal to the request, so the
+        # received bytes may be its echo. Two shorter replies cannot be equal to their requests.
         area, start, size = span
         first = await self.read(talk, Span(area, start, 16))
         return [*first, *await self.read(talk, Span(area, start + 16, size - 16))]
 
-    def _prepare(self, span: Span) -> Question:
+    def _prepare(self, span: Span) -> ReadRequest:
         place = self._place(span)
         if place is None or self.cost(span) is None:
-            raise BadValue(f"{span} cannot be read in one exchange")
+            raise BadValue(f"{span} cannot be read with one request")
         registers = span.size * place.registers
         request = pdu.read_request(place.function, place.at(span.start), registers)
         length = answer_length(request)
@@ -125,11 +124,11 @@ class Dialogue:
         else:
             units = pdu.words_in(registers)
         head = bytes((place.function, length - 2))
-        question = Question(request, head, length, self.chars(length), units)
-        if len(self._questions) >= _REMEMBERED:
-            self._questions.clear()
-        self._questions[span] = question
-        return question
+        prepared = ReadRequest(request, head, length, self.chars(length), units)
+        if len(self._prepared) >= _REMEMBERED:
+            self._prepared.clear()
+        self._prepared[span] = prepared
+        return prepared
 
     async def write(self, talk: Talk[Frame], span: Span, units: Sequence[int]) -> bool:
         request = self._write_request(span, units)
@@ -149,7 +148,7 @@ class Dialogue:
             if heard.station != frame.station or heard.transaction != number:
                 return None
             if heard.pdu == echo:
-                echo = None  # perhaps our own words: the device must say them again
+                echo = None  # perhaps the echo: the device must send the same again
                 return None
             if heard.pdu in good:
                 return True
@@ -161,7 +160,7 @@ class Dialogue:
     def _write_request(self, span: Span, units: Sequence[int]) -> bytes:
         place = self._place(span)
         if place is None or self.write_cost(span) is None or len(units) != span.size:
-            raise BadValue(f"{len(units)} units for {span} cannot be written in one exchange")
+            raise BadValue(f"{len(units)} units for {span} cannot be written with one request")
         largest = {Unit.BIT: 1, Unit.WORD: 0xFFFF, Unit.DWORD: 0xFFFF_FFFF}[place.area.unit]
         if not all(0 <= unit <= largest for unit in units):
             raise BadValue(f"units of {span.area} are 0 to {largest}")
@@ -172,46 +171,47 @@ class Dialogue:
             units = pdu.words_of(units, low_first=self.low_first)
         return pdu.write_words_request(wire, units, single=single)
 
-    async def resync(self, talk: Talk[Frame], doubt: Span | None, salt: int) -> int:
-        """Read another byte count than `doubt` has, or ask function 08 to repeat a token.
+    async def resync(self, talk: Talk[Frame], outstanding: Span | None, probe_token: int) -> int:
+        """Reads another byte count than the `outstanding` read, or sends a token by function 08.
 
-        Not while what is repeated may be an echo: a dead device would seem alive.
-        An exception names no address: it may be the late answer to `doubt`, and the answer to our
-        question still to come. So another size is asked then, unless questions carry a number.
+        Function 08 is not used while its reply may be an echo: a dead device would seem online.
+        An exception names no address: it may be the late reply to the `outstanding` read. So one
+        more read with another byte count follows it, unless requests carry a number.
         """
         loopback = self.diagnostics and (self.numbered or not talk.may_echo)
-        harmless = self._harmless(doubt)
+        harmless = self._harmless(outstanding)
         count = len(harmless)
         try:
             if loopback:
-                await self._loopback(talk, salt & 0xFFFF)
+                await self._loopback(talk, probe_token & 0xFFFF)
             else:
-                await self.read(talk, harmless[salt % count])
+                await self.read(talk, harmless[probe_token % count])
         except Refused:
             if self.numbered:
                 return _NUMBERS
             if loopback:
                 raise
-            await self.read(talk, harmless[(salt + 1) % count])
+            await self.read(talk, harmless[(probe_token + 1) % count])
         return _NUMBERS if self.numbered or loopback else max(1, count // 2)
 
-    def _harmless(self, doubt: Span | None) -> Sequence[Span]:
-        """Short reads near `doubt` of different byte counts, none of them its own."""
+    def _harmless(self, outstanding: Span | None) -> Sequence[Span]:
+        """Short reads near the `outstanding` one, of different byte counts, none equal to its."""
         places = self.dialect.places
-        if doubt is None or self._place(doubt) is None:
+        near = outstanding
+        if near is None or self._place(near) is None:
             first = (places.get("D") or next(iter(places.values()))).area
-            doubt = Span(first.name, first.first, 0)
-        place = places[doubt.area]
+            near = Span(first.name, first.first, 0)
+        place = places[near.area]
         area, step = place.area, 8 if _is_bits(place) else 1
-        steps = (doubt.size + step - 1) // step
+        steps = (near.size + step - 1) // step
         room = min(self._most(place, reading=True) // place.registers, area.last - area.first + 1)
-        # Small ones come first: they lie within what was asked, where the device has something.
+        # Small ones first: they lie within the outstanding read, at addresses that the device has.
         most = max(_FEWEST_SIZES, min(steps - 1, _MOST_SIZES))
         sizes = [n * step for n in range(1, most + 2) if n != steps and n * step <= room][:most]
-        if not sizes:  # limited to one unit: the answer to another function differs as well
+        if not sizes:  # limited to one unit: the reply to another function differs as well
             other = next(p for p in places.values() if p.function != place.function).area
             return [Span(other.name, other.first, 1)]
-        return [Span(area.name, min(doubt.start, area.last + 1 - n), n) for n in sizes]
+        return [Span(area.name, min(near.start, area.last + 1 - n), n) for n in sizes]
 
     async def _loopback(self, talk: Talk[Frame], token: int) -> None:
         request = pdu.loopback_request(token)

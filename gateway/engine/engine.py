@@ -1,0 +1,327 @@
+"""The engine of one line: what the line does next, and what each result means.
+
+Synchronous and pure: no asyncio, clock, port or log. Times are passed in: `now` in seconds of
+the line's clock, `time` in nanoseconds since 1970 for the samples. The line calls `expire` when
+`deadline` has come, then `next`, performs the job and passes the result to `conclude`. All other
+entries take what comes from outside. Each returns its effects as plain data.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+from gateway.engine.device import Device
+from gateway.engine.effects import Effect, Effects
+from gateway.engine.health import State
+from gateway.engine.in_flight import InFlight
+from gateway.engine.jobs import (
+    Answer,
+    Idle,
+    Job,
+    Poll,
+    Probe,
+    Repeat,
+    RequestJob,
+    Result,
+    Resynced,
+    Settle,
+    Settled,
+    Traffic,
+    Transacted,
+    Unfinished,
+    WriteTogether,
+    span_of,
+)
+from gateway.engine.records import LineRecord
+from gateway.engine.request_results import RequestResults
+from gateway.engine.requests import Request, Write, why_not_commanded
+from gateway.engine.results import Results, offline
+from gateway.engine.schedule import Schedule
+from gateway.engine.staleness import NEVER, Staleness
+from gateway.engine.stray import Stray
+from gateway.engine.unsolicited import UnsolicitedFrames
+from gateway.errors import (
+    BadValue,
+    Busy,
+    DeviceError,
+    Garbled,
+    LineDown,
+    Refused,
+    Unclear,
+    Unsteady,
+)
+from gateway.planning.wire_timing import WireTiming
+from gateway.tags import Reason, Tag
+
+GAP = 0.02  # seconds without a byte that end a run of noise
+
+
+class Engine:
+    """The rules of one line, and all that the line knows."""
+
+    def __init__(
+        self, name: str, devices: Sequence[Device], wire: WireTiming, seed: int = 0
+    ) -> None:
+        self.devices = devices
+        self.is_open = False
+        self.record = LineRecord()
+        self.deadline = NEVER  # when `expire` must be called
+        self.schedule = Schedule(devices, 0.0, seed)
+        self.name = name
+        self.wire = wire
+        self._effects = Effects()
+        self._staleness = Staleness(self.schedule, self._effects)
+        self._results = Results(name, self.schedule, self._staleness, self._effects)
+        self._requests = RequestResults(self.schedule, self._results, self._effects)
+        self._unsolicited = UnsolicitedFrames(devices, self._results, self._effects)
+        self._stray = Stray(name, devices, self._effects)
+        self._in_flight = InFlight()
+
+    # The cycle of the line
+
+    def next(self, now: float) -> Job:
+        """The next job. Every job but `Idle` must be concluded before the next call."""
+        in_flight = self._in_flight
+        if in_flight.continuation is not None:
+            return in_flight.resume(now)
+        job: Job | None = None
+        if self._unsolicited.speakers:
+            job = self._unsolicited.next(now)
+        if job is None:
+            job = self.schedule.next(now)
+            if type(job) is Write and (others := self.schedule.requests.companions(job)):
+                job = WriteTogether(job.device, [job, *others])
+        if not isinstance(job, Idle):
+            in_flight.begin(job, now)
+        return job
+
+    def alongside(self, poll: Poll, now: float) -> Sequence[Poll]:
+        """Other due polls of a device that takes several requests at once.
+
+        They share the transaction of `poll`; each is concluded by itself.
+        """
+        others = self.schedule.alongside(poll, poll.device.window - 1, now)
+        self._in_flight.open_polls += len(others)
+        return others
+
+    def conclude(
+        self, job: Transacted, result: Result, traffic: Traffic, now: float, time: int
+    ) -> list[Effect]:
+        """Applies the result of a job."""
+        self._count(job.device, traffic, now)
+        in_flight = self._in_flight
+        if isinstance(job, Poll):
+            self._conclude_poll(job, result, now, time)
+            if in_flight.open_polls:
+                return self._effects.take()
+            if in_flight.failed:
+                self._unclear(*in_flight.failed[0], traffic, now, time)
+        elif isinstance(job, Settle):
+            self._conclude_settle(job, result, now, time)
+        elif isinstance(job, Probe):
+            self._conclude_probe(job, result, traffic, now, time)
+        elif isinstance(job, Answer):
+            if isinstance(result, Garbled):
+                self._effects.warning("reply dropped", device=job.device.name, why=str(result))
+        else:
+            self._conclude_request(job, result, traffic, now, time)
+        if in_flight.continuation is None:
+            in_flight.end(now)
+        if self._staleness.due < self.deadline or type(job) is not Poll:
+            self._set_deadline()
+        return self._effects.take()
+
+    def _conclude_poll(self, poll: Poll, result: Result, now: float, time: int) -> None:
+        device, results = poll.device, self._results
+        self._in_flight.open_polls -= 1
+        match result:
+            case Refused():
+                results.answered(device, now, time)
+                results.refused(poll, result, now, time)
+            case Unsteady():
+                results.answered(device, now, time)
+                results.unsteady(poll, result, now, time)
+            case DeviceError():
+                self._in_flight.failed.append((poll, result))
+            case LineDown():
+                device.health.left_outstanding(poll.block.span)
+            case list() | tuple():
+                if device.health.needs_resync or not device.health.online:
+                    results.answered(device, now, time)
+                results.read(poll, result, now, time)
+
+    def _conclude_probe(
+        self, probe: Probe, result: Result, traffic: Traffic, now: float, time: int
+    ) -> None:
+        device = probe.device
+        match result:
+            case Resynced() | Refused():  # "no" is a sign of life, perhaps for an older request
+                told_from = result.told_from if isinstance(result, Resynced) else 0
+                if not probe.again and self._results.outstanding_requests(device) > told_from:
+                    quiet = device.longest_reply
+                    self._in_flight.continuation = Settle(device, quiet, quiet, probe)
+                else:
+                    self._results.answered(device, now, time)
+            case Unclear():
+                self._unclear(probe, result, traffic, now, time)
+
+    def _conclude_request(
+        self, job: RequestJob, result: Result, traffic: Traffic, now: float, time: int
+    ) -> None:
+        match self._requests.conclude(job, result, traffic, now, time):
+            case Unclear() as error:
+                self._unclear(job, error, traffic, now, time)
+            case Repeat() as repeat:
+                self._in_flight.continuation = repeat
+
+    def _unclear(
+        self, job: Unfinished, error: DeviceError, traffic: Traffic, now: float, time: int
+    ) -> None:
+        """The line settles next: the late reply must disturb no other transaction."""
+        device = job.device
+        before = self._results.unclear(device, error, span_of(job), now, time)
+        self._in_flight.continuation = Settle(
+            device,
+            0.0 if before is State.OFFLINE else device.settings.late_guard,
+            max(GAP, 4 * self.wire.character),
+            after=job,
+            error=error,
+            before=before,
+            sent=traffic.sent > 0,
+            failed=tuple(self._in_flight.failed),
+        )
+
+    def _conclude_settle(self, settle: Settle, result: Result, now: float, time: int) -> None:
+        device, after = settle.device, settle.after
+        if settle.error is None:
+            if isinstance(after, Probe):
+                again = Probe(device, after.outstanding, after.token + 1, again=True)
+                self._in_flight.continuation = again
+            return
+        late = result.late if isinstance(result, Settled) else None
+        took = now - self._in_flight.begun
+        self._results.settled(device, settle.before, took, late, now, time)
+        for poll, error in settle.failed:
+            self._results.unread(poll, error, now, time)
+        if not isinstance(after, Poll | Probe):
+            self._in_flight.continuation = self._requests.settled(settle, now)
+
+    def _count(self, device: Device, traffic: Traffic, now: float) -> None:
+        characters = (traffic.sent + traffic.heard) * self.wire.character
+        self.record.busy += characters
+        self.record.turnarounds += traffic.turnaround
+        device.record.count_exchanges(traffic.exchanges, characters, traffic.turnaround)
+        if self._unsolicited.speakers:
+            self._unsolicited.transaction_ended(device, now, sent=traffic.sent, heard=traffic.heard)
+
+    # What comes from outside
+
+    def submit(self, request: Request, now: float) -> list[Effect]:
+        """Carries out the request as soon as the current transaction ends, or refuses it."""
+        queue, device = self.schedule.requests, request.device
+        if isinstance(request, Write):
+            for older in queue.superseded(request):
+                self._effects.ended(older, Busy("a newer value took its place; not sent"))
+        else:
+            control = device.settings.control
+            if why := why_not_commanded(device.driver, request.name, control=control):
+                self._effects.ended(request, BadValue(why))
+                return self._effects.take()
+        if not self.is_open:
+            why = self.record.trouble or f"line {self.name} is not open"
+            self._effects.ended(request, LineDown(why))
+        elif not self.schedule.reachable(device, now):
+            self._effects.ended(request, offline(device))
+        elif not queue.submit(request):
+            why = f"line {self.name}: too many orders are waiting; not sent"
+            self._effects.ended(request, Busy(why))
+        self._set_deadline()
+        return self._effects.take()
+
+    def expedite(self, device: Device, tag: Tag) -> None:
+        """Polls the tag's block before all other polls."""
+        poll = self.schedule.reader(device, tag)
+        if poll is not None:
+            self.schedule.expedite(poll)
+
+    def received(self, data: bytes, now: float, time: int) -> list[Effect]:
+        """Bytes that arrived outside of a transaction."""
+        self.record.unasked += len(data)
+        self._stray.received(data, now)
+        self._unsolicited.received(data, now, time)
+        self._set_deadline()
+        return self._effects.take()
+
+    def unmatched(self, device: Device, frame: Any, now: float, time: int) -> list[Effect]:
+        """A frame that arrived in a transaction with this device and is not its reply."""
+        device.record.count_stray()
+        self._stray.frames(device, [frame], now)
+        self._unsolicited.unmatched(device, frame, now, time)
+        self._set_deadline()
+        return self._effects.take()
+
+    def expire(self, now: float, time: int) -> list[Effect]:
+        """The deadline has come: requests that waited too long end, old values turn bad."""
+        for request in self.schedule.requests.expired(now):
+            waited = f"waited {now - request.submitted:.1f} s for the line"
+            refused = isinstance(request, Write) and request.alone
+            sent = "refused together with others, and not sent alone" if refused else "not sent"
+            self._effects.ended(request, Busy(f"{waited}; {sent}"))
+        if self._staleness.due <= now:
+            self._staleness.look(now, time)
+        self._unsolicited.tick(now, time)
+        self._set_deadline()
+        return self._effects.take()
+
+    def opened(self, now: float) -> list[Effect]:
+        """The port was opened: every device must answer again."""
+        self.is_open = True
+        record = self.record
+        record.opened += 1
+        record.since, record.trouble = now, ""
+        self._in_flight = InFlight()
+        for device in self.devices:
+            device.restart()
+        self.schedule.opened(now)
+        self._unsolicited.opened(now)
+        self._set_deadline()
+        return self._effects.take()
+
+    def lost(self, error: LineDown, now: float, time: int) -> list[Effect]:
+        """The port could not be opened, or was lost: every value is bad."""
+        why = str(error)
+        self._end_request_in_flight(error, now)
+        if self.is_open:
+            self.record.open_before += now - self.record.since
+        self.record.trouble = why
+        for device in self.devices:
+            device.restart(error)
+            self._effects.online(device, False)
+            self._effects.bad(device.tags, Reason.LINE_DOWN, time, why)
+        return self._close()
+
+    def stopped(self, now: float) -> list[Effect]:
+        """The gateway stops: every request gets its outcome."""
+        self._end_request_in_flight(None, now)
+        return self._close()
+
+    def _end_request_in_flight(self, error: LineDown | None, now: float) -> None:
+        job = self._in_flight.continuation or self._in_flight.job
+        self._in_flight = InFlight()
+        if job is not None:
+            self._requests.abandon(job, error, now)
+
+    def _close(self) -> list[Effect]:
+        self.is_open = False
+        self._staleness.stop()
+        for request in self.schedule.requests.withdraw():
+            self._effects.ended(request, LineDown(f"line {self.name} went down; not sent"))
+        self._set_deadline()
+        return self._effects.take()
+
+    def _set_deadline(self) -> None:
+        deadline = self._staleness.due
+        if self.schedule.requests.waiting:
+            deadline = min(deadline, self.schedule.requests.first.expires)
+        if self._unsolicited.speakers:
+            deadline = min(deadline, self._unsolicited.due)
+        self.deadline = deadline

@@ -1,0 +1,85 @@
+"""Counts of lines, devices and polls since the start."""
+
+from collections import Counter
+from dataclasses import dataclass, field
+
+from gateway.errors import DeviceError, Garbled, NoReply, Refused
+
+
+@dataclass(slots=True)
+class LineRecord:
+    """Counts of a line since the start. Times in seconds."""
+
+    opened: int = 0
+    since: float = 0.0  # when it was opened last, by the line's clock
+    open_before: float = 0.0  # how long it was open the times before
+    busy: float = 0.0  # characters on the wire, both ways
+    turnarounds: float = 0.0  # waiting for stations that answered
+    unasked: int = 0  # bytes that arrived outside of a transaction
+    trouble: str = ""  # why the port is not open
+
+
+@dataclass(slots=True)
+class Record:
+    """Counts since the start. Times in seconds."""
+
+    exchanges: int = 0
+    writes: int = 0
+    wire_time: float = 0.0
+    late: int = 0  # replies after the time-out
+    unasked: int = 0  # stray frames
+    heard: int = 0  # unsolicited frames that were understood
+    overruns: int = 0  # polls left out because the one before was late
+    overdue: int = 0  # blocks whose values turned bad because they were not read for too long
+    failures: Counter[str] = field(default_factory=Counter)  # by evidence
+    refusals: Counter[str] = field(default_factory=Counter)  # by the maker's code
+    turnaround: float | None = None  # what the station takes, measured
+    slowest_write: float = 0.0
+
+    def count_exchanges(self, exchanges: int, characters: float, turnarounds: float) -> None:
+        """So many requests were answered; seconds of the wire, and of the station's own time."""
+        self.wire_time += characters + turnarounds
+        if exchanges:
+            self.exchanges += exchanges
+            own, known = turnarounds / exchanges, self.turnaround
+            # Smoothed over about ten exchanges.
+            self.turnaround = own if known is None else known + 0.1 * (own - known)
+
+    def count_write(self, took: float) -> None:
+        self.writes += 1
+        self.slowest_write = max(self.slowest_write, took)
+
+    def count_failure(self, error: DeviceError) -> None:
+        match error:
+            case NoReply() | Garbled():
+                self.failures[error.evidence] += 1
+            case _:
+                self.failures["other"] += 1
+
+    def count_refusal(self, error: Refused) -> None:
+        self.refusals[error.code] += 1
+
+    def count_late(self) -> None:
+        self.late += 1
+
+    def count_stray(self, frames: int = 1) -> None:
+        self.unasked += frames
+
+    def count_unsolicited(self) -> None:
+        self.heard += 1
+
+    def count_overruns(self, missed: int) -> None:
+        self.overruns += missed
+
+    def count_overdue(self) -> None:
+        self.overdue += 1
+
+
+@dataclass(slots=True)
+class PollRecord:
+    """Counts of one block since it was planned. Times in seconds."""
+
+    reads: int = 0  # good ones
+    overruns: int = 0  # rounds left out because the one before was late
+    mean_gap: float = 0.0  # between two good reads, smoothed over about ten
+    worst_gap: float = 0.0

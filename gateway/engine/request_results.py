@@ -1,0 +1,165 @@
+"""Applies the result of a write or command, so that each client gets exactly one outcome."""
+
+from gateway.engine.device import Device
+from gateway.engine.effects import Effects
+from gateway.engine.jobs import (
+    Confirm,
+    Repeat,
+    RequestJob,
+    Result,
+    Sent,
+    Settle,
+    Traffic,
+    Transacted,
+    WriteTogether,
+    requests_of,
+)
+from gateway.engine.requests import Command, Outcome, Request, Write
+from gateway.engine.results import Results
+from gateway.engine.schedule import Schedule
+from gateway.errors import Busy, DeviceError, LineDown, Refused, Unclear
+
+BROADCAST_PAUSE = 0.1  # seconds
+STOPPED = "the gateway stopped before the acknowledgement came; it may have been done"
+
+
+class Differs(Unclear):
+    """The write was acknowledged, but reading back does not show it."""
+
+
+class RequestResults:
+    """The rules for results of writes and commands.
+
+    A write is never simply sent again: its tag says what follows an unclear end.
+    """
+
+    def __init__(self, schedule: Schedule, results: Results, effects: Effects) -> None:
+        self._schedule = schedule
+        self._results = results
+        self._effects = effects
+
+    def conclude(
+        self, job: RequestJob, result: Result, traffic: Traffic, now: float, time: int
+    ) -> Unclear | Repeat | None:
+        """Returns what is left to do: to settle after an unclear end, or to write once more."""
+        if isinstance(result, Unclear):
+            return result
+        if isinstance(result, LineDown):
+            self.abandon(job, result, now)
+            return None
+        match job:
+            case Confirm():
+                return self._confirmed(job, result, now, time)
+            case Command():
+                self._commanded(job, result, traffic, now, time)
+            case WriteTogether():
+                self._written_together(job, result, now, time)
+            case Write() as write:
+                self._end(write, self._written(write, result, None, now, time), now)
+            case Repeat(write=write, error=error):
+                self._end(write, self._written(write, result, error, now, time), now)
+        return None
+
+    def settled(self, settle: Settle, now: float) -> Confirm | None:
+        """The line is quiet after an unclear end. Returns what the tag's rule allows next."""
+        job, error = settle.after, settle.error
+        if error is None:
+            return None
+        match job:
+            case Write(device=device, tag=tag) if settle.sent:
+                if tag.write is not None and (tag.write.verify or tag.write.repeat):
+                    health = device.health
+                    token = health.next_probe_token()
+                    return Confirm(device, job, error, health.outstanding, token)
+            case Confirm(error=first) | Repeat(error=first):
+                error = first
+        outcome = error if settle.sent or isinstance(job, Confirm | Repeat) else Busy(str(error))
+        for request in requests_of(job):
+            self._end(request, outcome, now)
+        return None
+
+    def abandon(self, job: Transacted, why: LineDown | None, now: float) -> None:
+        """The port was lost in the middle of the job. `why` None: the gateway stops."""
+        for request in requests_of(job):
+            span, what = None, "the command"
+            if isinstance(request, Write):
+                span, what = request.tag.span, "the write"
+            request.device.health.left_outstanding(span)
+            unknown = STOPPED if why is None else f"{why}; it is unknown if {what} was done"
+            self._end(request, Unclear(unknown), now)
+
+    def _written(
+        self, write: Write, result: Result, first: DeviceError | None, now: float, time: int
+    ) -> Outcome:
+        """`first`: the unclear end of the first try, of a write that was repeated."""
+        device = write.device
+        match result:
+            case Sent(acknowledged=False):
+                self._pause(device)
+                return write.result(now, time, acknowledged=False)
+            case Sent(held=held, refused_back=refused):
+                self._results.answered(device, now, time)
+                if refused is not None:
+                    return Differs(f"acknowledged, but reading back was refused: {refused}")
+                if held is not None and not write.holds(held):
+                    shown = write.tag.decode(held)
+                    return Differs(f"acknowledged, but the device now holds {shown!r}")
+                return write.result(now, time, verified=held is not None)
+            case Refused():
+                self._refused(device, result, now, time)
+                return first or result  # a refused repetition says nothing of the first try
+        raise TypeError(f"{result!r} is no result of a write")
+
+    def _written_together(self, job: WriteTogether, result: Result, now: float, time: int) -> None:
+        if isinstance(result, Refused):
+            self._refused(job.device, result, now, time)
+            self._schedule.requests.each_alone(job.writes)
+            return
+        self._results.answered(job.device, now, time)
+        for write in job.writes:
+            self._end(write, write.result(now, time), now)
+
+    def _confirmed(self, job: Confirm, result: Result, now: float, time: int) -> Repeat | None:
+        """`result`: the units read back, None where the tag does not say `verify`."""
+        write, rule = job.write, job.write.tag.write
+        outcome: Outcome = job.error
+        if isinstance(result, Refused):
+            self._refused(job.device, result, now, time)
+        elif isinstance(result, Sent) and result.held is not None and write.holds(result.held):
+            self._results.answered(job.device, now, time)
+            outcome = write.result(now, time, verified=True)
+        elif rule is not None and rule.repeat and now < write.expires:
+            return Repeat(job.device, write, job.error)
+        self._end(write, outcome, now)
+        return None
+
+    def _commanded(
+        self, command: Command, result: Result, traffic: Traffic, now: float, time: int
+    ) -> None:
+        device = command.device
+        if isinstance(result, Refused):
+            self._refused(device, result, now, time)
+        elif isinstance(result, str):
+            if traffic.exchanges:
+                self._results.answered(device, now, time)
+            else:
+                self._pause(device)
+        if not isinstance(result, str | Exception):
+            raise TypeError(f"{result!r} is no result of a command")
+        self._end(command, result, now)
+
+    def _refused(self, device: Device, error: Refused, now: float, time: int) -> None:
+        self._results.answered(device, now, time)
+        device.record.count_refusal(error)
+
+    def _pause(self, device: Device) -> None:
+        """After a broadcast the stations need time to take it in, and none replies."""
+        self._effects.pause(device.turnaround.configured or BROADCAST_PAUSE)
+
+    def _end(self, request: Request, outcome: Outcome, now: float) -> None:
+        self._effects.ended(request, outcome)
+        if isinstance(request, Write):
+            request.device.record.count_write(now - request.submitted)
+            poll = self._schedule.reader(request.device, request.tag)
+            if poll is not None:
+                self._schedule.expedite(poll)  # the new value is read at once

@@ -1,0 +1,116 @@
+"""Performs one job on an open transaction: the driver's calls, in their order, and no decision."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from gateway.engine.device import Device
+from gateway.engine.jobs import (
+    Answer,
+    Confirm,
+    Poll,
+    Probe,
+    Repeat,
+    Result,
+    Resynced,
+    Sent,
+    Settle,
+    Settled,
+    Transacted,
+    WriteTogether,
+)
+from gateway.engine.requests import Command, Write
+from gateway.errors import BadValue, DeviceError, Evidence, LineDown, Refused, Unclear, Unsteady
+from gateway.line.transaction import Transaction
+from gateway.planning.planner import Block
+from gateway.protocols.driver import Controllable, Monitor, ScatteredWriter, Talk
+
+DIFFER = "two readings in a row differ; verify_reads is for values that change slowly"
+
+
+async def perform(job: Transacted, transaction: Transaction) -> Result:
+    """The result of the job. Every error of a device or the port is a result."""
+    try:
+        if isinstance(job, Poll):
+            device, block = job.device, job.block
+            if block.listed or device.settings.verify_reads > 1:
+                return await read_with_care(transaction, device, block, register=job.register)
+            return await device.driver.read(transaction, block.span)
+        return await _perform(job, transaction)
+    except (DeviceError, BadValue, LineDown) as error:
+        return error
+
+
+async def _perform(job: Transacted, transaction: Transaction) -> Result:
+    driver: Any = job.device.driver
+    match job:
+        case Settle(guard=guard, gap=gap):
+            return Settled(await transaction.settle(guard, gap))
+        case Probe(outstanding=outstanding, token=token):
+            return Resynced(await driver.resync(transaction, outstanding, token))
+        case Write() | Repeat():
+            return await _write(job.write if isinstance(job, Repeat) else job, transaction)
+        case WriteTogether(writes=writes) if isinstance(driver, ScatteredWriter):
+            parts = [(write.tag.span, write.units) for write in writes]
+            return Sent(await driver.write_scattered(transaction, parts))
+        case Confirm():
+            return await _confirm(job, transaction)
+        case Command(name=name, argument=argument) if isinstance(driver, Controllable):
+            return await driver.control(transaction, name, argument)
+        case Answer(frame=frame):
+            await transaction.tell(frame)
+            return None
+    raise TypeError(f"{job.device.name} cannot perform {job!r}")
+
+
+async def read_with_care(
+    talk: Talk[Any], device: Device, block: Block, *, register: bool = False
+) -> Sequence[int]:
+    """The units of the block, read as often as `verify_reads` says.
+
+    `register`: give the PLC its monitor list first. Raises `Unsteady` where two reads differ: a
+    check sum does not see everything.
+    """
+    driver = device.driver
+    if register and isinstance(driver, Monitor):
+        await driver.register(talk, block.listed)
+    units = await _read_once(talk, device, block)
+    for _ in range(1, device.settings.verify_reads):
+        if list(await _read_once(talk, device, block)) != list(units):
+            raise Unsteady(DIFFER, evidence=Evidence.CHECKSUM)
+    return units
+
+
+async def _read_once(talk: Talk[Any], device: Device, block: Block) -> Sequence[int]:
+    driver = device.driver
+    if not block.listed or not isinstance(driver, Monitor):
+        return await driver.read(talk, block.span)
+    parts = await driver.read_registered(talk, block.listed)
+    return [unit for part in parts for unit in part]
+
+
+async def _write(write: Write, talk: Talk[Any]) -> Sent:
+    """One write, with all that its tag asks for. A bit is changed in the word as it is."""
+    driver, tag = write.device.driver, write.tag
+    units = write.units
+    if tag.address.bit is not None:
+        (word,) = await driver.read(talk, tag.span)
+        bit = 1 << tag.address.bit
+        units = [word | bit if write.units[0] else word & ~bit]
+    acknowledged = await driver.write(talk, tag.span, units)
+    if not acknowledged or tag.write is None or not tag.write.verify:
+        return Sent(acknowledged)
+    try:
+        return Sent(held=await driver.read(talk, tag.span))
+    except Refused as error:
+        return Sent(refused_back=error)
+
+
+async def _confirm(job: Confirm, talk: Talk[Any]) -> Sent:
+    driver, tag = job.device.driver, job.write.tag
+    try:
+        await driver.resync(talk, job.outstanding, job.token)
+    except Refused as error:
+        raise Unclear(f"nor what it says to a question about it: {error}") from error
+    if tag.write is None or not tag.write.verify:
+        return Sent()
+    return Sent(held=await driver.read(talk, tag.span))

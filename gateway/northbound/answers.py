@@ -1,0 +1,146 @@
+"""The threads that send replies, and the room for queries.
+
+A reply blocks while its client does not receive, so no reply is sent on the event loop. Queries
+for one key are answered on `narrow` threads; wildcards and history, on `wide` threads, must not
+delay them.
+"""
+
+import asyncio
+import threading
+import time
+from collections.abc import Callable, Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+
+import structlog
+import zenoh
+
+log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
+
+Answer = Callable[[zenoh.Query], None]
+
+OPEN_LIMIT = 1024  # queries taken and not finished
+WIDE_LIMIT = 64  # of these, wildcards and history
+REFUSALS_LIMIT = 256  # error replies in progress; beyond, a query ends without a reply
+CLOSE_TIMEOUT = 0.5  # seconds for the replies in progress when the gateway ends
+
+
+@dataclass(slots=True)
+class QueryCounters:
+    """Counters since the start."""
+
+    queries: int = 0
+    refused: int = 0  # because too many queries were open
+    unanswered: int = 0  # refused without an error reply
+
+
+class AnswerPool:
+    """Bounds the open queries and sends every reply on a thread."""
+
+    def __init__(self, refuse: Answer) -> None:
+        """`refuse` replies that the gateway is busy; it is called on an answering thread."""
+        self.counters = QueryCounters()
+        self._reply_busy = refuse
+        self._open = threading.Semaphore(OPEN_LIMIT)
+        self._open_wide = threading.Semaphore(WIDE_LIMIT)
+        self._refusals = threading.Semaphore(REFUSALS_LIMIT)
+        self._narrow = ThreadPoolExecutor(3, "zenoh answers")
+        self._wide = ThreadPoolExecutor(2, "zenoh snapshots")
+        self._batch: list[tuple[zenoh.Query, Answer]] = []
+        self._closing = False
+
+    # -- event loop --
+
+    def admit(self, query: zenoh.Query) -> bool:
+        """Takes the query in; False if there is no room and the query is refused."""
+        self.counters.queries += 1
+        if self._closing or not self._open.acquire(blocking=False):
+            self.refuse(query)
+            return False
+        return True
+
+    def admit_wide(self, query: zenoh.Query) -> bool:
+        """Takes the room of an admitted wide query, until `release_wide`; False if the query is
+        refused."""
+        if self._open_wide.acquire(blocking=False):
+            return True
+        self._open.release()
+        self.refuse(query)
+        return False
+
+    def release_wide(self) -> None:
+        self._open_wide.release()
+
+    def answer(self, query: zenoh.Query, answer: Answer) -> None:
+        """Answers an admitted query. The answers of one loop turn go to a thread together."""
+        self._batch.append((query, answer))
+        if len(self._batch) == 1:
+            asyncio.get_running_loop().call_soon(self._flush)
+
+    def answer_wide(self, query: zenoh.Query, answer: Answer) -> None:
+        """Answers an admitted query on a thread for wide ones, if there is room."""
+        if not self.admit_wide(query):
+            return
+        future = self._wide.submit(self._finish, query, answer)
+        future.add_done_callback(lambda _: self._open_wide.release())
+        future.add_done_callback(_report)
+
+    def close(self) -> None:
+        """Refuses every query from now on."""
+        self._closing = True
+
+    async def drain(self) -> None:
+        """Waits until all open queries are answered, at most `CLOSE_TIMEOUT`."""
+        until = time.monotonic() + CLOSE_TIMEOUT
+        for _ in range(OPEN_LIMIT):
+            while not self._open.acquire(blocking=False):
+                if time.monotonic() > until:
+                    return
+                await asyncio.sleep(0.01)
+
+    def end(self) -> None:
+        """Ends the threads, after the session is closed."""
+        self._narrow.shutdown(wait=False, cancel_futures=True)
+        self._wide.shutdown(wait=False, cancel_futures=True)
+
+    def _flush(self) -> None:
+        batch, self._batch = self._batch, []
+        self._narrow.submit(self._finish_all, batch).add_done_callback(_report)
+
+    # -- any thread --
+
+    def refuse(self, query: zenoh.Query) -> None:
+        """Replies busy, or ends the query without a reply if too many error replies wait."""
+        self.counters.refused += 1
+        if self._closing or not self._refusals.acquire(blocking=False):
+            self.counters.unanswered += 1
+            query.drop()  # type: ignore[no-untyped-call]  # Zenoh's stub lacks it
+            return
+        self._narrow.submit(self._refuse, query).add_done_callback(_report)
+
+    # -- answering threads --
+
+    def _refuse(self, query: zenoh.Query) -> None:
+        try:
+            with query:
+                self._reply_busy(query)
+        finally:
+            self._refusals.release()
+
+    def _finish_all(self, batch: Iterable[tuple[zenoh.Query, Answer]]) -> None:
+        for query, answer in batch:
+            self._finish(query, answer)
+
+    def _finish(self, query: zenoh.Query, answer: Answer) -> None:
+        try:
+            with query:
+                answer(query)
+        except zenoh.ZError as error:
+            log.debug("reply failed", error=str(error))
+        finally:
+            self._open.release()
+
+
+def _report(future: Future[None]) -> None:
+    if not future.cancelled() and (error := future.exception()):
+        log.error("answer crashed", exc_info=error)

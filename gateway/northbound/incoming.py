@@ -1,0 +1,147 @@
+"""Everything that clients send to this gateway: queries and puts, from declaration to end."""
+
+from collections.abc import Callable
+from dataclasses import asdict
+from typing import TypeVar
+
+import zenoh
+
+from gateway.northbound.audit import Audit
+from gateway.northbound.commands import Commands
+from gateway.northbound.inbox import Inbox
+from gateway.northbound.interfaces import History, Plant
+from gateway.northbound.keys import Keys
+from gateway.northbound.queries import Queries, StatusDocuments
+from gateway.northbound.replies import Replies
+from gateway.northbound.tag_index import TagIndex
+from gateway.northbound.writers import Writers
+from gateway.northbound.writes import PutWrites, Writes
+
+T = TypeVar("T")
+
+
+class Incoming:
+    """Made once; `start` connects it to the open session. Belongs to the event loop."""
+
+    def __init__(
+        self,
+        keys: Keys,
+        plant: Plant,
+        index: TagIndex,
+        audit: Audit,
+        documents: StatusDocuments,
+        history: History | None,
+        writers: Writers | None,
+    ) -> None:
+        self._keys = keys
+        self._plant = plant
+        self._index = index
+        self._audit = audit
+        self._documents = documents
+        self._history = history
+        self._writers = writers
+        self._queries: Queries | None = None
+        self._puts: PutWrites | None = None
+
+    def counters(self) -> dict[str, int]:
+        """Queries and puts since the start."""
+        counted = {"refusals_untold": self._audit.suppressed}
+        if self._queries is not None:
+            counted |= asdict(self._queries.counters)
+        if self._puts is not None:
+            counted["puts_refused"] = self._puts.refused
+        return counted
+
+    def start(self, session: zenoh.Session) -> "Declarations":
+        """Returns the declarations that send queries and puts here."""
+        stamp = session.new_timestamp
+        writes = Writes(self._plant, self._index, self._audit, self._writers)
+        commands = Commands(self._keys, self._plant, stamp, self._audit, self._writers)
+        replies = Replies(self._keys, self._plant, self._index, stamp, self._history)
+        self._queries = Queries(
+            self._plant, self._index, writes, commands, replies, self._documents
+        )
+        self._puts = PutWrites(writes, self._index)
+        queries = Inbox(self._queries.take, self._queries.refuse)
+        puts = Inbox(self._puts.take, self._puts.refuse)
+        return Declarations(session, self._keys, self._command_keys(), self._index, queries, puts)
+
+    async def close(self) -> None:
+        """Ends what waits for devices; replies that are on their way get half a second."""
+        if self._puts is not None:
+            self._puts.close()
+        if self._queries is not None:
+            await self._queries.close()
+
+    def end(self) -> None:
+        """Ends the answering threads, after the session is closed."""
+        if self._queries is not None:
+            self._queries.end()
+
+    def _command_keys(self) -> list[str]:
+        """One key per device and command; the commands to a line lie under the status keys."""
+        return [
+            self._keys.command(device, command)
+            for device, commands in self._plant.commands().items()
+            for command in sorted(commands)
+        ]
+
+
+class Declarations:
+    """Declares queryables, subscribers and tokens. Each call blocks: not on the event loop.
+
+    Zenoh undeclares an object that is no longer referenced, so the caller keeps the results.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        keys: Keys,
+        command_keys: list[str],
+        index: TagIndex,
+        queries: Inbox[zenoh.Query],
+        puts: Inbox[zenoh.Sample],
+    ) -> None:
+        self._session = session
+        self._keys = keys
+        self._command_keys = command_keys
+        self._devices = index.devices
+        self._queries = queries
+        self._puts = puts
+
+    def status(self) -> list[object]:
+        """Declares the status keys; a standby gateway answers them too."""
+        return [self._queryable(self._keys.statuses, complete=False)]
+
+    def plant(self) -> list[object]:
+        """Declares values, writes and commands; only the active gateway answers them.
+
+        Values are not `complete`: other gateways may share the prefix, and Zenoh is to query all
+        of them. A device has one gateway, so its writes go to one queryable only.
+        """
+        shared = [self._keys.values, self._keys.late, self._keys.metas]
+        if any(device.blocks for device in self._devices):
+            shared.append(self._keys.blocks)
+        return [
+            *(self._queryable(key, complete=False) for key in shared),
+            *(self._queryable(self._keys.sets(d.name), complete=True) for d in self._devices),
+            *(self._queryable(key, complete=True) for key in self._command_keys),
+            self._session.declare_subscriber(
+                f"{self._keys.values}/@set",
+                _direct(self._puts),
+                allowed_origin=zenoh.Locality.REMOTE,
+            ),
+        ]
+
+    def token(self) -> list[object]:
+        """Declares the gateway's liveliness token."""
+        return [self._session.liveliness().declare_token(self._keys.own)]
+
+    def _queryable(self, key: str, *, complete: bool) -> object:
+        return self._session.declare_queryable(key, _direct(self._queries), complete=complete)
+
+
+def _direct(inbox: Callable[[T], None]) -> "zenoh.handlers.Callback[T]":
+    """Runs on Zenoh's receiving thread: an inbox only appends, so it needs no thread per
+    declaration."""
+    return zenoh.handlers.Callback(inbox, indirect=False)

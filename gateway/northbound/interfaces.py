@@ -1,0 +1,83 @@
+"""The parts of the gateway that the Zenoh side uses: its plant and its history."""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Literal, Protocol
+
+from gateway.engine.requests import CommandResult
+from gateway.tags import Sample, Tag, WriteResult
+from gateway.values import Value
+
+
+class Device(Protocol):
+    """One device and its tags."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def tags(self) -> Iterable[Tag]: ...
+
+    @property
+    def blocks(self) -> bool | Literal["only"]:
+        """True: each scan is also published as one `@block`. "only": single values are not."""
+
+
+class Plant(Protocol):
+    """The devices, their samples, writes and commands. All but `sample` on the event loop."""
+
+    def devices(self) -> Iterable[Device]: ...
+
+    def tag(self, key: str) -> Tag | None:
+        """Finds a tag by `device/name`."""
+
+    def sample(self, tag: Tag) -> Sample:
+        """Returns the current sample. Answering threads call it too: one look-up, nothing else.
+
+        The plant updates it before it calls `Northbound.publish`; otherwise a reader could keep
+        the older of two values.
+        """
+
+    def mark_published(self, samples: Sequence[Sample]) -> None:
+        """Notes samples that are about to be published again: later changes are measured against
+        them."""
+
+    async def write(self, tag: Tag, value: Value) -> WriteResult:
+        """Returns when the device has acknowledged. Raises `GatewayError`; `Busy` and `BadValue`
+        only when nothing was sent. Cancelled when the client no longer waits."""
+
+    def commands(self) -> Mapping[str, frozenset[str]]:
+        """By device: the commands of its protocol, allowed or not."""
+
+    def speaker(self, line: str) -> str:
+        """Returns the device that sends a command to all stations of a line. Raises `BadValue`."""
+
+    async def control(self, device: str, command: str, argument: str) -> CommandResult:
+        """Returns the device's answer. Raises `GatewayError`; `BadValue` before anything is
+        sent."""
+
+    def is_fresh(self, tag: Tag, max_age: float) -> bool:
+        """True if the current sample is younger than `max_age` seconds, or cannot be read now."""
+
+    async def fresh(self, tag: Tag, max_age: float) -> Sample:
+        """Returns the current sample if it `is_fresh`, otherwise reads the device. Raises `Busy`
+        when the line did not get to it in time."""
+
+    def status(self) -> Mapping[str, Mapping[str, object]]:
+        """Documents by path: `status`, `lines/<line>`, `devices/<device>`."""
+
+
+class History(Protocol):
+    """Recorded samples, found by Zenoh's time ranges; `now`: ns since 1970, when the query came."""
+
+    def samples(self, tag: Tag, time_range: str, limit: int | None, now: int) -> Iterator[Sample]:
+        """The first `limit` samples in the order of time; called from an answering thread.
+
+        Raises `BadValue` for a range that cannot be parsed, and `Busy`, also in the middle, when
+        the file cannot be read now.
+        """
+
+    def writes(self, time_range: str, limit: int | None, now: int) -> Iterator[str]:
+        """Outcomes of writes and commands, as on the `writes` key. Raises like `samples`."""
+
+    def record_write(self, time: int, outcome: str) -> None:
+        """Records one outcome, as on the `writes` key; `time`: ns since 1970. Never blocks."""

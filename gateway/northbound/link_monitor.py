@@ -1,0 +1,56 @@
+"""The links of the session: counted, logged, and watched for their return."""
+
+import asyncio
+import time
+
+import structlog
+import zenoh
+
+from gateway.northbound.inbox import Inbox
+from gateway.northbound.rate_limit import RateLimit
+
+log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
+
+_MOST_LOST = 256  # lost links that are remembered
+
+
+class LinkMonitor:
+    """Sets `returned` when a router, or a session that was linked before, is linked again."""
+
+    def __init__(self) -> None:
+        self.returned = asyncio.Event()
+        self._up: dict[str, str] = {}  # kind of each linked session, by its id
+        self._lost: dict[str, None] = {}  # ids of sessions that are gone, oldest first
+        self._log_limit = RateLimit(100, 1.0)  # any client can link as often as it likes
+
+    def __len__(self) -> int:
+        return len(self._up)
+
+    def kinds(self) -> list[str]:
+        """`router`, `peer` or `client` for each link."""
+        return sorted(self._up.values())
+
+    def declare(self, session: zenoh.Session, inbox: Inbox[zenoh.TransportEvent]) -> object:
+        return session.info.declare_transport_events_listener(
+            zenoh.handlers.Callback(inbox, indirect=False), history=True
+        )
+
+    def take(self, event: zenoh.TransportEvent) -> None:
+        """Handles one event on the event loop."""
+        session, kind = str(event.transport.zid), str(event.transport.whatami)
+        is_up = event.kind != zenoh.SampleKind.DELETE
+        if self._log_limit.allows(time.monotonic()):
+            log.info("Zenoh link up" if is_up else "Zenoh link down", to=kind, id=session)
+        if is_up:
+            self._linked(session, kind)
+        else:
+            self._up.pop(session, None)
+            self._lost[session] = None
+            if len(self._lost) > _MOST_LOST:
+                del self._lost[next(iter(self._lost))]
+
+    def _linked(self, session: str, kind: str) -> None:
+        self._up[session] = kind
+        if kind == "router" or session in self._lost:
+            self._lost.pop(session, None)
+            self.returned.set()

@@ -1,0 +1,169 @@
+"""Hot standby on Zenoh: declares and observes the liveliness tokens that `election` decides by.
+
+A router does not pass on messages between two peers, and gateways are peers. So a gateway that
+connects to other sessions declares and observes its tokens in a second session, as a client.
+"""
+
+import asyncio
+import json
+import time
+from contextlib import suppress
+from dataclasses import dataclass
+
+import structlog
+import zenoh
+
+from gateway.northbound.election import Election, Role, RoleToken, State
+from gateway.northbound.inbox import Inbox
+from gateway.northbound.keys import Keys
+from gateway.northbound.session import as_client, off_loop, opened
+
+log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
+
+_DECIDE_EVERY = 0.2  # seconds
+_QUERY_TIMEOUT = 0.4  # seconds
+_DECISIONS_WITHOUT_LINK = 15  # until the missing link is logged
+_TOKENS = {State.CLAIMING: (Role.CLAIM,), State.ACTIVE: (Role.CLAIM, Role.ACTIVE)}
+
+
+@dataclass(frozen=True, slots=True)
+class StandbySettings:
+    """`group`: shared by the gateways of one plant. `alone`: seconds, see `Election`."""
+
+    group: str
+    alone: float | None = None
+
+
+class Standby:
+    """Sets `active` when this gateway may open its lines, `replaced` when it must close them.
+
+    Without settings it is `enabled` false, and active at once and for ever.
+    """
+
+    def __init__(self, settings: StandbySettings | None, keys: Keys, config: zenoh.Config) -> None:
+        """`config`: of the gateway's own session."""
+        self.enabled = settings is not None
+        self.active = asyncio.Event()
+        self.replaced = asyncio.Event()
+        self._settings = settings or StandbySettings("")
+        if not self.enabled:
+            self.active.set()
+        self._keys = keys
+        connects = json.loads(config.get_json("connect/endpoints")) not in ([], {}, None)
+        self._config = as_client(config) if connects and self.enabled else None
+        self._election: Election | None = None
+        self._session: zenoh.Session | None = None  # of the tokens
+        self._tokens: dict[Role, zenoh.LivelinessToken] = {}
+        self._declared: list[object] = []  # Zenoh undeclares an object without a reference
+
+    def documents(self) -> dict[str, dict[str, object]]:
+        """The status document; none without a standby group."""
+        if not self.enabled:
+            return {}
+        state = State.STANDBY if self._election is None else self._election.state
+        others = [] if self._election is None else self._election.others_active()
+        group = self._settings.group
+        return {"standby": {"group": group, "stand": state.value, "others_active": others}}
+
+    async def run(self, session: zenoh.Session) -> None:
+        """Runs until cancelled. `session` is the gateway's own. Raises `GatewayError`, `ZError`."""
+        if not self.enabled:
+            return
+        election = self._election = Election(
+            self._keys.gateway,
+            str(session.zid()),
+            time.monotonic(),
+            needs_link=self._config is not None,
+            alone=self._settings.alone,
+        )
+        opening = asyncio.create_task(self._open(session, election))
+        try:
+            await self._decide(election, opening)
+        finally:
+            opening.cancel()
+            with suppress(asyncio.CancelledError):
+                await opening
+            own = self._session
+            if own is not None and own is not session:
+                await off_loop(own.close)
+
+    async def _open(self, session: zenoh.Session, election: Election) -> None:
+        """Opens the session of the tokens, if it is another one, and observes the group."""
+        found = session if self._config is None else await opened(self._config, retry=True)
+
+        def token_changed(sample: zenoh.Sample) -> None:
+            if token := _parse_token(str(sample.key_expr)):
+                election.token_changed(token, sample.kind == zenoh.SampleKind.PUT)
+
+        def link_changed(event: zenoh.TransportEvent) -> None:
+            linked, kind = str(event.transport.zid), str(event.transport.whatami)
+            is_up = event.kind != zenoh.SampleKind.DELETE
+            election.link_changed(linked, is_up, kind == "router", time.monotonic())
+
+        tokens = zenoh.handlers.Callback(Inbox(token_changed, lambda _: None), indirect=False)
+        links = zenoh.handlers.Callback(Inbox(link_changed, lambda _: None), indirect=False)
+        self._session = found
+
+        def declare() -> list[object]:
+            return [
+                found.info.declare_transport_events_listener(links, history=True),
+                found.liveliness().declare_subscriber(self._group_keys, tokens, history=True),
+            ]
+
+        self._declared = await off_loop(declare)
+
+    async def _decide(self, election: Election, opening: asyncio.Task[None]) -> None:
+        def token_found(reply: zenoh.Reply) -> None:
+            if reply.ok and (token := _parse_token(str(reply.ok.key_expr))):
+                election.token_found(token, time.monotonic())
+
+        replies = Inbox(token_found, lambda _: None)
+        without_link = 0
+        while True:
+            if opening.done():
+                opening.result()
+            before, state = election.state, election.decide(time.monotonic())
+            if state is not before:
+                log.info("standby state changed", group=self._settings.group, state=state.value)
+            await self._update_tokens(election, state)
+            if state is State.ACTIVE:
+                self.active.set()
+            if state is State.REPLACED and not self.replaced.is_set():
+                log.error("gateway replaced", why="another gateway of the group may be active")
+                self.replaced.set()
+            without_link = without_link + 1 if election.waits_for_link else 0
+            if without_link == _DECISIONS_WITHOUT_LINK:
+                log.warning("standby link missing", so="the gateway waits for the network")
+            if election.needs_query and self._session is not None:
+                await off_loop(self._query_tokens, self._session, replies)
+            await asyncio.sleep(_DECIDE_EVERY)
+
+    async def _update_tokens(self, election: Election, state: State) -> None:
+        """Declares and undeclares tokens until they are those of the state."""
+        session = self._session
+        if session is None or state is State.REPLACED:
+            return  # replaced: the token stays until the lines are really closed
+        wanted = _TOKENS.get(state, ())
+        for role in [role for role in self._tokens if role not in wanted]:
+            await off_loop(self._tokens.pop(role).undeclare)
+        for role in wanted:
+            if role not in self._tokens:
+                group, name = self._settings.group, self._keys.gateway
+                key = self._keys.role_token(group, role.value, name, election.session)
+                self._tokens[role] = await off_loop(session.liveliness().declare_token, key)
+
+    @property
+    def _group_keys(self) -> str:
+        return f"{self._keys.group(self._settings.group)}/**"
+
+    def _query_tokens(self, session: zenoh.Session, replies: Inbox[zenoh.Reply]) -> None:
+        """Queries the tokens besides subscribing to them, so that one lost message does no
+        harm."""
+        handler = zenoh.handlers.Callback(replies, indirect=False)
+        session.liveliness().get(self._group_keys, handler, timeout=_QUERY_TIMEOUT)
+
+
+def _parse_token(key: str) -> RoleToken | None:
+    """`…/@standby/<group>/<role>/<name>/<session>`"""
+    *_, role, name, session = key.split("/")
+    return RoleToken(Role(role), name, session) if role in list(Role) else None
