@@ -33,9 +33,9 @@ from gateway.config.yaml_file import read_yaml
 from gateway.engine.device import DeviceSettings
 from gateway.history import Historian
 from gateway.northbound import StandbySettings, payload
-from gateway.northbound.standby import Standby
 from gateway.northbound.keys import Keys
 from gateway.northbound.payload import Problem
+from gateway.northbound.standby import Standby
 from gateway.protocols.registry import PROTOCOLS
 from gateway.tags import Reason, WriteResult, bad, good
 from tests.e2e.processes import ROOT, Program, plc_gateway, started, until
