@@ -73,7 +73,7 @@ class Counting:
     def samples(self, samples: Sequence[Sample]) -> None:
         self.count += len(samples)
 
-    def alive(self, device: Device, alive: bool) -> None:
+    def online(self, device: Device, online: bool) -> None:
         pass
 
 

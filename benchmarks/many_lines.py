@@ -44,7 +44,7 @@ class Watching:
         self.samples_seen += len(samples)
         self._mirror.update(samples)
 
-    def alive(self, device: Device, alive: bool) -> None:
+    def online(self, device: Device, online: bool) -> None:
         pass
 
 

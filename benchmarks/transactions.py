@@ -77,7 +77,7 @@ class Counting:
             self.cpu = time.process_time()
             self.done.set()
 
-    def alive(self, device: Device, alive: bool) -> None:
+    def online(self, device: Device, online: bool) -> None:
         pass
 
 

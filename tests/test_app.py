@@ -117,7 +117,7 @@ async def test_a_bad_value_is_never_sent(tmp_path: Path, value: Any) -> None:
         with pytest.raises(BadValue):
             await watched.gateway.write(tag(watched, "recipe"), value)
         [line] = watched.gateway.lines
-        assert line.devices[0].record.writes == 0
+        assert line.engine.devices[0].record.writes == 0
 
 
 async def test_a_write_to_a_line_that_is_not_open_fails_at_once(tmp_path: Path) -> None:
@@ -133,7 +133,7 @@ async def test_a_disabled_device_is_never_spoken_to(tmp_path: Path) -> None:
         with pytest.raises(Offline, match="device mixer is disabled"):
             await gateway.write(tag(watched, "recipe"), 7)
         assert (await gateway.fresh(tag(watched, "speed"), 0.0)).reason is Reason.DISABLED
-        assert [line.devices for line in gateway.lines] == [[]]
+        assert [line.engine.devices for line in gateway.lines] == [[]]
 
 
 async def test_a_fresh_value_is_read_now(tmp_path: Path) -> None:
@@ -227,8 +227,10 @@ async def test_where_the_clock_does_not_tell_which_reading_it_was_another_follow
     watched = made(tmp_path)
     gateway, speed, hastened = watched.gateway, tag(watched, "speed"), list[Tag]()
     [line] = gateway.lines
-    [poll] = [p for p in line.polls(line.devices[0]) if speed in p.block.tags]
-    line.is_open = True
+    [poll] = [
+        p for p in line.engine.schedule.polls(line.engine.devices[0]) if speed in p.block.tags
+    ]
+    line.engine.is_open = True
     line.refresh = lambda _, tag: hastened.append(tag)  # type: ignore[method-assign]
     poll.asked = 7.0
     asking = asyncio.create_task(gateway.fresh(speed, 0.0))
@@ -304,5 +306,5 @@ def test_the_plan_is_that_of_the_running_lines(tmp_path: Path) -> None:
     [expected] = forecasts(watched.gateway.config)
     [line] = watched.gateway.lines
     assert [row.block.span for row in expected.blocks] == [
-        block.span for device in line.devices for block in device.blocks
+        block.span for device in line.engine.devices for block in device.blocks
     ]

@@ -90,10 +90,10 @@ async def test_seed_0_busy_hastened_polls_leave_no_places_behind() -> None:
     async with running(hall):
         await asyncio.sleep(2)
         for _ in range(1000):
-            hall.line.refresh(mixer, mixer.tags[0])
+            hall.line.expedite(mixer, mixer.tags[0])
             await asyncio.sleep(0.1)
         assert len(hall.reads(mixer)) > 900
-        assert len(hall.line._schedule._waiting) < 100
+        assert len(hall.line.engine.schedule._waiting) < 100
 
 
 @on_virtual_time
@@ -130,7 +130,7 @@ async def test_seeds_0_and_2_lean_stations_are_left_time_to_take_in_what_goes_to
     said: list[str | GatewayError] = []
     async with running(hall):
         await asyncio.sleep(5)
-        assert (mixer.reckoned or 1.0) < 0.02  # measured
+        assert (mixer.turnaround.expected or 1.0) < 0.02  # measured
         hall.line.command(mixer, "global", "on", said.append)
         await asyncio.sleep(1)
     place = next(i for i, (_, data) in enumerate(hall.bench.sent) if data[5:7] == b"GW")
@@ -163,7 +163,7 @@ def test_seed_13_storm_polls_that_come_and_go_behind_a_late_one_leave_no_places(
     schedule, now = Schedule([greedy, modest], 0.0), 0.0
     for each in (greedy, modest):
         each.answered()
-        schedule.woke(each, now)
+        schedule.came_online(each, now)
     for _ in range(2000):
         now += 0.5
         greedy.used(now, now - 5.0)
@@ -179,7 +179,7 @@ def test_seed_7_lean_polls_that_were_planned_anew_leave_no_places() -> None:
     mixer = device(words(100, 2, every=86_400.0))
     schedule = Schedule([mixer], 0.0)
     mixer.answered()
-    schedule.woke(mixer, 0.0)
+    schedule.came_online(mixer, 0.0)
     job = schedule.next(0.0)
     assert isinstance(job, Poll)
     schedule.polled(job, 0.0)

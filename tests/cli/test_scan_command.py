@@ -28,7 +28,10 @@ def test_scan_prints_a_configuration_of_the_stations_found(tmp_path: Path) -> No
     ("options", "says"),
     [
         (["--protocol", "vigor"], "--port"),
-        (["--port", "COM3", "--protocol", "frames"], "scan cannot look for frames: use one of vigor"),
+        (
+            ["--port", "COM3", "--protocol", "frames"],
+            "scan cannot look for frames: use one of vigor",
+        ),
         (["--port", "COM3", "--protocol", "vigor", "--baud", "fast"], "'fast' is no number"),
     ],
 )

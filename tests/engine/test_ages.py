@@ -22,7 +22,7 @@ def answering(station: int, *intervals: float) -> Device:
         make_tag(f"D{66 * n}", every=every, write=WriteRule()) for n, every in enumerate(intervals)
     ]
     found = device(tags, station=station)
-    found.answered()
+    found.health.answered()
     return found
 
 
@@ -42,9 +42,9 @@ def ages(devices: list[Device], seconds: float, written: Device | None = None) -
     """The worst of each poll, on a wire that takes what is reckoned. `written`: all the time."""
     schedule, now, worst = Schedule(devices, 0.0), 0.0, dict[Poll, float]()
     while now < seconds:
-        if written is not None and not schedule.orders:
+        if written is not None and not schedule.requests:
             write = Write(written, written.tags[0], [1], now, now + 99, lambda _: None)
-            schedule.orders.submit(write)
+            schedule.requests.submit(write)
         match schedule.next(now):
             case Poll(device=of, last_good=before) as poll:
                 begun = now
@@ -59,7 +59,7 @@ def ages(devices: list[Device], seconds: float, written: Device | None = None) -
             case Idle(until):
                 now = until if written is None else now + 0.001
     polls = [poll for device in devices for poll in schedule.polls(device)]
-    return {poll: worst.get(poll, now - (poll.last_good or 0.0)) for poll in polls}
+    return {poll: worst.get(poll, now - (poll.last.at or 0.0)) for poll in polls}
 
 
 def over(found: dict[Poll, float]) -> float:

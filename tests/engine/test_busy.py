@@ -3,12 +3,12 @@
 import asyncio
 from dataclasses import replace
 
-from gateway.engine.device import Device, Standing
+from gateway.engine.health import State
 from gateway.engine.results import BUSY_PAUSE
 from gateway.protocols.modbus import ModbusRtu
 from gateway.stations.modbus import ModbusStation
 from gateway.tags import Quality, Reason
-from tests.sim.plant import WIRE, Bench, Plant, Unruly, make_tag, running
+from tests.sim.plant import WIRE, Bench, Plant, Unruly, made_device, make_tag, running
 from tests.sim.virtual import on_virtual_time
 
 READ, BUSY = 3, 6
@@ -23,7 +23,7 @@ def busy_plant() -> tuple[Plant, list[float], list[int]]:
     driver = ModbusRtu(station=1)
     tags = [make_tag(f"holding:{n}", driver, every=10.0) for n in range(10)]
     times = replace(driver.timing, retries=2)
-    dev = Device("plc", driver, WIRE, times, tuple(tags), 0.3)
+    dev = made_device("plc", driver, WIRE, times, tuple(tags), 0.3)
     station = _Patched(station=1)
     serve, asked, left = station._serve, list[float](), [0]
 
@@ -44,7 +44,7 @@ def busy_plant() -> tuple[Plant, list[float], list[int]]:
 @on_virtual_time
 async def test_busy_twice_is_asked_again_at_growing_pauses_and_no_value_turns_bad() -> None:
     line, asked, left = busy_plant()
-    (dev,) = line.devices
+    (dev,) = line.engine.devices
     async with running(line):
         await asyncio.sleep(5)
         assert line.good(dev)
@@ -55,14 +55,14 @@ async def test_busy_twice_is_asked_again_at_growing_pauses_and_no_value_turns_ba
         assert BUSY_PAUSE <= second - first < BUSY_PAUSE + 0.1
         assert 2 * BUSY_PAUSE <= third - second < 2 * BUSY_PAUSE + 0.1
         assert {sample.quality for _, sample in line.told} == {Quality.GOOD}
-        assert dev.standing is Standing.UP
+        assert dev.state is State.ONLINE
         assert dev.record.refusals == {"06": 2}
 
 
 @on_virtual_time
 async def test_a_device_that_stays_busy_has_bad_values_but_is_not_taken_apart() -> None:
     line, asked, left = busy_plant()
-    (dev,) = line.devices
+    (dev,) = line.engine.devices
     async with running(line):
         await asyncio.sleep(5)
         left[0] = 3
@@ -70,7 +70,7 @@ async def test_a_device_that_stays_busy_has_bad_values_but_is_not_taken_apart() 
         assert len(asked) == 3
         assert {line.reason(tag) for tag in dev.tags} == {Reason.REFUSED}
         assert "busy" in line.now[dev.tags[0]].detail
-        assert dev.refusals.bad == {}
+        assert dev.bad_addresses.bad == {}
         assert len(dev.blocks) == 1
         await asyncio.sleep(12)
         assert line.good(dev)

@@ -2,12 +2,13 @@
 
 import pytest
 
-from gateway.engine.device import Device, Standing
+from gateway.engine.device import Device
+from gateway.engine.health import State
 from gateway.errors import Evidence, Garbled, NoReply, Unclear
 from gateway.protocols.driver import Span
 from gateway.protocols.modbus import ModbusRtu
 from gateway.tags import Reason
-from tests.sim.plant import WIRE, device, make_tag, words
+from tests.sim.plant import WIRE, device, made_device, make_tag, words
 
 
 @pytest.fixture
@@ -18,46 +19,51 @@ def dev() -> Device:
 def test_a_device_starts_in_doubt_for_answers_to_an_earlier_gateway_may_still_come(
     dev: Device,
 ) -> None:
-    assert dev.standing is Standing.STARTING
-    assert dev.doubtful
-    assert not dev.served
+    assert dev.state is State.STARTING
+    assert dev.health.needs_resync
+    assert not dev.health.online
 
 
 def test_an_answer_ends_all_doubt(dev: Device) -> None:
     dev.failed(NoReply("silence"), Span("D", 0, 10), 0.0)
-    dev.answered()
-    assert (dev.standing, dev.failures, dev.doubtful, dev.doubt) == (Standing.UP, 0, False, None)
+    dev.health.answered()
+    assert (dev.state, dev.failures, dev.health.needs_resync, dev.health.outstanding) == (
+        State.ONLINE,
+        0,
+        False,
+        None,
+    )
     assert dev.diagnosis() == ""
 
 
 def test_a_failure_of_a_device_that_answered_makes_it_failing(dev: Device) -> None:
-    dev.answered()
+    dev.health.answered()
     dev.failed(NoReply("silence"), Span("D", 0, 10), 0.0)
-    assert dev.standing is Standing.FAILING
-    assert dev.served
-    assert dev.doubtful
+    assert dev.state is State.FAILING
+    assert dev.health.online
+    assert dev.health.needs_resync
 
 
-@pytest.mark.parametrize("standing", [Standing.STARTING, Standing.SILENT])
-def test_a_failure_of_one_that_did_not_leaves_it_so(dev: Device, standing: Standing) -> None:
-    dev.standing = standing
+@pytest.mark.parametrize("standing", [State.STARTING, State.OFFLINE])
+def test_a_failure_of_one_that_did_not_leaves_it_so(dev: Device, standing: State) -> None:
+    dev.state = standing
     dev.failed(NoReply("silence"), None, 0.0)
-    assert dev.standing is standing
+    assert dev.state is standing
 
 
 def test_a_probe_that_fails_does_not_forget_what_may_still_be_answered(dev: Device) -> None:
     dev.failed(NoReply("silence"), Span("D", 0, 10), 0.0)
     dev.failed(NoReply("silence"), None, 0.0)
-    assert dev.doubt == Span("D", 0, 10)
+    assert dev.health.outstanding == Span("D", 0, 10)
 
 
 def test_a_reopened_line_leaves_the_doubt(dev: Device) -> None:
-    dev.answered()
-    dev.doubt = Span("D", 0, 10)
+    dev.health.answered()
+    dev.health.outstanding = Span("D", 0, 10)
     dev.start()
-    assert dev.standing is Standing.STARTING
-    assert dev.doubtful
-    assert dev.doubt == Span("D", 0, 10)
+    assert dev.state is State.STARTING
+    assert dev.health.needs_resync
+    assert dev.health.outstanding == Span("D", 0, 10)
 
 
 def test_who_is_slow_is_not_called_dead_when_nobody_waits_for_it(dev: Device) -> None:
@@ -104,26 +110,26 @@ def test_the_load_is_the_share_of_the_lines_time(dev: Device) -> None:
 def test_a_device_without_a_readable_tag_is_a_broadcast() -> None:
     everybody = ModbusRtu(station=0)
     tags = (make_tag("holding:1", everybody),)
-    assert Device("all", everybody, WIRE, everybody.timing, tags, 0.5).broadcast
+    assert made_device("all", everybody, WIRE, everybody.timing, tags, 0.5).broadcast
     assert not device([make_tag("D0")]).broadcast
 
 
 def test_a_device_without_tags_that_could_be_read_is_none() -> None:
     """It may be told to run and to stop: a late answer must not acknowledge the next command."""
     assert not device([]).broadcast
-    assert device([]).doubtful
+    assert device([]).health.needs_resync
 
 
 def test_nothing_is_planned_where_the_turnaround_is_as_it_was(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     dev, planned = device([make_tag("D0"), make_tag("D42")]), list[float]()
-    monkeypatch.setattr(Device, "plan", lambda self: planned.append(self.reckoned))
+    monkeypatch.setattr(Device, "plan", lambda self: planned.append(self.turnaround.expected))
     for turnaround in (0.030, 0.031, 0.029, 0.028, 0.040):
         dev.record.turnaround = turnaround
         dev.record.exchanges += 50
-        dev.learn()
-        assert dev.reckoned == turnaround
+        dev.learn_turnaround()
+        assert dev.turnaround.expected == turnaround
     assert planned == [0.030, 0.040]
 
 
@@ -133,19 +139,21 @@ def test_a_measured_turnaround_that_changes_the_optimum_plans_anew() -> None:
     assert len(dev.blocks) == 4
     dev.measured(0.060)
     dev.record.exchanges = 49
-    assert not dev.learn()
+    assert not dev.learn_turnaround()
     dev.record.exchanges = 50
-    assert dev.learn()
+    assert dev.learn_turnaround()
     assert len(dev.blocks) < 4
-    assert not dev.learn()
+    assert not dev.learn_turnaround()
 
 
 def test_a_turnaround_set_in_the_file_is_not_learned_over() -> None:
     known = device([make_tag("D0"), make_tag("D14"), make_tag("D28")])
-    dev = Device("plc", known.driver, known.wire, known.timing, known.tags, 0.5, turnaround=0.005)
+    dev = made_device(
+        "plc", known.driver, known.wire, known.timing, known.tags, 0.5, turnaround=0.005
+    )
     dev.measured(0.5)
     dev.record.exchanges = 1000
-    assert not dev.learn()
+    assert not dev.learn_turnaround()
 
 
 def test_a_measured_turnaround_is_reckoned_with_though_the_plan_stays() -> None:
@@ -155,9 +163,9 @@ def test_a_measured_turnaround_is_reckoned_with_though_the_plan_stays() -> None:
     dev.measured(0.060)
     dev.record.exchanges = 50
     before = dev.load
-    assert not dev.learn()
+    assert not dev.learn_turnaround()
     assert dev.blocks is blocks
-    assert (dev.reckoned, dev.turnaround) == (0.060, None)
+    assert (dev.turnaround.expected, dev.turnaround) == (0.060, None)
     assert dev.load > before
 
 

@@ -161,7 +161,7 @@ async def test_a_line_that_goes_down_meanwhile_makes_them_unclear_and_the_rest_n
         assert all(isinstance(outcome.once, LineDown) for outcome in waiting.values())
         line.bench.come_back()
         await asyncio.sleep(5)
-        assert all(len(outcome.said) == 1 for outcome in (outcomes | waiting).values())
+        assert all(len(outcome.outcomes) == 1 for outcome in (outcomes | waiting).values())
     assert line.stations[0].memory.read("D", 0) == [0]
 
 

@@ -6,15 +6,16 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from gateway.engine.device import Device, Standing
+from gateway.engine.device import Device
+from gateway.engine.health import State
 from gateway.engine.jobs import PAUSE_FIRST, PAUSE_LONGEST, Idle, Poll, Probe
-from gateway.engine.requests import WAITING_ORDERS, Write
-from gateway.engine.schedule import SILENT_SHARE, Schedule
+from gateway.engine.requests import MOST_WAITING, Write
+from gateway.engine.schedule import OFFLINE_SHARE, Schedule
 from gateway.errors import NoReply
 from gateway.planning.bad_addresses import RETRY
 from gateway.protocols.modbus import ModbusRtu
 from gateway.tags import WriteRule
-from tests.sim.plant import WIRE, device, make_tag
+from tests.sim.plant import WIRE, device, made_device, make_tag
 
 
 def up(*numbers: int, every: float = 1.0, station: int = 1) -> Device:
@@ -22,7 +23,7 @@ def up(*numbers: int, every: float = 1.0, station: int = 1) -> Device:
     found = device(
         [make_tag(f"D{n}", every=every, write=WriteRule()) for n in numbers], station=station
     )
-    found.answered()
+    found.health.answered()
     return found
 
 
@@ -45,7 +46,7 @@ def test_writes_go_first() -> None:
     dev = up(0)
     schedule = Schedule([dev], 0.0)
     mine = write(dev)
-    schedule.orders.submit(mine)
+    schedule.requests.submit(mine)
     assert schedule.next(0.0) is mine
     assert isinstance(schedule.next(0.0), Poll)
 
@@ -55,7 +56,7 @@ def test_but_not_twice_in_a_row_while_a_poll_is_due() -> None:
     schedule = Schedule([dev], 0.0)
     writes = [write(dev) for _ in range(4)]
     for one in writes:
-        schedule.orders.submit(one)
+        schedule.requests.submit(one)
     jobs: list[Any] = []
     for _ in range(6):
         jobs.append(schedule.next(0.0))
@@ -69,8 +70,8 @@ def test_a_write_does_not_wait_for_polls_that_are_not_to_be_asked_any_more() -> 
     """The second write goes at once when the poll that was due has been replaced meanwhile."""
     dev = up(0)
     schedule = Schedule([dev], 0.0)
-    schedule.orders.submit(write(dev))
-    schedule.orders.submit(second := write(dev))
+    schedule.requests.submit(write(dev))
+    schedule.requests.submit(second := write(dev))
     assert isinstance(schedule.next(0.0), Write)
     schedule.plan(dev, 0.0)
     schedule.polls(dev)[0].live = False
@@ -89,8 +90,8 @@ def test_what_somebody_wants_to_see_goes_before_other_polls() -> None:
     dev = up(0, 1000, 2000)
     schedule = Schedule([dev], 0.0)
     wanted = schedule.polls(dev)[2]
-    schedule.hasten(wanted)
-    schedule.hasten(wanted)
+    schedule.expedite(wanted)
+    schedule.expedite(wanted)
     assert served(schedule, 0.0) is wanted
     assert len({served(schedule, 0.0), served(schedule, 0.0)}) == 2
     assert schedule.next(0.0) == Idle(1.0)
@@ -102,7 +103,7 @@ def test_but_not_twice_in_a_row_while_one_is_due() -> None:
     wanted, other = schedule.polls(dev)
     asked = []
     for _ in range(4):
-        schedule.hasten(wanted)
+        schedule.expedite(wanted)
         asked.append(served(schedule, 0.0))
     assert asked == [wanted, other, wanted, wanted]
 
@@ -112,7 +113,7 @@ def test_a_poll_that_is_wanted_while_it_is_asked_is_asked_once_more() -> None:
     schedule = Schedule([dev], 0.0)
     poll = schedule.next(0.0)
     assert isinstance(poll, Poll)
-    schedule.hasten(poll)
+    schedule.expedite(poll)
     schedule.polled(poll, 0.1)
     assert served(schedule, 0.1) is poll
     assert schedule.next(0.1) == Idle(1.1)
@@ -139,12 +140,12 @@ def test_a_device_in_doubt_is_probed_before_anything_else() -> None:
     dev = up(0)
     schedule = Schedule([dev], 0.0)
     doubt(dev)
-    for what in (lambda: None, lambda: schedule.orders.submit(write(dev))):
+    for what in (lambda: None, lambda: schedule.requests.submit(write(dev))):
         what()
         job = schedule.next(0.0)
         assert isinstance(job, Probe)
         assert job.device is dev
-    dev.answered()
+    dev.health.answered()
     assert isinstance(schedule.next(0.0), Write)
     assert isinstance(schedule.next(0.0), Poll)
 
@@ -154,7 +155,7 @@ def test_a_write_does_not_wait_behind_one_for_a_device_that_has_just_failed() ->
     schedule = Schedule([dead, well], 0.0)
     first, second, other = write(dead), write(dead), write(well)
     for one in (first, second, other):
-        schedule.orders.submit(one)
+        schedule.requests.submit(one)
     doubt(dead)
     assert isinstance(schedule.next(0.0), Probe)
     schedule.failed(2.0, took=2.0)
@@ -175,7 +176,7 @@ def test_a_bad_poll_is_tried_again_within_a_minute_however_rarely_it_is_asked() 
 def test_a_refused_address_is_asked_for_rarely_but_then_does_not_wait_as_long_again() -> None:
     dev = up(0)
     (poll,) = Schedule([dev], 0.0).polls(dev)
-    assert not dev.refusals.refused(poll.block, 0, "28")
+    assert not dev.bad_addresses.refused(poll.block, 0, "28")
     assert poll.every == RETRY
     assert poll.deadline == poll.due + 1.0
 
@@ -185,9 +186,9 @@ def test_a_wanted_poll_of_a_device_in_doubt_stays_wanted() -> None:
     schedule = Schedule([dev], 0.0)
     wanted = schedule.polls(dev)[1]
     doubt(dev)
-    schedule.hasten(wanted)
+    schedule.expedite(wanted)
     assert isinstance(schedule.next(0.0), Probe)
-    dev.answered()
+    dev.health.answered()
     assert schedule.next(0.0) is wanted
 
 
@@ -195,8 +196,8 @@ def test_a_device_not_heard_yet_is_probed_at_once() -> None:
     dev = device([make_tag("D0")])
     schedule = Schedule([dev], 0.0)
     assert isinstance(schedule.next(0.0), Probe)
-    dev.answered()
-    schedule.woke(dev, 0.1)
+    dev.health.answered()
+    schedule.came_online(dev, 0.1)
     assert isinstance(schedule.next(0.1), Poll)
 
 
@@ -212,7 +213,7 @@ def test_while_polls_of_others_are_due_such_probes_get_half_of_the_time() -> Non
                 probing += 0.5
                 doubt(found)
                 schedule.failed(now, 0.5)
-                schedule.silent(found, now, 0.5)
+                schedule.went_offline(found, now, 0.5)
             case Poll() as poll:
                 now += 0.02
                 schedule.polled(poll, now)
@@ -238,7 +239,7 @@ def test_a_silent_device_is_left_alone_but_for_probes_at_growing_pauses() -> Non
     now, pauses = 0.0, []
     doubt(dev)
     for _ in range(12):
-        schedule.silent(dev, now, 0.5)
+        schedule.went_offline(dev, now, 0.5)
         job = schedule.next(now)
         assert isinstance(job, Idle)
         pauses.append(job.until - now)
@@ -248,8 +249,8 @@ def test_a_silent_device_is_left_alone_but_for_probes_at_growing_pauses() -> Non
     for number, pause in enumerate(pauses):
         assert 0.9 <= pause / min(PAUSE_FIRST * 2**number, PAUSE_LONGEST) <= 1.1
     assert len(set(pauses[8:])) == 4  # jitter
-    dev.answered()
-    schedule.woke(dev, now)
+    dev.health.answered()
+    schedule.came_online(dev, now)
     assert isinstance(schedule.next(now), Poll)
 
 
@@ -259,7 +260,7 @@ def test_all_silent_devices_together_get_a_twentieth_while_others_are_served() -
     schedule = Schedule([healthy, *silent], 0.0)
     for dev in silent:
         doubt(dev)
-        schedule.silent(dev, 0.0, 0.5)
+        schedule.went_offline(dev, 0.0, 0.5)
     now, probing, probed = 10.0, 0.0, set()
     while now < 1000.0:
         match schedule.next(now):
@@ -267,11 +268,11 @@ def test_all_silent_devices_together_get_a_twentieth_while_others_are_served() -
                 now += 0.5
                 probing += 0.5
                 probed.add(found)
-                schedule.silent(found, now, 0.5)
+                schedule.went_offline(found, now, 0.5)
             case Poll() as poll:
                 now += 0.02
                 schedule.polled(poll, now)
-    assert 0.8 * SILENT_SHARE <= probing / now <= SILENT_SHARE
+    assert 0.8 * OFFLINE_SHARE <= probing / now <= OFFLINE_SHARE
     assert probed == set(silent)  # in turn
 
 
@@ -281,9 +282,9 @@ def test_with_nobody_else_to_serve_silent_devices_have_all_the_time() -> None:
     for dev in silent:
         doubt(dev)
     for dev in silent:
-        schedule.silent(dev, 0.0, 0.5)
+        schedule.went_offline(dev, 0.0, 0.5)
     assert isinstance(schedule.next(1.2), Probe)
-    schedule.silent(silent[0], 1.7, 0.5)
+    schedule.went_offline(silent[0], 1.7, 0.5)
     assert isinstance(schedule.next(1.7), Probe)
 
 
@@ -291,7 +292,7 @@ def test_a_silent_device_is_reachable_only_when_its_probe_is_allowed() -> None:
     healthy, silent = up(0), up(0, station=2)
     schedule = Schedule([healthy, silent], 0.0)
     doubt(silent)
-    schedule.silent(silent, 0.0, 0.5)
+    schedule.went_offline(silent, 0.0, 0.5)
     assert schedule.reachable(healthy, 0.0)
     assert not schedule.reachable(silent, 9.4)
     assert schedule.reachable(silent, 9.5)
@@ -300,12 +301,12 @@ def test_a_silent_device_is_reachable_only_when_its_probe_is_allowed() -> None:
 def test_a_broadcast_device_is_never_asked() -> None:
     everybody = ModbusRtu(station=0)
     tags = (make_tag("holding:1", everybody),)
-    dev = Device("all", everybody, WIRE, everybody.timing, tags, 0.5)
+    dev = made_device("all", everybody, WIRE, everybody.timing, tags, 0.5)
     assert dev.broadcast
     schedule = Schedule([dev], 0.0)
     assert schedule.next(0.0) == Idle(float("inf"))
     doubt(dev)
-    assert not dev.doubtful
+    assert not dev.health.needs_resync
 
 
 def test_a_poll_without_answers_is_asked_less_and_less() -> None:
@@ -331,7 +332,7 @@ def test_replaced_polls_are_asked_at_once_and_the_old_one_no_more() -> None:
     schedule = Schedule([dev], 0.0)
     whole = schedule.next(0.0)
     assert isinstance(whole, Poll)
-    halves = dev.refusals.refused(whole.block, 0, "28")
+    halves = dev.bad_addresses.refused(whole.block, 0, "28")
     schedule.replace(whole, halves, 0.0)
     assert {served(schedule, 0.0).block.span for _ in halves} == {b.span for b in halves}
     assert schedule.next(0.0) == Idle(1.0)
@@ -340,10 +341,10 @@ def test_replaced_polls_are_asked_at_once_and_the_old_one_no_more() -> None:
 def test_a_plan_keeps_what_is_known_of_a_block() -> None:
     dev = up(0, 1000)
     schedule = Schedule([dev], 0.0)
-    served(schedule, 0.0).last_good = 0.25
+    served(schedule, 0.0).last.at = 0.25
     schedule.plan(dev, 0.5)
     first, second = schedule.polls(dev)
-    assert first.last_good == 0.25
+    assert first.last.at == 0.25
     assert served(schedule, 0.5) is second
     assert schedule.next(0.5) == Idle(1.0)
 
@@ -353,19 +354,19 @@ def test_writes_are_withdrawn_by_device_and_expire() -> None:
     schedule = Schedule([one, two], 0.0)
     writes = [write(one), write(two), write(one, expires=1.0), write(two)]
     for each in writes:
-        assert schedule.orders.submit(each)
-    assert schedule.orders.expired(0.9) == []
-    assert schedule.orders.expired(1.0) == [writes[2]]
-    assert schedule.orders.withdraw(two) == [writes[1], writes[3]]
-    assert schedule.orders.withdraw() == [writes[0]]
-    assert schedule.orders.withdraw() == []
+        assert schedule.requests.submit(each)
+    assert schedule.requests.expired(0.9) == []
+    assert schedule.requests.expired(1.0) == [writes[2]]
+    assert schedule.requests.withdraw(two) == [writes[1], writes[3]]
+    assert schedule.requests.withdraw() == [writes[0]]
+    assert schedule.requests.withdraw() == []
 
 
 def test_too_many_waiting_writes_are_not_taken() -> None:
     dev = up(0)
     schedule = Schedule([dev], 0.0)
-    assert all(schedule.orders.submit(write(dev)) for _ in range(WAITING_ORDERS))
-    assert not schedule.orders.submit(write(dev))
+    assert all(schedule.requests.submit(write(dev)) for _ in range(MOST_WAITING))
+    assert not schedule.requests.submit(write(dev))
 
 
 class AnyOrder(RuleBasedStateMachine):
@@ -390,18 +391,18 @@ class AnyOrder(RuleBasedStateMachine):
         self.now += seconds
 
     def _heard(self, found: Device) -> None:
-        before = found.standing
-        found.answered()
-        if before in (Standing.STARTING, Standing.SILENT):
-            found.refusals.abandon()
-            self.schedule.woke(found, self.now)
+        before = found.state
+        found.health.answered()
+        if before in (State.STARTING, State.OFFLINE):
+            found.bad_addresses.abandon()
+            self.schedule.came_online(found, self.now)
 
     def _not_heard(self, found: Device) -> None:
-        unknown = not found.served
+        unknown = not found.health.online
         doubt(found)
         self.schedule.failed(self.now, 1.0)
         if unknown or found.failures > 2:
-            self.schedule.silent(found, self.now, 1.0)
+            self.schedule.went_offline(found, self.now, 1.0)
 
     @rule(answers=st.booleans(), refused=st.booleans(), hastened=st.booleans())
     def next_job(self, answers: bool, refused: bool, hastened: bool) -> None:
@@ -410,13 +411,13 @@ class AnyOrder(RuleBasedStateMachine):
                 (self._heard if answers else self._not_heard)(found)
             case Poll() as poll:
                 assert poll.live
-                assert poll.device.served
-                assert not poll.device.doubtful
+                assert poll.device.health.online
+                assert not poll.device.health.needs_resync
                 assert poll.due <= self.now
                 self.running = poll
                 self.now += 0.05
                 if hastened:
-                    self.schedule.hasten(poll)
+                    self.schedule.expedite(poll)
                 self._end(poll, answers=answers, refused=refused)
                 self.running = None
             case Write():
@@ -432,17 +433,17 @@ class AnyOrder(RuleBasedStateMachine):
             schedule.polled(poll, self.now)
         elif answers:
             self._heard(found)
-            halves = found.refusals.refused(poll.block, 0, "28")
+            halves = found.bad_addresses.refused(poll.block, 0, "28")
             if halves:
                 schedule.replace(poll, halves, self.now)
             else:
                 schedule.polled(poll, self.now)
-            if found.refusals.settle():
+            if found.bad_addresses.settle():
                 found.plan()
                 schedule.plan(found, self.now)
         else:
             self._not_heard(found)
-            if found.standing is Standing.SILENT:
+            if found.state is State.OFFLINE:
                 return
             if poll.tries < 2:
                 schedule.again(poll)
@@ -452,17 +453,17 @@ class AnyOrder(RuleBasedStateMachine):
     @rule(which=st.integers(0, 2), number=st.integers(0, 9))
     def hasten(self, which: int, number: int) -> None:
         polls = self.schedule.polls(self.devices[which])
-        self.schedule.hasten(polls[number % len(polls)])
+        self.schedule.expedite(polls[number % len(polls)])
 
     @rule(which=st.integers(0, 2))
     def submit(self, which: int) -> None:
-        self.schedule.orders.submit(write(self.devices[which], expires=1e9))
+        self.schedule.requests.submit(write(self.devices[which], expires=1e9))
         self.submitted += 1
 
     @precondition(lambda self: self.submitted)
     @rule(which=st.integers(0, 2))
     def withdraw(self, which: int) -> None:
-        self.submitted -= len(self.schedule.orders.withdraw(self.devices[which]))
+        self.submitted -= len(self.schedule.requests.withdraw(self.devices[which]))
 
     @rule(which=st.integers(0, 2))
     def plan(self, which: int) -> None:
@@ -486,7 +487,7 @@ class AnyOrder(RuleBasedStateMachine):
         return [
             poll
             for found in self.devices
-            if found.served
+            if found.health.online
             for poll in self.schedule.polls(found)
             if poll.due <= self.now
         ]
@@ -498,12 +499,12 @@ class AnyOrder(RuleBasedStateMachine):
             assert covered == set(found.tags)
             for poll in self.schedule.polls(found):
                 assert poll.live
-                if found.served and poll is not self.running:
+                if found.health.online and poll is not self.running:
                     assert self._queues(poll) == 1, poll
 
     @invariant()
     def no_write_is_lost(self) -> None:
-        assert len(self.schedule.orders) == self.submitted - self.written
+        assert len(self.schedule.requests) == self.submitted - self.written
 
 
 AnyOrder.TestCase.settings = settings(max_examples=60, stateful_step_count=40, deadline=None)

@@ -16,7 +16,7 @@ def scattered(count: int, station: int = 1, every: float = 0.5) -> Device:
 
 def limit(line: Plant) -> float:
     """By the rule: twice the worst age promised, and what one failure takes."""
-    return 2 * max(worst_ages(asked(line.devices))) + 0.5 + 0.5
+    return 2 * max(worst_ages(asked(line.engine.devices))) + 0.5 + 0.5
 
 
 @on_virtual_time
@@ -53,7 +53,7 @@ async def test_no_good_value_is_older_than_its_limit() -> None:
         most = limit(line)
         line.stations[0].late = lambda _: 0.3
         for _ in range(3000):
-            if not line.line._schedule.orders:
+            if not line.line.engine.schedule.requests:
                 line.submit(other, other.tags[0], 1)
             await asyncio.sleep(0.02)
             most = max(most, limit(line))  # it grows as the slow one is measured
@@ -84,9 +84,9 @@ async def test_who_is_written_to_all_the_time_is_read_like_the_others() -> None:
     async with running(line):
         await asyncio.sleep(5)
         for _ in range(3000):
-            if not line.line._schedule.orders:
+            if not line.line.engine.schedule.requests:
                 line.submit(devices[0], devices[0].tags[0], 1)
             await asyncio.sleep(0.02)
     # What is written is read back each time; of the others none is left behind.
-    reads = [min(poll.reads for poll in line.line.polls(dev)) for dev in devices]
+    reads = [min(poll.reads for poll in line.line.engine.schedule.polls(dev)) for dev in devices]
     assert min(reads) > 0.6 * max(reads)

@@ -14,11 +14,12 @@ from structlog.testing import capture_logs
 
 from gateway.app import Gateway, device_of
 from gateway.config import Config, load
-from gateway.engine.device import Device, Standing
-from gateway.engine.unsolicited import ANSWER_WITHIN
+from gateway.engine.device import Device
+from gateway.engine.health import State
+from gateway.engine.request_results import Differs
+from gateway.engine.unsolicited import REPLY_WITHIN
 from gateway.errors import GatewayError, LineDown, Refused
 from gateway.line.line import Line
-from gateway.line.writing import Differs
 from gateway.northbound.republish import Republisher
 from gateway.stations.vigor import VigorStation
 from gateway.tags import Quality, Reason, Sample, Tag, WriteResult, good
@@ -83,8 +84,8 @@ class Bench:
     def samples(self, samples: Sequence[Sample]) -> None:
         self.told += [(now(), sample) for sample in samples]
 
-    def alive(self, device: Device, alive: bool) -> None:
-        self.lives.append(alive)
+    def online(self, device: Device, online: bool) -> None:
+        self.lives.append(online)
 
     # What tests ask
 
@@ -100,7 +101,7 @@ class Bench:
         return self.values(name)[-1]
 
     def tag(self, key: str) -> tuple[Device, Tag]:
-        return next((d, t) for d in self.line.devices for t in d.tags if t.name == key)
+        return next((d, t) for d in self.line.engine.devices for t in d.tags if t.name == key)
 
     async def write_tag(self, name: str, value: Value) -> WriteResult | GatewayError:
         device, tag = self.tag(name)
@@ -116,7 +117,7 @@ async def running(config: Config, number: int = 0, **how: Any) -> AsyncIterator[
     """One line of the file, open and served. It must neither end nor fail."""
     bench = Bench(**how)
     line = config.lines[number]
-    devices = [device_of(device, line) for device in line.devices]
+    devices = [device_of(device, line) for device in line.engine.devices]
     bench.line = Line(
         line.name,
         devices,
@@ -129,8 +130,8 @@ async def running(config: Config, number: int = 0, **how: Any) -> AsyncIterator[
     task = asyncio.create_task(bench.line.run())
     await asyncio.sleep(0.1)
     yield bench
-    assert bench.line.is_open, bench.line.record.trouble
-    assert bench.line.record.opened == 1
+    assert bench.line.engine.is_open, bench.line.engine.record.trouble
+    assert bench.line.engine.record.opened == 1
     assert not task.done()
     task.cancel()
     await asyncio.gather(task, return_exceptions=True)
@@ -146,7 +147,7 @@ def example(name: str) -> Config:
 @on_virtual_time
 async def test_a_scale_streams_and_nobody_asks_it_anything() -> None:
     async with running(example("scale")) as bench:
-        (device,) = bench.line.devices
+        (device,) = bench.line.engine.devices
         assert bench.lives == []
         for _ in range(20):
             bench.say(MOVING)
@@ -156,7 +157,7 @@ async def test_a_scale_streams_and_nobody_asks_it_anything() -> None:
         assert bench.values("weight")[-2:] == [-12.0, 1234.5]
         assert bench.last("state") == "ST"
         assert bench.lives == [True]
-        assert device.standing is Standing.UP
+        assert device.state is State.ONLINE
         assert device.record.heard == 40
         assert bench.sent == []
 
@@ -183,7 +184,7 @@ async def test_what_is_not_understood_makes_all_that_is_listened_to_bad_until_th
 ):
     with capture_logs() as logs:
         async with running(example("scale")) as bench:
-            (device,) = bench.line.devices
+            (device,) = bench.line.engine.devices
             bench.say(STABLE * 2)
             bench.say(OVERLOAD * 3)
             assert bench.last("weight") is Reason.GARBLED
@@ -204,7 +205,7 @@ async def test_one_field_that_does_not_parse_is_bad_alone_and_its_bytes_are_in_t
             bench.say(b"US,+1.2.3.4.  g\r\n" * 3)
             assert bench.last("weight") is Reason.GARBLED
             assert bench.last("state") == "US"
-            assert bench.line.devices[0].record.failures == {"shape": 3}
+            assert bench.line.engine.devices[0].record.failures == {"shape": 3}
     (noted,) = [entry for entry in logs if entry["event"] == "not understood"]
     assert noted["bytes"] == b"US,+1.2.3.4.  g".hex(" ")
 
@@ -264,14 +265,14 @@ async def test_a_silent_device_costs_nothing() -> None:
     """Nothing is sent, and the line is not even woken."""
     async with running(example("barcode-reader")) as bench:
         rounds = 0
-        looked = bench.line._schedule.next
+        looked = bench.line.engine.schedule.next
 
         def counted(at: float) -> Any:
             nonlocal rounds
             rounds += 1
             return looked(at)
 
-        bench.line._schedule.next = counted  # type: ignore[method-assign,assignment]  # it counts
+        bench.line.engine.schedule.next = counted  # type: ignore[method-assign,assignment]  # it counts
         asyncio.get_running_loop().call_later(86400, lambda: None)
         await asyncio.sleep(86400)
         assert rounds == 0
@@ -526,7 +527,7 @@ async def test_a_device_that_is_never_asked_is_written_to_but_never_probed(tmp_p
     path = tmp_path / "plant.yaml"
     path.write_text(PRINTER)
     async with running(load(path)) as bench:
-        (device,) = bench.line.devices
+        (device,) = bench.line.engine.devices
         done = await bench.write_tag("loud", "HELLO")
         assert isinstance(done, WriteResult)
         assert done.acknowledged is False
@@ -539,7 +540,7 @@ async def test_a_device_that_is_never_asked_is_written_to_but_never_probed(tmp_p
         bench.replies = lambda _: b"OK\r"
         assert isinstance(await bench.write_tag("proud", 8), WriteResult)
         assert bench.lives == [True]
-        assert device.standing is Standing.UP
+        assert device.state is State.ONLINE
         assert bench.values("state") == []
 
 
@@ -648,7 +649,7 @@ async def test_an_answer_that_comes_too_late_is_not_sent() -> None:
     async with running(example("weighing-machine")) as bench:
         await asyncio.sleep(1)
         bench.say(frame)
-        assert bench.line._listening.next(now() + ANSWER_WITHIN) is None  # the line was held up
+        assert bench.line._listening.next(now() + REPLY_WITHIN) is None  # the line was held up
         await asyncio.sleep(1)
         assert bench.sent == []
 

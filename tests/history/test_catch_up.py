@@ -15,8 +15,8 @@ from gateway.config import ZenohConfig, ZenohMode
 from gateway.engine.requests import CommandResult
 from gateway.history import Historian
 from gateway.northbound import Northbound, payload
-from gateway.northbound.payload import Failure, Problem, WriteOutcome
 from gateway.northbound.interfaces import History
+from gateway.northbound.payload import Failure, Problem, WriteOutcome
 from gateway.tags import Reason, Sample, Tag, WriteResult, bad, good
 from tests.e2e.processes import Program
 from tests.history_writer import WEEK, until

@@ -26,10 +26,10 @@ def searched(numbers: range, culprit: int) -> Device:
     while refused:
         block = refused.pop()
         if not block.span.start <= culprit < block.span.start + block.span.size:
-            found.refusals.read(block)
+            found.bad_addresses.read(block)
             continue
-        refused += found.refusals.refused(block, 1_000, "28")
-    assert found.refusals.settle()
+        refused += found.bad_addresses.refused(block, 1_000, "28")
+    assert found.bad_addresses.settle()
     found.plan()
     return found
 
@@ -42,7 +42,7 @@ def test_what_was_found_is_planned_around_after_a_restart(tmp_path: Path) -> Non
     assert len(after.blocks) == 1
     Notebook(tmp_path / "state.json").recall([after])
     assert [block.span for block in after.blocks] == [block.span for block in before.blocks]
-    (bad,) = after.refusals.bad.values()
+    (bad,) = after.bad_addresses.bad.values()
     assert (bad.since, bad.code, [tag.text for tag in bad.tags]) == (1_000, "28", ["D7"])
 
 
@@ -51,7 +51,7 @@ def test_addresses_without_a_tag_are_forgotten(tmp_path: Path) -> None:
     notebook.save(notebook.page([searched(range(20), 7)]))
     after = dev(1, 2, 3)
     notebook.recall([after])
-    assert after.refusals.bad == {}
+    assert after.bad_addresses.bad == {}
     assert len(after.blocks) == 1
 
 
@@ -59,12 +59,12 @@ def test_an_address_that_is_read_in_another_way_now_is_asked_for(tmp_path: Path)
     """The range that was refused is no item of the new plan: it would stay refused for ever."""
     before = device([make_tag("D100", type="float64")])
     (block,) = before.blocks
-    assert not before.refusals.refused(block, 1_000, "28")
+    assert not before.bad_addresses.refused(block, 1_000, "28")
     notebook = Notebook(tmp_path / "state.json")
     notebook.save(notebook.page([before]))
     after = dev(100, 102)
     notebook.recall([after])
-    assert after.refusals.bad == {}
+    assert after.bad_addresses.bad == {}
 
 
 def test_no_file_is_nothing_known(tmp_path: Path) -> None:
@@ -119,7 +119,7 @@ def test_the_latest_time_that_can_be_shown_is_known(tmp_path: Path) -> None:
     path.write_bytes(_since(2**63 - 1))
     after = dev(1, 2)
     Notebook(path).recall([after])
-    [bad] = after.refusals.bad.values()
+    [bad] = after.bad_addresses.bad.values()
     assert refused_sentence(after, bad).endswith("since 2262-04-11T23:47:16.854775Z")
 
 

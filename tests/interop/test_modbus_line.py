@@ -18,7 +18,7 @@ from gateway.tags import Quality, Reason, WriteResult, WriteRule
 from gateway.transport import Receiver, SerialPath, SerialSettings, TcpAddress, open_port
 from tests.e2e.processes import plc_gateway, write_config
 from tests.interop.peers import HERE, free_port, pty_pair, running
-from tests.sim.plant import Bench, Outcome, Plant, make_tag
+from tests.sim.plant import Bench, Outcome, Plant, made_device, make_tag
 from tests.sim.plant import running as serving
 from tests.zenoh_peer import free_endpoint
 
@@ -106,7 +106,7 @@ def device_of(driver: Any, wire: WireTiming) -> Device:
     write = WriteRule(verify=True)
     tags = [make_tag(t, driver, type=_type(t), every=0.05, write=write) for t in texts]
     timing = replace(driver.timing, reply_timeout=1.0)
-    return Device("peer", driver, wire, timing, tuple(tags), 1.0)
+    return made_device("peer", driver, wire, timing, tuple(tags), 1.0)
 
 
 def _type(text: str) -> str:
@@ -150,7 +150,7 @@ async def test_a_whole_line_with(name: str, request: pytest.FixtureRequest, tmp_
                 tag = next(tag for tag in device.tags if tag.text == text)
                 outcome = Outcome(0.0)
                 line.line.submit(device, tag, tag.encode(value), outcome)
-                await until(lambda outcome=outcome: bool(outcome.said))
+                await until(lambda outcome=outcome: bool(outcome.outcomes))
                 assert isinstance(outcome.once, WriteResult)
                 assert outcome.once.verified
                 await until(lambda tag=tag, value=value: line.now[tag].value == value)

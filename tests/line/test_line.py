@@ -8,7 +8,8 @@ from typing import Any
 import pytest
 from structlog.testing import capture_logs
 
-from gateway.engine.device import Device, Standing
+from gateway.engine.device import Device
+from gateway.engine.health import State
 from gateway.errors import Busy, Evidence, GatewayError, LineDown, Offline, Refused, Unclear
 from gateway.line.line import PATIENCE, REOPEN_LONGEST
 from gateway.planning.wire_timing import WireTiming
@@ -40,10 +41,10 @@ class Witness:
         self.right = 0
         self.wrong: list[tuple[float, str, Any]] = []
         self._before = plant.samples
-        plant.line._then.upstairs = self
+        plant.line._sink = self
 
-    def alive(self, device: Device, alive: bool) -> None:
-        self.plant.alive(device, alive)
+    def online(self, device: Device, online: bool) -> None:
+        self.plant.online(device, online)
 
     def samples(self, samples: Any) -> None:
         began = self.plant.bench.sent[-1][0] if self.plant.bench.sent else 0.0
@@ -118,7 +119,7 @@ async def test_a_late_answer_within_the_guard_is_waited_for_and_counted() -> Non
         line.stations[0].late = lambda _: 0.4
         await asyncio.sleep(5)
         assert dev.record.late >= 3
-        assert dev.standing is Standing.SILENT
+        assert dev.state is State.OFFLINE
         assert "raise reply_timeout" in dev.diagnosis()
         await asyncio.sleep(60)
         assert "raise reply_timeout" in dev.diagnosis()  # probes do not wait for it any more
@@ -154,7 +155,7 @@ async def test_late_acknowledgements_never_prove_another_write(late_acks: float)
             if deaf:
                 station.inner.hear = lambda data, now: []  # type: ignore[method-assign]
             outcome = line.submit(dev, tag, value)
-            while not outcome.said:
+            while not outcome.outcomes:
                 await asyncio.sleep(0.01)
             station.inner.hear = hear  # type: ignore[method-assign]
             held = station.memory.read("D", tag.address.number)[0]
@@ -246,7 +247,7 @@ async def test_healthy_stations_keep_95_percent_of_their_reads(
         fresh = [clocks(20, station=n, every=every) for n in range(1, healthy + mute + 1)]
         line = plant(fresh if dead else [d for d in fresh if d.name in [a.name for a in alive]])
         wind_up(line)
-        for dev, station in zip(line.devices, line.stations, strict=True):
+        for dev, station in zip(line.engine.devices, line.stations, strict=True):
             station.mute = dev.name not in [a.name for a in alive]
         async with running(line):
             await asyncio.sleep(2)
@@ -254,7 +255,7 @@ async def test_healthy_stations_keep_95_percent_of_their_reads(
             await asyncio.sleep(2 * mute)
             settled = now()
             await asyncio.sleep(span)
-        ok = [d for d in line.devices if d.name in [a.name for a in alive]]
+        ok = [d for d in line.engine.devices if d.name in [a.name for a in alive]]
         probed = sum(
             len(data) * WIRE.character + 0.5
             for at, data in line.bench.sent
@@ -455,7 +456,7 @@ async def test_a_bit_of_a_word_is_changed_where_it_is() -> None:
         await asyncio.sleep(0.5)
         for bit, value in ((3, True), (0, False), (15, False), (14, True), (3, True)):
             before = memory.read("D", 7)[0]
-            outcome = line.submit(line.devices[0], tags[bit], value)
+            outcome = line.submit(line.engine.devices[0], tags[bit], value)
             await asyncio.sleep(0.5)
             expected = before | 1 << bit if value else before & ~(1 << bit)
             assert memory.read("D", 7)[0] == expected
@@ -469,7 +470,7 @@ async def test_a_written_value_is_seen_at_once() -> None:
     line = plant([device([slow])])
     async with running(line):
         await asyncio.sleep(1)
-        outcome = line.submit(line.devices[0], slow, 4711)
+        outcome = line.submit(line.engine.devices[0], slow, 4711)
         await asyncio.sleep(0.2)
         assert outcome.once.value == 4711
         assert line.now[slow].value == 4711
@@ -482,7 +483,7 @@ async def test_a_refused_write_says_the_makers_code() -> None:
     async with running(line):
         await asyncio.sleep(1)
         line.stations[0].inner.holes.add(("D", 0))
-        outcome = line.submit(line.devices[0], tag, 1)
+        outcome = line.submit(line.engine.devices[0], tag, 1)
         await asyncio.sleep(0.5)
         assert isinstance(outcome.once, Refused)
         assert outcome.once.code == "28"
@@ -510,10 +511,14 @@ async def test_an_overloaded_line_is_busy_all_the_time_and_starves_nobody() -> N
     line = plant(devices)
     async with running(line):
         await asyncio.sleep(2)
-        start, busy, waits = now(), line.line.record.busy, line.line.record.turnarounds
+        start, busy, waits = (
+            now(),
+            line.line.engine.record.busy,
+            line.line.engine.record.turnarounds,
+        )
         exchanges = sum(d.record.exchanges for d in devices)
         await asyncio.sleep(300)
-        spoken = line.line.record.busy - busy + line.line.record.turnarounds - waits
+        spoken = line.line.engine.record.busy - busy + line.line.engine.record.turnarounds - waits
         quiet = 0.005 * (sum(d.record.exchanges for d in devices) - exchanges)
     assert (spoken + quiet) / 300 >= 0.98
     for dev in devices:
@@ -596,7 +601,7 @@ async def test_the_pause_between_tries_grows_to_ten_seconds_and_starts_anew() ->
             assert len({round(pause, 6) for pause in pauses[8:]}) > 5  # jitter
             line.bench.come_back()
             await asyncio.sleep(REOPEN_LONGEST * 3)
-            assert line.line.is_open
+            assert line.line.engine.is_open
 
 
 @on_virtual_time
@@ -633,11 +638,11 @@ async def test_a_bug_in_a_driver_takes_its_line_down_and_no_more(
     monkeypatch.setattr(Vigor, "read", buggy)
     async with running(broken), running(sound):
         await asyncio.sleep(0.3)
-        assert "ZeroDivisionError" in broken.line.record.trouble
+        assert "ZeroDivisionError" in broken.line.engine.record.trouble
         assert broken.reason(broken.devices[0].tags[0]) is Reason.LINE_DOWN
         await asyncio.sleep(10)
         assert broken.good(broken.devices[0])
-        assert sound.line.record.opened == 1
+        assert sound.line.engine.record.opened == 1
 
 
 @on_virtual_time
@@ -651,10 +656,10 @@ async def test_a_bug_in_the_middle_of_a_write_answers_it(monkeypatch: pytest.Mon
     monkeypatch.setattr(Vigor, "write", buggy)
     async with running(line):
         await asyncio.sleep(1)
-        outcome = line.submit(line.devices[0], tag, 1)
+        outcome = line.submit(line.engine.devices[0], tag, 1)
         await asyncio.sleep(5)
         assert isinstance(outcome.once, Unclear)
-        assert line.good(line.devices[0])
+        assert line.good(line.engine.devices[0])
 
 
 # Refused addresses
@@ -704,7 +709,7 @@ async def test_noise_makes_no_wrong_value_and_no_exception(noise: float, silent:
     async with running(line):
         await asyncio.sleep(300)
         assert line.bench.damaged > 10
-        assert line.line.record.opened == 1
+        assert line.line.engine.record.opened == 1
         line.bench.noise = 0.0
         await asyncio.sleep(70)
         assert all(line.good(dev) for dev in devices)
@@ -780,6 +785,6 @@ async def test_polls_are_spread_over_their_period_after_the_first_round() -> Non
     line = plant([dev])
     async with running(line):
         await asyncio.sleep(45)
-        dues = sorted(poll.due % 10 for poll in line.line.polls(dev))
+        dues = sorted(poll.due % 10 for poll in line.line.engine.schedule.polls(dev))
     gaps = [b - a for a, b in itertools.pairwise(dues)]
     assert sum(gap > 0.2 for gap in gaps) >= 6, dues

@@ -8,7 +8,8 @@ from typing import Any
 import pytest
 from structlog.testing import capture_logs
 
-from gateway.engine.device import Device, Standing
+from gateway.engine.device import Device
+from gateway.engine.health import State
 from gateway.planning.wire_timing import WireTiming
 from gateway.protocols.computer_link import NO_REPLY_CAUSES, ComputerLink
 from gateway.protocols.vigor import Vigor
@@ -23,6 +24,7 @@ from tests.sim.plant import (
     clock_word,
     clockwork,
     device,
+    made_device,
     make_tag,
     plant,
     running,
@@ -45,7 +47,7 @@ def mixed(every: float = 0.3) -> Plant:
         for n in NUMBERS
     ]
     times = replace(vigor.timing, reply_timeout=0.3)
-    devices = [Device("vigor", vigor, ONE_FORMAT, times, tuple(tags), 0.3)]
+    devices = [made_device("vigor", vigor, ONE_FORMAT, times, tuple(tags), 0.3)]
     stations: list[Any] = [VigorStation(1)]
     for number, frame_format in ((5, 1), (6, 4)):
         driver = ComputerLink(station=number, frame_format=frame_format)  # type: ignore[arg-type]
@@ -76,12 +78,12 @@ async def test_three_protocol_variants_on_one_wire_are_all_healthy() -> None:
     line = mixed()
     async with running(line):
         await asyncio.sleep(30)
-        for dev in line.devices:
+        for dev in line.engine.devices:
             assert line.good(dev), dev.name
             assert dev.record.failures == {}
             assert dev.record.unasked == 0
             assert len(line.reads(dev)) > 80
-        for dev in line.devices:
+        for dev in line.engine.devices:
             outcome = line.submit(dev, dev.tags[0], 4711)
             await asyncio.sleep(1)
             assert isinstance(outcome.once, WriteResult)
@@ -98,12 +100,12 @@ async def test_one_that_dies_disturbs_neither_of_the_others(dead: int) -> None:
         await asyncio.sleep(5)
         line.stations[dead].mute = True
         await asyncio.sleep(60)
-        for i, dev in enumerate(line.devices):
-            assert (dev.standing is Standing.SILENT) == (i == dead)
+        for i, dev in enumerate(line.engine.devices):
+            assert (dev.state is State.OFFLINE) == (i == dead)
             assert line.good(dev) == (i != dead)
         line.stations[dead].mute = False
         await asyncio.sleep(90)
-        assert all(line.good(dev) for dev in line.devices)
+        assert all(line.good(dev) for dev in line.engine.devices)
     assert wrong(line) == []
 
 
@@ -119,7 +121,7 @@ async def test_late_and_lost_answers_on_a_mixed_wire_never_make_a_wrong_value() 
         await asyncio.sleep(2000)
     assert checks.wrong == []
     assert checks.right > 10_000
-    for dev, station in zip(line.devices[1:], line.stations[1:], strict=True):
+    for dev, station in zip(line.engine.devices[1:], line.stations[1:], strict=True):
         assert dev.record.late > 20
         assert commands(station).count("TT") > 20
         said = {data[9:] for _, data in station.heard if data[5:7] == b"TT"}
@@ -131,9 +133,9 @@ class Check:
 
     def __init__(self, line: Plant) -> None:
         self.line, self.right, self.wrong = line, 0, list[Any]()
-        line.line._then.upstairs = self
+        line.line._sink = self
 
-    def alive(self, device: Device, alive: bool) -> None: ...
+    def online(self, device: Device, online: bool) -> None: ...
 
     def samples(self, samples: Any) -> None:
         began = self.line.bench.sent[-1][0] if self.line.bench.sent else 0.0
@@ -229,7 +231,7 @@ async def test_on_demand_blocks_between_exchanges_are_counted_and_never_taken_fo
                 line.bench.received(block[start : start + 4])
             said += 1
     assert said - dev.record.unasked in (0, 1)  # perhaps one is on its way
-    assert line.line.record.unasked >= said * 12
+    assert line.line.engine.record.unasked >= said * 12
     assert checks.wrong == []
     assert dev.record.failures == {}
 
@@ -266,7 +268,7 @@ async def test_an_on_demand_block_instead_of_an_answer_is_no_answer() -> None:
             [on_demand(line, "7777")] if hear(data, at) else []
         )
         await asyncio.sleep(8)
-        assert dev.standing is Standing.SILENT
+        assert dev.state is State.OFFLINE
         assert 0x7777 not in {sample.value for _, sample in line.told}
         assert all(line.now[tag].quality is Quality.BAD for tag in dev.tags)
 
@@ -282,7 +284,7 @@ async def test_a_plc_that_does_not_answer_is_diagnosed_with_the_causes_it_may_ha
         await asyncio.sleep(2)
         line.stations[0].mute = True
         await asyncio.sleep(10)
-        assert dev.standing is Standing.SILENT
+        assert dev.state is State.OFFLINE
         assert "station number" in dev.diagnosis()
         assert NO_REPLY_CAUSES in dev.diagnosis()
         for number in ("6301", "6305", "6306", "D8121"):

@@ -11,7 +11,8 @@ from typing import Any
 import pytest
 from structlog.testing import capture_logs
 
-from gateway.engine.device import Device, Standing
+from gateway.engine.device import Device
+from gateway.engine.health import State
 from gateway.errors import Evidence, LineDown, Unclear
 from gateway.planning.wire_timing import NETWORK_BAUD, WireTiming
 from gateway.protocols.driver import AnyDriver
@@ -27,7 +28,7 @@ from gateway.stations.modbus import ModbusStation
 from gateway.tags import Quality, Reason, Tag, WriteResult, WriteRule
 from gateway.transport import Receiver
 from tests.line.test_line import Witness
-from tests.sim.plant import WIRE, Bench, Plant, Unruly, clock_word, make_tag, running
+from tests.sim.plant import WIRE, Bench, Plant, Unruly, clock_word, made_device, make_tag, running
 from tests.sim.virtual import on_virtual_time
 from tests.vectors import vectors
 
@@ -48,7 +49,7 @@ def slave(
     **timing: Any,
 ) -> Device:
     times = replace(driver.timing, **timing)
-    return Device(f"slave{driver.station}", driver, wire, times, tuple(tags), guard)
+    return made_device(f"slave{driver.station}", driver, wire, times, tuple(tags), guard)
 
 
 def registers(driver: AnyDriver, *sizes: int, every: float = 0.2) -> list[Tag]:
@@ -234,7 +235,7 @@ async def test_a_busy_slave_is_left_alone_longer_each_time(code: int) -> None:
         assert 0.4 <= pauses[1] < 0.5
         assert line.reason(devices[0].tags[0]) is Reason.REFUSED
         assert devices[0].record.refusals[f"0{code}"] == len(busy.answered)
-        assert devices[0].standing is Standing.UP
+        assert devices[0].state is State.ONLINE
         assert len(line.reads(devices[1], start)) >= 0.95 * 60
         busy.twist = lambda pdu: pdu
         await asyncio.sleep(6)
@@ -437,11 +438,11 @@ async def test_a_dead_slave_is_not_brought_to_life_by_the_echo_of_a_loopback() -
     line.stations[0].mute = True
     async with running(line):
         await asyncio.sleep(60)
-        assert dev.standing is Standing.SILENT
+        assert dev.state is State.OFFLINE
         assert not any(alive for _, _, alive in line.lives)
         line.stations[0].mute = False
         await asyncio.sleep(70)
-        assert dev.standing is Standing.UP
+        assert dev.state is State.ONLINE
 
 
 # Several questions open at once

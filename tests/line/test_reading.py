@@ -2,7 +2,7 @@
 
 import asyncio
 
-from gateway.engine.device import Standing
+from gateway.engine.health import State
 from gateway.tags import Quality, Reason
 from tests.sim.plant import device, plant, running, words
 from tests.sim.virtual import on_virtual_time
@@ -46,7 +46,7 @@ async def test_a_device_is_not_taken_for_silent_because_one_of_its_values_moves(
         await asyncio.sleep(20)
         moving, still = mixer.tags
         assert hall.now[moving].quality is Quality.BAD
-        assert mixer.standing is Standing.UP
+        assert mixer.state is State.ONLINE
         samples = [told for _, told in hall.told if told.tag is still]
         assert [told.quality for told in samples[1:]] == [Quality.GOOD] * (len(samples) - 1)
         assert len(samples) >= 19

@@ -9,7 +9,8 @@ from typing import Any
 
 import pytest
 
-from gateway.engine.device import Device, Standing
+from gateway.engine.device import Device
+from gateway.engine.health import State
 from gateway.errors import Busy, LineDown
 from gateway.planning.wire_timing import WireTiming
 from gateway.protocols.checksums import crc16
@@ -21,7 +22,7 @@ from gateway.simulator.plant import station_for
 from gateway.tags import Quality, Reason, Tag, WriteResult, WriteRule
 from gateway.transport import Receiver
 from tests.sim.bench import WIRE, Bench
-from tests.sim.plant import Outcome, Plant, device, make_tag, plant, running
+from tests.sim.plant import Outcome, Plant, device, made_device, make_tag, plant, running
 from tests.sim.virtual import on_virtual_time
 
 GUARD = 0.5
@@ -81,7 +82,7 @@ def now() -> float:
 
 def behind(server: DeviceServer, driver: AnyDriver, *tags: Tag) -> tuple[Plant, Device, Any]:
     """The line, its device, and the memory of its PLC."""
-    dev = Device("plc", driver, WIRE, driver.timing, tags, GUARD)
+    dev = made_device("plc", driver, WIRE, driver.timing, tags, GUARD)
     station = station_for(driver, [])
     return Plant([dev], [station], server, WIRE), dev, station.memory  # type: ignore[list-item]
 
@@ -113,13 +114,13 @@ async def test_after_a_stall_no_old_answer_is_taken_for_a_new_one(
     async with running(line):
         for phase in range(10):
             await asyncio.sleep(20 + phase * 0.11)
-            assert dev.standing is Standing.UP
+            assert dev.state is State.ONLINE
             server.flows.clear()
             end = now() + stall
             while now() < end:
                 await asyncio.sleep(1.0)
                 if wanted:
-                    line.line.refresh(dev, tags[0])
+                    line.line.expedite(dev, tags[0])
             server.flows.set()
         await asyncio.sleep(20)
         assert line.good(dev)
@@ -180,7 +181,7 @@ async def test_late_refusals_of_what_a_slave_does_not_have_acknowledge_nothing(
     server = DeviceServer(
         late=lambda chance: chance.uniform(0, longest) if chance.random() < 0.3 else 0.0, seed=3
     )
-    dev = Device("plc", driver, WIRE, driver.timing, tuple(tags), GUARD)
+    dev = made_device("plc", driver, WIRE, driver.timing, tuple(tags), GUARD)
     inner = station_for(driver, [])
     held: dict[int, set[int]] = {number: {number} for number in numbers}  # ever
     for number in numbers:
@@ -276,7 +277,7 @@ async def test_a_write_behind_a_long_wait_is_answered_when_its_time_is_over() ->
     tags = [make_tag(f"D{n}", driver, device="plc", write=WriteRule()) for n in (100, 1000)]
     server = DeviceServer()
     slow = replace(driver.timing, reply_timeout=15.0)
-    dev = Device("plc", driver, WIRE, slow, tuple(tags), GUARD)
+    dev = made_device("plc", driver, WIRE, slow, tuple(tags), GUARD)
     line = Plant([dev], [station_for(driver, [])], server, WIRE)  # type: ignore[list-item]
     async with running(line):
         await asyncio.sleep(5)
@@ -296,15 +297,15 @@ async def test_on_a_line_that_is_down_no_device_is_up() -> None:
     line, dev, _ = behind(server, driver, tag)
     async with running(line):
         await asyncio.sleep(5)
-        assert dev.standing is Standing.UP
+        assert dev.state is State.ONLINE
         assert server.ear is not None
         server.ear.lost(LineDown("pulled out"))
         await asyncio.sleep(0.01)
-        assert dev.standing is Standing.STARTING
+        assert dev.state is State.STARTING
         assert dev.diagnosis() == "pulled out"
         assert line.reason(tag) is Reason.LINE_DOWN
         await asyncio.sleep(5)
-        assert dev.standing is Standing.UP
+        assert dev.state is State.ONLINE
         assert dev.diagnosis() == ""
 
 
@@ -321,7 +322,7 @@ async def test_a_port_that_goes_while_the_line_settles_is_noticed_at_once(
     async with running(line):
         await asyncio.sleep(5)
         server.flows.clear()
-        await asyncio.sleep(8 * dev.patience)
+        await asyncio.sleep(8 * dev.longest_reply)
         asked = len(server.sent)
         server.flows.set()
         await asyncio.sleep(0.4)
@@ -343,7 +344,7 @@ async def test_one_refused_address_does_not_keep_the_turnaround_from_being_learn
         await asyncio.sleep(20)
         line.stations[0].late = lambda _: 0.4
         await asyncio.sleep(120)
-        assert dev.reckoned == pytest.approx(0.405, abs=0.02)
+        assert dev.turnaround.expected == pytest.approx(0.405, abs=0.02)
         known = dev.record.overdue
         await asyncio.sleep(60)
         assert dev.record.overdue == known

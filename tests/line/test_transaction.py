@@ -5,9 +5,9 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
+from gateway.line.clock import Clock
 
 from gateway.errors import Evidence, Garbled, LineDown, NoReply, Refused
-from gateway.line.clock import Clock
 from gateway.line.transaction import Turn
 from gateway.line.wire_log import Recorder
 from gateway.planning.wire_timing import WireTiming

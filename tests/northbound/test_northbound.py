@@ -28,13 +28,13 @@ from gateway.errors import (
     Refused,
 )
 from gateway.northbound import Northbound, payload
-from gateway.northbound.tag_index import TagIndex
 from gateway.northbound.inbox import LIMIT, Inbox
 from gateway.northbound.keys import Keys
 from gateway.northbound.link_monitor import LinkMonitor
 from gateway.northbound.publisher import EVENTS_LIMIT, Publisher
 from gateway.northbound.republish import Republisher
 from gateway.northbound.session import configure
+from gateway.northbound.tag_index import TagIndex
 from gateway.northbound.writes import MOST_WAITING
 from gateway.protocols.driver import Address, Span, Unit
 from gateway.tags import Form, Reason, Sample, Tag, WriteResult, WriteRule, bad, good

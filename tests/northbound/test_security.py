@@ -23,8 +23,8 @@ from gateway.engine.requests import CommandResult
 from gateway.errors import ConfigError
 from gateway.northbound import Northbound, secrets
 from gateway.northbound.audit import BURST, Audit
-from gateway.northbound.rate_limit import RateLimit
 from gateway.northbound.payload import Failure, Problem, WriteOutcome
+from gateway.northbound.rate_limit import RateLimit
 from gateway.northbound.session import configure
 from gateway.northbound.writers import NotAllowed, Writers
 from gateway.tags import WriteResult

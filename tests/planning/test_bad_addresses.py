@@ -26,7 +26,7 @@ class Asker:
 
     def ask(self, block: Block) -> bool:
         """True when the device was planned anew."""
-        refusals = self.device.refusals
+        refusals = self.device.bad_addresses
         self.exchanges += 1
         if self.there(block):
             again = refusals.read(block)
@@ -49,10 +49,10 @@ class Asker:
         for _ in range(200):
             blocks = self.device.blocks
             for block in blocks:
-                if block.span not in self.device.refusals.bad and self.ask(block):
+                if block.span not in self.device.bad_addresses.bad and self.ask(block):
                     break
             else:
-                if not self.device.refusals.searching:
+                if not self.device.bad_addresses.searching:
                     return
         raise AssertionError("the search does not end")
 
@@ -62,7 +62,7 @@ def words(*numbers: int) -> Device:
 
 
 def bad_numbers(found: Device) -> set[int]:
-    return {span.start for span in found.refusals.bad}
+    return {span.start for span in found.bad_addresses.bad}
 
 
 @settings(max_examples=200, deadline=None)
@@ -74,7 +74,7 @@ def test_any_set_of_bad_addresses_is_found(numbers: set[int], missing: set[int])
     asker.settle()
     assert bad_numbers(found) == numbers & missing
     for block in found.blocks:
-        assert asker.there(block) or block.span in found.refusals.bad
+        assert asker.there(block) or block.span in found.bad_addresses.bad
     assert {tag for b in found.blocks for tag in b.tags} == set(found.tags)
 
 
@@ -85,7 +85,7 @@ def test_neighbours_of_bad_addresses_stay_in_one_block(missing: set[int]) -> Non
     found = words(*range(64))
     Asker(found, missing).settle()
     runs = "".join(" " if n in missing else "x" for n in range(64)).split()
-    good = [block for block in found.blocks if block.span not in found.refusals.bad]
+    good = [block for block in found.blocks if block.span not in found.bad_addresses.bad]
     assert [block.span.size for block in good] == [len(run) for run in runs]
 
 
@@ -115,16 +115,16 @@ def test_an_address_that_works_again_rejoins_its_block(
     for number in returns:
         asker.missing.discard(number)
         for block in found.blocks:
-            if block.span in found.refusals.bad and asker.ask(block):
+            if block.span in found.bad_addresses.bad and asker.ask(block):
                 break
         asker.settle()
         assert bad_numbers(found) == asker.missing
-        assert not found.refusals.searching
+        assert not found.bad_addresses.searching
     asker.missing.clear()
     for _ in range(41):
         asker.settle()
         for block in found.blocks:
-            if block.span in found.refusals.bad and asker.ask(block):
+            if block.span in found.bad_addresses.bad and asker.ask(block):
                 break
     assert [block.span.size for block in found.blocks] == [41]
 
@@ -143,16 +143,16 @@ def test_a_bad_address_in_a_faster_block_is_cut_off() -> None:
 def test_a_bad_range_keeps_its_time_code_and_tags() -> None:
     found = words(3)
     (block,) = found.blocks
-    assert found.refusals.refused(block, 77, "28") == ()
-    (bad,) = found.refusals.bad.values()
+    assert found.bad_addresses.refused(block, 77, "28") == ()
+    (bad,) = found.bad_addresses.bad.values()
     assert (bad.span, bad.since, bad.code, bad.tags) == (block.span, 77, "28", block.tags)
-    assert found.refusals.refused(block, 99, "28") == ()
-    assert found.refusals.bad[block.span].since == 77
+    assert found.bad_addresses.refused(block, 99, "28") == ()
+    assert found.bad_addresses.bad[block.span].since == 77
 
 
 def test_a_bad_address_is_read_rarely() -> None:
     found = words(3)
     (block,) = found.blocks
     assert found.interval(block) == 1.0
-    found.refusals.refused(block, 0, "28")
+    found.bad_addresses.refused(block, 0, "28")
     assert found.interval(block) == RETRY

@@ -86,7 +86,7 @@ def test_refused_addresses_are_in_no_list() -> None:
     dev.lists = False
     dev.plan()
     bad = next(block for block in dev.blocks if block.tags[0].text == "D800")
-    dev.refusals.refused(bad, 0, "06")
+    dev.bad_addresses.refused(bad, 0, "06")
     dev.lists = True
     dev.plan()
     [block] = listed(dev)
@@ -137,7 +137,7 @@ async def _power_cycle(line: Plant) -> None:
 async def _timed_out(line: Plant) -> None:
     station = line.stations[0]
     station.late = lambda _: 0.4
-    while not line.devices[0].failures:
+    while not line.engine.devices[0].failures:
         await asyncio.sleep(0.01)
     station.late = lambda _: 0.0
 
@@ -285,9 +285,9 @@ class Witness:
         self.plant = plant
         self.right = 0
         self.wrong: list[tuple[float, str, int]] = []
-        plant.line._then.upstairs = self
+        plant.line._sink = self
 
-    def alive(self, device: Device, alive: bool) -> None: ...
+    def online(self, device: Device, online: bool) -> None: ...
 
     def samples(self, samples: Any) -> None:
         sample: Sample

@@ -21,7 +21,7 @@ MUTANTS = (
     Mutant(
         "no late-reply guard",
         "line/line.py",
-        "guard = 0.0 if before is Standing.SILENT else device.late_guard",
+        "guard = 0.0 if before is State.OFFLINE else device.settings.late_guard",
         "guard = 0.0",
         "tests/line/test_line.py",
         (54, 55, 53, 48),
@@ -30,7 +30,7 @@ MUTANTS = (
     Mutant(
         "no doubt after a failure: no resync",
         "engine/device.py",
-        "        self.doubtful = not self.broadcast\n        if doubt is not None:",
+        "        self.health.needs_resync = not self.broadcast\n        if doubt is not None:",
         "        if doubt is not None:",
         "tests/line/test_line.py",
         (54, 55, 53, 14, 48),
@@ -108,8 +108,8 @@ MUTANTS = (
     Mutant(
         "Modbus TCP: one question more than the window",
         "line/polling.py",
-        "self.then.schedule.beside(poll, device.window - 1, now)",
-        "self.then.schedule.beside(poll, device.window, now)",
+        "self.then.schedule.alongside(poll, device.window - 1, now)",
+        "self.then.schedule.alongside(poll, device.window, now)",
         "tests/line/test_modbus_line.py",
         (1, 2, 7),
         "lean",
@@ -249,7 +249,7 @@ MUTANTS = (
     Mutant(
         "age by a clock that people set",
         "app.py",
-        "return asyncio.get_running_loop().time() - poll.last_good < max_age",
+        "return asyncio.get_running_loop().time() - poll.last.at < max_age",
         "return self._wall() - self.mirror[tag].time < max_age * 1e9",
         "tests/cases",
         (14, 20, 42, 52),

@@ -5,7 +5,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 from gateway.config import LineConfig
-from gateway.engine.device import Device, Standing
+from gateway.engine.device import Device
+from gateway.engine.health import State
 from gateway.line.line import Line
 from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.frames import FrameDriver
@@ -87,10 +88,10 @@ class Bus:
         self.story.counts[f"frames {protocol}"] += 1
         if start - self._to_all_until < AFTER_ALL:
             self.broke(f"{self.line.name}: spoke {start - self._to_all_until:.3f} s after all")
-        named = [d for d in self.line.devices if self.number_of(d) == number]
+        named = [d for d in self.line.engine.devices if self.number_of(d) == number]
         if number == ALL.get(protocol):
             self._to_all_until = end
-            named = named or [d for d in self.line.devices if d.control]
+            named = named or [d for d in self.line.engine.devices if d.control]
         if not named:
             self.broke(f"{self.line.name}: spoke to station {number}, which is not served")
             return
@@ -121,11 +122,12 @@ class Bus:
         if isinstance(station, Troubled) and self.unasked(station):
             return  # it cannot be made to wait
         device = next(
-            (d for d in self.line.devices if self.stations.get(d.name) is station), self.asked
+            (d for d in self.line.engine.devices if self.stations.get(d.name) is station),
+            self.asked,
         )
         if device is None or self.excused(self.now() - self.began - 30.0):
             return
-        if device.standing in (Standing.SILENT, Standing.STARTING):
+        if device.state in (State.OFFLINE, State.STARTING):
             return  # nobody waits for late answers to a probe: that is the rule
         self.broke(f"{self.line.name}: spoke while {device.name} did")
 
@@ -147,7 +149,7 @@ class Bus:
     @property
     def collides(self) -> bool:
         """Somebody on it speaks when he likes, though he or others are asked."""
-        drivers = [device.driver for device in self.line.devices]
+        drivers = [device.driver for device in self.line.engine.devices]
         speakers = [d for d in drivers if isinstance(d, FrameDriver) and d.sends_unsolicited]
         return bool(speakers) and (len(drivers) > 1 or bool(speakers[0].settings.ask))
 
@@ -176,7 +178,7 @@ class Bus:
     def _questioned(self, question: Asked, device: Device) -> None:
         """Never more are open than its window says, and no number is used again soon."""
         now = self.now()
-        since = max(now - device.timing.reply_timeout, self.line.record.since)
+        since = max(now - device.timing.reply_timeout, self.line.engine.record.since)
         key = question.unit, question.number
         if key in self.open and now - self.open[key] < 30.0:
             self.broke(f"{device.name}: number {question.number} is used again")
@@ -192,7 +194,7 @@ class Bus:
         """When the exchange began that fetched the tag's value, which has just come."""
         if self.protocol != "modbus-tcp":
             return self.sent_at
-        device = next(d for d in self.line.devices if d.name == tag.device)
+        device = next(d for d in self.line.engine.devices if d.name == tag.device)
         return max(
             (
                 at

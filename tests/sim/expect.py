@@ -4,7 +4,8 @@ import asyncio
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from gateway.engine.device import Device, Standing
+from gateway.engine.device import Device
+from gateway.engine.health import State
 from gateway.line.line import Line
 from gateway.planning.bad_addresses import RETRY
 from gateway.protocols.frames import FrameDriver
@@ -39,8 +40,11 @@ class Expectations:
 
     def times(self, line: Line) -> tuple[float, float]:
         """The longest that one failed conversation takes, and the line's load."""
-        longest = max(d.timing.reply_timeout + d.late_guard for d in line.devices) + SPOKEN
-        return longest, max(1.0, sum(d.load for d in line.devices))
+        longest = (
+            max(d.timing.reply_timeout + d.settings.late_guard for d in line.engine.devices)
+            + SPOKEN
+        )
+        return longest, max(1.0, sum(d.load for d in line.engine.devices))
 
     def every(self, bus: Bus, device: Device, tag: Tag) -> float:
         """How often it is to be heard of."""
@@ -53,7 +57,7 @@ class Expectations:
         """Whom it concerns, as far as they can be known at all."""
         return [
             (device, tag)
-            for device in self.lines[episode.line].line.devices
+            for device in self.lines[episode.line].line.engine.devices
             if episode.device in ("", device.name)
             for tag in device.tags
             if episode.tag in ("", tag.name) and self.judge.readable(tag)
@@ -64,12 +68,12 @@ class Expectations:
     def bad(self, episode: Episode) -> None:
         bus = self.lines[episode.line]
         gone = episode.kind == "gone"
-        if not (episode.silent or gone) or self._mixed(episode) or not bus.line.devices:
+        if not (episode.silent or gone) or self._mixed(episode) or not bus.line.engine.devices:
             return
         longest, load = self.times(bus.line)
         for device, tag in self.concerned(episode):
             every = self.every(bus, device, tag)
-            limit = 2 * load * every + 2 * (len(bus.line.devices) + 2) * longest + 1.0
+            limit = 2 * load * every + 2 * (len(bus.line.engine.devices) + 2) * longest + 1.0
             if tag.span.area == LISTENED:
                 if episode.kind == "stall":
                     continue  # what comes by itself goes on coming
@@ -104,12 +108,14 @@ class Expectations:
 
     def good(self, episode: Episode) -> None:
         bus = self.lines[episode.line]
-        if not bus.line.devices or episode.end >= self.seconds:
+        if not bus.line.engine.devices or episode.end >= self.seconds:
             return
         longest, load = self.times(bus.line)
         for device, tag in self.concerned(episode):
             every = self.every(bus, device, tag)
-            limit = LONGEST_PAUSE + 20 * longest * len(bus.line.devices) + 2 * load * every + 5.0
+            limit = (
+                LONGEST_PAUSE + 20 * longest * len(bus.line.engine.devices) + 2 * load * every + 5.0
+            )
             if tag.span.area == LISTENED:
                 limit += 20 * every  # now and then it says what nobody understands
             if episode.kind == "gone" or not summed(device):
@@ -156,17 +162,17 @@ class Expectations:
                 await asyncio.sleep(10.0)
                 self._look_at_ages()
             for line in gateway.lines:
-                schedule = line._schedule
-                polls = sum(len(schedule.polls(device)) for device in line.devices)
+                schedule = line.engine.schedule
+                polls = sum(len(schedule.polls(device)) for device in line.engine.devices)
                 kept = len(schedule._waiting) + len(schedule._ready) + len(schedule._urgent)
                 if kept > 5 * polls + 50:  # twice as many in two queues, and those that are urgent
                     judge.broke(f"{line.name}: {kept} places in the queues for {polls} polls")
-                if len(schedule.orders) > 4 * len(line.devices):
-                    judge.broke(f"{line.name}: {len(schedule.orders)} orders wait")
+                if len(schedule.requests) > 4 * len(line.engine.devices):
+                    judge.broke(f"{line.name}: {len(schedule.requests)} orders wait")
                 if len(line._listening._answers) > 4:
                     judge.broke(f"{line.name}: {len(line._listening._answers)} answers wait")
             waiting = sum(map(len, gateway._waiting.values()))
-            if waiting > 2 * len(judge.served):
+            if waiting > 2 * len(judge.health.online):
                 judge.broke(f"{waiting} who asked for fresh values are still remembered")
             timers = len(asyncio.get_running_loop()._scheduled)  # type: ignore[attr-defined]
             if timers > self.most_timers:
@@ -179,7 +185,7 @@ class Expectations:
         """No good value is old, whatever goes on: a bound of our own, above the gateway's."""
         judge = self.judge
         for bus in self.lines.values():
-            devices = bus.line.devices
+            devices = bus.line.engine.devices
             if not devices:
                 continue
             longest, _ = self.times(bus.line)
@@ -196,16 +202,16 @@ class Expectations:
 
     def _look_at_shares(self, bus: Bus) -> None:
         """A device that has been well for two minutes, on a line that was, is served."""
-        if not bus.line.devices:
+        if not bus.line.engine.devices:
             return
         longest, load = self.times(bus.line)
-        for device in bus.line.devices:
+        for device in bus.line.engine.devices:
             for tag in device.tags:
                 station = self.judge.stations.get(device.name)
                 if station is None or station.lacks(tag) or not self.judge.readable(tag):
                     continue
                 every = self.every(bus, device, tag)
-                patience = 4 * load * every + 6 * longest * len(bus.line.devices)
+                patience = 4 * load * every + 6 * longest * len(bus.line.engine.devices)
                 if bus.collides or tag.span.area == LISTENED:
                     patience += 20 * every + LONGEST_PAUSE
                 since = self.judge.read_at.get(tag, 0.0)
@@ -241,11 +247,11 @@ class Expectations:
             return
         judge = self.judge
         for bus in self.lines.values():
-            for device in bus.line.devices:
-                well = device.standing is Standing.UP and judge.alive.get(device.name)
+            for device in bus.line.engine.devices:
+                well = device.state is State.ONLINE and judge.alive.get(device.name)
                 if not well and not device.broadcast and not bus.collides:
                     judge.broke(
-                        f"{device.name} is {device.standing.value} at the end: {device.trouble}"
+                        f"{device.name} is {device.state.value} at the end: {device.trouble}"
                     )
                 for tag in device.tags:
                     sample = judge.gateway.mirror[tag]

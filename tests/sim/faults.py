@@ -75,7 +75,7 @@ class Faults:
     def _trouble(self, station: Troubled, episode: Episode, kind: str) -> None:
         device = self.devices.get(episode.device)
         timeout = device.timing.reply_timeout if device else DEFAULT_TIMES
-        guard = device.late_guard if device else DEFAULT_TIMES
+        guard = device.settings.late_guard if device else DEFAULT_TIMES
         strength = episode.strength
         match kind:
             case "deaf":

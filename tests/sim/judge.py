@@ -33,7 +33,7 @@ class Judge:
         self._plain = self.gateway.samples
         self.gateway.samples = self.told  # type: ignore[method-assign]  # the lines call it
         self.known = {tag for device in self.gateway.config.devices for tag in device.tags}
-        self.served = {device.name for device in self.gateway.spoken_to}
+        self.health.online = {device.name for device in self.gateway.spoken_to}
 
     def broke(self, what: str) -> None:
         if len(self.story.broken) < MOST_TROUBLES:
@@ -63,7 +63,7 @@ class Judge:
 
     def shown_alive(self, device: str, alive: bool) -> None:
         self.alive[device] = alive
-        if device not in self.served:
+        if device not in self.health.online:
             self.broke(f"{device} is not served, but shown")
 
     def _judge(self, sample: Sample) -> None:
@@ -92,8 +92,8 @@ class Judge:
         """It was said just now, or while the device itself was asked."""
         station = self.stations[sample.tag.device].inner
         assert isinstance(station, Gadget)
-        device = next(d for d in bus.line.devices if d.name == sample.tag.device)
-        since = self.now - 0.6 - device.timing.reply_timeout - device.late_guard
+        device = next(d for d in bus.line.engine.devices if d.name == sample.tag.device)
+        since = self.now - 0.6 - device.timing.reply_timeout - device.settings.late_guard
         if any(end >= since and value == sample.value for _, end, value in station.said):
             return
         if bus.hurt["<"] >= since - 0.5:
@@ -103,7 +103,7 @@ class Judge:
 
     def _blind(self, what: str, tag: Tag) -> None:
         bus = self.buses[tag.device]
-        device = next(d for d in bus.line.devices if d.name == tag.device)
+        device = next(d for d in bus.line.engine.devices if d.name == tag.device)
         self.story.counts[what if summed(device) else f"{what} without a sum"] += 1
 
     # What devices say by themselves
@@ -113,7 +113,7 @@ class Judge:
         bus = self.buses[name]
         start, end, value = station.said[-1]
         passed = start - self.began
-        well = bus.line.is_open and bus.line.record.since < start - 2.0
+        well = bus.line.engine.is_open and bus.line.engine.record.since < start - 2.0
         troubled = any(e.start < passed + 2.0 and e.end > passed - 5.0 for e in bus.episodes)
         troubled = troubled or (isinstance(bus.wire, SimWire) and bus.wire.behind > start - 5.0)
         if well and not troubled and not bus.collides:

@@ -10,7 +10,7 @@ from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.driver import AnyDriver
 from gateway.stations.computer_link import ComputerLinkStation
 from gateway.tags import Tag
-from tests.sim.plant import WIRE, Bench, Plant, Unruly, make_tag
+from tests.sim.plant import WIRE, Bench, Plant, Unruly, made_device, make_tag
 
 
 def link_device(
@@ -23,7 +23,7 @@ def link_device(
     name = name or f"link{driver.station}"
     made = [make_tag(text, driver, device=name, every=every, **settings) for text in addresses]
     times = replace(driver.timing, **{"reply_timeout": 0.3, **timing})
-    return Device(name, driver, wire, times, tuple(made), guard, control=control)
+    return made_device(name, driver, wire, times, tuple(made), guard, control=control)
 
 
 def link_station(driver: AnyDriver) -> ComputerLinkStation:

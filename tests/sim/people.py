@@ -6,10 +6,11 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import Any
 
+from gateway.protocols.computer_link.bad_addresses import model_name
+
 from gateway.engine.device import Device
 from gateway.errors import BadValue, Busy, GatewayError, LineDown, Offline, Refused
 from gateway.protocols.computer_link import ComputerLink
-from gateway.protocols.computer_link.refusals import model_name
 from gateway.protocols.frames.driver import LISTENED
 from gateway.tags import Quality, Tag, WriteResult
 from gateway.values import Kind, Value
@@ -256,7 +257,7 @@ class Person:
         """To every PLC of the line that listens."""
         await asyncio.sleep(SOON)
         for name, station in self.bus.stations.items():
-            device = next((d for d in self.bus.line.devices if d.name == name), None)
+            device = next((d for d in self.bus.line.engine.devices if d.name == name), None)
             if device is None or not _alike(device, self.device):
                 continue  # another format: it does not understand
             if self.deaf(name, since) or self.bus.hurt_at >= since:

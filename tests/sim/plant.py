@@ -9,7 +9,9 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from gateway.engine.device import Device
+from gateway.engine import requests
+from gateway.engine.device import Device, DeviceSettings
+from gateway.engine.engine import Engine
 from gateway.errors import GatewayError
 from gateway.line.line import Line
 from gateway.planning.wire_timing import WireTiming
@@ -17,7 +19,7 @@ from gateway.protocols.driver import AnyDriver, Span, Timing, Unit
 from gateway.protocols.vigor import Vigor
 from gateway.stations.station import Memory
 from gateway.stations.vigor import VigorStation
-from gateway.tags import Quality, Reason, Sample, Tag, WriteResult
+from gateway.tags import Quality, Reason, Sample, Tag
 from gateway.values import Layout, Value, parse_type
 from tests.sim.bench import WIRE, Bench, Unruly
 
@@ -81,13 +83,11 @@ class Plant:
 
     def __post_init__(self) -> None:
         self.line = Line(
-            "line",
-            self.devices,
-            self.wire,
-            lambda ear: self.bench.open(self.stations, self.wire, ear),
+            Engine("line", self.devices, self.wire, self.bench.seed),
+            lambda receiver: self.bench.open(self.stations, self.wire, receiver),
             self,
-            lambda: int(_now() * SECOND),
             echo=self.bench.echo or None,
+            wall=lambda: int(_now() * SECOND),
             seed=self.bench.seed,
         )
 
@@ -96,8 +96,8 @@ class Plant:
             self.told.append((_now(), sample))
             self.now[sample.tag] = sample
 
-    def alive(self, device: Device, alive: bool) -> None:
-        self.lives.append((_now(), device.name, alive))
+    def online(self, device: Device, online: bool) -> None:
+        self.lives.append((_now(), device.name, online))
 
     # What tests ask
 
@@ -128,27 +128,39 @@ class Plant:
         return [(at, data) for at, data in self.bench.sent if data[3:4] in b"67" and at >= since]
 
     def submit(self, device: Device, tag: Tag, value: Value) -> "Outcome":
-        outcome = Outcome(_now())
-        self.line.submit(device, tag, tag.encode(value), outcome)
-        return outcome
+        return Outcome(_now()).of(self.line.write(device, tag, tag.encode(value)))
+
+    def command(self, device: Device, name: str, argument: str = "") -> "Outcome":
+        return Outcome(_now()).of(self.line.command(device, name, argument))
 
 
 @dataclass
 class Outcome:
-    """What became of a write, and whether it was said once."""
+    """The outcome of a request, and when it came."""
 
     asked: float
-    said: list[WriteResult | GatewayError] = field(default_factory=list)
+    outcomes: list[requests.Outcome] = field(default_factory=list)
     at: float = 0.0
 
-    def __call__(self, outcome: WriteResult | GatewayError) -> None:
-        self.said.append(outcome)
+    def of(self, future: "asyncio.Future[Any]") -> "Outcome":
+        if future.done():
+            self._take(future)
+        else:
+            future.add_done_callback(self._take)
+        return self
+
+    def _take(self, future: "asyncio.Future[Any]") -> None:
+        error = future.exception()
+        if error is not None and not isinstance(error, GatewayError):
+            raise error
+        self.outcomes.append(future.result() if error is None else error)
         self.at = _now()
 
     @property
-    def once(self) -> WriteResult | GatewayError:
-        assert len(self.said) == 1, self.said
-        return self.said[0]
+    def once(self) -> Any:
+        """The one outcome."""
+        (outcome,) = self.outcomes
+        return outcome
 
 
 def device(
@@ -162,7 +174,28 @@ def device(
 ) -> Device:
     driver = Vigor(station=station)
     times: Timing = replace(driver.timing, **timing)
-    return Device(name or f"plc{station}", driver, wire, times, tuple(tags), guard)
+    return made_device(name or f"plc{station}", driver, wire, times, tuple(tags), guard)
+
+
+def made_device(
+    name: str,
+    driver: AnyDriver,
+    wire: WireTiming,
+    timing: Timing,
+    tags: Sequence[Tag],
+    late_guard: float = 0.5,
+    **settings: Any,
+) -> Device:
+    """A device as the file would make it."""
+    known = DeviceSettings(
+        name=name,
+        driver=driver,
+        timing=timing,
+        tags=tuple(tags),
+        late_guard=late_guard,
+        **settings,
+    )
+    return Device(known, wire)
 
 
 def plant(

@@ -22,16 +22,16 @@ from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from gateway.engine.device import Device
-from gateway.errors import DeviceError, NoReply
 from gateway.line.reading import read_block
+
+from gateway.errors import DeviceError, NoReply
 from gateway.planning.wire_timing import WireTiming
 from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.driver import Address, AnyDriver, Span
 from gateway.protocols.modbus import ModbusAscii, ModbusRtu
 from gateway.protocols.vigor import Vigor
 from gateway.simulator.plant import station_for
-from tests.sim.plant import make_tag
+from tests.sim.plant import made_device, make_tag
 from tests.sim.wire import Format, Noise, spoil
 
 RATES = (1e-5, 1e-4, 1e-3)
@@ -104,7 +104,7 @@ class Bench:
         self.right = WORDS[:size]
         addresses = [Address(area, start + n) for n in range(size)]
         tags = [make_tag(case.driver.spell(address), case.driver) for address in addresses]
-        self.device = Device(
+        self.device = made_device(
             "plc", case.driver, WireTiming(19200, 10), case.driver.timing, tuple(tags), 0.0
         )
         [self.block] = self.device.blocks

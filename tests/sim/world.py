@@ -59,7 +59,7 @@ class World:
         for line, settings in zip(gateway.lines, config.lines, strict=True):
             self._lines[line.name].line = line
             self._lines[line.name].config = settings
-        self.devices = {d.name: d for line in gateway.lines for d in line.devices}
+        self.devices = {d.name: d for line in gateway.lines for d in line.engine.devices}
         self._buses = {d.name: self._lines[s.name] for s in config.lines for d in s.devices}
         self.judge = Judge(gateway, self._buses, self.stations, story, self._began)
         most = 400 + 8 * len(self.judge.known) + 4 * len(drawn.episodes)
@@ -213,7 +213,7 @@ class World:
 
     def _begun(self, bus: Bus, until: float) -> None:
         """The first of an unasked frame has arrived: was anybody speaking then?"""
-        if bus.line._turn is None and bus.line.is_open:
+        if bus.line._turn is None and bus.line.engine.is_open:
             bus.speaking = self._loop.time(), until
 
     async def live(self) -> None:

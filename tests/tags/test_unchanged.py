@@ -8,7 +8,6 @@ import pytest
 
 from gateway.engine.device import Device
 from gateway.engine.jobs import Poll
-from gateway.engine.results import Consequences
 from gateway.engine.schedule import Schedule
 from gateway.errors import NoReply
 from gateway.tags import Publish, Quality, Reason, Sample, Tag, bad, good
@@ -29,7 +28,7 @@ class Reader:
         self.passed: Sequence[Sample] = ()
         self.schedule = Schedule([self.device], 0.0)
         self.then = Consequences("line", self.schedule, self, lambda: self.time)
-        self.device.answered()
+        self.device.health.answered()
         self.schedule.plan(self.device, 0.0)
         self.device.turnaround = WIRE.character  # set: not planned anew
 
@@ -37,7 +36,7 @@ class Reader:
         self.passed = samples
         self.news = self.mirror.update(samples)
 
-    def alive(self, device: Device, alive: bool) -> None:
+    def online(self, device: Device, online: bool) -> None:
         raise AssertionError("nobody asked for it")
 
     @property

@@ -7,8 +7,8 @@ from collections.abc import Coroutine
 from typing import Any, TypeVar
 
 import pytest
-
 from gateway.line.clock import Clock
+
 from gateway.line.transaction import Turn
 from gateway.line.wire_log import Recorder
 from gateway.planning.wire_timing import WireTiming
