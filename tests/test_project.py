@@ -118,3 +118,29 @@ def test_dependency_updates_cover_every_ecosystem() -> None:
 def test_the_readme_names_the_projects_pages(page: str) -> None:
     assert (ROOT / page).is_file()
     assert f"({page})" in (ROOT / "README.md").read_text("utf-8")
+
+
+def test_the_contributors_table_has_the_layers_in_the_order_of_their_imports() -> None:
+    [layers] = [
+        contract["layers"]
+        for contract in PROJECT["tool"]["importlinter"]["contracts"]
+        if contract["id"] == "layers"
+    ]
+    text = (ROOT / "CONTRIBUTING.md").read_text("utf-8")
+    rows = text.partition("| folder | question")[2].partition("\n\n")[0].splitlines()[2:]
+    named = [
+        name.removesuffix("/").removesuffix(".py")
+        for row in rows
+        for name in re.findall(r"`([^`]+)`", row.split("|")[1])
+    ]
+    assert named == [layer for layer in layers if layer != "__main__"]
+
+
+def test_the_contributors_page_names_only_files_and_targets_that_exist() -> None:
+    text = (ROOT / "CONTRIBUTING.md").read_text("utf-8")
+    paths = re.findall(r"`((?:gateway|tests|docs)/[\w./-]*)`", text)
+    targets = re.findall(r"make ([a-z]+)", text)
+    makefile = (ROOT / "Makefile").read_text()
+    assert len(paths) >= 10
+    assert [path for path in paths if not (ROOT / path).exists()] == []
+    assert [name for name in targets if f"\n{name}:" not in makefile] == []
