@@ -139,7 +139,7 @@ def test_the_contributors_table_has_the_layers_in_the_order_of_their_imports() -
 def test_the_contributors_page_names_only_files_and_targets_that_exist() -> None:
     text = (ROOT / "CONTRIBUTING.md").read_text("utf-8")
     paths = re.findall(r"`((?:gateway|tests|docs)/[\w./-]*)`", text)
-    targets = re.findall(r"make ([a-z]+)", text)
+    targets = re.findall(r"[`$] ?make ([a-z]+)", text)
     makefile = (ROOT / "Makefile").read_text()
     assert len(paths) >= 10
     assert [path for path in paths if not (ROOT / path).exists()] == []
