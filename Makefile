@@ -34,7 +34,7 @@ bench: .venv/ready
 	$(BIN)/python -m benchmarks.northbound
 
 clean:
-	rm -rf .venv build dist *.egg-info
+	rm -rf .venv build dist *.egg-info .coverage
 
 .venv/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv

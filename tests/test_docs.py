@@ -408,6 +408,27 @@ def _wants(command: Any) -> int:
     )
 
 
+def test_the_reference_lists_every_command_and_every_option() -> None:
+    group: Any = typer.main.get_command(cli)
+    listed = [name.split()[0] for name in names("commands.md", "Commands", "command")]
+    assert listed == list(group.commands)
+    options = {
+        (name, option)
+        for name, command in group.commands.items()
+        for param in command.params
+        if param.param_type_name == "option"
+        for option in (*param.opts, *param.secondary_opts)
+    }
+    on_page = {
+        (name, option.split()[0])
+        for cell, commands, _ in table("commands.md", "Options", "option")
+        for option in re.findall(r"`(.*?)`", cell)
+        for name in re.findall(r"`(.*?)`", commands)
+    }
+    on_page |= {("scan", option) for option in names("commands.md", "Options of scan", "option")}
+    assert options == on_page
+
+
 def test_the_plan_in_the_readme_is_the_one_that_check_prints(tmp_path: Path) -> None:
     [plan] = [block for block in _blocks("/README.md") if block.language == "text"]
     [file] = [block for block in FILES if block.page == "/README.md"]
