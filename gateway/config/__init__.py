@@ -32,28 +32,28 @@ __all__ = [
     "schema",
 ]
 
-# Settings whose values are texts even where YAML sees a number: `7E1`, `40101`, `unit: 1`.
+# Settings that are texts even where YAML sees a number: `7E1`, `40101`, `unit: 1`.
 _TEXTS = frozenset({"address", "description", "format", "name", "port", "prefix", "unit"})
 
 
 def load(path: str | Path) -> Config:
-    """The file, checked and complete. Paths in it are relative to its folder.
+    """Reads and checks the file. Paths in it are relative to its folder.
 
-    Raises `ConfigErrors` with every mistake there is.
+    Raises `ConfigErrors` with every mistake.
     """
-    with _uncollected():
+    with _without_gc():
         file, mistakes = read_yaml(Path(path), _TEXTS)
         config = Builder(mistakes, Path(path).parent).config(file.data)
-    mistakes.tell()
+    mistakes.raise_all()
     if config is None:
         raise AssertionError(f"{path}: no configuration, and no mistake either")
     return config
 
 
 @contextmanager
-def _uncollected() -> Iterator[None]:
-    """No garbage collection meanwhile: walking the growing tree again and again costs two thirds
-    of the time that a large file takes, and there is no garbage in it."""
+def _without_gc() -> Iterator[None]:
+    """Disables the garbage collector: walking the growing tree again and again takes two thirds
+    of the time of a large file, and finds no garbage in it."""
     enabled = gc.isenabled()
     gc.disable()
     try:

@@ -1,4 +1,4 @@
-"""From the file to the plant: lines, devices and tags, with every mistake found on the way."""
+"""Builds the configuration from the data of the file, and notes every mistake."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -44,15 +44,15 @@ from gateway.tags import Tag
 
 @dataclass(slots=True)
 class Builder:
-    """Builds one `Config`; `folder` is where relative paths in the file start."""
+    """Builds one `Config`. Paths in the file are relative to `folder`."""
 
     mistakes: Mistakes
     folder: FilePath
-    _devices: dict[str, str] = field(default_factory=dict)  # name -> line it is on
-    _recorded: Path | None = None  # where the first tag with `history: true` stands
+    _devices: dict[str, str] = field(default_factory=dict)  # name -> its line
+    _recorded: Path | None = None  # of the first tag with `history: true`
 
     def config(self, data: Mapping[str, Any]) -> Config | None:
-        """The whole file; None (and mistakes) where not even a stand-in could be made."""
+        """Returns the whole file; None, after mistakes, where no part could be made."""
         top = section(FileSection, data, (), self.mistakes, "the file")
         raw_lines = data.get("lines")
         defaults = self._defaults(data, (), TagDefaults())
@@ -128,13 +128,13 @@ class Builder:
         tags = tuple(self._tags(name, raw.get("tags"), (*path, "tags"), defaults, driver))
         if settings is None or driver is None:
             return None
-        usual = driver.timing
+        default = driver.timing
         timing = Timing(
-            reply_timeout=_either(settings.reply_timeout, usual.reply_timeout),
-            turnaround=_either(settings.turnaround, usual.turnaround),
-            silence=_either(settings.silence, usual.silence),
-            silence_chars=usual.silence_chars,
-            retries=usual.retries if settings.retries is None else settings.retries,
+            reply_timeout=_either(settings.reply_timeout, default.reply_timeout),
+            turnaround=_either(settings.turnaround, default.turnaround),
+            silence=_either(settings.silence, default.silence),
+            silence_chars=default.silence_chars,
+            retries=default.retries if settings.retries is None else settings.retries,
         )
         return DeviceSettings(
             name=name,
@@ -184,8 +184,8 @@ class Builder:
             own = section(TagSection, raw, place, self.mistakes, "a tag")
             if own is None or driver is None:
                 continue
-            doubt = isinstance(raw, dict) and "type" in raw and own.type is None
-            source = TagSource(device, name, own, defaults, place, type_unknown=doubt)
+            unknown_type = isinstance(raw, dict) and "type" in raw and own.type is None
+            source = TagSource(device, name, own, defaults, place, type_unknown=unknown_type)
             if isinstance(driver, TypedFields):
                 tag = field_tag(source, driver, driver, self.mistakes)
             else:
@@ -262,7 +262,7 @@ class Builder:
         )
 
     def _file(self, name: FilePath | None, path: Path) -> FilePath | None:
-        """A file that must be there."""
+        """Returns the path of a file that must exist."""
         if name is None:
             return None
         file = self.folder / name
@@ -284,5 +284,5 @@ def _mapping(raw: object) -> list[tuple[str, object]]:
     return list(raw.items()) if isinstance(raw, dict) else []
 
 
-def _either(own: float | None, usual: float) -> float:
-    return usual if own is None else own
+def _either(own: float | None, default: float) -> float:
+    return default if own is None else own

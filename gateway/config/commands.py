@@ -1,4 +1,4 @@
-"""Commands to PLCs (run, stop, loopback, model): what the file allows, and through whom."""
+"""Commands to PLCs (run, stop, loopback, model): permission and destination."""
 
 from collections.abc import Mapping
 
@@ -8,32 +8,32 @@ from gateway.engine.requests import why_not_commanded
 from gateway.errors import BadValue
 from gateway.protocols.driver import Controllable
 
-TO_ALL = "global"  # every station of the line hears it, and none answers
+TO_ALL = "global"  # goes to every station of the line; no station replies
 
 
 class NotControlled(BadValue):
-    """The file does not say `control: true`; nothing has been sent."""
+    """The file has no `control: true` for the device; nothing has been sent."""
 
 
 def commands_of(device: DeviceSettings) -> frozenset[str]:
-    """What a device of this protocol can be told, allowed or not."""
+    """Returns the commands of the protocol, permitted or not."""
     return device.driver.controls if isinstance(device.driver, Controllable) else frozenset()
 
 
 def every_command(config: Config) -> Mapping[str, frozenset[str]]:
-    """By device; only those whose protocol has commands. `TO_ALL` belongs to the line."""
+    """Returns the commands by device, without `TO_ALL`, which belongs to the line."""
     found = {device.name: commands_of(device) - {TO_ALL} for device in config.devices}
     return {name: commands for name, commands in found.items() if commands}
 
 
 def speaker(config: Config, line: str) -> str:
-    """The device in whose name a line tells all its stations. Raises `BadValue`."""
+    """Returns the device that sends `TO_ALL` to the line. Raises `BadValue`."""
     for one in config.lines:
         if one.name == line:
             for device in one.devices:
                 if device.enabled and TO_ALL in commands_of(device):
                     return device.name
-            raise BadValue(f"no device of line {line} knows a command to all stations")
+            raise BadValue(f"no device of line {line} has a command to all stations")
     raise BadValue(f"there is no line {line}")
 
 
@@ -46,9 +46,9 @@ def line_of(config: Config, device: str) -> LineConfig:
 
 
 def check_command(config: Config, device: str, command: str) -> None:
-    """Raises `BadValue` for a command that is none, `NotControlled` for one not allowed.
+    """Raises `BadValue` for an unknown command, `NotControlled` for one without permission.
 
-    What goes to all stations is allowed only where every device that would obey allows it.
+    A command to all stations needs the permission of every device that carries it out.
     """
     line = line_of(config, device)
     (asked,) = (one for one in line.devices if one.name == device)
@@ -56,7 +56,7 @@ def check_command(config: Config, device: str, command: str) -> None:
         raise BadValue(f"{device}: {why}")
     if not asked.enabled:
         raise BadValue(f"device {device} is disabled")
-    hears = [one for one in line.devices if one is asked or command == TO_ALL]
-    for one in hears:
+    receivers = [one for one in line.devices if one is asked or command == TO_ALL]
+    for one in receivers:
         if command in commands_of(one) and not one.control:
-            raise NotControlled(f"{one.name} is not to be told: it has no `control: true`")
+            raise NotControlled(f"{one.name} does not permit commands: it has no `control: true`")

@@ -1,7 +1,6 @@
-"""A protocol's own settings before pydantic sees them: durations in seconds, no unknown names.
+"""Prepares the settings of a protocol for pydantic: durations in seconds, no unknown names.
 
-They may be nested (the frames of a no-protocol device), and pydantic would pass over what a
-dataclass does not know.
+Settings may be nested, and pydantic would ignore unknown names in a nested dataclass.
 """
 
 import dataclasses
@@ -18,7 +17,7 @@ _LEFT_OUT = object()
 def plain_settings(
     kind: type[Any], raw: Mapping[str, Any], path: Path, mistakes: Mistakes
 ) -> dict[str, Any]:
-    """The settings of a dataclass without those that are mistakes, which are noted."""
+    """Returns the settings of a dataclass without mistakes, and notes those."""
     hints = get_type_hints(kind)
     known = [field.name for field in dataclasses.fields(kind) if field.init]
     found: dict[str, Any] = {}
@@ -34,7 +33,7 @@ def plain_settings(
 
 
 def is_duration(hint: Any) -> bool:
-    """Every float among a protocol's settings is a time."""
+    """Every float among the settings of a protocol is a time."""
     return float in (hint, *get_args(hint))
 
 
@@ -70,7 +69,7 @@ def _plain(hint: Any, value: Any, path: Path, mistakes: Mistakes) -> Any:
 
 
 def _number(hint: Any, value: Any, path: Path) -> Any:
-    """`format` is read as a text wherever it stands in the file; here it may be a number."""
+    """Converts a `format` that is a number: the file reader takes every `format` as a text."""
     whole = int in (hint, *get_args(hint)) and path[-1] == "format"
     return int(value) if whole and isinstance(value, str) and value.isdecimal() else value
 

@@ -1,4 +1,4 @@
-"""Makes the tags of devices with typed fields: the driver says most of what a tag is."""
+"""Makes the tags of devices with typed fields: the driver knows their type and access."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -53,7 +53,7 @@ def _write(
         return None
     if field.writable:
         return write_rule(source, settings.write, field.type, mistakes)
-    if source.says("write"):
+    if source.sets("write"):
         problem = f"{name} cannot be written: the device has no frame for it"
         hint = f", {field.write_hint}" if field.write_hint else ""
         mistakes.add((*source.path, "write"), problem + hint)
@@ -63,14 +63,14 @@ def _write(
 def _misfits(
     source: TagSource, name: str, field: TypedField, write: WriteRule | None
 ) -> Iterator[tuple[str, str]]:
-    """(setting, what is wrong with it)."""
-    for setting in filter(source.says, _OF_WORDS):
+    """Yields settings with their mistake."""
+    for setting in filter(source.sets, _OF_WORDS):
         yield setting, f"the field {name} has its own type: remove {setting} here"
     yield from only_for_numbers(source, field.type)
     if source.own.event and not field.unsolicited:
         hint = f": {field.event_hint}" if field.event_hint else ""
         yield "event", f"{name} never arrives unsolicited{hint}"
-    if source.says("every") and not field.polled:
+    if source.sets("every") and not field.polled:
         yield "every", f"{name} is never polled: it has no interval"
     if not field.polled and not field.unsolicited and write is None:
         yield "write", f"{name} can only be written: it needs write: true"

@@ -1,4 +1,4 @@
-"""Mistakes in the file, told to the person who has to mend it: all at once, each with its place."""
+"""Mistakes in the file, reported all at once, each with its place."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
@@ -11,7 +11,7 @@ Path = tuple[str | int, ...]
 
 
 class ConfigErrors(ConfigError):
-    """Every mistake of one file. `messages` are `file:line: path: what is wrong`, by line."""
+    """Every mistake of one file. `messages` are `file:line: path: mistake`, by line."""
 
     def __init__(self, messages: Sequence[str]) -> None:
         super().__init__("\n".join(messages))
@@ -19,13 +19,13 @@ class ConfigErrors(ConfigError):
 
 
 class Places(Protocol):
-    """Where in the file something was written."""
+    """The lines of the file, by path."""
 
     @property
     def name(self) -> str: ...
 
     def line(self, path: Path) -> int:
-        """The line, from 1, of the deepest part of `path` that the file has."""
+        """Returns the line, from 1, of the deepest part of `path` in the file."""
 
 
 @dataclass(slots=True)
@@ -45,7 +45,7 @@ class Mistakes:
     def __len__(self) -> int:
         return len(self._found)
 
-    def tell(self) -> None:
+    def raise_all(self) -> None:
         """Raises `ConfigErrors` if there was any mistake."""
         if self._found:
             self._found.sort(key=lambda entry: entry[0])
@@ -67,7 +67,7 @@ def one_of(names: Iterable[str]) -> str:
 
 
 def meant(name: str, known: Iterable[str]) -> str:
-    """What the writer may have meant, or all there is to choose from."""
+    """Suggests the most similar name, or all names."""
     choices, lower = list(known), name.lower()
     for spelt in (lower, lower.replace("-", "_")):
         if close := get_close_matches(spelt, choices, n=1, cutoff=0.7):
@@ -79,7 +79,7 @@ def meant(name: str, known: Iterable[str]) -> str:
 
 
 def shown(value: object) -> str:
-    """A value as the file has it."""
+    """Returns a value as the file writes it."""
     match value:
         case None:
             return "nothing"

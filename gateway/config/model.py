@@ -1,7 +1,7 @@
 """The sections of the file as pydantic sees them: name, type and meaning of every setting.
 
-The descriptions are what an editor shows. What one setting alone cannot tell (an address its
-device does not have, two stations of one number) is found in `gateway.config.build`.
+An editor shows the descriptions. Mistakes that need more than one setting (an address that the
+device does not have, two stations with one number) are found by `gateway.config.build`.
 """
 
 from pathlib import Path
@@ -45,7 +45,7 @@ from gateway.values import Order, ValueType
 
 
 class Section(BaseModel):
-    """Settings of one kind; a setting that is not listed is a mistake."""
+    """Settings of one kind; any other setting is a mistake."""
 
     model_config = ConfigDict(
         extra="forbid",
@@ -60,18 +60,18 @@ class GatewaySection(Section):
     """This gateway."""
 
     name: Name = "gateway"
-    """This gateway's own chunk in the key space."""
+    """The chunk of this gateway in the keys."""
     state: FilePath | None = None
-    """A file for what was learned of the devices (refused addresses), kept across restarts."""
+    """The file that keeps learned properties of the devices (refused addresses) across restarts."""
     standby: Group | None = None
-    """A name shared by two gateways of one plant: one serves, the other stands by."""
+    """A name shared by two gateways of one plant: one is active, the other is the standby."""
     standby_alone: Interval | None = None
-    """Go on the wire after so long without any Zenoh link; left out: wait for the network."""
+    """Become active after this time without any Zenoh link; left out: wait for the network."""
 
     @model_validator(mode="after")
     def _together(self) -> Self:
         if self.standby_alone is not None and self.standby is None:
-            raise ValueError("standby_alone means nothing without standby")
+            raise ValueError("standby_alone has no effect without standby")
         return self
 
 
@@ -79,13 +79,13 @@ class TlsSection(Section):
     """Certificates, as PEM files."""
 
     ca: FilePath | None = None
-    """Whose certificates are believed."""
+    """The certificate authority to trust."""
     certificate: FilePath | None = None
-    """This gateway's own."""
+    """The certificate of this gateway."""
     key: FilePath | None = None
-    """The private key of the certificate; closed to other users of this machine."""
+    """The private key of the certificate; not readable by other users of this machine."""
     mutual: bool = False
-    """Both sides show a certificate: who has none cannot connect."""
+    """Both sides show a certificate: a client without one cannot connect."""
 
     @model_validator(mode="after")
     def _together(self) -> Self:
@@ -97,39 +97,39 @@ class TlsSection(Section):
 
 
 class ZenohSection(Section):
-    """How to join the Zenoh network."""
+    """The Zenoh session."""
 
     prefix: Prefix = "plant"
-    """Every key starts with it."""
+    """The beginning of every key."""
     mode: Literal["peer", "client", "router"] = "peer"
-    """How this session takes part in the network."""
+    """The role of this session in the network."""
     listen: Endpoints = ["tcp/127.0.0.1:7447"]
-    """Endpoints to listen at; loopback unless you say otherwise."""
+    """Endpoints to listen on; by default only this machine can connect."""
     connect: list[Endpoint] = []
     """Endpoints to connect to."""
     config_file: FilePath | None = None
-    """A Zenoh JSON5 file for everything else, laid under these settings."""
+    """A Zenoh JSON5 file for all other settings; the settings here replace its own."""
     tls: TlsSection | None = None
-    """For endpoints that begin with tls/ or quic/."""
+    """Certificates for endpoints that begin with tls/ or quic/."""
     user: str | None = None
-    """Our own name where we connect to."""
+    """The user name of this gateway where it connects."""
     password_file: FilePath | None = None
-    """Its first line is our password; without it: the variable PLC_GATEWAY_ZENOH_PASSWORD."""
+    """Its first line is the password; left out: the variable PLC_GATEWAY_ZENOH_PASSWORD."""
     users_file: FilePath | None = None
-    """Who may connect to us: a line `user:password` each, as Zenoh has it."""
+    """The users that may connect to this gateway: one line `user:password` each."""
 
     @model_validator(mode="after")
     def _with_user(self) -> Self:
         if self.password_file is not None and self.user is None:
-            raise ValueError("password_file means nothing without user")
+            raise ValueError("password_file has no effect without user")
         return self
 
 
 class WritersSection(Section):
-    """Who may write, by tokens."""
+    """The clients that may write, by their tokens."""
 
     file: FilePath
-    """A line `name:salt:hash` each; see docs/security.md."""
+    """One line `name:salt:hash` for each client; see docs/security.md."""
 
 
 class HistorySection(Section):
@@ -144,29 +144,29 @@ class HistorySection(Section):
         PlainValidator(parsers.size),
         WithJsonSchema({"type": "string", "pattern": r"^[0-9]+(\.[0-9]+)? ?([kKMGT]B)$"}),
     ] = 10**9
-    """The oldest samples are deleted when the file grows beyond it."""
+    """The oldest samples are deleted when the file grows beyond this size."""
 
 
 class WebSection(Section):
     """The status page and /metrics."""
 
     listen: WebAddress = ("127.0.0.1", 8080)
-    """Where the page is served."""
+    """The address of the page."""
 
 
 class WriteSection(Section):
-    """What may be written, and how."""
+    """The rules for writing a tag."""
 
     min: Finite | None = None
-    """The least value, in the tag's own unit."""
+    """The least value, in the unit of the tag."""
     max: Finite | None = None
-    """The greatest value, in the tag's own unit."""
+    """The greatest value, in the unit of the tag."""
     verify: bool = False
     """Read back after the acknowledgement and compare."""
     repeat: bool = False
-    """May be sent again when nobody knows whether it was done."""
+    """Send the write again after an unclear result."""
     latest: bool = False
-    """Of several waiting writes only the last is sent."""
+    """Of several waiting writes, send only the last."""
 
     @model_validator(mode="after")
     def _order(self) -> Self:
@@ -185,9 +185,9 @@ class TagDefaults(Section):
     type: Annotated[
         ValueType | None, PlainValidator(parsers.value_type), WithJsonSchema(TYPE_SCHEMA)
     ] = None
-    """What the words mean; left out: bool for a bit, a whole number otherwise."""
+    """The type of the value; left out: bool for a bit, a whole number otherwise."""
     every: Interval = 1.0
-    """How often the tag is read."""
+    """The interval of reading."""
     scale: Annotated[Finite, AfterValidator(parsers.scale), WithJsonSchema(SCALE_SCHEMA)] = 1.0
     """value = raw x scale + offset"""
     offset: Finite = 0.0
@@ -195,15 +195,15 @@ class TagDefaults(Section):
     unit: Text = ""
     """The unit of the value, for people: rpm, °C."""
     description: Text = ""
-    """What it is, for people."""
+    """A description, for people."""
     deadband: Annotated[
         Deadband | None, PlainValidator(parsers.deadband), WithJsonSchema(DEADBAND_SCHEMA)
     ] = None
     """A smaller change is not published: 0.5 (in the tag's unit) or 2%."""
     word_order: OrderName = Order.LOW_FIRST
-    """Which word of a 32- or 64-bit value has the lower address."""
+    """The word of a 32- or 64-bit value at the lower address."""
     byte_order: OrderName | None = None
-    """Which byte of each word comes first."""
+    """The byte of each word that comes first."""
     publish: Annotated[
         Publish,
         PlainValidator(parsers.publish),
@@ -211,9 +211,9 @@ class TagDefaults(Section):
     ] = Publish.CHANGE
     """Publish when the value changes, or every value that is read."""
     heartbeat: Interval | None = None
-    """Publish at least so often, changed or not."""
+    """Publish at least this often, changed or not."""
     history: bool = False
-    """Keep the values on disk."""
+    """Store the values on disk."""
     payload: Annotated[
         Form,
         PlainValidator(parsers.form),
@@ -224,64 +224,64 @@ class TagDefaults(Section):
         Annotated[bool, Choice("flag")] | Annotated[WriteSection, Choice("rule")],
         Discriminator(_write_shape),
     ] = False
-    """Whether and how it may be written."""
+    """Permission to write the tag, with its rules."""
 
 
 class TagSection(TagDefaults):
     """One value of a device."""
 
     address: Text
-    """As the maker writes it: D100, X17, D7.3, holding:100; of frames the name of a field."""
+    """As the maker writes it: D100, X17, D7.3, holding:100; for frames the name of a field."""
     event: bool = False
-    """Every frame counts, also one that says the same as the last: a bar code."""
+    """Publish every frame, even with the same value as the last: a bar code."""
 
 
 class DeviceSection(Section):
-    """A device's settings that do not depend on its protocol."""
+    """Settings of a device that do not depend on its protocol."""
 
     reply_timeout: Interval | None = None
-    """How long it may take to answer, beyond the characters' own time on the wire."""
+    """Time-out from request to reply, without the time of the characters on the wire."""
     turnaround: Duration | None = None
-    """What it usually takes to answer; measured when left out."""
+    """Usual time from request to reply; left out: measured."""
     silence: Duration | None = None
-    """Quiet kept on the wire before it is spoken to."""
+    """Pause on the line before each request."""
     retries: Annotated[int, Field(ge=0, le=10)] | None = None
-    """How often a read that went wrong is asked again; writes never are."""
+    """How often a failed read is repeated; writes are not."""
     verify_reads: Annotated[int, Field(ge=1, le=3)] = 1
-    """How many readings in a row must agree before a value is believed."""
+    """The number of equal reads in a row before a value counts."""
     late_guard: Duration | None = None
-    """How long a late reply is waited for before anyone speaks again."""
+    """How long the line waits for a late reply before the next request."""
     blocks: Annotated[
         bool | Literal["only"],
         PlainValidator(parsers.blocks),
         WithJsonSchema({"enum": [True, False, "only"]}),
     ] = False
-    """One put per scan with all changed tags, at <device>/@block: also, or only that."""
+    """One put per scan with all changed tags, at <device>/@block: true adds it, only replaces."""
     control: bool = False
-    """The device may be told to run, to stop and the like."""
+    """Permission for commands to the device, such as run and stop."""
     enabled: bool = True
-    """false: the device stays in the file but is not spoken to."""
+    """false: the device stays in the file and gets no requests."""
     defaults: dict[str, Any] = {}
     tags: dict[str, Any] = {}
-    """What is read, by name."""
+    """The values of the device, by name."""
 
 
 class LineSection(Section):
-    """One wire and the devices on it."""
+    """One line and the devices on it."""
 
     port: Port
     """A serial port, tcp://host:port, rfc2217://host:port, or simulator."""
     baudrate: Baudrate = None
-    """Of the wire, also of the one behind a device server; the protocol's custom if left out."""
+    """Speed of the line, also behind a device server; left out: the default of the protocol."""
     format: Annotated[
         str | None, PlainValidator(parsers.serial_format), WithJsonSchema(FORMAT_SCHEMA)
     ] = None
-    """Data bits, parity, stop bits: 7E1, 8N1; the protocol's custom if left out."""
+    """Data bits, parity, stop bits: 7E1, 8N1; left out: the default of the protocol."""
     echo: bool | None = None
-    """true: the port hears what it says itself, as some two-wire RS-485 converters do."""
+    """true: the port receives its own requests, as with some two-wire RS-485 converters."""
     defaults: dict[str, Any] = {}
     devices: dict[str, Any]
-    """The stations on this wire, by name."""
+    """The devices on this line, by name."""
 
 
 class FileSection(Section):
@@ -294,4 +294,4 @@ class FileSection(Section):
     web: WebSection | None = None
     defaults: dict[str, Any] = {}
     lines: dict[str, Any]
-    """The wires, by name."""
+    """The lines, by name."""

@@ -1,7 +1,6 @@
-"""How single settings are written: `500ms`, `1GB`, `2%`, `7E1`, names, key prefixes.
+"""Parsers of single settings: `500ms`, `1GB`, `2%`, `7E1`, names, key prefixes.
 
-Every function takes what the file has, of any type, and raises `ConfigError` saying what
-would be right.
+Each takes a value of the file, of any type, and raises `ConfigError` with a correct example.
 """
 
 import math
@@ -26,25 +25,25 @@ _ENDPOINT = re.compile(r"[a-z][a-z0-9_-]*/[^\s/]\S*\Z")
 _WITH_PORT = ("tcp", "udp", "tls", "quic", "ws")
 _SERVER = re.compile(r"(?:([^/\\:\s]+):)?([0-9]+)\Z")  # as in its manual: `4001`, `10.0.0.7:4001`
 _FORMAT = re.compile(r"[78][NEO][12]\Z")
-# Rates that serial ports and PLCs know; a slip of the keyboard is rarely one of them.
+# Rates of serial ports and PLCs; a typing mistake is rarely one of them.
 BAUDRATES = (
     *(110, 300, 600, 1200, 2400, 4800, 9600, 14400, 19200, 28800, 31250, 38400, 56000, 57600),
     *(76800, 115200, 128000, 187500, 230400, 250000, 256000, 460800, 500000, 576000, 921600),
     *(1000000, 1152000, 1500000, 2000000, 2500000, 3000000, 3500000, 4000000),
 )
-_LONGEST_TIME = 3650 * 86400.0  # ten years; more is a slip, and clocks overflow
+_LONGEST_TIME = 3650 * 86400.0  # ten years; more is a mistake, and clocks overflow
 
 DURATIONS = "500ms, 2s, 15min, 1h or 7d"
 
 
 def duration(text: object) -> float:
-    """`500ms` -> 0.5 seconds. A number without its unit is refused."""
+    """Parses `500ms` as 0.5 seconds. Refuses a number without unit."""
     if isinstance(text, (int, float)) and not isinstance(text, bool) and 0 < text < _LONGEST_TIME:
         number = shown(text)
         raise ConfigError(f"{number} has no unit: write {number}s or {number}ms")
     match = _DURATION.match(text) if isinstance(text, str) else None
     if match is None:
-        raise ConfigError(f"{shown(text)} is no duration: write it as {DURATIONS}")
+        raise ConfigError(f"{shown(text)} is no duration: write {DURATIONS}")
     if match[2] not in SECONDS:
         hint = f"{match[1]}min for minutes" if match[2] in "mM" else one_of(SECONDS)
         raise ConfigError(f"{text}: {match[2]} is no unit of time: use {hint}")
@@ -56,7 +55,7 @@ def duration(text: object) -> float:
 
 
 def interval(text: object) -> float:
-    """A duration that is not zero."""
+    """Parses a duration that is not zero."""
     seconds = duration(text)
     if seconds == 0:
         raise ConfigError(f"{text}: an interval is longer than zero, such as 500ms")
@@ -64,10 +63,10 @@ def interval(text: object) -> float:
 
 
 def size(text: object) -> int:
-    """`1GB` -> 1000000000 bytes."""
+    """Parses `1GB` as 1000000000 bytes."""
     match = _SIZE.match(text) if isinstance(text, str) else None
     if match is None:
-        raise ConfigError(f"{shown(text)} is no size: write it as 500MB or 1GB")
+        raise ConfigError(f"{shown(text)} is no size: write 500MB or 1GB")
     octets = int(float(match[1]) * BYTES[match[2]])
     if octets < 10**6:
         raise ConfigError(f"{text} is too little: use at least 1MB")
@@ -75,27 +74,27 @@ def size(text: object) -> int:
 
 
 def deadband(text: object) -> Deadband:
-    """`0.5` in the tag's unit, `2%` of the last published value."""
+    """Parses `0.5` (in the unit of the tag) or `2%` (of the last published value)."""
     if isinstance(text, (int, float)) and not isinstance(text, bool):
         if not 0 <= text < math.inf:
             raise ConfigError(f"{shown(text)}: a deadband is 0 or more")
         return Deadband(float(text))
     match = _PERCENT.match(text) if isinstance(text, str) else None
     if match is None:
-        raise ConfigError(f"{shown(text)} is no deadband: write 0.5 (in the tag's unit) or 2%")
+        raise ConfigError(f"{shown(text)} is no deadband: write 0.5 (in the unit of the tag) or 2%")
     if float(match[1]) > 100:
-        raise ConfigError(f"{text}: more than 100% would publish next to nothing")
+        raise ConfigError(f"{text}: more than 100% would publish almost nothing")
     return Deadband(float(match[1]), percent=True)
 
 
 def name(text: object, *, slashes: bool = False) -> str:
-    """Letters and digits of any script, `_`, `-` and `.`.
+    """Parses a name: letters and digits of any script, `_`, `-` and `.`.
 
-    It comes out in composed form (NFC), so that it is one key however it was typed.
+    Returns it in composed form (NFC), so that it is one key however it was typed.
     """
     text = unicodedata.normalize("NFC", _text(text))
     if not text:
-        raise ConfigError("a name has at least one character")
+        raise ConfigError("a name needs at least one character")
     for letter in text:
         if not (letter in "_-." or (slashes and letter == "/") or _lettered(letter)):
             also = ", `/`" if slashes else ""
@@ -103,40 +102,40 @@ def name(text: object, *, slashes: bool = False) -> str:
                 f"{text!r} has {_spelt(letter)}: names are letters and digits, `_`, `-`, `.`{also}"
             )
     if slashes and ("" in text.split("/")):
-        raise ConfigError(f"{text!r}: a `/` stands between two parts of a name, not at its end")
+        raise ConfigError(f"{text!r}: a `/` separates two parts of a name and cannot be at its end")
     return text
 
 
 def tag_name(text: object) -> str:
-    """As `name`; a `/` may stand inside."""
+    """Parses a name with optional `/` inside."""
     return name(text, slashes=True)
 
 
 def prefix(text: object) -> str:
-    """A Zenoh key prefix of one or more chunks: `plant/site-1`."""
+    """Parses a Zenoh key prefix of one or more chunks: `plant/site-1`."""
     text = _text(text)
     for chunk in text.split("/"):
         if not chunk:
-            raise ConfigError(f"{text!r}: a prefix is chunks with one `/` between two of them")
+            raise ConfigError(f"{text!r}: one `/` separates the chunks of a prefix")
         if chunk.startswith("@"):
-            raise ConfigError(f"{text!r}: chunks with @ are the gateway's own: leave the @ out")
+            raise ConfigError(f"{text!r}: chunks with @ are reserved for the gateway: remove the @")
         if wild := next((letter for letter in "*$?#" if letter in chunk), None):
-            raise ConfigError(f"{text!r} has {wild}, a wildcard of Zenoh: leave it out")
+            raise ConfigError(f"{text!r} has {wild}, a wildcard of Zenoh: remove it")
         if not chunk.isprintable():
-            raise ConfigError(f"{text!r} has a character that cannot be seen: leave it out")
+            raise ConfigError(f"{text!r} has an invisible character: remove it")
     return text
 
 
 def endpoint(text: object) -> str:
-    """A Zenoh endpoint: `tcp/127.0.0.1:7447`."""
+    """Parses a Zenoh endpoint: `tcp/127.0.0.1:7447`."""
     if not isinstance(text, str) or not _ENDPOINT.match(text):
-        raise ConfigError(f"{shown(text)} is no Zenoh endpoint: write it as tcp/127.0.0.1:7447")
+        raise ConfigError(f"{shown(text)} is no Zenoh endpoint: write tcp/127.0.0.1:7447")
     check_address(text)
     return text
 
 
 def check_address(endpoint: str) -> None:
-    """Raises `ConfigError` where Zenoh could neither listen nor connect."""
+    """Raises `ConfigError` for an endpoint that Zenoh cannot use."""
     protocol, slash, address = endpoint.partition("/")
     if not slash or not address:
         raise ConfigError(f"{endpoint!r}: write it as tcp/127.0.0.1:7447")
@@ -157,16 +156,16 @@ def once(endpoints: list[str]) -> list[str]:
 
 
 def web_address(text: object) -> tuple[str, int]:
-    """`127.0.0.1:8080` -> host and port."""
+    """Parses `127.0.0.1:8080` as host and port."""
     match = _WEB.match(text) if isinstance(text, str) else None
     if match is None or not 1 <= int(match[2]) <= 65535:
-        raise ConfigError(f"{shown(text)} is no address to listen at: write it as 127.0.0.1:8080")
+        raise ConfigError(f"{shown(text)} is no address to listen on: write 127.0.0.1:8080")
     return match[1].strip("[]"), int(match[2])
 
 
 def scale(factor: float) -> float:
     if factor == 0:
-        raise ConfigError("a scale of 0 would make every value the same")
+        raise ConfigError("a scale of 0 makes every value the same")
     return factor
 
 
@@ -174,7 +173,7 @@ def port(text: object) -> PortAddress:
     text = _text(text)
     if match := _SERVER.match(text):
         host = match[1] or "host"
-        raise ConfigError(f"{text} is no port: of a device server write tcp://{host}:{match[2]}")
+        raise ConfigError(f"{text} is no port: for a device server write tcp://{host}:{match[2]}")
     return parse_port(text)
 
 
@@ -188,7 +187,7 @@ def baudrate(value: object) -> int:
 
 
 def serial_format(text: object) -> str:
-    """`7E1`: data bits, parity, stop bits."""
+    """Parses `7E1`: data bits, parity, stop bits."""
     if not isinstance(text, str) or not _FORMAT.match(text):
         raise ConfigError(
             f"{shown(text)} is no character format: write data bits (7 or 8), parity (N, E or O) "

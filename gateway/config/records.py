@@ -1,4 +1,4 @@
-"""What the file says, checked and complete: plain data for the rest of the gateway."""
+"""The checked and complete configuration: plain data for the rest of the gateway."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -20,7 +20,7 @@ class ZenohMode(StrEnum):
 class TlsConfig:
     """Certificates (PEM files). `mutual`: both sides show one."""
 
-    ca: Path | None = None  # whose certificates are believed
+    ca: Path | None = None  # certificate authority to trust
     certificate: Path | None = None
     key: Path | None = None
     mutual: bool = False
@@ -47,7 +47,7 @@ class ZenohConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HistoryConfig:
-    """Where samples of tags with `history: true` are kept, how long (seconds), how many bytes."""
+    """The store of samples. `keep` in seconds, `max_size` in bytes."""
 
     path: Path
     keep: float
@@ -56,7 +56,7 @@ class HistoryConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WebConfig:
-    """Where the status page listens."""
+    """The address of the status page."""
 
     host: str
     port: int
@@ -64,13 +64,13 @@ class WebConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LineConfig:
-    """One wire and the devices on it."""
+    """One line and the devices on it."""
 
     name: str
     port: PortAddress
     serial: SerialSettings
     wire: WireTiming
-    echo: bool | None  # whether the port hears what it says; None: not said
+    echo: bool | None  # the port receives its own requests; None: unknown
     devices: tuple[DeviceSettings, ...]
 
     @property
@@ -84,13 +84,13 @@ class LineConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Config:
-    """One whole file. `history` and `web` are None where the file has no such section."""
+    """One whole file. `history` and `web` are None where the file has not the section."""
 
     name: str
-    state_file: Path | None = None  # what was learned of the devices, kept across restarts
-    standby: str | None = None  # the group of gateways that stand in for one another
-    standby_alone: float | None = None  # seconds without a link until it goes on the wire anyway
-    writers_file: Path | None = None  # None: whoever Zenoh lets through may write
+    state_file: Path | None = None  # learned properties of the devices, across restarts
+    standby: str | None = None  # the group of an active and a standby gateway
+    standby_alone: float | None = None  # seconds without a link until it becomes active
+    writers_file: Path | None = None  # None: every client of Zenoh may write
     zenoh: ZenohConfig
     history: HistoryConfig | None
     web: WebConfig | None

@@ -29,7 +29,7 @@ _PARTS: dict[str, type[Section]] = {"Line": LineSection, "Tag": TagSection, "Def
 
 
 def schema() -> dict[str, Any]:
-    """A device is one of its protocols' shapes, with the settings of all devices in each."""
+    """Returns the schema. A device has one shape per protocol, each with the common settings."""
     root = FileSection.model_json_schema()
     shared: dict[str, Any] = root.setdefault("$defs", {})
     for name, part in _PARTS.items():
@@ -82,7 +82,7 @@ def _device(protocol: str, shared: dict[str, Any]) -> dict[str, Any]:
 
 
 def _is_station(driver: type[Any], number: int) -> bool:
-    """Whether the protocol has it, in its widest settings: those that hold when left out."""
+    """Returns True for a station number of the protocol with its default settings."""
     try:
         driver(station=number)
     except ConfigError:
@@ -91,14 +91,14 @@ def _is_station(driver: type[Any], number: int) -> bool:
 
 
 def _mend(kind: type[Any], properties: dict[str, Any]) -> None:
-    """Say of a dataclass's settings what the file knows and pydantic does not."""
+    """Corrects the schema of durations, which pydantic takes for numbers."""
     for name, hint in get_type_hints(kind).items():
         if name in properties and is_duration(hint):
             properties[name] = dict(DURATION_SCHEMA)
 
 
 def _write_default(setting: dict[str, Any]) -> None:
-    """As the file would say it: `7d`, not 604800 seconds. One that it cannot say is left out."""
+    """Writes a default as the file does: `7d`, not 604800 seconds. Removes null defaults."""
     match setting.get("default", ...), setting.get("pattern"):
         case float(seconds), pattern if pattern in _TIMES:
             setting["default"] = _in_unit(seconds, SECONDS)
@@ -116,7 +116,7 @@ def _may_be_null(setting: dict[str, Any]) -> bool:
 
 
 def _in_unit(amount: float, units: Mapping[str, float]) -> str:
-    """In the largest unit of which it is a whole number, or the smallest."""
+    """Writes an amount in the largest unit that gives a whole number, or the smallest."""
     whole = [unit for unit, size in units.items() if amount and amount % size == 0]
     unit = max(whole, key=units.__getitem__, default=min(units, key=units.__getitem__))
     return f"{amount / units[unit]:g}{unit}"

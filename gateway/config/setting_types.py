@@ -1,4 +1,4 @@
-"""How one setting looks to pydantic and to an editor: durations, names, files, endpoints."""
+"""Types of single settings for pydantic and for editors: durations, names, files, endpoints."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -17,9 +17,9 @@ DURATION_SCHEMA: dict[str, Any] = {
 INTERVAL_SCHEMA = DURATION_SCHEMA | {
     "pattern": r"^(?=[0-9.]*[1-9])[0-9]+(\.[0-9]+)? ?(ms|s|min|h|d)$"
 }
-# `40101` as an address, `7E1` as a format and `true` as a unit look like others to an editor.
+# To an editor `40101` as an address and `true` as a unit are a number and a boolean.
 TEXT_SCHEMA: dict[str, Any] = {"type": ["string", "number", "boolean"]}
-# Letters and digits of any script: an editor is told what of ASCII is neither.
+# Letters and digits of any script: the pattern excludes the other characters of ASCII.
 _NAME = r"[^\x00-,/:-@\[-\^`{-\x7f\s]+"
 NAME_PATTERN, TAG_NAME_PATTERN = f"^{_NAME}$", f"^{_NAME}(/{_NAME})*$"
 _CHUNK = r"[^/@*$?#][^/*$?#]*"
@@ -52,7 +52,7 @@ _ORDER_SCHEMA = {"type": "string", "enum": [order.value for order in Order]}
 _HOST = r"(\[[0-9A-Fa-f:.%]+\]|[^\[\]/:\s]+)"
 _PORT_SCHEMA = {
     "type": "string",
-    # One of the network, or a path: no other scheme, and no `host:port` without any.
+    # A network port, or a path: no other scheme, and no `host:port` without a scheme.
     "pattern": rf"^((tcp|rfc2217)://{_HOST}:[0-9]{{1,5}}"
     r"|(?![A-Za-z][A-Za-z0-9+.-]+://|([^/\\:\s]+:)?[0-9]+$)\S(.*\S)?)$",
     "examples": ["/dev/ttyUSB0", "COM3", "tcp://10.0.0.7:4001", "rfc2217://host:port", "simulator"],

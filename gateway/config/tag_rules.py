@@ -1,4 +1,4 @@
-"""From what the file says of a tag to the tag: does its device have it, and does all of it fit?"""
+"""Makes tags: checks that the device has the address and that all settings fit."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -15,10 +15,10 @@ _WIDE = (Kind.INT32, Kind.UINT32, Kind.FLOAT32, Kind.BCD32)
 
 @dataclass(frozen=True, slots=True)
 class TagSource:
-    """One tag as the file has it: its own settings, and those it inherits.
+    """One tag in the file: its own settings, and those that it inherits.
 
-    What is inherited and does not suit the tag is passed over (a scale for a bit, `write` for
-    an input); what the tag says itself must suit it.
+    An inherited setting that does not fit the tag is ignored (a scale for a bit, `write` for an
+    input); a setting of its own must fit.
     """
 
     device: str
@@ -26,28 +26,28 @@ class TagSource:
     own: TagSection
     inherited: TagDefaults
     path: Path
-    type_unknown: bool = False  # its `type` was a mistake, so nothing can be said of what fits
+    type_unknown: bool = False  # its `type` was a mistake: the fit cannot be checked
 
-    def says(self, setting: str) -> bool:
+    def sets(self, setting: str) -> bool:
         return setting in self.own.model_fields_set
 
 
 def inherit(outer: TagDefaults, inner: TagDefaults) -> TagDefaults:
-    """The settings of `outer`, with those that `inner` says itself laid over them."""
+    """Returns the settings of `outer`, replaced by those that `inner` sets itself."""
     if not inner.model_fields_set:
         return outer
     return outer.model_copy(update={name: getattr(inner, name) for name in inner.model_fields_set})
 
 
 def build_tag(source: TagSource, driver: AnyDriver, mistakes: Mistakes) -> Tag | None:
-    """The tag, or None after its mistakes were noted."""
+    """Returns the tag, or None after its mistakes were noted."""
     before = len(mistakes)
     address = address_of(source, driver, mistakes)
     if address is None:
         return None
     area = driver.areas.get(address.area)
-    if area is None:  # a broadcast has no areas that can only be read
-        problem = f"{source.own.address} can only be read, and station {driver.station} never is"
+    if area is None:  # a broadcast has no areas that are only readable
+        problem = f"{source.own.address} is read-only, and station {driver.station} cannot be read"
         mistakes.add((*source.path, "address"), problem)
         return None
     if source.type_unknown:
@@ -68,7 +68,7 @@ def build_tag(source: TagSource, driver: AnyDriver, mistakes: Mistakes) -> Tag |
 
 
 def address_of(source: TagSource, driver: AnyDriver, mistakes: Mistakes) -> Address | None:
-    """What the tag's address means to its device, or None after the mistake was noted."""
+    """Returns the address of the tag, or None after the mistake was noted."""
     try:
         return driver.address(source.own.address)
     except ConfigError as error:
@@ -85,7 +85,7 @@ def assemble(
     layout: Layout,
     write: WriteRule | None,
 ) -> Tag:
-    """The tag, without what only numbers have where it is none."""
+    """Returns the tag, without settings of numbers where its type is no number."""
     number = layout.type.is_number
     return Tag(
         device=source.device,
@@ -123,7 +123,7 @@ def _type(
     misfit = _type_misfit(settings.type, area, address, driver)
     if misfit is None:
         return settings.type
-    if source.says("type"):
+    if source.sets("type"):
         mistakes.add((*source.path, "type"), misfit)
     return default
 
@@ -167,7 +167,7 @@ def _misfits(
     kind: ValueType,
     write: WriteRule | None,
 ) -> Iterator[tuple[str, str]]:
-    """(setting, what is wrong with it)."""
+    """Yields settings with their mistake."""
     area = driver.areas[span.area]
     first = driver.spell(Address(area.name, span.start))
     cost = driver.cost(span) if area.readable else driver.write_cost(span)
@@ -175,7 +175,7 @@ def _misfits(
         last = driver.spell(Address(area.name, area.last))
         yield "address", f"a {kind} at {first} takes {span.size} words, but the last is {last}"
     elif cost is None:
-        yield "type", f"a {kind} is {span.size} words, more than one exchange can carry"
+        yield "type", f"a {kind} is {span.size} words, more than one request can carry"
     if not area.readable and write is None:
         yield "write", f"{first} is never read at station {driver.station}: it needs write: true"
     if not area.readable and address.bit is not None:
@@ -188,24 +188,24 @@ def _misfits(
 def _unsuited(
     source: TagSource, area: Area, first: str, kind: ValueType
 ) -> Iterator[tuple[str, str]]:
-    """Settings that such a tag cannot have."""
+    """Yields settings that this tag cannot have."""
     spelt = source.own.address
     if source.own.event:
-        yield "event", f"{first} is polled: events are what a device says unasked"
+        yield "event", f"{first} is polled: only an unsolicited value can be an event"
     if area.unit is Unit.DWORD:
-        for setting in filter(source.says, ("word_order", "byte_order")):
+        for setting in filter(source.sets, ("word_order", "byte_order")):
             yield setting, f"{first} has 32 bits by nature: it needs no {setting}"
-    elif source.says("word_order") and not (kind.is_number and kind.words > 1):
+    elif source.sets("word_order") and not (kind.is_number and kind.words > 1):
         yield "word_order", f"{spelt} is {kind}: only numbers of 32 or 64 bits have a word_order"
-    if kind.kind is Kind.BOOL and source.says("byte_order"):
+    if kind.kind is Kind.BOOL and source.sets("byte_order"):
         yield "byte_order", f"{spelt} is {kind}: only words have a byte_order"
     yield from only_for_numbers(source, kind)
 
 
 def only_for_numbers(source: TagSource, kind: ValueType) -> Iterator[tuple[str, str]]:
-    """Settings of numbers that a text or a bit has."""
+    """Yields settings of numbers at a text or a bit."""
     if not kind.is_number:
-        for setting in filter(source.says, ("scale", "offset", "deadband")):
+        for setting in filter(source.sets, ("scale", "offset", "deadband")):
             yield setting, f"a {kind} has no {setting}: only numbers have"
 
 
@@ -217,19 +217,19 @@ def _write(
     kind: ValueType,
     mistakes: Mistakes,
 ) -> WriteRule | None:
-    """The rule for writing; None where nothing may be written."""
+    """Returns the rule for writing; None where the tag cannot be written."""
     setting, path = settings.write, (*source.path, "write")
     if setting is False:
         return None
-    own, spelt = source.says("write"), source.own.address
+    own, spelt = source.sets("write"), source.own.address
     area = driver.areas[span.area]
     if not area.writable:
         if own:
-            mistakes.add(path, f"{spelt} can only be read: nothing can be written to {area.name}")
+            mistakes.add(path, f"{spelt} is read-only: {area.name} cannot be written")
         return None
     if area.readable and driver.cost(span) is not None and driver.write_cost(span) is None:
         if own:
-            mistakes.add(path, f"{spelt} cannot be written in one exchange")
+            mistakes.add(path, f"{spelt} cannot be written with one request")
         return None
     return write_rule(source, setting, kind, mistakes)
 
@@ -237,11 +237,11 @@ def _write(
 def write_rule(
     source: TagSource, setting: bool | WriteSection, kind: ValueType, mistakes: Mistakes
 ) -> WriteRule:
-    """What `write:` says of a tag that can be written."""
+    """Returns the rule of `write:` for a tag that can be written."""
     if not isinstance(setting, WriteSection):
         return WriteRule()
     bounded = setting.min is not None or setting.max is not None
-    if bounded and not kind.is_number and source.says("write"):
+    if bounded and not kind.is_number and source.sets("write"):
         mistakes.add((*source.path, "write"), f"a {kind} has no min and max: only numbers have")
     number = kind.is_number
     return WriteRule(
@@ -254,8 +254,8 @@ def write_rule(
 
 
 def check_bounds(source: TagSource, tag: Tag, mistakes: Mistakes) -> None:
-    """A bound that the device cannot hold would be refused at the first write: say so now."""
-    if tag.write is None or not source.says("write"):
+    """Notes a bound that the device cannot hold: the first write with it would be refused."""
+    if tag.write is None or not source.sets("write"):
         return
     for setting in ("min", "max"):
         bound = getattr(tag.write, setting)

@@ -1,4 +1,4 @@
-"""Pydantic's findings, in the words of somebody who stands before the machine."""
+"""Validates with pydantic, and words its findings for a plant engineer."""
 
 import dataclasses
 import json
@@ -17,12 +17,12 @@ from gateway.protocols.registry import PROTOCOLS, Protocol
 
 S = TypeVar("S", bound=Section)
 
-# The branches of `write:`, which pydantic names in its places but the file does not.
+# The branches of `write:`: pydantic names them in its places, the file does not.
 _BRANCHES = ("flag", "rule")
 
 
 def section(kind: type[S], raw: object, path: Path, mistakes: Mistakes, called: str) -> S | None:
-    """The section, or what is left of it without its mistakes; None if that is nothing."""
+    """Returns the section without its mistakes; None if that is impossible."""
     try:
         return kind.model_validate(raw)
     except ValidationError as error:
@@ -38,7 +38,7 @@ def section(kind: type[S], raw: object, path: Path, mistakes: Mistakes, called: 
 
 
 def _without(raw: Any, place: Path) -> Any:
-    """A copy of the settings without the one at `place`; a list with a mistake goes as a whole."""
+    """Copies the settings without the one at `place`; removes a list with a mistake as a whole."""
     if not isinstance(raw, dict) or not place or place[0] not in raw:
         return raw
     rest = dict(raw)
@@ -79,7 +79,7 @@ def driver_of(
 
 
 def driver_settings(protocol: str) -> set[str]:
-    """The names of its own settings in the file."""
+    """Returns the names of its own settings in the file."""
     return {field.name for field in dataclasses.fields(PROTOCOLS[protocol].settings) if field.init}
 
 
@@ -96,7 +96,7 @@ def _adapter(known: Protocol) -> TypeAdapter[Any]:
 
 
 def _known(kind: type[Section], place: Path) -> Collection[str]:
-    """The settings there are at a place inside a section."""
+    """Returns the settings at a place inside a section."""
     for chunk in place:
         inner = _inner(kind.model_fields[str(chunk)].annotation)
         if inner is None:

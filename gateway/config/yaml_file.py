@@ -25,7 +25,7 @@ _TOO_DEEP = f"more than {_DEEPEST} levels deep: look for a bracket or a dash too
 
 
 def _descend(loader: Any, parent: yaml.Node | None, _index: object) -> None:
-    """The reader calls itself for each level, and some thousands of them are a crash."""
+    """Limits the depth: the reader is recursive, and some thousands of levels end in a crash."""
     loader.depth += 1
     if loader.depth > _DEEPEST and parent is not None:
         raise yaml.MarkedYAMLError(problem=_TOO_DEEP, problem_mark=parent.start_mark)
@@ -35,8 +35,8 @@ def _ascend(loader: Any) -> None:
     loader.depth -= 1
 
 
-# libyaml is ten times faster; PyYAML's own reader serves where it was built without. What a
-# scalar means is decided here, so PyYAML's own search for it (half of its time) is left out.
+# libyaml is ten times faster; PyYAML's own reader is the fallback. This module finds the type of
+# a scalar, so PyYAML's own search for it (half of its time) is left out.
 _LOADER: Any = type(
     "_Loader",
     (yaml.CBaseLoader if yaml.__with_libyaml__ else yaml.BaseLoader,),
@@ -61,9 +61,9 @@ _WORDS: dict[str, object] = {
     **dict.fromkeys(("-.inf", "-.Inf"), float("-inf")),
     **dict.fromkeys((".nan", ".NaN"), float("nan")),
 }
-# What an alias may blow a small file up to; ten times a gateway of 10,000 tags.
+# Limits the growth of a small file by aliases; ten times a gateway of 10,000 tags.
 _MOST_NODES = 2_000_000
-# What helps where the reader uses such words; of several the first.
+# Advice by words in the message of the reader; the first match counts.
 _REMEDIES = {
     "escape character": "in double quotes a backslash begins an escape: use single quotes",
     "quoted scalar": "close the quote",
@@ -81,7 +81,7 @@ _NUMERIC = frozenset("+-.0123456789")
 
 @dataclass(slots=True)
 class YamlFile:
-    """One file that has been read; `data` is dicts, lists, texts, numbers, booleans and None."""
+    """One file; `data` is dicts, lists, texts, numbers, booleans and None."""
 
     name: str
     root: yaml.MappingNode
@@ -92,7 +92,7 @@ class YamlFile:
     _nodes: int = 0
 
     def line(self, path: Path) -> int:
-        """The line, from 1, of the deepest part of `path` that the file has."""
+        """Returns the line, from 1, of the deepest part of `path` in the file."""
         node: yaml.Node = self.root
         mark = node.start_mark
         for chunk in path:
@@ -107,7 +107,7 @@ class YamlFile:
         return _line(mark)
 
     def read(self, mistakes: Mistakes) -> None:
-        """Fill `data`, and find what YAML allows but a configuration does not."""
+        """Fills `data`, and notes YAML that a configuration must not use."""
         found = self._plain(self.root, (), mistakes)
         self.data = found if isinstance(found, dict) else {}
 
@@ -170,7 +170,7 @@ class YamlFile:
             )
 
     def _of(self, node: yaml.MappingNode) -> Entries:
-        """The entries by name, first key first; what `<<` brings in gives way to the rest."""
+        """Returns the entries by name; the first of equal keys counts, and those of `<<` last."""
         if id(node) not in self._entries:
             self._entries[id(node)] = {}  # a mapping merged into itself brings nothing
             own: Entries = {}
@@ -185,10 +185,10 @@ class YamlFile:
 
 
 def read_yaml(path: FilePath, texts: frozenset[str]) -> tuple[YamlFile, Mistakes]:
-    """The file, and what was wrong in it so far.
+    """Returns the file and the mistakes found so far.
 
     `texts` are the keys whose values are texts even where they look like numbers (`7E1`).
-    Raises `ConfigErrors` where nothing can be read at all.
+    Raises `ConfigErrors` where the file cannot be read.
     """
     text = _text(path)
     try:
@@ -247,9 +247,9 @@ def _syntax(name: str, text: str, error: yaml.MarkedYAMLError) -> str:
     begun = ""
     if error.context_mark and _line(error.context_mark) != line:
         begun = f" that begins in line {_line(error.context_mark)}"
-    told = f"{context}{begun}, {problem}" if context else problem
-    remedies = (remedy for word, remedy in _REMEDIES.items() if word in told)
-    return f"{name}:{line}: no YAML: {': '.join([told, *islice(remedies, 1)])}"
+    message = f"{context}{begun}, {problem}" if context else problem
+    remedies = (remedy for word, remedy in _REMEDIES.items() if word in message)
+    return f"{name}:{line}: no YAML: {': '.join([message, *islice(remedies, 1)])}"
 
 
 def _line(mark: Any) -> int:
@@ -279,5 +279,5 @@ def _merged(node: yaml.MappingNode) -> Iterator[yaml.MappingNode]:
 
 
 def _parts(value: yaml.Node) -> list[yaml.Node]:
-    """What one `<<` brings in: a mapping, or a list of them."""
+    """Returns the mappings of one `<<`: a mapping, or a list of mappings."""
     return value.value if isinstance(value, yaml.SequenceNode) else [value]

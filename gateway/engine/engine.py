@@ -15,6 +15,7 @@ from gateway.engine.health import State
 from gateway.engine.in_flight import InFlight
 from gateway.engine.jobs import (
     Answer,
+    Confirm,
     Idle,
     Job,
     Poll,
@@ -33,7 +34,7 @@ from gateway.engine.jobs import (
 )
 from gateway.engine.records import LineRecord
 from gateway.engine.request_results import RequestResults
-from gateway.engine.requests import Request, Write, why_not_commanded
+from gateway.engine.requests import Command, Request, Write, why_not_commanded
 from gateway.engine.results import Results, offline
 from gateway.engine.schedule import Schedule
 from gateway.engine.staleness import NEVER, Staleness
@@ -90,8 +91,14 @@ class Engine:
             job = self.schedule.next(now)
             if type(job) is Write and (others := self.schedule.requests.companions(job)):
                 job = WriteTogether(job.device, [job, *others])
-        if not isinstance(job, Idle):
-            in_flight.begin(job, now)
+        if isinstance(job, Idle):
+            return job
+        in_flight.job, in_flight.begun = job, now
+        if isinstance(job, Poll):
+            in_flight.open_polls = 1
+            in_flight.charged = None if job.expedited else job.device
+        else:
+            in_flight.charged = job.device if isinstance(job, Probe) else None
         return job
 
     def alongside(self, poll: Poll, now: float) -> Sequence[Poll]:
@@ -107,32 +114,39 @@ class Engine:
         self, job: Transacted, result: Result, traffic: Traffic, now: float, time: int
     ) -> list[Effect]:
         """Applies the result of a job."""
-        self._count(job.device, traffic, now)
-        in_flight = self._in_flight
+        characters = (traffic.sent + traffic.heard) * self.wire.character
+        self.record.busy += characters
+        self.record.turnarounds += traffic.turnaround
+        device, in_flight = job.device, self._in_flight
+        device.record.count_exchanges(traffic.exchanges, characters, traffic.turnaround)
         if isinstance(job, Poll):
-            self._conclude_poll(job, result, now, time)
+            in_flight.open_polls -= 1
+            if isinstance(result, list | tuple):
+                self._results.read(job, result, now, time)
+            else:
+                self._conclude_failed_poll(job, result, now, time)
             if in_flight.open_polls:
                 return self._effects.take()
             if in_flight.failed:
                 self._unclear(*in_flight.failed[0], traffic, now, time)
-        elif isinstance(job, Settle):
-            self._conclude_settle(job, result, now, time)
-        elif isinstance(job, Probe):
-            self._conclude_probe(job, result, traffic, now, time)
-        elif isinstance(job, Answer):
-            if isinstance(result, Garbled):
-                self._effects.warning("reply dropped", device=job.device.name, why=str(result))
         else:
-            self._conclude_request(job, result, traffic, now, time)
+            self._conclude_other(job, result, traffic, now, time)
         if in_flight.continuation is None:
-            in_flight.end(now)
-        if self._staleness.due < self.deadline or type(job) is not Poll:
+            in_flight.job = None
+            if in_flight.failed:
+                in_flight.failed.clear()
+            if in_flight.charged is not None and len(self.devices) > 1:
+                in_flight.charged.used(now, in_flight.begun)
+        if self._unsolicited.speakers:
+            self._unsolicited.transaction_ended(device, now, sent=traffic.sent, heard=traffic.heard)
             self._set_deadline()
-        return self._effects.take()
+        elif self._staleness.due < self.deadline or not isinstance(job, Poll):
+            self._set_deadline()
+        effects, self._effects.collected = self._effects.collected, []
+        return effects
 
-    def _conclude_poll(self, poll: Poll, result: Result, now: float, time: int) -> None:
+    def _conclude_failed_poll(self, poll: Poll, result: Result, now: float, time: int) -> None:
         device, results = poll.device, self._results
-        self._in_flight.open_polls -= 1
         match result:
             case Refused():
                 results.answered(device, now, time)
@@ -144,10 +158,23 @@ class Engine:
                 self._in_flight.failed.append((poll, result))
             case LineDown():
                 device.health.left_outstanding(poll.block.span)
-            case list() | tuple():
-                if device.health.needs_resync or not device.health.online:
-                    results.answered(device, now, time)
-                results.read(poll, result, now, time)
+            case _:
+                raise TypeError(f"{result!r} is no result of a poll")
+
+    def _conclude_other(
+        self, job: Transacted, result: Result, traffic: Traffic, now: float, time: int
+    ) -> None:
+        match job:
+            case Settle():
+                self._conclude_settle(job, result, now, time)
+            case Probe():
+                self._conclude_probe(job, result, traffic, now, time)
+            case Answer():
+                if isinstance(result, Garbled):
+                    why = str(result)
+                    self._effects.warning("reply dropped", device=job.device.name, why=why)
+            case Write() | WriteTogether() | Command() | Confirm() | Repeat():
+                self._conclude_request(job, result, traffic, now, time)
 
     def _conclude_probe(
         self, probe: Probe, result: Result, traffic: Traffic, now: float, time: int
@@ -204,14 +231,6 @@ class Engine:
             self._results.unread(poll, error, now, time)
         if not isinstance(after, Poll | Probe):
             self._in_flight.continuation = self._requests.settled(settle, now)
-
-    def _count(self, device: Device, traffic: Traffic, now: float) -> None:
-        characters = (traffic.sent + traffic.heard) * self.wire.character
-        self.record.busy += characters
-        self.record.turnarounds += traffic.turnaround
-        device.record.count_exchanges(traffic.exchanges, characters, traffic.turnaround)
-        if self._unsolicited.speakers:
-            self._unsolicited.transaction_ended(device, now, sent=traffic.sent, heard=traffic.heard)
 
     # What comes from outside
 

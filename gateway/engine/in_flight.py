@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 
 from gateway.engine.device import Device
-from gateway.engine.jobs import Confirm, Poll, Probe, Repeat, Transacted
+from gateway.engine.jobs import Confirm, Poll, Repeat, Transacted
 from gateway.errors import DeviceError
 
 
@@ -18,14 +18,6 @@ class InFlight:
     failed: list[tuple[Poll, DeviceError]] = field(default_factory=list)
     continuation: Transacted | None = None
 
-    def begin(self, job: Transacted, now: float) -> None:
-        self.job, self.begun = job, now
-        if type(job) is Poll:
-            self.open_polls = 1
-            self.charged = None if job.expedited else job.device
-        else:
-            self.charged = job.device if type(job) is Probe else None
-
     def resume(self, now: float) -> Transacted:
         """Hands out the continuation. What confirms or repeats a write has its own time."""
         job, self.continuation = self.continuation, None
@@ -35,11 +27,3 @@ class InFlight:
         if isinstance(job, Confirm | Repeat):
             self.begun = now
         return job
-
-    def end(self, now: float) -> None:
-        """The job is concluded, and nothing follows it."""
-        self.job = None
-        self.failed.clear()
-        if self.charged is not None:
-            self.charged.used(now, self.begun)
-            self.charged = None

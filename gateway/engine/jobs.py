@@ -43,18 +43,6 @@ class Poll:
     last: LastRead = field(default_factory=LastRead)
     record: PollRecord = field(default_factory=PollRecord)
 
-    def read(self, now: float) -> None:
-        """It was read well."""
-        last, record = self.last, self.record
-        if last.at is not None:
-            gap = now - last.at
-            if gap > record.worst_gap:
-                record.worst_gap = gap
-            record.mean_gap += (gap - record.mean_gap) / max(1, min(10, record.reads))
-        record.reads += 1
-        last.at = now
-        last.ever = True
-
     def forget(self, now: float) -> float:
         """Its values turn bad. Returns their age."""
         age = 0.0 if self.last.at is None else now - self.last.at

@@ -3,12 +3,12 @@
 import heapq
 import itertools
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 
-from gateway.engine.jobs import EXPEDITED, NOT_QUEUED, Poll
+from gateway.engine.jobs import EXPEDITED, Poll
 
 ROOM = 16  # entries a heap may hold beside twice the valid ones
-_Heap = list[tuple[float, int, Poll]]
+Heap = list[tuple[float, int, Poll]]
 
 
 class PollQueue:
@@ -18,13 +18,13 @@ class PollQueue:
     and are dropped when they come up or when there are too many.
     """
 
-    __slots__ = ("_due", "_expedited", "_most_due", "_most_waiting", "_tickets", "_waiting")
+    __slots__ = ("_most_due", "_most_waiting", "_tickets", "due", "expedited", "waiting")
 
     def __init__(self) -> None:
+        self.waiting: Heap = []  # by due time
+        self.due: Heap = []  # by deadline; after `ripen` the first entry is valid
+        self.expedited: deque[Poll] = deque()  # before all due polls; after `ripen` likewise
         self._tickets = itertools.count()
-        self._waiting: _Heap = []
-        self._due: _Heap = []
-        self._expedited: deque[Poll] = deque()
         self._most_waiting = self._most_due = ROOM
 
     def push(self, poll: Poll) -> None:
@@ -32,7 +32,7 @@ class PollQueue:
         if not (poll.live and poll.device.health.online) or poll.ticket == EXPEDITED:
             return
         poll.ticket = next(self._tickets)
-        waiting = self._waiting
+        waiting = self.waiting
         heapq.heappush(waiting, (poll.due, poll.ticket, poll))
         if len(waiting) > self._most_waiting:
             waiting[:] = [e for e in waiting if e[2].live and e[2].ticket == e[1]]
@@ -46,16 +46,16 @@ class PollQueue:
         """The poll goes before all due polls."""
         if poll.ticket != EXPEDITED:
             poll.ticket = EXPEDITED
-            self._expedited.append(poll)
+            self.expedited.append(poll)
 
     def ripen(self, now: float) -> bool:
         """Moves polls that have come due to their heap. True when there is one to hand out."""
-        waiting, due, expedited = self._waiting, self._due, self._expedited
+        waiting, due, expedited = self.waiting, self.due, self.expedited
         while waiting and waiting[0][0] <= now:
             _, ticket, poll = heapq.heappop(waiting)
             if poll.ticket == ticket and poll.live:
                 heapq.heappush(due, (poll.due + poll.block.every, ticket, poll))
-        while due and not _is_valid(due[0]):
+        while due and (due[0][2].ticket != due[0][1] or not _is_valid(due[0])):
             heapq.heappop(due)
         if len(due) > self._most_due:
             due[:] = [entry for entry in due if _is_valid(entry)]
@@ -64,30 +64,9 @@ class PollQueue:
             expedited.popleft()
         return bool(due or expedited)
 
-    @property
-    def next_due(self) -> float:
-        """When the next waiting poll comes due."""
-        return self._waiting[0][0] if self._waiting else float("inf")
-
-    @property
-    def first(self) -> Poll | None:
-        """The due poll with the earliest deadline, after `ripen`."""
-        return self._due[0][2] if self._due else None
-
-    @property
-    def first_expedited(self) -> Poll | None:
-        """After `ripen`."""
-        return self._expedited[0] if self._expedited else None
-
-    def due(self, which: Callable[[Poll], bool]) -> Iterator[Poll]:
-        """The due polls of which that is true, in no order."""
-        return (entry[2] for entry in self._due if _is_valid(entry) and which(entry[2]))
-
-    def take(self, poll: Poll) -> None:
-        """The poll is handed out: its entry is stale now."""
-        if poll.ticket == EXPEDITED:
-            self._expedited.remove(poll)
-        poll.ticket = NOT_QUEUED
+    def valid(self) -> Iterator[Poll]:
+        """The due polls, in no order."""
+        return (entry[2] for entry in self.due if _is_valid(entry))
 
 
 def _is_valid(entry: tuple[float, int, Poll]) -> bool:
@@ -95,7 +74,7 @@ def _is_valid(entry: tuple[float, int, Poll]) -> bool:
     return poll.ticket == entry[1] and poll.live and poll.device.health.online
 
 
-def _tidy(heap: _Heap) -> int:
+def _tidy(heap: Heap) -> int:
     """Restores the heap. Returns the most entries it may have until it is looked through again."""
     heapq.heapify(heap)
     return 2 * len(heap) + ROOM

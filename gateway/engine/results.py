@@ -55,7 +55,17 @@ class Results:
     def read(self, poll: Poll, units: Sequence[int], now: float, time: int) -> None:
         """A block was read well."""
         device, block = poll.device, poll.block
-        poll.read(now)
+        health, last = device.health, poll.last
+        if health.needs_resync or not health.online:
+            self.answered(device, now, time)
+        record = poll.record
+        if last.at is not None:
+            gap = now - last.at
+            if gap > record.worst_gap:
+                record.worst_gap = gap
+            record.mean_gap += (gap - record.mean_gap) / max(1, min(10, record.reads))
+        record.reads += 1
+        last.at, last.ever = now, True
         self._effects.collected.append(Samples(self._samples(poll, units, time)))
         if block.of_fields:
             self._count_garbled(device, units)

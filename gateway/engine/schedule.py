@@ -6,12 +6,13 @@ from collections.abc import Iterable, Iterator, Sequence
 
 from gateway.engine.device import Device
 from gateway.engine.health import PAUSE_LONGEST, State
-from gateway.engine.jobs import EXPEDITED, Idle, LastRead, Poll, Probe
+from gateway.engine.jobs import EXPEDITED, NOT_QUEUED, Idle, LastRead, Poll, Probe
 from gateway.engine.poll_queue import PollQueue
 from gateway.engine.requests import Request, RequestQueue
 from gateway.planning.planner import Block
 from gateway.tags import Tag
 
+NEVER = float("inf")
 GOLDEN = 0.6180339887498949  # its multiples spread evenly, however many there are
 OFFLINE_SHARE = 0.05  # of the wire's time, for all offline devices together
 
@@ -122,7 +123,8 @@ class Schedule:
             if job is not None:
                 return job
         self._wrote = False
-        until = self._queue.next_due
+        waiting = self._queue.waiting
+        until = waiting[0][0] if waiting else NEVER
         others = [device for device in self.devices if not device.health.online]
         for device, allowed in self._probes(others) if others else ():
             starting = device.health.state is State.STARTING
@@ -143,11 +145,8 @@ class Schedule:
 
     def _next_poll(self, now: float) -> Poll | Probe:
         queue = self._queue
-        earliest, wanted = queue.first, queue.first_expedited
-        expedited = wanted is not None and not (self._expedited and earliest is not None)
-        poll = wanted if expedited else earliest
-        if poll is None:
-            raise AssertionError("no poll is due")
+        expedited = bool(queue.expedited) and not (self._expedited and queue.due)
+        poll = queue.expedited[0] if expedited else queue.due[0][2]
         if not expedited and len(self.devices) > 1 and poll.deadline < now:
             poll = self._fairest(now)
         if poll.device.health.needs_resync:
@@ -161,14 +160,14 @@ class Schedule:
 
     def alongside(self, poll: Poll, most: int, now: float) -> list[Poll]:
         """Other due polls of the same device, for one that takes several requests at once."""
-        others = sorted(
-            self._queue.due(lambda other: other.device is poll.device),
-            key=lambda other: (other.deadline, other.ticket),
-        )
+        others = [other for other in self._queue.valid() if other.device is poll.device]
+        others.sort(key=lambda other: (other.deadline, other.ticket))
         return [self._hand_out(other, now) for other in others[:most]]
 
     def _hand_out(self, poll: Poll, now: float) -> Poll:
-        self._queue.take(poll)
+        if poll.ticket == EXPEDITED:
+            self._queue.expedited.remove(poll)
+        poll.ticket = NOT_QUEUED  # its entry in the heap is stale now
         if poll.due > now:
             poll.due = now
         poll.asked = now
@@ -180,12 +179,12 @@ class Schedule:
 
     def _fairest(self, now: float) -> Poll:
         """Of the late polls the one whose device has recently used the wire least."""
-        late = self._queue.due(lambda poll: poll.deadline < now)
+        late = (poll for poll in self._queue.valid() if poll.deadline < now)
         return min(late, key=lambda poll: (poll.device.recent_use(now), poll.deadline))
 
     def _first_without_resync(self) -> Poll | None:
         """The earliest due poll of a device that needs no resync."""
-        ready = self._queue.due(lambda poll: not poll.device.health.needs_resync)
+        ready = (poll for poll in self._queue.valid() if not poll.device.health.needs_resync)
         return min(ready, key=lambda poll: poll.deadline, default=None)
 
     def _probes(self, others: Sequence[Device]) -> Iterator[tuple[Device, float]]:

@@ -16,7 +16,7 @@ import structlog
 from gateway.engine.device import Device
 from gateway.engine.effects import Effect, LogEvent, OnlineChange, Pause, RequestEnded, Samples
 from gateway.engine.engine import Engine
-from gateway.engine.jobs import Idle, Poll, Settle, Transacted
+from gateway.engine.jobs import Idle, Poll, Settle, Traffic
 from gateway.engine.requests import Command, Outcome, Request, Write
 from gateway.errors import GatewayError, LineDown
 from gateway.line.channel import NEVER, Alarm, Channel
@@ -181,16 +181,26 @@ class Line:
             if self._transaction is None or not isinstance(job, Settle):
                 self._transaction = Transaction(channel, job.device, self._unmatched)
             if isinstance(job, Poll) and job.device.window > 1:
-                jobs = (job, *engine.alongside(job, begun))
-                await asyncio.gather(*(self._perform(each, self._transaction) for each in jobs))
-            else:
-                await self._perform(job, self._transaction)
+                await self._perform_together((job, *engine.alongside(job, begun)), channel)
+                continue
+            result = await perform(job, self._transaction)
+            traffic, self._transaction.traffic = self._transaction.traffic, Traffic()
+            self._deliver(engine.conclude(job, result, traffic, now(), self._wall()))
         raise self._lost
 
-    async def _perform(self, job: Transacted, transaction: Transaction) -> None:
-        result = await perform(job, transaction)
-        traffic = transaction.take_traffic()
-        self._deliver(self.engine.conclude(job, result, traffic, _now(), self._wall()))
+    async def _perform_together(self, polls: Sequence[Poll], channel: Channel) -> None:
+        """Several requests are open at once on one transaction."""
+        transaction = self._transaction
+        if transaction is None:
+            raise AssertionError("no transaction is open")
+
+        async def one(poll: Poll) -> None:
+            result = await perform(poll, transaction)
+            traffic, transaction.traffic = transaction.traffic, Traffic()
+            now, at = channel.now(), self._wall()
+            self._deliver(self.engine.conclude(poll, result, traffic, now, at))
+
+        await asyncio.gather(*map(one, polls))
 
     async def _idle(self, until: float) -> None:
         self._wake.clear()

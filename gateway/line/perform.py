@@ -34,7 +34,7 @@ async def perform(job: Transacted, transaction: Transaction) -> Result:
             device, block = job.device, job.block
             if block.listed or device.settings.verify_reads > 1:
                 return await read_with_care(transaction, device, block, register=job.register)
-            return await device.driver.read(transaction, block.span)
+            return await device.settings.driver.read(transaction, block.span)
         return await _perform(job, transaction)
     except (DeviceError, BadValue, LineDown) as error:
         return error

@@ -76,7 +76,7 @@ class Transaction:
         self._on_unmatched_frame = on_unmatched_frame
         # A request of an older transaction may still be answered.
         self._needs_resync = device.health.needs_resync
-        self._codec: Codec[Any] = device.driver.codec()
+        self._codec: Codec[Any] = device.settings.driver.codec()
         self._open: list[_Request] = []
         self._broken: Garbled | None = None
         self._heard = b""  # since the last request or reply
@@ -91,16 +91,13 @@ class Transaction:
         echo = self._channel.echo
         return not echo.strip and echo.found is not False
 
-    def take_traffic(self) -> Traffic:
-        """What passed since the last call."""
-        traffic, self.traffic = self.traffic, Traffic()
-        return traffic
-
     async def tell(self, frame: Any) -> None:
         data = self._codec.encode(frame)
         channel = self._channel
         await channel.quiet(self._device.silence)
-        self._send(data)
+        self.has_sent = True
+        channel.send(data)
+        self.traffic.sent += len(data)
         # No reply follows; the wire is busy until the last character is out.
         channel.pause(len(data) * channel.wire.character)
 
@@ -111,14 +108,16 @@ class Transaction:
                 await channel.quiet(device.silence)
             self._begin_hearing()
         data = self._codec.encode(frame)
-        self._send(data)
-        started, character = channel.quiet_since, channel.wire.character
+        started, character = channel.now(), channel.wire.character
         spoken = (len(data) * (2 if channel.echo.strip else 1) + reply) * character
-        until = started + spoken + device.timing.reply_timeout
+        until = started + spoken + device.settings.timing.reply_timeout
+        channel.alarm.by(until, self._expire)
+        self.has_sent = True
+        channel.send(data)
+        self.traffic.sent += len(data)
         future: asyncio.Future[T] = asyncio.get_running_loop().create_future()
         request = _Request(data, answers, until, reply, future)
         self._open.append(request)
-        channel.alarm.by(until, self._expire)
         try:
             answer = await future
         finally:
@@ -137,7 +136,7 @@ class Transaction:
     def _begin_hearing(self) -> None:
         """No byte that arrived before the request may be read as its reply."""
         if self._heard or self.traffic.heard or self._broken is not None:
-            self._codec = self._device.driver.codec()
+            self._codec = self._device.settings.driver.codec()
             self._broken = None
         if self._gap is not None:
             self._gap.cancel()
@@ -237,7 +236,7 @@ class Transaction:
             late.arrived = True
             late.wake()
             return
-        station = self._device.driver.station
+        station = self._device.settings.driver.station
         foreign = getattr(frame, "station", station) != station
         if self._stray is not Evidence.STATION:
             self._stray = Evidence.STATION if foreign else Evidence.SHAPE
@@ -249,11 +248,6 @@ class Transaction:
             return late.answers(frame) is not None
         except DeviceError:
             return not self._needs_resync  # a refusal names no request
-
-    def _send(self, data: bytes) -> None:
-        self._channel.send(data)
-        self.has_sent = True
-        self.traffic.sent += len(data)
 
     def _expire(self) -> float:
         """Ends the requests whose time is over. Returns when to look again."""

@@ -63,7 +63,7 @@ def written(folder: Path, endpoint: str = "tcp/127.0.0.1:7447", **devices: Any) 
         ("old", "stop", "disabled"),
         ("nobody", "stop", "no device nobody"),
         ("oven", "explode", "none of its commands"),
-        ("oven", "global", "saw is not to be told"),
+        ("oven", "global", "saw does not permit commands"),
     ],
 )
 def test_what_the_file_does_not_allow(tmp_path: Path, device: str, command: str, why: str) -> None:

@@ -235,17 +235,17 @@ SECTIONS = [
     bad(
         "prefix with a wildcard",
         "zenoh: {prefix: plant/**}\n" + tags("speed: {address: D1}"),
-        "1: zenoh.prefix: 'plant/**' has *, a wildcard of Zenoh: leave it out",
+        "1: zenoh.prefix: 'plant/**' has *, a wildcard of Zenoh: remove it",
     ),
     bad(
         "prefix with an at sign",
         'zenoh: {prefix: "@plant"}\n' + tags("speed: {address: D1}"),
-        "1: zenoh.prefix: '@plant': chunks with @ are the gateway's own: leave the @ out",
+        "1: zenoh.prefix: '@plant': chunks with @ are reserved for the gateway: remove the @",
     ),
     bad(
         "prefix with a slash at its end",
         "zenoh: {prefix: plant/}\n" + tags("speed: {address: D1}"),
-        "1: zenoh.prefix: 'plant/': a prefix is chunks with one `/` between two of them",
+        "1: zenoh.prefix: 'plant/': one `/` separates the chunks of a prefix",
     ),
     bad(
         "zenoh settings",
@@ -253,7 +253,7 @@ SECTIONS = [
         "  config_file: zenoh.json5\n" + tags("speed: {address: D1}"),
         "2: zenoh.mode: 'server' is not known: use peer, client or router",
         "3: zenoh.listen: 'tcp/127.0.0.1:7447' is no list: write it as [first, second]",
-        "4: zenoh.connect[0]: '10.0.0.1' is no Zenoh endpoint: write it as tcp/127.0.0.1:7447",
+        "4: zenoh.connect[0]: '10.0.0.1' is no Zenoh endpoint: write tcp/127.0.0.1:7447",
         "5: zenoh.config_file: there is no file zenoh.json5",
     ),
     bad(
@@ -261,7 +261,7 @@ SECTIONS = [
         "history: {path: 3, keep: 7, max_size: 1}\n" + tags("speed: {address: D1}"),
         "1: history.path: 3 is no file name",
         "1: history.keep: 7 has no unit: write 7s or 7ms",
-        "1: history.max_size: 1 is no size: write it as 500MB or 1GB",
+        "1: history.max_size: 1 is no size: write 500MB or 1GB",
     ),
     bad(
         "history in the file of the state",
@@ -285,14 +285,14 @@ SECTIONS = [
     bad(
         "web address",
         "web: {listen: 8080}\n" + tags("speed: {address: D1}"),
-        "1: web.listen: 8080 is no address to listen at: write it as 127.0.0.1:8080",
+        "1: web.listen: 8080 is no address to listen on: write 127.0.0.1:8080",
     ),
     bad(
         "defaults",
         "defaults:\n  evry: 1s\n  every: 0s\n  scale: 0\n" + tags("speed: {address: D1}"),
         "2: defaults.evry: no setting of defaults: did you mean every?",
         "3: defaults.every: 0s: an interval is longer than zero, such as 500ms",
-        "4: defaults.scale: a scale of 0 would make every value the same",
+        "4: defaults.scale: a scale of 0 makes every value the same",
     ),
     bad(
         "a Python object",
@@ -449,7 +449,7 @@ DEVICES = [
         f"7: {M}.reply_timeout: 0s: an interval is longer than zero, such as 500ms",
         f"8: {M}.turnaround: 5 has no unit: write 5s or 5ms",
         f"9: {M}.retries: 99 is above 10",
-        f"10: {M}.silence: 'short' is no duration: write it as 500ms, 2s, 15min, 1h or 7d",
+        f"10: {M}.silence: 'short' is no duration: write 500ms, 2s, 15min, 1h or 7d",
         f"11: {M}.late_guard: 1m: m is no unit of time: use 1min for minutes",
         f"12: {M}.blocks: 1 is not known: use true, false or only",
         f"13: {M}.replytimeout: no setting of a vigor device: did you mean reply_timeout?",
@@ -549,7 +549,7 @@ TAGS = [
         tags(f"a: {{address: D1, every: {10**299}}}", f"b: {{address: D1, scale: 0x{'f' * 300}}}",
              f"c: {{address: D1, scale: {'9' * 5000}}}"),
         f"8: {M}.tags.a.every: such a large number is no duration: "
-        "write it as 500ms, 2s, 15min, 1h or 7d",
+        "write 500ms, 2s, 15min, 1h or 7d",
         f"9: {M}.tags.b.scale: such a large number is no number",
         f"10: {M}.tags.c.scale: inf is no number that can be used",
     ),
@@ -567,13 +567,13 @@ TAGS = [
         "string too long",
         tags('a: {address: D1, type: "string[251]"}', 'b: {address: D1, type: "string[130]"}'),
         f"8: {M}.tags.a.type: string[251]: a string has 1 to 250 characters",
-        f"9: {M}.tags.b.type: a string[130] is 65 words, more than one exchange can carry",
+        f"9: {M}.tags.b.type: a string[130] is 65 words, more than one request can carry",
     ),
     bad(
         "numbers",
         tags("a: {address: D1, scale: 0}", "b: {address: D1, scale: big}",
              "c: {address: D1, offset: .nan}", "d: {address: D1, offset: true}"),
-        f"8: {M}.tags.a.scale: a scale of 0 would make every value the same",
+        f"8: {M}.tags.a.scale: a scale of 0 makes every value the same",
         f"9: {M}.tags.b.scale: 'big' is no number",
         f"10: {M}.tags.c.offset: nan is no number that can be used",
         f"11: {M}.tags.d.offset: true is no number",
@@ -595,7 +595,7 @@ TAGS = [
         f"9: {M}.tags.b.every: 500 has no unit: write 500s or 500ms",
         f"10: {M}.tags.c.every: 1 hour: hour is no unit of time: use ms, s, min, h or d",
         f"11: {M}.tags.d.heartbeat: 0ms: an interval is longer than zero, such as 500ms",
-        f"12: {M}.tags.e.every: '-1s' is no duration: write it as 500ms, 2s, 15min, 1h or 7d",
+        f"12: {M}.tags.e.every: '-1s' is no duration: write 500ms, 2s, 15min, 1h or 7d",
         f"13: {M}.tags.f.every: 4000d is longer than ten years",
     ),
     bad(
@@ -603,8 +603,8 @@ TAGS = [
         tags("a: {address: D1, deadband: -1}", "b: {address: D1, deadband: 5 rpm}",
              "c: {address: D1, deadband: 200%}", "d: {address: D1, deadband: .inf}"),
         f"8: {M}.tags.a.deadband: -1: a deadband is 0 or more",
-        f"9: {M}.tags.b.deadband: '5 rpm' is no deadband: write 0.5 (in the tag's unit) or 2%",
-        f"10: {M}.tags.c.deadband: 200%: more than 100% would publish next to nothing",
+        f"9: {M}.tags.b.deadband: '5 rpm' is no deadband: write 0.5 (in the unit of the tag) or 2%",
+        f"10: {M}.tags.c.deadband: 200%: more than 100% would publish almost nothing",
         f"11: {M}.tags.d.deadband: inf: a deadband is 0 or more",
     ),
     bad(
@@ -631,7 +631,7 @@ TAGS = [
         "write to an input",
         on_mixer("protocol: modbus-rtu\nstation: 3\ntags:\n"
                  "  a: {address: 'input:7', write: true}"),
-        f"9: {M}.tags.a.write: input:7 can only be read: nothing can be written to input",
+        f"9: {M}.tags.a.write: input:7 is read-only: input cannot be written",
     ),
     bad(
         "reading a broadcast",
@@ -640,7 +640,7 @@ TAGS = [
                  "  c: {address: 'holding:8', write: {verify: true}}\n"
                  "  d: {address: 'holding:8.3', write: true}"),
         f"9: {M}.tags.a.write: holding:7 is never read at station 0: it needs write: true",
-        f"10: {M}.tags.b.address: input:7 can only be read, and station 0 never is",
+        f"10: {M}.tags.b.address: input:7 is read-only, and station 0 cannot be read",
         f"11: {M}.tags.c.write: holding:8 is never read at station 0: verify cannot work",
         f"12: {M}.tags.d.address: holding:8 is never read at station 0: write the whole word",
     ),
@@ -649,11 +649,11 @@ TAGS = [
         tags("a b: {address: D1}", "/a: {address: D1}", "a//b: {address: D1}",
              '"a*": {address: D1}', '"@set": {address: D1}', '"": {address: D1}'),
         f"8: {M}.tags.a b: 'a b' has a space: names are letters and digits, `_`, `-`, `.`, `/`",
-        f"9: {M}.tags./a: '/a': a `/` stands between two parts of a name, not at its end",
-        f"10: {M}.tags.a//b: 'a//b': a `/` stands between two parts of a name, not at its end",
+        f"9: {M}.tags./a: '/a': a `/` separates two parts of a name and cannot be at its end",
+        f"10: {M}.tags.a//b: 'a//b': a `/` separates two parts of a name and cannot be at its end",
         f"11: {M}.tags.a*: 'a*' has '*': names are letters and digits, `_`, `-`, `.`, `/`",
         f"12: {M}.tags.@set: '@set' has '@': names are letters and digits, `_`, `-`, `.`, `/`",
-        f"13: {M}.tags.: a name has at least one character",
+        f"13: {M}.tags.: a name needs at least one character",
     ),
     bad(
         "duplicate tag",
@@ -1291,13 +1291,13 @@ def test_payload_is_json_unless_tag_device_line_or_file_says_raw(
     [
         ("zenoh: {tls: {certificate: a.pem}}", "certificate and key belong together"),
         ("zenoh: {tls: {mutual: true}}", "mutual needs ca, certificate and key"),
-        ("zenoh: {password_file: p}", "password_file means nothing without user"),
+        ("zenoh: {password_file: p}", "password_file has no effect without user"),
         ("zenoh: {users_file: nowhere}", "1: zenoh.users_file: there is no file nowhere"),
         ("zenoh: {tls: {ca: nowhere}}", "1: zenoh.tls.ca: there is no file nowhere"),
         ("zenoh: {password: x}", "1: zenoh.password: no setting of zenoh"),
         ("writers: {file: nowhere}", "1: writers.file: there is no file nowhere"),
         ("writers: {}", "1: writers.file: missing"),
-        ("gateway: {standby_alone: 1min}", "standby_alone means nothing without standby"),
+        ("gateway: {standby_alone: 1min}", "standby_alone has no effect without standby"),
         ("gateway: {standby: a/b}", "1: gateway.standby: 'a/b' has a `/`"),
         ("defaults: {payload: xml}", "1: defaults.payload: 'xml' is not known: use json or raw"),
     ],

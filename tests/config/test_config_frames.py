@@ -163,7 +163,7 @@ MISTAKES = {
         on_line("plc: {protocol: vigor, station: 1, tags: {a: {address: D1, event: true}}}"),
         (
             "5: lines.hall.devices.plc.tags.a.event: D1 is polled: "
-            "events are what a device says unasked"
+            "only an unsolicited value can be an event"
         ),
     ),
     "unknown settings, however deep": (

@@ -122,7 +122,7 @@ def test_only_the_whole_reply_is_an_acknowledgement() -> None:
 def test_the_k120s_weighing_machine_is_answered_ack_station_ok_eot() -> None:
     one = device("weighing")
     (frame,) = one.codec().feed(BY_ID["noproto-k120s-001"].frame)
-    heard = one.hear(frame)
+    heard = one.decode(frame)
     assert heard is not None
     assert heard.values == {"station": "0", "weight": 0x3412}
     assert heard.reply is not None
@@ -131,7 +131,7 @@ def test_the_k120s_weighing_machine_is_answered_ack_station_ok_eot() -> None:
 
 def test_a_weighing_frame_of_another_shape_is_not_answered() -> None:
     frame = BY_ID["noproto-k120s-001"].frame
-    assert device("weighing").hear(frame[:3] + frame[4:]) is None
+    assert device("weighing").decode(frame[:3] + frame[4:]) is None
 
 
 def test_a_frame_with_a_field_that_cannot_be_read_is_not_answered() -> None:
@@ -148,8 +148,8 @@ def test_a_frame_with_a_field_that_cannot_be_read_is_not_answered() -> None:
             )
         },
     )
-    assert one.hear(b"W1.5") == UnsolicitedFrame("weight", {"weight": 1.5, "first": "W"}, b"OK")
-    heard = one.hear(b"W1.x")
+    assert one.decode(b"W1.5") == UnsolicitedFrame("weight", {"weight": 1.5, "first": "W"}, b"OK")
+    heard = one.decode(b"W1.x")
     assert heard is not None
     assert heard.reply is None
     assert heard.values["first"] == "W"  # one bad field does not take the others with it
@@ -166,17 +166,17 @@ OVERLOAD = b"OL,+999999.9  g\r\n"
 def test_a_scale_by_pattern_or_by_columns(name: str) -> None:
     one = device(name)
     stable, overload = one.codec().feed(STABLE + OVERLOAD)
-    heard = one.hear(stable)
+    heard = one.decode(stable)
     assert heard is not None
     assert (heard.values["weight"], heard.values["state"]) == (1234.5, "ST")
     assert heard.reply is None
-    assert one.hear(overload) is None
+    assert one.decode(overload) is None
 
 
 def test_a_barcode_between_start_and_end_code() -> None:
     one = device("reader")
     frames = one.codec().feed(b"\x02400638133393-1\x03" * 2)
-    assert [one.hear(frame) for frame in frames] == [
+    assert [one.decode(frame) for frame in frames] == [
         UnsolicitedFrame("scan", {"barcode": "400638133393-1"})
     ] * 2
 
@@ -302,7 +302,7 @@ def changed(name: str, *path: str, to: Any) -> dict[str, Any]:
         (
             changed("scale", "listen", "weighing", "fields", "net", to={"type": "decimal"}),
             ("listen", "weighing"),
-            "field net: say its offset or columns, or name a group",
+            "field net: give its offset or columns, or name a group",
         ),
         (
             changed("scale", "listen", "weighing", "fields", "unit", to={"type": "kg"}),
@@ -312,7 +312,7 @@ def changed(name: str, *path: str, to: Any) -> dict[str, Any]:
         (
             changed("scale", "listen", "weighing", "fields", to={"weight": {"type": "decimal"}}),
             ("listen", "weighing"),
-            "group state: say in fields",
+            "group state: add a field",
         ),
         (
             changed("scale", "listen", "weighing", "stale_after", to="0s"),
@@ -338,7 +338,7 @@ def changed(name: str, *path: str, to: Any) -> dict[str, Any]:
         (
             changed("inverter", "write", "setpoint", "send", to="S="),
             ("write", "setpoint"),
-            "stands in it once, as {value}",
+            "needs {value} exactly once",
         ),
         (
             changed("inverter", "write", "setpoint", "send", to="S={value:06.2f}"),
@@ -360,7 +360,7 @@ def changed(name: str, *path: str, to: Any) -> dict[str, Any]:
         (
             changed("inverter", "write", "setpoint", "match", to=None),
             ("write", "setpoint"),
-            "how does the device say yes",
+            "for the acknowledgement",
         ),
         (
             changed(
@@ -385,9 +385,9 @@ def changed(name: str, *path: str, to: Any) -> dict[str, Any]:
                 },
             ),
             (),
-            "frequency is a field of frequency, again: one of them asks for it",
+            "frequency is a field of frequency, again: keep one of them",
         ),
-        ({"protocol": "frames", "framing": {}}, (), "say what it sends"),
+        ({"protocol": "frames", "framing": {}}, (), "at least one of listen, ask and write"),
     ],
 )
 def test_a_mistake_is_told_with_its_place(

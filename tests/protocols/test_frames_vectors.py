@@ -1,12 +1,12 @@
 """No-protocol framing against the worked frames of the VB-1COM, RS, EX485LNK and K120S manuals."""
 
 import re
+from typing import Literal
 
 import pytest
 
 from gateway.errors import BadValue, ConfigError, Garbled
 from gateway.protocols.frames import FrameCodec, FrameReader, Framing
-from gateway.protocols.frames.framing import from_words, to_words
 from gateway.protocols.frames.presets import written_out
 from tests.vectors import Vector, vectors
 
@@ -40,6 +40,25 @@ def vb_1com(fields: dict[str, str], **more: int) -> Framing:
         buffer=8 if bfm0 >> 14 & 1 else 16,
         **more,
     )
+
+
+def to_words(data: bytes, buffer: int = 16, *, high_first: bool = False) -> list[int]:
+    """The buffer words of `data`: low byte first, or one byte per word (`buffer` 8)."""
+    if buffer == 8:
+        return list(data)
+    even = data + bytes(len(data) % 2)
+    order: Literal["big", "little"] = "big" if high_first else "little"
+    return [int.from_bytes(even[i : i + 2], order) for i in range(0, len(even), 2)]
+
+
+def from_words(
+    words: list[int], count: int, buffer: int = 16, *, high_first: bool = False
+) -> bytes:
+    """The first `count` bytes of buffer words."""
+    if buffer == 8:
+        return bytes(word & 0xFF for word in words)[:count]
+    order: Literal["big", "little"] = "big" if high_first else "little"
+    return b"".join(word.to_bytes(2, order) for word in words)[:count]
 
 
 def ended_by_terminator(vector: Vector) -> bool:

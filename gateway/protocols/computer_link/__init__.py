@@ -9,7 +9,7 @@ from gateway.protocols.computer_link.codec import (
     Text,
 )
 from gateway.protocols.computer_link.driver import ComputerLink
-from gateway.protocols.computer_link.refusals import NO_REPLY_CAUSES
+from gateway.protocols.computer_link.replies import NO_REPLY_CAUSES
 
 __all__ = [
     "NO_REPLY_CAUSES",

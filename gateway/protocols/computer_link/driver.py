@@ -8,34 +8,36 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal, TypeVar
 
 from gateway.errors import BadValue, ConfigError
+from gateway.protocols.computer_link.access import Access, possible, read_access, write_access
 from gateway.protocols.computer_link.codec import (
     ALL_STATIONS,
-    PC,
-    PC_ON_DEMAND,
     Ack,
     Enquiry,
     Frame,
     FrameFormat,
     LinkCodec,
-    Nak,
-    Text,
 )
 from gateway.protocols.computer_link.devices import DEVICE, PROFILES, Profile, ProfileName
-from gateway.protocols.computer_link.lists import (
+from gateway.protocols.computer_link.replies import (
+    AREA_C_ECHO,
+    NO_REPLY_CAUSES,
+    accept_ack,
+    accept_text,
+    describe_stray,
+    model_name,
+)
+from gateway.protocols.computer_link.scattered import (
     data_characters,
     decode_all,
     listed_characters,
-    monitored_ways,
-    scattered_ways,
+    monitored_access,
+    scattered_access,
 )
-from gateway.protocols.computer_link.refusals import NO_REPLY_CAUSES, model_name, refused
-from gateway.protocols.computer_link.ways import Way, read_way, write_way
 from gateway.protocols.devices import parse_device, spell_device
 from gateway.protocols.driver import Address, Area, Cost, ScanHints, Span, Talk, Timing, Traits
 
 LinkTalk = Talk[Frame]
 T = TypeVar("T")
-W = TypeVar("W")
 
 _TRAITS = Traits(baudrate=9600, format="7E1")
 _COUNT, _CODE = 2, 2  # characters of a count, of an error code
@@ -44,10 +46,10 @@ _SWITCH = {"1": "1", "on": "1", "true": "1", "0": "0", "off": "0", "false": "0"}
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ComputerLink:
-    """A device that speaks the Computer Link; the fields are its settings in the file.
+    """A PLC on the Computer Link; the fields are its settings in the file.
 
-    `message_wait` is seconds in steps of 10 ms: the PLC answers no sooner. `send_area_c`
-    acknowledges each data reply. `monitor` lets scattered addresses be registered in the PLC.
+    `message_wait` is seconds in steps of 10 ms: the PLC replies no sooner. `send_area_c`
+    acknowledges each data reply. `monitor` registers scattered addresses in the PLC.
     """
 
     protocol: Literal["computer-link"] = "computer-link"
@@ -99,25 +101,19 @@ class ComputerLink:
 
     @property
     def echo_conflict(self) -> tuple[str, str] | None:
-        if not self.send_area_c:
-            return None
-        reason = (
-            "the echo of this acknowledgement is equal to the acknowledgement of a write by the "
-            "PLC: leave it out, no known PLC needs it"
-        )
-        return "send_area_c", reason
+        return ("send_area_c", AREA_C_ECHO) if self.send_area_c else None
 
     @property
     def timing(self) -> Timing:
         return Timing(
             reply_timeout=1.0 + self.message_wait,
             turnaround=max(0.02, self.message_wait),
-            silence=0.02,  # about two scans between an exchange and the next ENQ
+            silence=0.02,  # about two scans of the PLC before the next ENQ
             retries=2,
         )
 
     def address(self, text: str) -> Address:
-        """`D100`, `D0100`, `X17` (octal), `TN5` or `T5`, `D7.3`. Raises `ConfigError`."""
+        """Parses `D100`, `D0100`, `X17` (octal), `TN5` or `T5`, `D7.3`. Raises `ConfigError`."""
         letters = text[:2].upper()
         if letters in ("TC", "CC") and text[2:3].isdigit():
             contact, value = f"{letters[0]}S{text[2:]}", f"{letters[0]}{text[2:]}"
@@ -136,78 +132,78 @@ class ComputerLink:
     # Batch read and write (2-1 to 2-4)
 
     def cost(self, span: Span) -> Cost | None:
-        way = read_way(self._limits, span)
-        return None if way is None else self._text_cost(DEVICE + _COUNT, way.characters)
+        access = read_access(self._limits, span)
+        return None if access is None else self._text_cost(DEVICE + _COUNT, access.characters)
 
     def write_cost(self, span: Span) -> Cost | None:
-        way = write_way(self._limits, span)
-        return None if way is None else self._ack_cost(DEVICE + _COUNT + way.characters)
+        access = write_access(self._limits, span)
+        return None if access is None else self._ack_cost(DEVICE + _COUNT + access.characters)
 
     async def read(self, talk: LinkTalk, span: Span) -> Sequence[int]:
-        way = _possible(read_way(self._limits, span), span)
-        command = "WR" if way.in_words else "BR"
-        return await self._ask_text(talk, command, way.batch, way.characters, way.decode)
+        access = possible(read_access(self._limits, span), span)
+        command = "WR" if access.in_words else "BR"
+        return await self._ask_text(talk, command, access.batch, access.characters, access.decode)
 
     async def write(self, talk: LinkTalk, span: Span, units: Sequence[int]) -> bool:
-        way = _possible(write_way(self._limits, span), span)
-        command = "WW" if way.in_words else "BW"
-        return await self._ask_ack(talk, command, way.batch + "".join(way.encode(units)))
+        access = possible(write_access(self._limits, span), span)
+        command = "WW" if access.in_words else "BW"
+        return await self._ask_ack(talk, command, access.batch + "".join(access.encode(units)))
 
     # Scattered writes (2-5, 2-6)
 
     def scattered_write_cost(self, spans: Sequence[Span]) -> Cost | None:
         """One BT for points, one WT for words and whole sixteens of points.
 
-        None also where two spans meet: the first value would be acknowledged and never seen.
+        None also where two spans overlap: the first value would be acknowledged and lost.
         """
-        ways = scattered_ways(self._limits, spans)
-        return None if ways is None else self._ack_cost(_COUNT + listed_characters(ways))
+        accesses = scattered_access(self._limits, spans)
+        return None if accesses is None else self._ack_cost(_COUNT + listed_characters(accesses))
 
     async def write_scattered(
         self, talk: LinkTalk, parts: Sequence[tuple[Span, Sequence[int]]]
     ) -> bool:
         spans = [span for span, _ in parts]
-        ways = _possible(scattered_ways(self._limits, spans), spans)
+        accesses = possible(scattered_access(self._limits, spans), spans)
         pieces = [
             device + piece
-            for way, (_, units) in zip(ways, parts, strict=True)
-            for device, piece in zip(way.devices(), way.encode(units), strict=True)
+            for access, (_, units) in zip(accesses, parts, strict=True)
+            for device, piece in zip(access.devices(), access.encode(units), strict=True)
         ]
-        command = "WT" if ways[0].in_words else "BT"
+        command = "WT" if accesses[0].in_words else "BT"
         return await self._ask_ack(talk, command, f"{len(pieces):02X}{''.join(pieces)}")
 
     # Registered reads (2-7 to 2-10)
 
     def monitor_cost(self, spans: Sequence[Span]) -> Cost | None:
         """One MB for up to ten points, one MN for up to ten words or sixteens of points."""
-        ways = self._registered(spans)
-        return None if ways is None else self._text_cost(0, data_characters(ways))
+        accesses = self._registered(spans)
+        return None if accesses is None else self._text_cost(0, data_characters(accesses))
 
     async def register(self, talk: LinkTalk, spans: Sequence[Span]) -> None:
         """The PLC has one list of points and one of words; each replaces the one before."""
-        ways = _possible(self._registered(spans), spans)
-        devices = [device for way in ways for device in way.devices()]
-        command = "WM" if ways[0].in_words else "BM"
+        accesses = possible(self._registered(spans), spans)
+        devices = [device for access in accesses for device in access.devices()]
+        command = "WM" if accesses[0].in_words else "BM"
         await self._ask_ack(talk, command, f"{len(devices):02X}{''.join(devices)}")
 
     async def read_registered(self, talk: LinkTalk, spans: Sequence[Span]) -> list[Sequence[int]]:
-        ways = _possible(self._registered(spans), spans)
-        command = self.monitor_word_command if ways[0].in_words else "MB"
-        characters = data_characters(ways)
+        accesses = possible(self._registered(spans), spans)
+        command = self.monitor_word_command if accesses[0].in_words else "MB"
+        characters = data_characters(accesses)
         return await self._ask_text(
-            talk, command, "", characters, lambda data: decode_all(ways, data)
+            talk, command, "", characters, lambda data: decode_all(accesses, data)
         )
 
-    # Control (2-11 to 2-13) and the question that cannot be mistaken
+    # Commands (2-11 to 2-13) and resync
 
     @property
     def controls(self) -> frozenset[str]:
         return frozenset({"run", "stop", "loopback", "model", "global"})
 
     async def control(self, talk: LinkTalk, command: str, argument: str) -> str:
-        """`run`, `stop`, `model`; `loopback` with the text to send; `global` with on or off.
+        """Sends `run`, `stop`, `model`; `loopback` with a text; `global` with on or off.
 
-        `global` goes to every station of the line, and none answers.
+        `global` goes to every station of the line, and no station replies.
         """
         if command not in self.controls:
             raise BadValue(f"{command!r} is none of {', '.join(sorted(self.controls))}")
@@ -236,19 +232,14 @@ class ComputerLink:
 
     def describe_stray(self, frame: Frame) -> str | None:
         """Explains on-demand data of the PLC, and the echo of a request."""
-        match frame:
-            case Text(station, data, pc) if pc == PC_ON_DEMAND:
-                return f"on-demand data of station {station}: {data}"
-            case Enquiry(_, command, area):
-                return f"echo of {command} {area}"
-        return None
+        return describe_stray(frame)
 
     @property
     def _limits(self) -> Profile:
         return PROFILES[self.profile]
 
-    def _registered(self, spans: Sequence[Span]) -> list[Way] | None:
-        return monitored_ways(self._limits, spans) if self.monitor else None
+    def _registered(self, spans: Sequence[Span]) -> list[Access] | None:
+        return monitored_access(self._limits, spans) if self.monitor else None
 
     async def _loopback(self, talk: LinkTalk, text: str) -> str:
         most = self._limits.loopback
@@ -271,39 +262,24 @@ class ComputerLink:
         characters: int,
         decode: Callable[[str], T | None],
     ) -> T:
-        """Ask for data; `decode` says None to what cannot be the data asked for."""
-
-        def answers(frame: Frame) -> T | None:
-            match frame:
-                case Text(self.station, data, pc) if pc == PC:
-                    return decode(data)
-                case Nak(self.station, code, pc) if pc == PC:
-                    raise refused(self.station, code)
-            return None
-
+        """Requests data; `decode` returns None for data of another request."""
         reply = self._text_cost(len(area), characters).reply
-        answer = await talk.ask(self._enquiry(command, area), reply, answers)
+        answer = await talk.ask(
+            self._enquiry(command, area), reply, accept_text(self.station, decode)
+        )
         if self.send_area_c and not talk.may_echo:  # its echo would acknowledge the next write
             await talk.tell(Ack(self.station))
         return answer
 
     async def _ask_ack(self, talk: LinkTalk, command: str, area: str) -> bool:
-        def answers(frame: Frame) -> bool | None:
-            match frame:
-                case Ack(self.station, pc) if pc == PC:
-                    return True
-                case Nak(self.station, code, pc) if pc == PC:
-                    raise refused(self.station, code)
-            return None
-
         refusal = self._ack_cost(len(area)).reply + _CODE
-        return await talk.ask(self._enquiry(command, area), refusal, answers)
+        return await talk.ask(self._enquiry(command, area), refusal, accept_ack(self.station))
 
     def _text_cost(self, area: int, characters: int) -> Cost:
-        """An exchange with `area` characters in the request and `characters` of data in the reply.
+        """The cost with `area` characters in the request and `characters` of data in the reply.
 
         Request: ENQ, station, PC number, command, wait, area; reply: STX, station, PC number,
-        data, ETX; both with sum and CR LF where set. Area C counts as ours.
+        data, ETX; both with sum and CR LF where set. Area C counts as part of the request.
         """
         tail = self._sum + self._end
         confirm = 5 + self._end if self.send_area_c else 0
@@ -319,10 +295,3 @@ class ComputerLink:
     @property
     def _end(self) -> int:
         return 2 if self.frame_format == 4 else 0
-
-
-def _possible(way: W | None, asked: object) -> W:
-    """The plan is made with the costs, so nothing impossible is ever asked for."""
-    if way is None:
-        raise ValueError(f"{asked} does not fit one exchange")
-    return way

@@ -1,6 +1,6 @@
-"""Bytes to frames and back for devices without a protocol, whatever arrives, in bounded memory.
+"""Bytes to frames and back for devices without a protocol, in bounded memory.
 
-A frame here is its data: header, terminator, sum, CR and LF are taken off, conversion is undone.
+A frame here is its data, without header, terminator, sum, CR and LF, and without conversion.
 """
 
 from functools import lru_cache
@@ -10,17 +10,17 @@ from gateway.protocols.frames.bytetext import octets
 from gateway.protocols.frames.framing import Framing
 from gateway.protocols.frames.presets import written_out
 
-_PIECE = 1024  # bytes looked at in one go: the buffer never holds more than this and one frame
+_PIECE = 1024  # bytes per step: the buffer never holds more than this and one frame
 _HEX = frozenset(b"0123456789ABCDEFabcdef")
 
 
 class FrameReader:
-    """The receiving side of a framing. It goes on after damage, so it can listen for years.
+    """The receiving side of a framing. It continues after damage, so it can listen for years.
 
-    A frame is complete by its length, its terminator, or a gap. What lies before a header is
-    skipped, also a frame that was begun and never ended. Where there is no header, a frame can
-    begin only where another has ended or the line was quiet: with `quiet=False`, and after
-    damage, everything up to there is thrown away.
+    A frame is complete by its length, its terminator, or a gap. Bytes before a header are
+    skipped, also a frame without an end. Without a header, a frame can begin only after the end
+    of another or after a silence: with `quiet=False`, and after damage, all bytes up to there
+    are discarded.
     """
 
     def __init__(self, framing: Framing, *, quiet: bool = True) -> None:
@@ -34,18 +34,18 @@ class FrameReader:
 
     @property
     def gap_timeout(self) -> float | None:
-        """Seconds without a byte after which `expire` is to be called; None: never."""
+        """Seconds without a byte until the call of `expire`; None: never."""
         return self._framing.gap_timeout
 
     @property
     def pending(self) -> int:
-        """The bytes kept: part of a frame, or nothing known yet."""
+        """The number of bytes kept: part of a frame, or still undecided."""
         return len(self._buffer)
 
     def feed(self, data: bytes) -> list[bytes | Garbled]:
-        """The frames completed by `data`, and what was damaged among them, in order.
+        """Returns the frames completed by `data`, and damage among them, in order.
 
-        Damage upon damage is told once.
+        Consecutive damage is returned once.
         """
         found: list[bytes | Garbled] = []
         for start in range(0, len(data), _PIECE):
@@ -55,7 +55,7 @@ class FrameReader:
         return found
 
     def expire(self) -> list[bytes | Garbled]:
-        """What the gap has ended: a frame that only a gap can end, or one cut short."""
+        """Returns the frames ended by the gap: complete ones, or damage where one was cut short."""
         found: list[bytes | Garbled] = []
         while self._hunt():
             _append(found, self._ended_by_gap())
@@ -66,7 +66,7 @@ class FrameReader:
         return found
 
     def settle(self) -> None:
-        """The line was quiet for so long that whatever comes now begins a frame."""
+        """Notes a silence after which the next byte begins a frame."""
         if not self._aligned:
             self._buffer.clear()
             self._aligned = True
@@ -99,7 +99,7 @@ class FrameReader:
         return "error 10, terminator missing" if self._framing.terminator else _NO_CR
 
     def _cut(self) -> bytes | Garbled | None:
-        """One frame, or one stretch of damage, off the buffer; None when it is not all there."""
+        """Takes one frame, or one piece of damage, off the buffer; None while it is incomplete."""
         if not self._hunt():
             return None
         framing, body = self._framing, len(self._header)
@@ -112,7 +112,7 @@ class FrameReader:
                 return None
             return self._endless(most)
         if framing.length is None and self._header:
-            # The data cannot hold a header: this one begins the frame, the one before was noise.
+            # The data cannot hold a header: this one begins the frame, the one before it is noise.
             again = self._buffer.rfind(self._header, 1, at)
             if again > 0:
                 self._drop(again)
@@ -131,7 +131,7 @@ class FrameReader:
         return damage
 
     def _end_of_data(self, most: int) -> int | None:
-        """Where the mark stands, the data being at most up to `most`; None: not there (yet)."""
+        """Returns the place of the mark, with data up to `most`; None: not received (yet)."""
         if self._framing.length is not None:
             at = len(self._header) + self._framing.length * self._unit
             return at if self._buffer.startswith(self._mark, at) else None
@@ -139,7 +139,7 @@ class FrameReader:
         return at if at >= 0 else None
 
     def _finish(self, at: int) -> bytes | Garbled | None:
-        """Check what follows the data, which ends at `at`, and cut the frame off."""
+        """Checks the bytes behind the data, which ends at `at`, and takes the frame."""
         framing, body = self._framing, len(self._header)
         data = bytes(self._buffer[body:at])
         end = at + len(self._mark)
@@ -178,7 +178,7 @@ class FrameReader:
         evidence: Evidence = Evidence.NOISE,
         aligned: bool = False,
     ) -> Garbled:
-        """Throw away what was damaged; behind a header only that, for a good frame may follow."""
+        """Discards damage; with a header only its first byte, because a good frame may follow."""
         damage = Garbled(why, bytes(self._buffer), evidence=evidence)
         if self._header:
             self._drop(1)
@@ -188,7 +188,7 @@ class FrameReader:
         return damage
 
     def _hunt(self) -> bool:
-        """Whether the buffer now begins where a frame begins."""
+        """Skips noise; returns True when the buffer begins with a frame."""
         if self._header:
             self._drop_to(self._buffer.find(self._header), keep=len(self._header) - 1)
             return self._buffer.startswith(self._header)
@@ -198,7 +198,7 @@ class FrameReader:
 
     def _align(self) -> None:
         if not self._mark:
-            self._buffer.clear()  # only a gap can tell where a frame begins
+            self._buffer.clear()  # only a gap shows the begin of a frame
             return
         self._drop_to(self._buffer.find(self._mark), keep=len(self._mark) - 1)
         end = len(self._mark) + self._after
@@ -214,7 +214,7 @@ class FrameReader:
 
 
 class FrameCodec:
-    """The codec of one turn: what a device answers, read strictly."""
+    """The codec of one transaction: raises the first damage."""
 
     def __init__(self, receive: Framing, send: Framing | None = None) -> None:
         self._reader = FrameReader(receive)
@@ -223,7 +223,7 @@ class FrameCodec:
 
     @property
     def gap_timeout(self) -> float | None:
-        """Seconds without a byte after which `expire` is to be called; None: never."""
+        """Seconds without a byte until the call of `expire`; None: never."""
         return self._reader.gap_timeout
 
     def encode(self, frame: bytes) -> bytes:
@@ -231,11 +231,11 @@ class FrameCodec:
         return self._send.encode(frame)
 
     def feed(self, data: bytes) -> list[bytes]:
-        """The frames completed by `data`. Raises `Garbled`, but hands out first what came first."""
+        """Returns the frames completed by `data`. Raises `Garbled`, after the frames before it."""
         return self._strictly(self._reader.feed(data))
 
     def expire(self) -> list[bytes]:
-        """The frame that a gap of `gap_timeout` has ended, if any. Raises `Garbled`."""
+        """Returns the frames ended by a gap of `gap_timeout`. Raises `Garbled`."""
         return self._strictly(self._reader.expire())
 
     def _strictly(self, found: list[bytes | Garbled]) -> list[bytes]:

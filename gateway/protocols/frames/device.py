@@ -1,8 +1,8 @@
-"""A device without a protocol of ours: what it says, what it is asked, what it is told.
+"""A device without a protocol: the frames that it sends and accepts.
 
-Its frames are named in the file. `listen`: it speaks when it likes. `ask`: it answers a request.
-`write`: it takes a value. A tag's address is the name of a field of these frames; what is
-written is named as the tag that writes it.
+The file names its frames. `listen`: unsolicited frames. `ask`: a request and its reply.
+`write`: a frame with a value. The address of a tag is the name of a field of these frames; a
+value to write is named as its frame.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -26,9 +26,9 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Frames:
-    """Settings of a `frames` device: how frames are bounded, and which there are.
+    """Settings of a `frames` device: its framing, and its frames.
 
-    `send_framing` is for devices that are spoken to in another framing than they speak.
+    `send_framing` is for devices whose requests have another framing than their replies.
     """
 
     protocol: Literal["frames"] = "frames"
@@ -42,7 +42,7 @@ class Frames:
         self._check_framings()
         longest = written_out(self.framing).longest
         if not (self.listen or self.ask or self.write):
-            raise ConfigError("say what it sends (listen), is asked (ask) or takes (write)")
+            raise ConfigError("it needs at least one of listen, ask and write")
         for text in self._patterns():
             check_pattern(text, longest)
         for text in self._templates():
@@ -51,9 +51,9 @@ class Frames:
 
     @property
     def timing(self) -> Timing:
-        """Customary times; the silence lets a device finish that speaks unasked.
+        """Default times; the silence lets an unsolicited frame end.
 
-        Where only a gap ends a reply, that gap is waited for each time.
+        Where only a gap ends a reply, each request takes this gap longer.
         """
         framing = written_out(self.framing)
         gap = 0.0
@@ -63,37 +63,37 @@ class Frames:
 
     @property
     def listened(self) -> frozenset[str]:
-        """The fields that come unasked."""
+        """The fields of unsolicited frames."""
         return frozenset(name for one in self.listen.values() for name in one.fields)
 
     @property
     def asked(self) -> Mapping[str, str]:
-        """The fields that are asked for, each with the name of its question."""
-        return {name: question for question, one in self.ask.items() for name in one.fields}
+        """The fields that are polled, each with the name of its request."""
+        return {name: request for request, one in self.ask.items() for name in one.fields}
 
     def field_of(self, address: str) -> Field:
-        """The field that a tag's address names. Raises `ConfigError` saying which there are."""
+        """Returns the field of an address. Raises `ConfigError` with the names of all fields."""
         for name, found in self._fields():
             if name == address:
                 return found
         raise ConfigError(f"{address!r} is no field of this device: it has {listed(self._names())}")
 
     def codec(self) -> FrameCodec:
-        """For one turn: the device is asked or told something."""
+        """Returns the codec of one transaction."""
         return FrameCodec(self.framing, self.send_framing)
 
     def reader(self, *, quiet: bool) -> FrameReader:
-        """For listening as long as the port is open. `quiet`: the line is known to be silent."""
+        """Returns the reader for unsolicited frames. `quiet`: the line is silent now."""
         return FrameReader(self.framing, quiet=quiet)
 
-    def cost(self, question: str) -> Cost:
-        """The characters of a question and of the longest reply to it."""
-        one = self.ask[question]
-        request = self._send.encode(octets(one.send))
-        return Cost(len(request), self._longest_reply(one.match, one.refused))
+    def cost(self, request: str) -> Cost:
+        """Returns the characters of a request and of its longest reply."""
+        one = self.ask[request]
+        frame = self._send.encode(octets(one.send))
+        return Cost(len(frame), self._longest_reply(one.match, one.refused))
 
     def write_cost(self, name: str) -> Cost:
-        """The characters of the longest write and of the longest reply to it."""
+        """Returns the characters of the longest write and of its longest reply."""
         one, send = self.write[name], self._send
         around = one.frame(b"")
         most = send.longest - len(around)
@@ -101,10 +101,10 @@ class Frames:
         reply = 0 if one.match is None else self._longest_reply(one.match, one.refused)
         return Cost(len(send.encode(around)) + value, reply)
 
-    def hear(self, frame: bytes) -> UnsolicitedFrame | None:
-        """What an unasked frame says; None for a frame that `listen` does not know.
+    def decode(self, frame: bytes) -> UnsolicitedFrame | None:
+        """Decodes an unsolicited frame; None for a frame without an entry in `listen`.
 
-        An answer tells the device that it was understood: there is none where a field was not.
+        The reply confirms the frame to the device: a frame with a damaged field gets none.
         """
         for name, one in self.listen.items():
             values = one.values(frame)
@@ -113,20 +113,20 @@ class Frames:
                 return UnsolicitedFrame(name, values, one.answer_to(frame) if good else None)
         return None
 
-    async def read(self, talk: Talk[bytes], question: str) -> Values:
-        """Ask. The fields of the reply, each a value or why there is none.
+    async def read(self, talk: Talk[bytes], request: str) -> Values:
+        """Returns the fields of the reply, each a value or the damage that hides it.
 
         Raises `Refused`, `NoReply`, `Garbled`, `LineDown`.
         """
-        one = self.ask[question]
+        one = self.ask[request]
         reply = self._longest_reply(one.match, one.refused)
         frame = octets(one.send)
-        return await talk.ask(frame, reply, _but_an_echo(talk, frame, one.answers))
+        return await talk.ask(frame, reply, _without_echo(talk, frame, one.answers))
 
     def put(self, name: str, value: Value) -> bytes:
-        """A value's own bytes in the frame that writes it.
+        """Returns the bytes of a value in the frame that writes it.
 
-        Raises `BadValue`, also for what the framing cannot carry: before the line is taken.
+        Raises `BadValue`, also for bytes that the framing cannot carry: before anything is sent.
         """
         one = self.write[name]
         raw = one.value.put(value)
@@ -134,8 +134,8 @@ class Frames:
         return raw
 
     async def tell(self, talk: Talk[bytes], name: str, raw: bytes) -> bool:
-        """Write what `put` has made. True when the device acknowledged it, False where it never
-        does. Raises as `read`.
+        """Writes bytes from `put`. Returns True when the device acknowledged them, False where
+        it never does. Raises as `read`.
         """
         one = self.write[name]
         frame = one.frame(raw)
@@ -143,14 +143,14 @@ class Frames:
             await talk.tell(frame)
             return False
         reply = self._longest_reply(one.match, one.refused)
-        return await talk.ask(frame, reply, _but_an_echo(talk, frame, one.answers))
+        return await talk.ask(frame, reply, _without_echo(talk, frame, one.answers))
 
     @property
     def _send(self) -> Framing:
         return written_out(self.framing if self.send_framing is None else self.send_framing)
 
     def _longest_reply(self, *patterns: str | None) -> int:
-        """The characters of the longest frame that one of the patterns takes."""
+        """Returns the characters of the longest frame that one of the patterns matches."""
         framing = written_out(self.framing)
         taken = (longest_match(text, framing.longest) for text in patterns if text is not None)
         return framing.on_line(framing.length or max(taken))
@@ -191,23 +191,23 @@ class Frames:
         return sorted({name for name, _ in self._fields()})
 
     def _check_names(self) -> None:
-        """A field has one meaning: one question at most asks for it, its values are of one kind."""
+        """Checks that a field has one meaning: at most one request, and one kind of values."""
         for name in self._names():
             if not NAME.match(name):
                 raise ConfigError(f"write {name!r}: letters, digits and _, no digit first")
-            asking = [question for question, one in self.ask.items() if name in one.fields]
-            if len(asking) > 1:
-                raise ConfigError(f"{name} is a field of {listed(asking)}: one of them asks for it")
+            requests = [request for request, one in self.ask.items() if name in one.fields]
+            if len(requests) > 1:
+                raise ConfigError(f"{name} is a field of {listed(requests)}: keep one of them")
             kinds = {found.kind for other, found in self._fields() if other == name}
             if len(kinds) > 1:
                 raise ConfigError(f"{name} cannot be {' and '.join(sorted(kinds))} at once")
 
 
-def _but_an_echo(
-    talk: Talk[bytes], said: bytes, answers: Callable[[bytes], T | None]
+def _without_echo(
+    talk: Talk[bytes], request: bytes, answers: Callable[[bytes], T | None]
 ) -> Callable[[bytes], T | None]:
-    """`answers`, but for our own words while they may come back: the device must say them again."""
-    echo = said if talk.may_echo else None
+    """Wraps `answers`: skips the echo of the request once while the line may echo."""
+    echo = request if talk.may_echo else None
 
     def answer(frame: bytes) -> T | None:
         nonlocal echo

@@ -1,4 +1,4 @@
-"""A no-protocol device among those that are polled: its questions are areas, fields addresses."""
+"""The driver of a device without a protocol: its requests are areas, its fields addresses."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -23,40 +23,40 @@ class WrittenField:
     name: str
 
     def put(self, value: Value) -> bytes:
-        """Raises `BadValue`, also for what the framing cannot carry."""
+        """Returns its bytes. Raises `BadValue`, also for bytes that the framing cannot carry."""
         return self.settings.put(self.name, value)
 
     def take(self, raw: bytes) -> Value:
-        """What bytes that were put mean. Raises `Garbled`."""
+        """Returns the value of bytes from `put`. Raises `Garbled`."""
         return self.settings.write[self.name].value.take(raw)
 
 
 @dataclass(frozen=True, slots=True)
 class FrameDriver:
-    """One area for each question, one for what comes unasked, one for what is only written.
+    """One area for each request, one for unsolicited fields, one for fields that are only written.
 
-    The units of a read are the fields' values, a `Garbled` for one that could not be read; those
+    The units of a read are the values of the fields, or the `Garbled` that hides one; the units
     of a write are the bytes of the value in its frame.
     """
 
     settings: Frames
     areas: Mapping[str, Area] = field(init=False, repr=False)
-    _questions: Mapping[str, str] = field(init=False, repr=False)  # by area
+    _requests: Mapping[str, str] = field(init=False, repr=False)  # by area
     _names: Mapping[str, tuple[str, ...]] = field(init=False, repr=False)  # fields, by area
     _places: Mapping[str, Address] = field(init=False, repr=False)  # by field
 
     def __post_init__(self) -> None:
         settings = self.settings
-        questions = {f"ask {question}": question for question in settings.ask}
+        requests = {f"ask {request}": request for request in settings.ask}
         listened = [name for one in settings.listen.values() for name in one.fields]
         names: dict[str, tuple[str, ...]] = {
-            area: tuple(settings.ask[question].fields) for area, question in questions.items()
+            area: tuple(settings.ask[request].fields) for area, request in requests.items()
         }
         names[LISTENED] = tuple(dict.fromkeys(n for n in listened if n not in settings.asked))
         known = {*listened, *settings.asked}
         names[WRITTEN] = tuple(name for name in settings.write if name not in known)
         areas = {
-            area: Area(area, Unit.WORD, 0, len(inside) - 1, readable=area in questions)
+            area: Area(area, Unit.WORD, 0, len(inside) - 1, readable=area in requests)
             for area, inside in names.items()
         }
         places = {
@@ -66,7 +66,7 @@ class FrameDriver:
         }
         for attribute, value in (
             ("areas", areas),
-            ("_questions", questions),
+            ("_requests", requests),
             ("_names", names),
             ("_places", places),
         ):
@@ -78,7 +78,7 @@ class FrameDriver:
 
     @property
     def station(self) -> int:
-        """No-protocol devices have no number; nobody else is on their side of the port."""
+        """Devices without a protocol have no station number."""
         return 0
 
     @property
@@ -104,7 +104,7 @@ class FrameDriver:
         return Listener(self.settings, now)
 
     def address(self, text: str) -> Address:
-        """A tag's address is the name of a field. Raises `ConfigError` saying which there are."""
+        """Finds the field with this name. Raises `ConfigError` with the names of all fields."""
         self.settings.field_of(text)
         return self._places[text]
 
@@ -125,9 +125,9 @@ class FrameDriver:
         )
 
     def cost(self, span: Span) -> Cost | None:
-        """That of the whole question, however few of its fields are wanted."""
-        question = self._questions.get(span.area)
-        return None if question is None else self.settings.cost(question)
+        """Returns the cost of the whole request, also for some of its fields."""
+        request = self._requests.get(span.area)
+        return None if request is None else self.settings.cost(request)
 
     def write_cost(self, span: Span) -> Cost | None:
         name = self.spell(Address(span.area, span.start))
@@ -139,8 +139,8 @@ class FrameDriver:
         return self.settings.codec()
 
     async def read(self, talk: Talk[bytes], span: Span) -> Sequence[Any]:
-        """Each field's value, or the `Garbled` that says why there is none."""
-        values = await self.settings.read(talk, self._questions[span.area])
+        """Returns the value of each field, or the `Garbled` that hides it."""
+        values = await self.settings.read(talk, self._requests[span.area])
         names = self._names[span.area][span.start : span.start + span.size]
         return [values[name] for name in names]
 
@@ -148,15 +148,15 @@ class FrameDriver:
         name = self.spell(Address(span.area, span.start))
         return await self.settings.tell(talk, name, bytes(units))
 
-    async def resync(self, talk: Talk[bytes], doubt: Span | None, salt: int) -> int:
-        """Another question than the doubtful one where there is one, else the same once more.
+    async def resync(self, talk: Talk[bytes], outstanding: Span | None, probe_token: int) -> int:
+        """Sends another request than the outstanding one; the same where there is no other.
 
-        Nothing in such frames says which request they answer: a late reply to the same question
-        is taken for the reply to this one.
+        These replies do not name their request: a late reply to the same request is taken for
+        the reply to this one.
         """
-        doubtful = None if doubt is None else self._questions.get(doubt.area)
-        questions = list(self.settings.ask)
-        others = [question for question in questions if question != doubtful] or questions
+        late = None if outstanding is None else self._requests.get(outstanding.area)
+        requests = list(self.settings.ask)
+        others = [request for request in requests if request != late] or requests
         if others:
-            await self.settings.read(talk, others[salt % len(others)])
+            await self.settings.read(talk, others[probe_token % len(others)])
         return 0

@@ -1,4 +1,4 @@
-"""How a value lies in a frame: taken out of what is heard, put into what is sent."""
+"""A field of a frame: decoding of received values, encoding of values to send."""
 
 import math
 import re
@@ -53,18 +53,18 @@ _WIDER = {
 _COLUMNS = re.compile(r"([1-9][0-9]{0,2})-([1-9][0-9]{0,2})\Z")
 _FORMAT = re.compile(r"[+ ]?0?(?P<width>[1-9][0-9]?)?(?:\.[0-9]{1,2}f|d)\Z")
 _NUMBER = re.compile(rb"(?P<sign>[+-]?) *(?P<number>[0-9]{1,18}(?:\.[0-9]{0,18})?|\.[0-9]{1,18})\Z")
-_LONGEST_NUMBER = 24  # characters, where the file does not say
+_LONGEST_NUMBER = 24  # characters, without `format`
 _HEX = re.compile(rb"(?:[0-9A-Fa-f]{2})+\Z")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Field:
-    """One value of a frame, both ways.
+    """One value of a frame.
 
-    Where it is: `offset` (bytes, the first is 0), `columns` (characters, the first is 1: `7-14`),
-    or, with neither, the group of its name in `match`. What it is: `uint8` to `float64` and BCD as
+    Its place: `offset` (bytes, the first is 0), `columns` (characters, the first is 1: `7-14`),
+    or, with neither, the group of its name in `match`. Its type: `uint8` to `float64` and BCD as
     raw bytes, with `hex` as two hex characters each; `text`, `integer`, `decimal` as characters.
-    `bit` picks one bit of an unsigned number. `format` says how a number is written, as in
+    `bit` picks one bit of an unsigned number. `format` is the format of a number to write, as in
     Python: `06.2f`, `+8.1f`, `04d`.
     """
 
@@ -131,12 +131,12 @@ class Field:
 
     @property
     def placed(self) -> bool:
-        """Whether it has a place of its own, not a group of `match`."""
+        """True when it has a place of its own, not a group of `match`."""
         return self.offset is not None or self.columns is not None
 
     @property
     def kind(self) -> Literal["bool", "integer", "number", "text"]:
-        """What its values are."""
+        """The kind of its values."""
         if self.bit is not None:
             return "bool"
         if self.type in ("decimal", *_FLOATS):
@@ -159,21 +159,21 @@ class Field:
 
     @property
     def size(self) -> int | None:
-        """The characters it takes in the frame; None where that is open."""
+        """Its characters in the frame; None where the number varies."""
         if self.type in _BCD or self.type in _STRUCT:
             return self._octets * (2 if self.hex else 1)
         return None
 
     @property
     def widest(self) -> int | None:
-        """The most characters that a value takes when it is written; None for a text."""
+        """The most characters of a written value; None for a text."""
         if self.size is not None or self.type == "text":
             return self.size
         match = _FORMAT.match(self.format or "")
         return int(match["width"]) if match and match["width"] else _LONGEST_NUMBER
 
     def cut(self, frame: bytes) -> bytes:
-        """The field's own bytes, by offset or columns. Raises `Garbled` if not all there."""
+        """Returns its bytes, by offset or columns. Raises `Garbled` if some are missing."""
         if self.columns is not None:
             first, last = (int(column) for column in self.columns.split("-"))
             start, end = first - 1, last
@@ -185,7 +185,7 @@ class Field:
         return frame[start:end]
 
     def take(self, raw: bytes) -> Value:
-        """The value of the field's bytes. Raises `Garbled`."""
+        """Returns the value of the bytes. Raises `Garbled`."""
         match self.type:
             case "text":
                 return self._text(raw)
@@ -232,7 +232,7 @@ class Field:
         return number if self.bit is None else bool(int(number) >> self.bit & 1)
 
     def put(self, value: Value) -> bytes:
-        """The field's bytes for a value. Raises `BadValue`."""
+        """Returns the bytes of a value. Raises `BadValue`."""
         if self.bit is not None:
             raise BadValue("one bit of a number cannot be written")
         if self.type == "text":
@@ -277,7 +277,7 @@ class Field:
 
 
 def check_writable(field: Field) -> None:
-    """A field for `{value}`: how it is written must be said in full. Raises `ConfigError`."""
+    """Checks a field for `{value}`: its format must be complete. Raises `ConfigError`."""
     if field.placed:
         raise ConfigError(
             "the place of a value that is sent is {value} in send: no offset, columns"

@@ -1,4 +1,4 @@
-"""Where a frame of a no-protocol device begins and ends: header, terminator, length, gap, sum.
+"""The begin and end of a frame without protocol: header, terminator, length, gap, sum.
 
 The framing of the Vigor VB-1COM (manual B-4: BFM#0 and #2 to #11, error numbers of BFM#29),
 which is general enough for scales, barcode readers and inverters of any make:
@@ -6,7 +6,6 @@ which is general enough for scales, barcode readers and inverters of any make:
     [header 0..4] data [terminator 0..4] [sum 2] [CR] [LF]
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -19,16 +18,16 @@ Preset = Literal["vb-1com", "vigor-rs", "ex485lnk-user", "k120s-drcv", "k120s-ds
 DEFAULT_GAP = 0.1  # s; ends a frame that neither a terminator nor its length can end
 
 
-# Which of several header bytes the sum leaves out; the manuals say the first, nothing confirms it.
+# The header bytes that the sum leaves out: the first, by the manuals; no recording confirms it.
 SumHeaderRule = Literal["first_byte_only", "whole_header"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Framing:
-    """One framing as the file writes it. With a `preset`, `presets.written_out` completes it.
+    """One framing as in the file. With a `preset`, `presets.written_out` completes it.
 
-    `length` counts exactly so many data bytes, whatever they are; `max_length` ends a frame that
-    nothing else has ended. Both count data before conversion. `gap` in seconds, in steps of 10 ms.
+    `length` is the exact number of data bytes, of any value; `max_length` ends a frame without
+    another end. Both count data before conversion. `gap` in seconds, in steps of 10 ms.
     """
 
     preset: Preset | None = None
@@ -87,12 +86,12 @@ class Framing:
 
     @property
     def mark(self) -> bytes:
-        """What ends the data: the terminator, or the CR where there is no terminator."""
+        """The end of the data: the terminator, or the CR where there is no terminator."""
         return octets(self.terminator) or self._ending[:1]
 
     @property
     def tail(self) -> bytes:
-        """The CR and LF that follow mark and sum."""
+        """The CR and LF behind mark and sum."""
         return self._ending if self.terminator else self._ending[1:]
 
     @property
@@ -101,7 +100,7 @@ class Framing:
 
     @property
     def gap_timeout(self) -> float | None:
-        """Seconds of silence that end a frame; None where silence ends nothing."""
+        """Seconds of silence that end a frame; None where a silence ends no frame."""
         if self.gap is None and not self.mark:
             return DEFAULT_GAP
         return self.gap
@@ -112,18 +111,18 @@ class Framing:
         return self.on_line(self.longest)
 
     def on_line(self, count: int) -> int:
-        """The characters of a frame of so many data bytes, everything included."""
+        """Returns the characters of a frame with `count` data bytes, everything included."""
         data = count * (2 if self.conversion else 1)
         around = octets(self.header) + self.mark + self.tail
         return data + len(around) + (2 if self.sum_check else 0)
 
     def sum_of(self, header: bytes, data: bytes) -> bytes:
-        """The sum over what is on the line, from behind the header through the terminator."""
+        """Returns the sum of the characters from behind the header to the terminator."""
         left_out = 1 if self.sum_header_rule == "first_byte_only" else len(header)
         return byte_sum(header[left_out:] + data + octets(self.terminator))
 
     def encode(self, payload: bytes) -> bytes:
-        """The whole frame around `payload`. Raises `BadValue` for data it cannot carry."""
+        """Returns the whole frame around `payload`. Raises `BadValue` for data it cannot carry."""
         if len(payload) > self.capacity:
             raise BadValue(f"{len(payload)} bytes of data, a frame holds {self.capacity}")
         if self.keep_terminator:
@@ -136,7 +135,7 @@ class Framing:
         return header + data + terminator + total + self._ending
 
     def _refuse_marks(self, data: bytes) -> None:
-        """Data that holds header, terminator or CR would be cut at the wrong place (B-4)."""
+        """Refuses data with header, terminator or CR: they would end the frame too early (B-4)."""
         header, mark = octets(self.header), self.mark
         if not mark:
             return
@@ -145,25 +144,3 @@ class Framing:
             raise BadValue(f"the data {data!r} holds what ends the frame")
         if header and line.rfind(header, 1, at) > 0:
             raise BadValue(f"the data {data!r} holds the header")
-
-
-def to_words(data: bytes, buffer: Literal[16, 8] = 16, *, high_first: bool = False) -> list[int]:
-    """The buffer words that `data` fills: low byte first, or one byte a word (`buffer` 8).
-
-    A lone last byte leaves the other half of its word 0. `high_first`: the other packing of K120S.
-    """
-    if buffer == 8:
-        return list(data)
-    order: Literal["big", "little"] = "big" if high_first else "little"
-    even = data + bytes(len(data) % 2)
-    return [int.from_bytes(even[i : i + 2], order) for i in range(0, len(even), 2)]
-
-
-def from_words(
-    words: Sequence[int], count: int, buffer: Literal[16, 8] = 16, *, high_first: bool = False
-) -> bytes:
-    """The first `count` bytes of buffer words; an odd count drops the last word's other byte."""
-    if buffer == 8:
-        return bytes(word & 0xFF for word in words)[:count]
-    order: Literal["big", "little"] = "big" if high_first else "little"
-    return b"".join(word.to_bytes(2, order) for word in words)[:count]

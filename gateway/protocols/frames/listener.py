@@ -4,8 +4,8 @@ from gateway.errors import Evidence, Garbled
 from gateway.protocols.frames.device import Frames
 from gateway.protocols.unsolicited import Stale, UnsolicitedEvent
 
-_QUIET = 0.05  # s; after it a byte begins a frame, where nothing else says what begins one
-_LONGEST_PAUSE = 1.0  # s; voids half a frame where the framing has no gap: its rest is lost
+_QUIET = 0.05  # s; a byte after it begins a frame, where no header marks the begin
+_LONGEST_PAUSE = 1.0  # s; discards half a frame where the framing has no gap: its rest is lost
 
 
 class Listener:
@@ -16,7 +16,7 @@ class Listener:
     """
 
     def __init__(self, device: Frames, now: float) -> None:
-        """`now` is when the port was opened: a frame may be on its way already."""
+        """`now`: the port was opened, possibly in the middle of a frame."""
         self._device = device
         self._reader = device.reader(quiet=False)
         self._last_byte = now
@@ -28,7 +28,7 @@ class Listener:
 
     @property
     def due(self) -> float | None:
-        """When `tick` has something to do; None: not before bytes arrive."""
+        """The time of the next `tick`; None: not before bytes arrive."""
         times = list(self._stale_at.values())
         if self._reader.pending:
             times.append(self._last_byte + self._gap)
@@ -36,7 +36,7 @@ class Listener:
 
     @property
     def busy_until(self) -> float | None:
-        """While it is in the middle of a frame: until when its next byte may come."""
+        """The latest time of the next byte of an incomplete frame; None between two frames."""
         if not self._reader.pending:
             return None
         gap = self._reader.gap_timeout
@@ -53,13 +53,13 @@ class Listener:
         return _LONGEST_PAUSE if gap is None else gap
 
     def received(self, data: bytes, now: float) -> list[UnsolicitedEvent]:
-        """Bytes that arrived at `now`."""
+        """Decodes bytes that arrived at `now`."""
         said = self._silence(now)
         self._last_byte = now
-        return said + self._said(self._reader.feed(data), now)
+        return said + self._events(self._reader.feed(data), now)
 
     def tick(self, now: float) -> list[UnsolicitedEvent]:
-        """Time has passed."""
+        """Ends frames by silence, and marks fields as stale."""
         said = self._silence(now)
         stale = frozenset(name for name, due in self._stale_at.items() if due <= now)
         for name in stale:
@@ -67,8 +67,8 @@ class Listener:
         return [*said, Stale(stale)] if stale else said
 
     def unmatched(self, frame: bytes, now: float) -> list[UnsolicitedEvent]:
-        """Decodes a whole frame of a transaction that is not its reply; an unknown one is none."""
-        event = self._understood(frame, now)
+        """Decodes a whole frame of a transaction that is not its reply; ignores an unknown one."""
+        event = self._decoded(frame, now)
         return [] if isinstance(event, Garbled) else [event]
 
     def restart(self, now: float) -> None:
@@ -77,25 +77,25 @@ class Listener:
         self._last_byte = now
 
     def _silence(self, now: float) -> list[UnsolicitedEvent]:
-        """What the silence up to `now` ended, by the time of the bytes, whoever woke us late."""
-        # Reckoned as `due` is: a difference of the same times could fall short of the gap.
+        """Ends frames by the silence up to `now`, counted from the last byte."""
+        # Computed as in `due`: a difference of the same times could be less than the gap.
         if now >= self._last_byte + self._gap:
-            return self._said(self._reader.expire(), now)
+            return self._events(self._reader.expire(), now)
         if now >= self._last_byte + _QUIET:
             self._reader.settle()
         return []
 
-    def _said(self, frames: list[bytes | Garbled], now: float) -> list[UnsolicitedEvent]:
-        """Damage upon damage is told once: noise must not fill lists."""
+    def _events(self, frames: list[bytes | Garbled], now: float) -> list[UnsolicitedEvent]:
+        """Returns consecutive damage once: noise must not fill lists."""
         said: list[UnsolicitedEvent] = []
         for item in frames:
-            news = item if isinstance(item, Garbled) else self._understood(item, now)
+            news = item if isinstance(item, Garbled) else self._decoded(item, now)
             if not (isinstance(news, Garbled) and said and isinstance(said[-1], Garbled)):
                 said.append(news)
         return said
 
-    def _understood(self, frame: bytes, now: float) -> UnsolicitedEvent:
-        decoded = self._device.hear(frame)
+    def _decoded(self, frame: bytes, now: float) -> UnsolicitedEvent:
+        decoded = self._device.decode(frame)
         if decoded is None:
             return Garbled("a frame that listen does not know", frame, evidence=Evidence.SHAPE)
         stale_after = self._device.listen[decoded.message].stale_after

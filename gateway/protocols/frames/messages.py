@@ -1,4 +1,4 @@
-"""The frames of a device as the file names them: heard unasked, asked for, written."""
+"""The frames of a device in the file: unsolicited frames, requests with replies, writes."""
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -15,12 +15,11 @@ Values = Mapping[str, Value | Garbled]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Listen:
-    """A frame that the device sends unasked.
+    """An unsolicited frame of the device.
 
     `match` is a regular expression for the whole data of the frame. `answer` is sent when all
-    fields could be read; `{name}` in it repeats that field as it was heard. After `stale_after`
-    seconds without such a frame its fields are no longer known. Without `fields` the frame is
-    known, and means nothing.
+    fields are good; `{name}` in it repeats the bytes of that field. After `stale_after` seconds
+    without the frame its fields become bad. A frame without `fields` is ignored.
     """
 
     match: str = ".*"
@@ -39,11 +38,11 @@ class Listen:
                 )
 
     def values(self, frame: bytes) -> Values | None:
-        """Its fields, each a value or why there is none; None for some other frame."""
+        """Returns its fields, each a value or the damage that hides it; None for another frame."""
         return _values(self.match, self.fields, frame)
 
     def answer_to(self, frame: bytes) -> bytes | None:
-        """What is answered to a frame all of whose fields could be read; None for nothing."""
+        """Returns the reply to a frame with good fields; None: no reply."""
         found = pattern(self.match).fullmatch(frame)
         if self.answer is None or found is None:
             return None
@@ -52,9 +51,9 @@ class Listen:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ask:
-    """A request, and the reply that `match` describes.
+    """A request, and its reply, which `match` describes.
 
-    A reply that `refused` describes is the device's "no"; its group `code` is the code.
+    `refused` describes an error reply; its group `code` is the error code.
     """
 
     send: str
@@ -67,10 +66,10 @@ class Ask:
         _check_fields(self.match, self.fields)
         _check_refused(self.refused)
         if not self.fields:
-            raise ConfigError("fields: say what the reply tells")
+            raise ConfigError("fields: name at least one field of the reply")
 
     def answers(self, frame: bytes) -> Values | None:
-        """What the reply says; None for a frame that is no reply to this. Raises `Refused`."""
+        """Returns the fields of the reply; None for a frame that is not it. Raises `Refused`."""
         values = _values(self.match, self.fields, frame)
         if values is None:
             _raise_refused(self.refused, frame)
@@ -79,9 +78,9 @@ class Ask:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Write:
-    """A frame with a `{value}` in it, and the reply by which the device says that it is done.
+    """A frame with a `{value}` in it, and the acknowledgement of the device.
 
-    Without `match` nobody acknowledges: it cannot be known whether the write was done.
+    Without `match` there is no acknowledgement, and the result of a write stays unknown.
     """
 
     send: str
@@ -91,20 +90,20 @@ class Write:
 
     def __post_init__(self) -> None:
         if list(_holes(self.send)) != ["value"]:
-            raise ConfigError(f"send {self.send!r}: the value stands in it once, as {{value}}")
+            raise ConfigError(f"send {self.send!r}: it needs {{value}} exactly once")
         check_writable(self.value)
         _check_refused(self.refused)
         if self.match is not None:
             _check_fields(self.match, {})
         elif self.refused is not None:
-            raise ConfigError("refused needs a match: how does the device say yes?")
+            raise ConfigError("refused needs a match for the acknowledgement")
 
     def frame(self, raw: bytes) -> bytes:
-        """The data of the frame that writes a value whose own bytes are `raw`."""
+        """Returns the data of the frame that writes a value with the bytes `raw`."""
         return filled(self.send, lambda _: raw)
 
     def answers(self, frame: bytes) -> bool | None:
-        """True for the acknowledgement; None for a frame that is none. Raises `Refused`."""
+        """Returns True for the acknowledgement; None for another frame. Raises `Refused`."""
         if self.match is not None and pattern(self.match).fullmatch(frame):
             return True
         _raise_refused(self.refused, frame)
@@ -112,7 +111,7 @@ class Write:
 
 
 def filled(text: str, fill: Callable[[str], bytes]) -> bytes:
-    """The template with its places filled."""
+    """Returns the template with its places filled."""
     pieces = template(text)
     return b"".join(fill(piece.name) if isinstance(piece, Hole) else piece for piece in pieces)
 
@@ -166,10 +165,10 @@ def _check_fields(match: str, fields: Mapping[str, Field]) -> None:
         if one.placed and name in groups:
             raise ConfigError(f"field {name} has a place of its own and is a group of match too")
         if not one.placed and name not in groups:
-            raise ConfigError(f"field {name}: say its offset or columns, or name a group of match")
+            raise ConfigError(f"field {name}: give its offset or columns, or name a group of match")
     for name in groups:
         if name not in fields:
-            raise ConfigError(f"match has a group {name}: say in fields what it is")
+            raise ConfigError(f"match has a group {name}: add a field with this name")
 
 
 def _check_refused(refused: str | None) -> None:

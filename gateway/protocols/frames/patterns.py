@@ -29,7 +29,7 @@ def pattern(text: str) -> re.Pattern[bytes]:
     """The compiled pattern, in which `.` is any byte at all. Raises `ConfigError`."""
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("error")  # `[[`: a later Python may read it in another way
+            warnings.simplefilter("error")  # `[[`: a later Python may read it differently
             return re.compile(text.encode("latin-1"), re.DOTALL)
     except UnicodeEncodeError:
         raise ConfigError(f"{text!r}: write characters beyond Latin-1 as bytes, \\xE4") from None
@@ -38,7 +38,7 @@ def pattern(text: str) -> re.Pattern[bytes]:
 
 
 def check_pattern(text: str, longest: int) -> None:
-    """Refuse what does not compile, or could take long on a frame of `longest` bytes."""
+    """Raises `ConfigError` for a pattern that is wrong, or slow on a frame of `longest` bytes."""
     pattern(text)
     steps = _ways(_Parser(text, longest).whole(), frozenset(), longest) * longest
     if steps > _MOST_STEPS:
@@ -100,7 +100,7 @@ def _first(node: _Node) -> frozenset[int]:
 
 
 def _empty(node: _Node) -> bool:
-    """Whether it can match nothing at all."""
+    """True when it can match an empty text."""
     match node:
         case _Atom(octets):
             return not octets
@@ -168,7 +168,7 @@ def _capped(ways: int) -> int:
 
 
 class _Parser:
-    """Takes a pattern that is known to compile apart."""
+    """Parses a pattern that compiles."""
 
     def __init__(self, text: str, longest: int) -> None:
         self._text = text

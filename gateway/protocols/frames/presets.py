@@ -37,7 +37,7 @@ _VB_1COM = {
 
 @lru_cache(maxsize=256)
 def written_out(framing: Framing) -> Framing:
-    """The same framing without its preset, everything said by hand. Raises `ConfigError`."""
+    """Returns the same framing without its preset, all settings explicit. Raises `ConfigError`."""
     match framing.preset:
         case None:
             return framing

@@ -1,29 +1,31 @@
-"""The ways a span can go over the wire, bit by bit or in words, and what each one carries.
+"""Access to a span, bit by bit or in words: the devices and characters of the request.
 
-Bit devices may be taken in words of sixteen points whose head number is a multiple of 8
-(X and Y: an octal number that ends in 0). A read may take more than was asked, a write may not.
+Bit devices may be accessed in words of sixteen points whose head number is a multiple of 8
+(X and Y: an octal number that ends in 0). A read may take more than the span, a write may not.
 """
 
 import re
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 from gateway.errors import BadValue
 from gateway.protocols.computer_link.devices import Profile, wire_name
 from gateway.protocols.driver import Area, Span, Unit
 
+T = TypeVar("T")
+
 HEAD = 8
 SIXTEEN = 16
-_NO_WORDS = ("TS", "CS")  # timer and counter contacts go bit by bit only (manual 1-7-1)
+_NO_WORDS = ("TS", "CS")  # timer and counter contacts are read bit by bit only (manual 1-7-1)
 _DIGITS = {Unit.BIT: 4, Unit.WORD: 4, Unit.DWORD: 8}
 _HEX = re.compile(r"[0-9A-F]*")
 _BITS = re.compile(r"[01]*")
 
 
-class Way(NamedTuple):
-    """How `asked` travels: `pieces` of `digits` characters, from `head` on, `step` apart."""
+class Access(NamedTuple):
+    """One access to read or write a span: `pieces` of `digits` characters, `step` devices apart."""
 
-    asked: Span
+    span: Span
     area: Area
     in_words: bool
     head: int
@@ -37,16 +39,16 @@ class Way(NamedTuple):
 
     @property
     def batch(self) -> str:
-        """Head device and number of pieces, as BR, WR, BW and WW name them (256 is "00")."""
+        """Head device and number of pieces, as BR, WR, BW and WW take them (256 is "00")."""
         return f"{wire_name(self.area, self.head)}{self.pieces & 0xFF:02X}"
 
     def devices(self) -> Iterator[str]:
-        """The device of each piece, as BT, WT, BM and WM name them."""
+        """Yields the device of each piece, as BT, WT, BM and WM take it."""
         for piece in range(self.pieces):
             yield wire_name(self.area, self.head + piece * self.step)
 
     def decode(self, data: str) -> list[int] | None:
-        """The units asked for; None for characters that cannot be their data."""
+        """Returns the units of the span; None for characters that cannot be their data."""
         legal = _HEX if self.in_words else _BITS
         if len(data) != self.characters or not legal.fullmatch(data):
             return None
@@ -55,14 +57,14 @@ class Way(NamedTuple):
             return units
         # Each word's least significant bit is its head device.
         bits = [word >> bit & 1 for word in units for bit in range(SIXTEEN)]
-        first = self.asked.start - self.head
-        return bits[first : first + self.asked.size]
+        first = self.span.start - self.head
+        return bits[first : first + self.span.size]
 
     def encode(self, units: Sequence[int]) -> list[str]:
-        """The pieces that say `units`. Raises `BadValue` for what does not fit."""
+        """Returns the pieces for `units`. Raises `BadValue` for units that do not fit."""
         top = 1 if self.area.unit is Unit.BIT else 16**self.digits - 1
-        if len(units) != self.asked.size or not all(0 <= unit <= top for unit in units):
-            raise BadValue(f"{self.asked} takes {self.asked.size} units of 0..{top}")
+        if len(units) != self.span.size or not all(0 <= unit <= top for unit in units):
+            raise BadValue(f"{self.span} takes {self.span.size} units of 0..{top}")
         if self.step == SIXTEEN:
             units = [
                 sum(bit << i for i, bit in enumerate(units[start : start + SIXTEEN]))
@@ -71,18 +73,18 @@ class Way(NamedTuple):
         return [f"{unit:0{self.digits}X}" for unit in units]
 
 
-def read_way(profile: Profile, span: Span) -> Way | None:
-    """The cheaper of BR and WR; None where neither can read the span in one exchange."""
+def read_access(profile: Profile, span: Span) -> Access | None:
+    """Returns the cheaper of BR and WR; None where neither reads the span in one request."""
     return _cheaper(
         _at_most(profile.read_bits, bit_by_bit(profile, span)),
         _within(profile, words_around(profile, span), profile.read_sixteens),
     )
 
 
-def write_way(profile: Profile, span: Span) -> Way | None:
-    """The cheaper of BW and WW; None where neither can write the span in one exchange."""
-    # WW would take more points than BW (Liyan: 8 words are 128, BW takes 64), but only where
-    # they lie in words. If a span cannot be written no longer one may be, so BW's limit holds.
+def write_access(profile: Profile, span: Span) -> Access | None:
+    """Returns the cheaper of BW and WW; None where neither writes the span in one request."""
+    # WW takes more points than BW (Liyan: 8 words are 128, BW takes 64), but only where they lie
+    # in words. If a span cannot be written, no longer one may be: so the limit of BW holds.
     sixteens = profile.write_bits // SIXTEEN
     return _cheaper(
         _at_most(profile.write_bits, bit_by_bit(profile, span)),
@@ -90,28 +92,28 @@ def write_way(profile: Profile, span: Span) -> Way | None:
     )
 
 
-def bit_by_bit(profile: Profile, span: Span) -> Way | None:
-    """One character a point; None for words and for what the device does not have."""
+def bit_by_bit(profile: Profile, span: Span) -> Access | None:
+    """One character per point; None for words and for devices that do not exist."""
     area = _area(profile, span)
     if area is None or area.unit is not Unit.BIT:
         return None
-    return Way(span, area, False, span.start, 1, span.size, 1)
+    return Access(span, area, False, span.start, 1, span.size, 1)
 
 
-def words_exactly(profile: Profile, span: Span) -> Way | None:
-    """Words that hold the span and nothing else; None where there are none."""
+def words_exactly(profile: Profile, span: Span) -> Access | None:
+    """Words that hold exactly the span; None where there are none."""
     area = _area(profile, span)
     if area is None or area.name in _NO_WORDS:
         return None
     if area.unit is not Unit.BIT:
-        return Way(span, area, True, span.start, 1, span.size, _DIGITS[area.unit])
+        return Access(span, area, True, span.start, 1, span.size, _DIGITS[area.unit])
     if span.start % HEAD or span.size % SIXTEEN:
         return None
-    return Way(span, area, True, span.start, SIXTEEN, span.size // SIXTEEN, 4)
+    return Access(span, area, True, span.start, SIXTEEN, span.size // SIXTEEN, 4)
 
 
-def words_around(profile: Profile, span: Span) -> Way | None:
-    """The fewest words that cover the span and do not leave its area."""
+def words_around(profile: Profile, span: Span) -> Access | None:
+    """The fewest words that hold the span and stay within its area."""
     area = _area(profile, span)
     if area is None or area.name in _NO_WORDS:
         return None
@@ -122,7 +124,7 @@ def words_around(profile: Profile, span: Span) -> Way | None:
     for head in (aligned, aligned - HEAD):  # the earlier head where the area ends too soon
         count = -(-(end - head) // SIXTEEN)
         if head >= area.first and head + count * SIXTEEN <= area.last + 1:
-            return Way(span, area, True, head, SIXTEEN, count, 4)
+            return Access(span, area, True, head, SIXTEEN, count, 4)
     return None
 
 
@@ -134,19 +136,26 @@ def _area(profile: Profile, span: Span) -> Area | None:
     return area if inside else None
 
 
-def _within(profile: Profile, way: Way | None, sixteens: int) -> Way | None:
-    if way is None:
+def _within(profile: Profile, access: Access | None, sixteens: int) -> Access | None:
+    if access is None:
         return None
     limits = {Unit.BIT: sixteens, Unit.WORD: profile.words, Unit.DWORD: profile.dwords}
-    return _at_most(limits[way.area.unit], way)
+    return _at_most(limits[access.area.unit], access)
 
 
-def _at_most(limit: int, way: Way | None) -> Way | None:
-    return way if way is not None and way.pieces <= limit else None
+def _at_most(limit: int, access: Access | None) -> Access | None:
+    return access if access is not None and access.pieces <= limit else None
 
 
-def _cheaper(bits: Way | None, words: Way | None) -> Way | None:
-    """Bit by bit where it costs no more: that asks for nothing beside the span."""
+def _cheaper(bits: Access | None, words: Access | None) -> Access | None:
+    """Bit by bit where it costs no more: it reads nothing besides the span."""
     if bits is None or words is None:
         return bits or words
     return words if words.characters < bits.characters else bits
+
+
+def possible(access: T | None, spans: object) -> T:
+    """Raises `ValueError` for None: the plan was made with the costs, so this is a mistake."""
+    if access is None:
+        raise ValueError(f"{spans} does not fit one request")
+    return access
