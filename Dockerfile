@@ -1,13 +1,13 @@
-# Two stages: the first builds a virtual environment, the second runs it as nobody in particular.
+# The first stage builds a virtual environment; the second runs it as an unprivileged user.
 FROM python:3.12-slim AS build
 WORKDIR /src
-COPY pyproject.toml constraints.txt README.md ./
+COPY pyproject.toml constraints.txt README.md LICENSE ./
 COPY gateway gateway
 RUN python -m venv /opt/gateway \
     && /opt/gateway/bin/pip install --no-cache-dir --constraint constraints.txt .
 
 FROM python:3.12-slim
-# Serial ports belong to dialout: docker run --device /dev/ttyUSB0 --group-add dialout ...
+# Serial ports belong to the group dialout: docker run --device /dev/ttyUSB0 --group-add dialout ...
 RUN useradd --system --uid 10001 --groups dialout --home-dir /data --create-home gateway
 COPY --from=build /opt/gateway /opt/gateway
 COPY config.example.yaml /etc/plc-gateway/config.yaml
@@ -16,9 +16,9 @@ USER gateway
 WORKDIR /data
 VOLUME /data
 EXPOSE 7447
-# Nothing is written outside /data: run with --read-only --tmpfs /tmp.
-# Where users_file closes the gateway: -e PLC_GATEWAY_CLI_USER -e PLC_GATEWAY_CLI_PASSWORD, as in
-# docs/security.md.
+# The gateway writes only below /data: run it with --read-only --tmpfs /tmp.
+# With `users_file` the health check needs -e PLC_GATEWAY_CLI_USER -e PLC_GATEWAY_CLI_PASSWORD
+# (docs/security.md).
 HEALTHCHECK --interval=30s --timeout=10s --start-period=15s \
     CMD ["plc-gateway", "health", "/etc/plc-gateway/config.yaml"]
 ENTRYPOINT ["plc-gateway"]

@@ -2,13 +2,17 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: run test check format schema sim fuzz soak mutants faults bench clean
+.PHONY: run test coverage check format schema sim fuzz soak mutants faults bench clean
 
 run: .venv/installed
 	$(BIN)/plc-gateway run config.example.yaml
 
 test: .venv/ready
 	$(BIN)/python -m pytest -n 2 --dist worksteal
+
+# Branch coverage of the suite; subprocesses are not counted.
+coverage: .venv/ready
+	$(BIN)/python -m pytest -n 2 --dist worksteal --cov --cov-report=term --cov-report=html:build/coverage
 
 check: .venv/ready
 	$(BIN)/ruff format --check .
@@ -30,7 +34,7 @@ bench: .venv/ready
 	$(BIN)/python -m benchmarks.northbound
 
 clean:
-	rm -rf .venv build dist *.egg-info
+	rm -rf .venv build dist *.egg-info .coverage
 
 .venv/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv

@@ -1,17 +1,17 @@
 """A Zenoh consumer that misses nothing: `python examples/catch_up.py --connect tcp/127.0.0.1:7447`.
 
 It prints every sample of the tags with `history: true` once: `time key value`, in the order of
-time, until Ctrl-C. When a router, the network or a gateway was away, it asks for what it missed by
-`_time`. Copy it, and put your own work where `main` prints.
+time, until Ctrl-C. After a router, the network or a gateway was away, it queries the missed samples
+by `_time`. Copy it, and replace the print in `main` with your own work.
 
-How it works:
+It works in three steps:
 
-1. It subscribes first and asks for history afterwards, so that nothing falls between the two.
-2. Whenever something may have been missed (a link or a gateway came or went, and once a minute in
-   any case, for a network may also drop samples when it is overloaded), it holds what arrives,
-   asks for everything since the last time all was well, sorts, and leaves out what it knows.
-3. An answer counts only if it is whole: some sample came, no error came, every gateway is still
-   there afterwards, and no link changed meanwhile. Otherwise it asks again.
+1. It subscribes first and queries history afterwards, so that it loses nothing in between.
+2. It checks for missed samples after every change of a link or a gateway, and once a minute,
+   because an overloaded network may also drop samples. A check holds back new samples, queries
+   everything since the last complete answer, sorts it, and leaves out known samples.
+3. An answer is complete if it has a sample and no error, if every gateway is still there
+   afterwards, and if no link changed meanwhile. Otherwise the check is repeated.
 """
 
 import argparse
@@ -26,12 +26,12 @@ from typing import NamedTuple
 
 import zenoh
 
-CHECK_EVERY = 60.0  # seconds between two checks when nothing seems to be wrong
-ANSWER_WITHIN = 60.0  # seconds for all that was missed
-RETRY_EVERY = 1.0  # seconds until an answer that was not whole is asked for again
-# Samples of different lines may reach history a moment later than their time says.
+CHECK_EVERY = 60.0  # seconds between two checks without a known gap
+ANSWER_WITHIN = 60.0  # seconds for the whole answer to a check
+RETRY_EVERY = 1.0  # seconds until an incomplete check is repeated
+# Samples of different lines may be recorded a moment after their time.
 MARGIN = timedelta(seconds=5)
-MISSED = object()  # in the queue: something may have been missed
+MISSED = object()  # in the queue: samples may be missing
 
 
 class Sample(NamedTuple):
@@ -40,7 +40,7 @@ class Sample(NamedTuple):
     time: str
     key: str
     payload: str  # JSON: value, quality, time, and the reason of a bad one
-    late: bool = False  # found by a check, after newer samples of its tag were given out
+    late: bool = False  # found by a check, after newer samples of its tag were delivered
 
     @property
     def value(self) -> object:
@@ -48,21 +48,21 @@ class Sample(NamedTuple):
 
 
 class Gap(Exception):
-    """The answer was not whole."""
+    """The answer was not complete."""
 
 
 class CatchUp:
-    """All samples under a prefix, each once. `since`: RFC 3339, from when on they are wanted."""
+    """All samples under a prefix, each once. `since`: RFC 3339, the time of the first sample."""
 
     def __init__(self, session: zenoh.Session, prefix: str, since: str) -> None:
-        self.since = since  # everything before was given out: keep it to go on after a restart
+        self.since = since  # everything before is delivered: keep it to continue after a restart
         self._session = session
         self._prefix = prefix
         self._arrived: queue.Queue[object] = queue.Queue()
         self._gateways: set[str] = set()
         self._links = 0  # changes so far
-        self._known: set[Sample] = set()  # given out, and not older than `since`
-        self._last: dict[str, Sample] = {}  # given out last, by key
+        self._known: set[Sample] = set()  # delivered, and not older than `since`
+        self._last: dict[str, Sample] = {}  # the last delivered sample of each key
         self._declared = [
             session.declare_subscriber(f"{prefix}/**", self._arrived.put),
             session.liveliness().declare_subscriber(
@@ -71,7 +71,7 @@ class CatchUp:
             session.info.declare_transport_events_listener(self._link),
         ]
 
-    # Zenoh's threads: they only take note.
+    # Zenoh's threads call these: they only record the change.
 
     def _gateway(self, token: zenoh.Sample) -> None:
         key = str(token.key_expr)
@@ -86,39 +86,39 @@ class CatchUp:
         self._links += 1
         self._arrived.put(MISSED)
 
-    # Your thread.
+    # Your thread calls these.
 
     def samples(self) -> Iterator[Sample]:
-        """Never ends."""
+        """Yields samples for ever."""
         due = time.monotonic()
         while True:
             if time.monotonic() >= due:
                 try:
-                    yield from self._news(self._missed())
+                    yield from self._new(self._missed())
                 except Gap:
                     due = time.monotonic() + RETRY_EVERY
                 else:
                     due = time.monotonic() + CHECK_EVERY
-                    self._all_is_well()
+                    self._advance()
             try:
                 arrived = self._arrived.get(timeout=max(0.0, due - time.monotonic()))
             except queue.Empty:
                 continue
             if arrived is MISSED:
-                due = min(due, time.monotonic() + RETRY_EVERY)  # links come in twos and threes
+                due = min(due, time.monotonic() + RETRY_EVERY)  # links change together
             elif isinstance(arrived, zenoh.Sample):
                 if due - time.monotonic() <= RETRY_EVERY:
-                    # A gap is suspected: this one is in history too, and will come in its place.
+                    # A check is due: this sample is in history too, and arrives in its place.
                     continue
-                yield from self._news([_sample(arrived)])
+                yield from self._new([_sample(arrived)])
 
     def _missed(self) -> list[Sample]:
-        """Everything since all was well. Raises `Gap` unless it is certain to be everything."""
+        """Returns every sample since the last complete check. Raises `Gap` if some may lack."""
         links, gateways = self._links, set(self._gateways)
-        asked = f"{self._prefix}/**?_time=[{self.since}..]"
-        found = [_sample(answer) for answer in self._answers(asked, links)]
-        # Nobody says how many samples there are: that the gateways are still there tells that
-        # none of them ended in the middle of its answer.
+        selector = f"{self._prefix}/**?_time=[{self.since}..]"
+        found = [_sample(answer) for answer in self._answers(selector, links)]
+        # The number of samples is unknown. A gateway that is still there did not end in the middle
+        # of its answer.
         for gateway in gateways:
             if not any(self._answers(f"{gateway}/status", links)):
                 raise Gap(gateway)
@@ -127,7 +127,7 @@ class CatchUp:
         return sorted(found)
 
     def _answers(self, selector: str, links: int) -> Iterator[zenoh.Sample]:
-        """Gives up as soon as a link changes: what was on its way may never come."""
+        """Yields the replies. Raises `Gap` when a link changes: replies may be lost then."""
         answers: queue.Queue[zenoh.Reply | None] = queue.Queue()
         handler = zenoh.handlers.Callback(answers.put, lambda: answers.put(None), indirect=False)
         self._session.get(selector, handler, timeout=ANSWER_WITHIN)
@@ -143,7 +143,7 @@ class CatchUp:
             yield reply.ok
         raise Gap
 
-    def _news(self, samples: list[Sample]) -> Iterator[Sample]:
+    def _new(self, samples: list[Sample]) -> Iterator[Sample]:
         for sample in samples:
             last = self._last.get(sample.key)
             if sample in self._known or sample == last:
@@ -154,7 +154,7 @@ class CatchUp:
                 self._last[sample.key] = sample
             yield sample._replace(late=late)
 
-    def _all_is_well(self) -> None:
+    def _advance(self) -> None:
         newest = datetime.fromisoformat(max(sample.time for sample in self._last.values()))
         since = (newest - MARGIN).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
         self.since = max(self.since, since)
@@ -162,7 +162,7 @@ class CatchUp:
 
 
 def _sample(received: zenoh.Sample) -> Sample:
-    """Tags with `payload: raw` have quality and time in the attachment, and are gone when bad."""
+    """Reads a sample. With `payload: raw` quality and time are in the attachment."""
     payload, about = received.payload.to_string(), received.attachment
     if about is not None:
         known = payload if received.kind == zenoh.SampleKind.PUT else None
@@ -184,7 +184,7 @@ def main() -> None:
 
 
 def opened(endpoint: str) -> zenoh.Session:
-    """Waits for the router; once open, a session comes back by itself."""
+    """Opens a session, and waits for the router. Zenoh reconnects an open session by itself."""
     config = zenoh.Config()
     config.insert_json5("mode", '"client"')
     config.insert_json5("connect/endpoints", json.dumps([endpoint]))

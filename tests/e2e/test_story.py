@@ -1,4 +1,4 @@
-"""docs/scada.md: each of its programs is run, against gateways that are set up as it says."""
+"""Runs every program of docs/scada.md against gateways that are set up as the page describes."""
 
 import json
 import subprocess
@@ -43,7 +43,7 @@ def set_up(folder: Path, zenoh: dict[str, object], client: str) -> Iterator[Stor
         yield Story(folder, path)
 
 
-def _all_good(path: Path) -> bool:
+def every_value_is_good(path: Path) -> bool:
     return plc_gateway("read", path).code == 0
 
 
@@ -53,13 +53,13 @@ def beginning(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Story]:
     assert OPEN.count(ENDPOINT) == 1
     client = OPEN.replace(ENDPOINT, endpoint)
     for story in set_up(tmp_path_factory.mktemp("story"), {"listen": [endpoint]}, client):
-        until(partial(_all_good, story.config), "every value is good")
+        until(partial(every_value_is_good, story.config), "every value is good")
         yield story
 
 
 @pytest.fixture(scope="module")
 def end(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Story]:
-    """As the page says in the end, but for the host."""
+    """The secured gateway of the last section, on this machine."""
     folder = tmp_path_factory.mktemp("end")
     certificates(folder)("gateway")
     secret(folder / "users.txt", "viewer:a long one\noperator:another\n")
@@ -72,13 +72,13 @@ def end(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Story]:
     yield from set_up(folder, settings, client.replace('"ca.pem"', f'"{folder / "ca.pem"}"'))
 
 
-def test_the_page_is_a_story_of_three_pages() -> None:
+def test_the_tutorial_fits_on_three_pages() -> None:
     assert len(PROGRAMS) == sum(block.language == "python" for block in BLOCKS) == 5
     assert sum(len(block.text.splitlines()) for block, _ in PROGRAMS) < 100
 
 
 @pytest.mark.parametrize(("program", "shown"), PROGRAMS[:-1], ids=str)
-def test_a_program_prints_the_output_of_the_page(
+def test_a_program_prints_what_the_page_shows(
     program: Block, shown: Block, beginning: Story
 ) -> None:
     path = beginning.folder / "program.py"
@@ -88,10 +88,10 @@ def test_a_program_prints_the_output_of_the_page(
     with Program(sys.executable, path) as running:
         if "…" in lines:
 
-            def said_all() -> bool:
+            def printed_all() -> bool:
                 return wanted <= set(map(shape, running.lines))
 
-            until(lambda: said_all() or not running.running, "it says what the page shows")
+            until(lambda: printed_all() or not running.running, "it prints what the page shows")
         else:
             assert running.ended() == 0
             assert [shape(line) for line in running.lines] == [shape(line) for line in lines]
@@ -106,8 +106,8 @@ BUSY = '{"error": "busy", "code": null, "reason": "it could not be read"}'
 GOOD = '{"value": 6, "quality": "good", "time": ""}'
 BAD = '{"value": null, "quality": "bad", "reason": "no-reply", "time": ""}'
 MUTE = ""
-NOBODY_KNOWS = "nobody knows, and the PLC could not be read"
-# In the place of a gateway: answers so, or (mute) lets the asker wait until he gives up.
+UNKNOWN = "unknown, and the PLC could not be read"
+# Stands in for a gateway: gives these answers, or none (mute) until the query times out.
 STAND_IN = """
 import json, sys, zenoh
 
@@ -134,15 +134,15 @@ with zenoh.open(config) as session:
     [
         ((DONE, MUTE), "done: 7"),
         ((REFUSED, GOOD), "not done: refused, no such address"),
-        ((UNCLEAR, GOOD), "nobody knows; the PLC now holds 6"),
-        ((UNCLEAR, BAD), NOBODY_KNOWS),
-        ((UNCLEAR, BUSY), NOBODY_KNOWS),
-        ((MUTE, GOOD), "nobody knows; the PLC now holds 6"),
-        ((MUTE, MUTE), NOBODY_KNOWS),
-        ((), NOBODY_KNOWS),
+        ((UNCLEAR, GOOD), "unknown; the PLC now holds 6"),
+        ((UNCLEAR, BAD), UNKNOWN),
+        ((UNCLEAR, BUSY), UNKNOWN),
+        ((MUTE, GOOD), "unknown; the PLC now holds 6"),
+        ((MUTE, MUTE), UNKNOWN),
+        ((), UNKNOWN),
     ],
 )
-def test_a_write_is_done_or_not_done_or_unclear(
+def test_a_write_is_done_or_not_done_or_unknown(
     answers: tuple[str, ...], said: str, tmp_path: Path
 ) -> None:
     endpoint = free_endpoint()
@@ -164,18 +164,18 @@ def test_a_write_is_done_or_not_done_or_unclear(
             assert program.lines == [said] * 3
 
 
-def test_with_access_control_a_viewer_reads_and_does_not_write(end: Story) -> None:
+def test_a_viewer_of_the_secured_gateway_reads_and_does_not_write(end: Story) -> None:
     program, shown = PROGRAMS[-1]
     command = [sys.executable, "-c", program.text]
 
-    def said() -> str:
+    def printed() -> str:
         done = subprocess.run(command, cwd=end.folder, capture_output=True, text=True, check=True)
         return done.stdout
 
-    until(lambda: said() == shown.text, "it says what the page shows")
+    until(lambda: printed() == shown.text, "it prints what the page shows")
 
 
 def inside(story: Story, program: str) -> str:
-    """Programs are started elsewhere."""
+    """The program with the full path of its file: the tests start it in another folder."""
     assert program.count('"scada.json5"') == 1
     return program.replace("scada.json5", str(story.folder / "scada.json5"))

@@ -34,8 +34,10 @@ from tests.e2e.processes import PATIENCE, Done, Program, started, vigor_line, wr
 from tests.northbound.test_northbound import PlainPlant, mixer, until
 from tests.zenoh_peer import ZenohPeer, free_endpoint
 
-PAGE = Path(__file__).parents[2] / "docs" / "security.md"
-GATEWAY_RULES, ROUTER_RULES = re.findall(r"```json5\n(.*?)```", PAGE.read_text(), re.DOTALL)
+PAGE, RULES_PAGE = (
+    Path(__file__).parents[2] / "docs" / name for name in ("security.md", "access-control.md")
+)
+GATEWAY_RULES, ROUTER_RULES = re.findall(r"```json5\n(.*?)```", RULES_PAGE.read_text(), re.DOTALL)
 PASSWORDS = {name: f"of-{name}-5f0c1" for name in ("gateway", "viewer", "operator", "health")}
 RECIPE = "plant/mixer/recipe/@set"
 TOKEN = "Zm9vYmFyYmF6cXV4Zm9vYmFyYmF6cXV4"  # noqa: S105  (of a test)
@@ -52,7 +54,7 @@ def writers_line(name: str, token: str) -> str:
     return f"{name}:{SALT}:{hashlib.sha256((SALT + token).encode()).hexdigest()}\n"
 
 
-# -- Zenoh's access control as docs/security.md has it -----------------------------------------
+# -- Zenoh's access control as docs/access-control.md has it -------------------------------------
 
 
 def users(folder: Path) -> Path:

@@ -1,0 +1,146 @@
+"""The project's own files agree: version, licence, typing, supported Pythons, hosted CI."""
+
+import re
+import tomllib
+from importlib import resources
+from typing import Any
+
+import pytest
+import yaml
+
+from gateway import __version__
+from tests.e2e.processes import ROOT, plc_gateway
+
+PROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
+PYTHONS = re.findall(
+    r"Python :: (3\.\d+)", "\n".join(PROJECT["project"]["classifiers"]), re.MULTILINE
+)
+
+
+def workflow() -> dict[str, Any]:
+    loaded: dict[str, Any] = yaml.safe_load((ROOT / ".github/workflows/ci.yml").read_text("utf-8"))
+    return loaded
+
+
+def test_the_package_has_one_version() -> None:
+    attribute = PROJECT["tool"]["setuptools"]["dynamic"]["version"]["attr"]
+    assert "version" in PROJECT["project"]["dynamic"]
+    assert attribute == "gateway.__version__"
+
+
+@pytest.mark.parametrize("argument", ["--version", "version"])
+def test_the_command_line_prints_the_version(argument: str) -> None:
+    done = plc_gateway(argument)
+    assert done.code == 0
+    assert done.out.split()[-1] == __version__
+
+
+def test_the_changelog_begins_with_the_version() -> None:
+    text = (ROOT / "CHANGELOG.md").read_text("utf-8")
+    versions = re.findall(r"^## \[?([\d.]+)\]?", text, re.MULTILINE)
+    assert versions[0] == __version__
+    assert len(versions) == len(set(versions))
+
+
+def test_the_package_is_typed() -> None:
+    assert "Typing :: Typed" in PROJECT["project"]["classifiers"]
+    assert PROJECT["tool"]["setuptools"]["package-data"]["gateway"] == ["py.typed"]
+    assert resources.files("gateway").joinpath("py.typed").is_file()
+
+
+def test_the_license_is_the_one_that_the_project_names() -> None:
+    assert PROJECT["project"]["license"] == "Apache-2.0"
+    assert PROJECT["project"]["license-files"] == ["LICENSE"]
+    text = (ROOT / "LICENSE").read_text("utf-8")
+    assert text.split()[:4] == ["Apache", "License", "Version", "2.0,"]
+    assert "END OF TERMS AND CONDITIONS" in text
+
+
+def test_the_container_is_built_with_every_file_that_the_build_needs() -> None:
+    copied = re.findall(r"^COPY (?!--from)(.*)$", (ROOT / "Dockerfile").read_text(), re.MULTILINE)
+    assert set(copied[0].split()) >= {"pyproject.toml", "README.md", "LICENSE", "constraints.txt"}
+
+
+def test_hosted_ci_runs_the_same_as_a_developer_on_every_supported_python() -> None:
+    job = workflow()["jobs"]["test"]
+    assert job["strategy"]["matrix"]["python"] == PYTHONS
+    [run] = [step for step in job["steps"] if "run" in step]
+    assert run["run"] == "bash .ci/run"
+    assert run["env"]["PYTHON"] == "python${{ matrix.python }}"
+
+
+def test_the_lowest_supported_python_is_the_one_that_pip_accepts() -> None:
+    assert PROJECT["project"]["requires-python"] == f">={PYTHONS[0]}"
+    assert PROJECT["tool"]["mypy"]["python_version"] == PYTHONS[0]
+
+
+def test_ci_uses_the_interpreter_that_it_is_given() -> None:
+    assert "export PYTHON=" in (ROOT / ".ci/run").read_text()
+    assert "$(PYTHON) -m venv" in (ROOT / "Makefile").read_text()
+
+
+def test_every_target_of_the_makefile_is_phony_or_a_file() -> None:
+    text = (ROOT / "Makefile").read_text()
+    [phony] = re.findall(r"^\.PHONY: (.*)$", text, re.MULTILINE)
+    targets = set(re.findall(r"^([a-z]+):", text, re.MULTILINE))
+    assert targets == set(phony.split())
+
+
+def test_every_pinned_package_is_pinned_once() -> None:
+    names = re.findall(r"^([\w.-]+)==", (ROOT / "constraints.txt").read_text(), re.MULTILINE)
+    assert len(names) == len(set(names))
+
+
+def test_every_package_of_the_project_has_a_pin() -> None:
+    def normal(name: str) -> str:
+        return re.sub(r"[-_.]+", "-", name).lower()
+
+    pins = re.findall(r"^([\w.-]+)==", (ROOT / "constraints.txt").read_text(), re.MULTILINE)
+    wanted = PROJECT["project"]["dependencies"]
+    wanted += PROJECT["project"]["optional-dependencies"]["dev"]
+    named = {normal(re.split(r"[~<>=;\[ ]", requirement)[0]) for requirement in wanted}
+    assert named <= {normal(pin) for pin in pins}
+
+
+def test_dependency_updates_cover_every_ecosystem() -> None:
+    updates = yaml.safe_load((ROOT / ".github/dependabot.yml").read_text("utf-8"))["updates"]
+    places = {update["package-ecosystem"]: update["directory"] for update in updates}
+    assert places == {
+        "pip": "/",
+        "npm": "/tests/interop",
+        "github-actions": "/",
+        "docker": "/",
+    }
+    assert (ROOT / "tests/interop/package.json").is_file()
+
+
+@pytest.mark.parametrize("page", ["CONTRIBUTING.md", "SECURITY.md"])
+def test_the_readme_names_the_projects_pages(page: str) -> None:
+    assert (ROOT / page).is_file()
+    assert f"({page})" in (ROOT / "README.md").read_text("utf-8")
+
+
+def test_the_contributors_table_has_the_layers_in_the_order_of_their_imports() -> None:
+    [layers] = [
+        contract["layers"]
+        for contract in PROJECT["tool"]["importlinter"]["contracts"]
+        if contract["id"] == "layers"
+    ]
+    text = (ROOT / "CONTRIBUTING.md").read_text("utf-8")
+    rows = text.partition("| folder | question")[2].partition("\n\n")[0].splitlines()[2:]
+    named = [
+        name.removesuffix("/").removesuffix(".py")
+        for row in rows
+        for name in re.findall(r"`([^`]+)`", row.split("|")[1])
+    ]
+    assert named == [layer for layer in layers if layer != "__main__"]
+
+
+def test_the_contributors_page_names_only_files_and_targets_that_exist() -> None:
+    text = (ROOT / "CONTRIBUTING.md").read_text("utf-8")
+    paths = re.findall(r"`((?:gateway|tests|docs)/[\w./-]*)`", text)
+    targets = re.findall(r"[`$] ?make ([a-z]+)", text)
+    makefile = (ROOT / "Makefile").read_text()
+    assert len(paths) >= 10
+    assert [path for path in paths if not (ROOT / path).exists()] == []
+    assert [name for name in targets if f"\n{name}:" not in makefile] == []
