@@ -7,7 +7,7 @@ entries take what comes from outside. Each returns its effects as plain data.
 """
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 from gateway.engine.device import Device
 from gateway.engine.effects import Effect, Effects
@@ -121,10 +121,10 @@ class Engine:
         device.record.count_exchanges(traffic.exchanges, characters, traffic.turnaround)
         if isinstance(job, Poll):
             in_flight.open_polls -= 1
-            if isinstance(result, list | tuple):
-                self._results.read(job, result, now, time)
-            else:
+            if isinstance(result, Exception):
                 self._conclude_failed_poll(job, result, now, time)
+            else:  # units are the only good result of a poll
+                self._results.read(job, cast("Sequence[int]", result), now, time)
             if in_flight.open_polls:
                 return self._effects.take()
             if in_flight.failed:
@@ -145,7 +145,7 @@ class Engine:
         effects, self._effects.collected = self._effects.collected, []
         return effects
 
-    def _conclude_failed_poll(self, poll: Poll, result: Result, now: float, time: int) -> None:
+    def _conclude_failed_poll(self, poll: Poll, result: Exception, now: float, time: int) -> None:
         device, results = poll.device, self._results
         match result:
             case Refused():
@@ -158,8 +158,6 @@ class Engine:
                 self._in_flight.failed.append((poll, result))
             case LineDown():
                 device.health.left_outstanding(poll.block.span)
-            case _:
-                raise TypeError(f"{result!r} is no result of a poll")
 
     def _conclude_other(
         self, job: Transacted, result: Result, traffic: Traffic, now: float, time: int

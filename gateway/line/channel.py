@@ -114,7 +114,7 @@ class Echo:
         if place < 0:
             if len(heard) <= reply:
                 self.found = False
-        elif len(heard) - place - len(request) >= SHORTEST_REPLY:
+        elif len(heard) - place - len(request) >= SHORTEST_REPLY and not self.found:
             self.found = True
             log.warning("adapter echoes", line=self._line, advice="set echo: true")
 

@@ -226,7 +226,7 @@ class Transaction:
                 return
             if answer is not None:
                 echo = self._channel.echo
-                if echo.found is None:
+                if not echo.strip and (echo.found is not False or request.data in self._heard):
                     echo.learn(request.data, self._heard, request.reply)
                 request.heard, self._heard = len(self._heard), b""
                 request.future.set_result(answer)

@@ -52,8 +52,10 @@ def plant(tmp_path: Path) -> Iterator[Plant]:
 
 @pytest.fixture
 def busy_plant(tmp_path: Path) -> Iterator[Plant]:
-    """Asked for far more than 19200 baud carry: the wire is never quiet."""
-    tags = {f"d{i}": {"address": f"D{100 * i}", "every": "50ms"} for i in range(20)}
+    """A line with far more requests than 19200 baud can carry: the wire is always busy."""
+    tags: dict[str, dict[str, object]] = {
+        f"d{i}": {"address": f"D{100 * i}", "every": "50ms"} for i in range(20)
+    }
     tags["speed"] = {"address": "D10", "every": "50ms", "publish": "always"}
     tags |= {f"w{i}": {"address": f"D{3000 + i}", "write": True} for i in range(20)}
     yield from _plant(tmp_path, tags)
@@ -136,7 +138,7 @@ def test_a_client_without_its_router_ends_in_time(tmp_path: Path) -> None:
     zenoh = {"mode": "client", "listen": [], "connect": [free_endpoint()]}
     path = write_config(tmp_path / "config.yaml", "", lines, zenoh=zenoh)
     with gateway("run", path) as program:
-        program.says("device answers")
+        program.says("device online")
         program.says("no Zenoh router yet")
         told = time.monotonic()
         assert program.end() == 0
@@ -152,7 +154,7 @@ async def test_a_second_gateway_at_the_same_port_reports_it_and_waits(
     tags = {"speed": {"address": "D10"}}
     other = write_config(tmp_path / "other.yaml", endpoint, {"hall": vigor_line(tty, tags)})
     with started(plant.config) as first:
-        first.says("device answers")
+        first.says("device online")
         with gateway("run", other) as second:
             why = second.says("line down")
             assert f"{tty}: in use by another program" in why
