@@ -54,8 +54,9 @@ FENCED = re.compile(r"^( *)```(\w+)\n(.*?)^\1```$", re.DOTALL | re.MULTILINE)
 OF_DEVICES = "no-protocol.md"
 # The pages whose Python programs run here against the example gateway.
 OF_PROGRAMS = ("read-values.md", "write-values.md", "browse.md")
-# The tutorial's programs run in tests/e2e/test_story.py; the replay's is a test of tests/cases.
-RUN_ELSEWHERE = ("scada.md", "wire-log-to-test.md")
+# The tutorial's programs run in tests/e2e/test_story.py; the replay is a test of tests/cases; the
+# loop in architecture.md is pseudo code.
+RUN_ELSEWHERE = ("scada.md", "wire-log-to-test.md", "architecture.md")
 
 
 class Block(NamedTuple):
