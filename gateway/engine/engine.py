@@ -213,6 +213,11 @@ class Engine:
         if self._unsolicited.speakers:
             self._unsolicited.transaction_ended(device, now, sent=traffic.sent, heard=traffic.heard)
 
+    @property
+    def is_idle(self) -> bool:
+        """No job is in flight: bytes that arrive now belong to no transaction."""
+        return self._in_flight.job is None
+
     # What comes from outside
 
     def submit(self, request: Request, now: float) -> list[Effect]:
