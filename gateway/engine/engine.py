@@ -12,11 +12,11 @@ from typing import Any, cast
 from gateway.engine.device import Device
 from gateway.engine.effects import Effect, Effects
 from gateway.engine.health import State
-from gateway.engine.in_flight import InFlight
 from gateway.engine.jobs import (
     Answer,
     Confirm,
     Idle,
+    InFlight,
     Job,
     Poll,
     Probe,
@@ -230,22 +230,11 @@ class Engine:
         if not isinstance(after, Poll | Probe):
             self._in_flight.continuation = self._requests.settled(settle, now)
 
-<<<<<<< HEAD
-=======
-    def _count(self, device: Device, traffic: Traffic, now: float) -> None:
-        characters = (traffic.sent + traffic.heard) * self.wire.character
-        self.record.busy += characters
-        self.record.turnarounds += traffic.turnaround
-        device.record.count_exchanges(traffic.exchanges, characters, traffic.turnaround)
-        if self._unsolicited.speakers:
-            self._unsolicited.transaction_ended(device, now, sent=traffic.sent, heard=traffic.heard)
-
     @property
     def is_idle(self) -> bool:
         """No job is in flight: bytes that arrive now belong to no transaction."""
         return self._in_flight.job is None
 
->>>>>>> ca04ff6f49eee20b524e7e652123bfb64ae82f9a
     # What comes from outside
 
     def submit(self, request: Request, now: float) -> list[Effect]:
