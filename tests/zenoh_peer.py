@@ -1,19 +1,19 @@
-"""A Zenoh router, peer or client in another process, driven from a test.
+"""A Zenoh router, peer or client in another process, controlled by a test.
 
 In a test:
 
     async with ZenohPeer(Mode.ROUTER, listen=[endpoint]) as router: ...
     async with ZenohPeer("client", connect=[endpoint]) as client:
-        heard = await client.subscribe("plant/**")             # a Subscription: its samples
-        await heard.next(lambda s: s.key == "plant/mixer/speed" and s.json["value"] == 12)
+        values = await client.subscribe("plant/**")            # a Subscription: its samples
+        await values.next(lambda s: s.key == "plant/mixer/speed" and s.json["value"] == 12)
         replies = await client.get("plant/mixer/*")            # list of Reply
         [reply] = await client.get("plant/mixer/recipe/@set", b"7")
         replies = await client.many([("plant/mixer/recipe/@set", b"7")] * 1000)   # all at once
         await client.put("plant/mixer/recipe/@set", b"7")
         await client.delete("plant/mixer/recipe/@set")
-        alive = await client.liveliness("plant/**")            # a Subscription: PUT and DELETE
+        tokens = await client.liveliness("plant/**")           # a Subscription: PUT and DELETE
         await client.until_alive("plant/*", ["plant/mixer"])   # these and no others
-        await client.kill()                                    # SIGKILL; .pid is there for the rest
+        await client.kill()                                    # SIGKILL; other signals by `.pid`
 
 `subscribe(key, advanced=True)` is Zenoh's AdvancedSubscriber with history.
 
@@ -37,13 +37,13 @@ import zenoh
 from zenoh import ext
 
 TIMEOUT = 10.0  # seconds a test waits for anything
-# A question that every gateway answers. Zenoh declares without waiting, but what was declared
-# before goes the same way first.
+# A query that every gateway answers. Zenoh does not wait for a declaration to arrive, but earlier
+# declarations go the same way before the query.
 BARRIER = "*/@gateway/*/status"
 
 
 def free_endpoint() -> str:
-    """A loopback endpoint nobody listens on now."""
+    """Returns a loopback endpoint with a free port."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
@@ -97,7 +97,7 @@ class Subscription:
         return {sample.key: sample for sample in self.samples}
 
     async def next(self, wanted: Callable[[Heard], bool], timeout: float = TIMEOUT) -> Heard:
-        """The first sample that fits among those not yet passed over by `forget`."""
+        """Returns the first sample that fits, of those since `forget`; waits for it."""
         seen = 0
         async with asyncio.timeout(timeout):
             while True:
@@ -109,7 +109,7 @@ class Subscription:
                 await self._arrived.wait()
 
     async def until(self, done: Callable[["Subscription"], bool], timeout: float = TIMEOUT) -> None:
-        """Waits until `done(self)`, looked at after every arrival."""
+        """Waits until `done(self)`, checked after every arrival."""
         async with asyncio.timeout(timeout):
             while not done(self):
                 self._arrived.clear()
@@ -129,13 +129,10 @@ class ZenohPeer:
         connect: Sequence[str] = (),
         config: dict[str, Any] | None = None,
     ) -> None:
-        self._setup = {
-            "mode": str(mode),
-            "listen": list(listen),
-            "connect": list(connect),
-            "config": config or {},
-        }
+        self.config = config or {}
         self.connect = list(connect)
+        self._mode = str(mode)
+        self._listen = list(listen)
         self._process: asyncio.subprocess.Process | None = None
         self._reader: asyncio.Task[None] | None = None
         self._asked: dict[int, asyncio.Future[Any]] = {}
@@ -143,10 +140,16 @@ class ZenohPeer:
         self._count = 0
 
     async def __aenter__(self) -> Self:
+        setup = {
+            "mode": self._mode,
+            "listen": self._listen,
+            "connect": self.connect,
+            "config": self.config,
+        }
         self._process = await asyncio.create_subprocess_exec(
             sys.executable,
             str(Path(__file__)),
-            json.dumps(self._setup),
+            json.dumps(setup),
             stdin=asyncio.subprocess.PIPE,
             stdout=asyncio.subprocess.PIPE,
             limit=64 * 1024 * 1024,
@@ -155,7 +158,7 @@ class ZenohPeer:
         try:
             await self._ask("hello")
         except BaseException:
-            await self.kill()  # nobody would: there is no `__aexit__` after this
+            await self.kill()  # `__aexit__` is not called after an exception here
             raise
         return self
 
@@ -179,27 +182,28 @@ class ZenohPeer:
 
     async def kill(self) -> None:
         assert self._process is not None
-        with suppress(ProcessLookupError):  # it has ended by itself
+        with suppress(ProcessLookupError):  # it has ended already
             self._process.kill()
         await self._process.wait()
 
     async def subscribe(self, key: str, *, advanced: bool = False) -> Subscription:
-        """Returns when every gateway that can be reached knows of it."""
+        """Returns when every reachable gateway knows the subscription."""
         subscription = await self._subscribe("subscribe", key=key, advanced=advanced)
         await self.get(BARRIER)
         return subscription
 
     async def liveliness(self, key: str) -> Subscription:
-        """Tokens that come (PUT) and go (DELETE), those already there included."""
+        """Observes tokens: declared (PUT, also before) and undeclared (DELETE)."""
         return await self._subscribe("liveliness", key=key)
 
     async def tokens(self, key: str) -> list[str]:
-        """Zenoh 1.10.2 answers nothing now and then just after a token came: see `until_alive`."""
+        """Returns the tokens. Zenoh 1.10.2 sometimes answers nothing just after a token was
+        declared: see `until_alive`."""
         result: list[str] = await self._ask("tokens", key=key)
         return result
 
     async def until_alive(self, key: str, tokens: list[str], timeout: float = TIMEOUT) -> None:
-        """Waits until these tokens, and no others, are alive under `key`."""
+        """Waits until exactly these tokens are declared under `key`."""
         async with asyncio.timeout(timeout):
             while await self.tokens(key) != tokens:
                 pass
@@ -219,7 +223,7 @@ class ZenohPeer:
         return replies
 
     async def get_until(self, selector: str, wanted: Callable[[Any], bool]) -> Any:
-        """The one document there, once it is as wanted: a status may be a fifth of a second old."""
+        """Waits until the one document is as wanted: a status may be a fifth of a second old."""
         async with asyncio.timeout(TIMEOUT):
             while True:
                 [reply] = await self.get(selector)
@@ -232,7 +236,7 @@ class ZenohPeer:
         timeout: float = TIMEOUT,
         **how: str,
     ) -> list[list[Reply]]:
-        """All at once; the replies of each in the order of the queries."""
+        """Sends all queries at once. Returns the replies of each, in the order of the queries."""
         asked = [(selector, _text(payload)) for selector, payload in queries]
         result = await self._ask("get", queries=asked, timeout=timeout, how=how)
         return [

@@ -12,11 +12,11 @@ from typing import Any, cast
 from gateway.engine.device import Device
 from gateway.engine.effects import Effect, Effects
 from gateway.engine.health import State
-from gateway.engine.in_flight import InFlight
 from gateway.engine.jobs import (
     Answer,
     Confirm,
     Idle,
+    InFlight,
     Job,
     Poll,
     Probe,
@@ -229,6 +229,11 @@ class Engine:
             self._results.unread(poll, error, now, time)
         if not isinstance(after, Poll | Probe):
             self._in_flight.continuation = self._requests.settled(settle, now)
+
+    @property
+    def is_idle(self) -> bool:
+        """No job is in flight: bytes that arrive now belong to no transaction."""
+        return self._in_flight.job is None
 
     # What comes from outside
 

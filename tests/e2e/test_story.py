@@ -13,7 +13,7 @@ import pytest
 import yaml
 
 from tests.e2e.processes import Program, plc_gateway, started, until
-from tests.northbound.test_security import GATEWAY_RULES, certificates, secret
+from tests.northbound.access import GATEWAY_RULES, certificates, secret
 from tests.test_docs import ENDPOINT, EXAMPLE, Block, _blocks, shape
 from tests.zenoh_peer import free_endpoint
 

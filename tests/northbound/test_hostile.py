@@ -15,7 +15,7 @@ from pathlib import Path
 
 from benchmarks.northbound import Lag, memory
 from gateway.config import ZenohConfig
-from tests.northbound.test_northbound import PlainDevice, PlainPlant, serving, tag
+from tests.northbound.plant import PlainDevice, PlainPlant, serving, tag
 from tests.zenoh_peer import ZenohPeer, free_endpoint
 
 # One with everything on every key, and two with questions alone: 10,000 a second and more.

@@ -1,4 +1,4 @@
-"""What the status documents say of lines and devices."""
+"""The status documents of lines and devices."""
 
 import asyncio
 import json
