@@ -35,6 +35,7 @@ from gateway.history import Historian
 from gateway.northbound import StandbySettings, payload
 from gateway.northbound.keys import Keys
 from gateway.northbound.payload import Problem
+from gateway.northbound.secrets import exposures
 from gateway.northbound.standby import Standby
 from gateway.protocols.registry import PROTOCOLS
 from gateway.tags import Reason, WriteResult, bad, good
@@ -647,6 +648,13 @@ _DOCUMENTS = """\
     for reply in session.get("plant/@gateway/**"):
         print(reply.ok.key_expr, reply.ok.payload.to_string())
 """
+
+
+def test_the_warning_of_an_unprotected_gateway_is_the_one_of_the_page() -> None:
+    [shown] = [block for block in _blocks("security.md") if block.language == "text"]
+    config = zenoh.Config()
+    config.insert_json5("listen/endpoints", json.dumps(["tcp/0.0.0.0:7447"]))
+    assert exposures(config) == [shown.text.strip()]
 
 
 # ---- form --------------------------------------------------------------------------------------
