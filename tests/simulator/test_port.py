@@ -11,7 +11,7 @@ from gateway.errors import LineDown
 from gateway.planning.wire_timing import WireTiming
 from gateway.simulator.port import FIFO, open_simulator
 from gateway.transport import Port, SerialSettings, SimulatorAddress, open_port
-from tests.transport.ends import Heard, Says, counted
+from tests.transport.ends import FixedStation, RecordingReceiver, run_from_zero
 from tests.vectors import vectors
 
 REQUEST, REPLY = (vector.frame for vector in vectors("vigor")[:2])
@@ -24,29 +24,29 @@ def turned(data: bytes) -> bytes:
 
 
 def test_a_request_is_heard_when_its_last_character_is_through_by_every_station() -> None:
-    async def play() -> tuple[Says, Says]:
-        one, other = Says(), Says()
-        port = await open_simulator([one, other], WIRE, Heard())
+    async def play() -> tuple[FixedStation, FixedStation]:
+        one, other = FixedStation(), FixedStation()
+        port = await open_simulator([one, other], WIRE, RecordingReceiver())
         port.write(REQUEST)
         await asyncio.sleep(1)
         return one, other
 
-    for station in counted(play):
+    for station in run_from_zero(play):
         assert station.heard == [(pytest.approx(len(REQUEST) * C), REQUEST)]
 
 
 def test_a_reply_comes_in_fifo_chunks_each_at_its_time() -> None:
     reply = bytes(range(40))
 
-    async def play() -> Heard:
-        ear = Heard(asyncio.get_running_loop().time)
-        port = await open_simulator([Says(reply)], WIRE, ear, turnaround=0.004)
+    async def play() -> RecordingReceiver:
+        receiver = RecordingReceiver(asyncio.get_running_loop().time)
+        port = await open_simulator([FixedStation(reply)], WIRE, receiver, turnaround=0.004)
         port.write(REQUEST)
         await asyncio.sleep(1)
-        return ear
+        return receiver
 
     begin = len(REQUEST) * C + 0.004
-    assert counted(play).pieces == [
+    assert run_from_zero(play).pieces == [
         (pytest.approx(begin + FIFO * C), reply[:FIFO]),
         (pytest.approx(begin + 2 * FIFO * C), reply[FIFO : 2 * FIFO]),
         (pytest.approx(begin + 40 * C), reply[2 * FIFO :]),
@@ -59,123 +59,125 @@ def test_the_pieces_of_a_reply_keep_their_order_when_the_machine_stalls(stalled:
     reply = bytes(range(100))
 
     async def play() -> bytes:
-        loop, ear = asyncio.get_running_loop(), Heard()
-        port = await open_simulator([Says(reply)], WIRE, ear)
+        loop, receiver = asyncio.get_running_loop(), RecordingReceiver()
+        port = await open_simulator([FixedStation(reply)], WIRE, receiver)
         clock, looks = loop.time, itertools.count()
         loop.time = lambda: clock() + (0.1 if next(looks) > stalled else 0.0)  # type: ignore[method-assign]
         port.write(REQUEST)
         await asyncio.sleep(1)
-        return ear.data
+        return receiver.data
 
-    assert counted(play) == reply
+    assert run_from_zero(play) == reply
 
 
 def test_two_frames_of_a_station_follow_each_other() -> None:
     async def play() -> bytes:
-        ear = Heard()
-        port = await open_simulator([Says(REPLY, REQUEST)], WIRE, ear)
+        receiver = RecordingReceiver()
+        port = await open_simulator([FixedStation(REPLY, REQUEST)], WIRE, receiver)
         port.write(REQUEST)
         await asyncio.sleep(1)
-        return ear.data
+        return receiver.data
 
-    assert counted(play) == REPLY + REQUEST
+    assert run_from_zero(play) == REPLY + REQUEST
 
 
 def test_a_slow_station_answers_later_by_its_delay() -> None:
-    async def play() -> Heard:
-        ear = Heard(asyncio.get_running_loop().time)
-        port = await open_simulator([Says(b"A", delay=0.3)], WIRE, ear, turnaround=0.005)
+    async def play() -> RecordingReceiver:
+        receiver = RecordingReceiver(asyncio.get_running_loop().time)
+        port = await open_simulator(
+            [FixedStation(b"A", delay=0.3)], WIRE, receiver, turnaround=0.005
+        )
         port.write(REQUEST)
         await asyncio.sleep(1)
-        return ear
+        return receiver
 
-    assert counted(play).pieces == [(pytest.approx((len(REQUEST) + 1) * C + 0.305), b"A")]
+    assert run_from_zero(play).pieces == [(pytest.approx((len(REQUEST) + 1) * C + 0.305), b"A")]
 
 
 def test_two_writes_at_once_follow_each_other() -> None:
-    async def play() -> Says:
-        station = Says()
-        port = await open_simulator([station], WIRE, Heard())
+    async def play() -> FixedStation:
+        station = FixedStation()
+        port = await open_simulator([station], WIRE, RecordingReceiver())
         port.write(REQUEST)
         port.write(REPLY)
         await asyncio.sleep(1)
         return station
 
-    assert counted(play).heard == [
+    assert run_from_zero(play).heard == [
         (pytest.approx(len(REQUEST) * C), REQUEST),
         (pytest.approx(len(REQUEST + REPLY) * C), REPLY),
     ]
 
 
 def test_two_stations_that_answer_at_once_spoil_each_other() -> None:
-    async def play() -> Heard:
-        ear = Heard()
-        port = await open_simulator([Says(REPLY), Says(REPLY[:2])], WIRE, ear)
+    async def play() -> RecordingReceiver:
+        receiver = RecordingReceiver()
+        port = await open_simulator([FixedStation(REPLY), FixedStation(REPLY[:2])], WIRE, receiver)
         port.write(REQUEST)
         await asyncio.sleep(1)
-        return ear
+        return receiver
 
-    pieces = [data for _, data in counted(play).pieces]
+    pieces = [data for _, data in run_from_zero(play).pieces]
     assert sorted(pieces) == sorted([turned(REPLY[:2]), turned(REPLY[:2]) + REPLY[2:]])
 
 
 def test_writing_while_a_station_is_sending_spoils_both() -> None:
     reply = bytes(16)
 
-    async def play() -> tuple[Heard, Says]:
-        ear, station = Heard(), Says(reply)
-        port = await open_simulator([station], WIRE, ear, turnaround=0.005)
+    async def play() -> tuple[RecordingReceiver, FixedStation]:
+        receiver, station = RecordingReceiver(), FixedStation(reply)
+        port = await open_simulator([station], WIRE, receiver, turnaround=0.005)
         port.write(b"?")
         # In the middle of the reply's tenth character; two characters touch three.
         await asyncio.sleep(C + 0.005 + 9.5 * C)
         station.frames = []
         port.write(b"ab")
         await asyncio.sleep(1)
-        return ear, station
+        return receiver, station
 
-    ear, station = counted(play)
-    assert ear.data == bytes(9) + b"\xff" * 3 + bytes(4)
+    receiver, station = run_from_zero(play)
+    assert receiver.data == bytes(9) + b"\xff" * 3 + bytes(4)
     assert [data for _, data in station.heard] == [b"?", turned(b"ab")]
 
 
 def test_an_overlap_of_less_than_a_bit_is_not_noticed() -> None:
-    async def play() -> tuple[Heard, Says]:
-        ear, station = Heard(), Says(REPLY)
-        port = await open_simulator([station], WIRE, ear, turnaround=0.0)
+    async def play() -> tuple[RecordingReceiver, FixedStation]:
+        receiver, station = RecordingReceiver(), FixedStation(REPLY)
+        port = await open_simulator([station], WIRE, receiver, turnaround=0.0)
         port.write(b"?")
         await asyncio.sleep((1 + len(REPLY) - 0.05) * C)
         station.frames = []
         port.write(REQUEST)
         await asyncio.sleep(1)
-        return ear, station
+        return receiver, station
 
-    ear, station = counted(play)
-    assert ear.data == REPLY
+    receiver, station = run_from_zero(play)
+    assert receiver.data == REPLY
     assert station.heard[1][1] == REQUEST
 
 
 def test_a_late_reply_meets_the_next_request() -> None:
-    async def play() -> tuple[Heard, Says]:
-        ear, late = Heard(), Says(b"late", delay=0.1)
-        port = await open_simulator([late], WIRE, ear, turnaround=0.0)
+    async def play() -> tuple[RecordingReceiver, FixedStation]:
+        receiver, late = RecordingReceiver(), FixedStation(b"late", delay=0.1)
+        port = await open_simulator([late], WIRE, receiver, turnaround=0.0)
         port.write(b"?")
         await asyncio.sleep(0.1 - C / 2)  # it begins one and a half characters later
         late.frames = []
         port.write(b"next")
         await asyncio.sleep(1)
-        return ear, late
+        return receiver, late
 
-    ear, late = counted(play)
-    assert ear.data == turned(b"lat") + b"e"
+    receiver, late = run_from_zero(play)
+    assert receiver.data == turned(b"lat") + b"e"
     assert late.heard[1][1] == b"n" + turned(b"ext")
 
 
 def test_a_request_right_after_a_reply_collides_with_nothing() -> None:
     async def play() -> list[bytes]:
         port: Port
-        station = Says(REPLY)
+        station = FixedStation(REPLY)
 
-        class Hasty(Heard):
+        class Hasty(RecordingReceiver):
             def received(self, data: bytes) -> None:
                 super().received(data)
                 if self.data.endswith(REPLY):
@@ -186,29 +188,32 @@ def test_a_request_right_after_a_reply_collides_with_nothing() -> None:
         await asyncio.sleep(10)
         return [data for _, data in station.heard]
 
-    heard = counted(play)
+    heard = run_from_zero(play)
     assert len(heard) > 100
     assert set(heard) == {REQUEST}
 
 
 def test_not_paced_takes_no_time_and_keeps_the_order() -> None:
-    async def play() -> tuple[Heard, Says]:
-        ear, station = Heard(asyncio.get_running_loop().time), Says(bytes(300))
-        port = await open_simulator([station], WIRE, ear, paced=False)
+    async def play() -> tuple[RecordingReceiver, FixedStation]:
+        receiver, station = (
+            RecordingReceiver(asyncio.get_running_loop().time),
+            FixedStation(bytes(300)),
+        )
+        port = await open_simulator([station], WIRE, receiver, paced=False)
         for number in range(20):
             port.write(bytes([number]))
         await asyncio.sleep(0.001)
-        return ear, station
+        return receiver, station
 
-    ear, station = counted(play)
+    receiver, station = run_from_zero(play)
     assert [data for _, data in station.heard] == [bytes([number]) for number in range(20)]
-    assert ear.pieces == [(0.0, bytes(300))] * 20
+    assert receiver.pieces == [(0.0, bytes(300))] * 20
 
 
 def test_nothing_is_heard_after_close_and_writing_fails() -> None:
-    async def play() -> tuple[Heard, Says]:
-        ear, station = Heard(), Says(REPLY)
-        port = await open_simulator([station], WIRE, ear)
+    async def play() -> tuple[RecordingReceiver, FixedStation]:
+        receiver, station = RecordingReceiver(), FixedStation(REPLY)
+        port = await open_simulator([station], WIRE, receiver)
         port.write(REQUEST)
         await asyncio.sleep(len(REQUEST) * C + 0.006)
         await port.close()
@@ -216,10 +221,10 @@ def test_nothing_is_heard_after_close_and_writing_fails() -> None:
         with pytest.raises(LineDown):
             port.write(REQUEST)
         await asyncio.sleep(1)
-        return ear, station
+        return receiver, station
 
-    ear, station = counted(play)
-    assert (ear.data, ear.losses, len(station.heard)) == (b"", [], 1)
+    receiver, station = run_from_zero(play)
+    assert (receiver.data, receiver.losses, len(station.heard)) == (b"", [], 1)
 
 
 moments = st.lists(st.tuples(st.floats(0, 0.05), st.binary(min_size=1, max_size=20)), max_size=8)
@@ -231,21 +236,23 @@ def test_the_same_play_is_heard_the_same_and_no_character_is_lost(
     writes: list[tuple[float, bytes]], answers: list[tuple[bytes, float]]
 ) -> None:
     async def play() -> tuple[list[tuple[float, bytes]], list[list[tuple[float, bytes]]]]:
-        ear = Heard(asyncio.get_running_loop().time)
-        stations = [Says(*([frame] if frame else []), delay=delay) for frame, delay in answers]
-        port = await open_simulator(stations, WIRE, ear)
+        receiver = RecordingReceiver(asyncio.get_running_loop().time)
+        stations = [
+            FixedStation(*([frame] if frame else []), delay=delay) for frame, delay in answers
+        ]
+        port = await open_simulator(stations, WIRE, receiver)
         for pause, data in writes:
             await asyncio.sleep(pause)
             port.write(data)
         await asyncio.sleep(5)
-        return ear.pieces, [station.heard for station in stations]
+        return receiver.pieces, [station.heard for station in stations]
 
-    first = counted(play)
-    assert counted(play) == first
+    first = run_from_zero(play)
+    assert run_from_zero(play) == first
     replied = sum(len(frame) for frame, _ in answers) * len(writes)
     assert sum(len(data) for _, data in first[0]) == replied
 
 
 async def test_a_simulator_is_not_opened_without_its_stations() -> None:
     with pytest.raises(ValueError, match="open_simulator"):
-        await open_port(SimulatorAddress(), SerialSettings(), Heard())
+        await open_port(SimulatorAddress(), SerialSettings(), RecordingReceiver())

@@ -2,6 +2,7 @@
 
 import asyncio
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,7 @@ from gateway.errors import LineDown
 from gateway.planning.wire_timing import NETWORK_BAUD, WireTiming
 from gateway.simulator.serve import serve_on_pty, serve_on_tcp
 from gateway.transport import Port, SerialSettings, open_port, parse_port
-from tests.transport.ends import PATIENCE, Heard, Says, listening
+from tests.transport.ends import PATIENCE, FixedStation, RecordingReceiver, listening
 from tests.vectors import vectors
 
 REQUEST, REPLY = (vector.frame for vector in vectors("vigor")[:2])
@@ -18,43 +19,43 @@ WIRE = WireTiming(19200, 10)
 SEVEN_EVEN = SerialSettings(19200, "7E1")
 
 
-async def reach(address: str, ear: Heard) -> Port:
-    return await open_port(parse_port(address), SEVEN_EVEN, ear)
+async def reach(address: str, receiver: RecordingReceiver) -> Port:
+    return await open_port(parse_port(address), SEVEN_EVEN, receiver)
 
 
 async def test_stations_on_a_pty_answer_at_the_wires_speed() -> None:
-    ear, loop = Heard(), asyncio.get_running_loop()
-    served = await serve_on_pty([Says(REPLY)], WIRE, None)
-    port = await reach(served.address, ear)
+    receiver, loop = RecordingReceiver(), asyncio.get_running_loop()
+    served = await serve_on_pty([FixedStation(REPLY)], WIRE, None)
+    port = await reach(served.address, receiver)
     begin = loop.time()
     port.write(REQUEST)
-    await ear.until(lambda e: len(e.data) >= len(REPLY))
-    assert ear.data == REPLY
+    await receiver.until(lambda r: len(r.data) >= len(REPLY))
+    assert receiver.data == REPLY
     assert loop.time() - begin >= len(REQUEST + REPLY) * WIRE.character + 0.005
     await port.close()
     await served.close()
 
 
 async def test_a_pty_serves_one_program_after_another_and_its_end_is_heard() -> None:
-    served = await serve_on_pty([Says(REPLY)], WIRE, None)
+    served = await serve_on_pty([FixedStation(REPLY)], WIRE, None)
     for _ in range(2):
-        ear = Heard()
-        port = await reach(served.address, ear)
+        receiver = RecordingReceiver()
+        port = await reach(served.address, receiver)
         port.write(REQUEST)
-        await ear.until(lambda e: len(e.data) >= len(REPLY))
+        await receiver.until(lambda r: len(r.data) >= len(REPLY))
         await port.close()
-    last = Heard()
+    last = RecordingReceiver()
     port = await reach(served.address, last)
     await served.close()
     await served.close()
-    await last.until(lambda e: bool(e.losses))
+    await last.until(lambda r: bool(r.losses))
     await port.close()
 
 
 async def test_a_pty_nobody_reads_does_not_stop_the_wire() -> None:
     loop, troubles = asyncio.get_running_loop(), []
     loop.set_exception_handler(lambda _, context: troubles.append(context))
-    station = Says(bytes(3000))
+    station = FixedStation(bytes(3000))
     served = await serve_on_pty([station], WireTiming(NETWORK_BAUD), None, turnaround=0.0)
     user = os.open(served.address, os.O_RDWR | os.O_NOCTTY)
     async with asyncio.timeout(PATIENCE):
@@ -71,12 +72,12 @@ async def test_a_pty_nobody_reads_does_not_stop_the_wire() -> None:
 async def test_a_link_to_the_pty_replaces_an_old_one_and_goes_with_it(tmp_path: Path) -> None:
     link = tmp_path / "ttyPLC"
     link.symlink_to("/dev/pts/of-a-run-that-crashed")
-    served = await serve_on_pty([Says(REPLY)], WIRE, str(link))
+    served = await serve_on_pty([FixedStation(REPLY)], WIRE, str(link))
     assert served.address == str(link)
-    ear = Heard()
-    port = await reach(served.address, ear)
+    receiver = RecordingReceiver()
+    port = await reach(served.address, receiver)
     port.write(REQUEST)
-    await ear.until(lambda e: len(e.data) >= len(REPLY))
+    await receiver.until(lambda r: len(r.data) >= len(REPLY))
     await port.close()
     await served.close()
     assert not link.is_symlink()
@@ -100,23 +101,27 @@ async def test_a_file_in_the_links_place_is_kept(tmp_path: Path) -> None:
 
 
 async def test_one_wire_behind_a_tcp_port_is_heard_by_everybody() -> None:
-    served = await serve_on_tcp([Says(REPLY)], WIRE, "127.0.0.1", 0)
-    ears = Heard(), Heard()
-    ports = [await reach(served.address, ear) for ear in ears]
+    served = await serve_on_tcp([FixedStation(REPLY)], WIRE, "127.0.0.1", 0)
+    receivers = RecordingReceiver(), RecordingReceiver()
+    ports = [await reach(served.address, receiver) for receiver in receivers]
     begin = asyncio.get_running_loop().time()
     # Only what has been accepted hears: ask by each in turn.
     ports[0].write(REQUEST)
-    await ears[0].until(lambda e: len(e.data) >= len(REPLY))
+    await receivers[0].until(lambda r: len(r.data) >= len(REPLY))
     assert asyncio.get_running_loop().time() - begin >= len(REQUEST + REPLY) * WIRE.character
     ports[1].write(REQUEST)
-    await ears[1].until(lambda e: e.data.endswith(REPLY))
-    await ears[0].until(lambda e: len(e.data) >= 2 * len(REPLY))
+    await receivers[1].until(lambda r: r.data.endswith(REPLY))
+    await receivers[0].until(lambda r: len(r.data) >= 2 * len(REPLY))
     for port in ports:
         await port.close()
     await served.close()
 
 
-class Echo(Says):
+def _ends_with(data: bytes) -> Callable[[RecordingReceiver], bool]:
+    return lambda receiver: receiver.data.endswith(data)
+
+
+class Echo(FixedStation):
     """Answers with what it was asked."""
 
     def hear(self, data: bytes, now: float) -> list[bytes]:
@@ -125,16 +130,16 @@ class Echo(Says):
 
 async def test_network_stations_answer_each_connection_alone() -> None:
     served = await serve_on_tcp([Echo()], WireTiming(NETWORK_BAUD), "127.0.0.1", 0, paced=False)
-    ears = Heard(), Heard()
-    ports = [await reach(served.address, ear) for ear in ears]
+    receivers = RecordingReceiver(), RecordingReceiver()
+    ports = [await reach(served.address, receiver) for receiver in receivers]
     for who, question in ((0, b"a"), (1, b"b"), (0, b"c")):
         ports[who].write(question)
-        await ears[who].until(lambda e, last=question: e.data.endswith(last))
-    assert (ears[0].data, ears[1].data) == (b"ac", b"b")
+        await receivers[who].until(_ends_with(question))
+    assert (receivers[0].data, receivers[1].data) == (b"ac", b"b")
     await ports[0].close()
     await served.close()
     await served.close()
-    await ears[1].until(lambda e: bool(e.losses))
+    await receivers[1].until(lambda r: bool(r.losses))
     await ports[1].close()
 
 

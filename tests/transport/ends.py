@@ -1,8 +1,7 @@
-"""The far ends of ports in these tests: ears, ptys, a loop whose time is only counted."""
+"""Both ends of a port in tests: a receiver, the far end of a pty, a station."""
 
 import asyncio
 import os
-import selectors
 import socket
 import termios
 import tty
@@ -11,39 +10,40 @@ from contextlib import contextmanager
 from typing import Any, TypeVar
 
 from gateway.stations.station import Memory
+from tests.sim.virtual import VirtualLoop
 
 T = TypeVar("T")
-PATIENCE = 5.0  # seconds; never waited for when all is well
+PATIENCE = 5.0  # seconds; reached only by a failing test
 
 
-class Heard:
-    """An `Receiver` that remembers; `until` waits for what it should hear."""
+class RecordingReceiver:
+    """A `Receiver` that keeps what it gets; `until` waits for it."""
 
     def __init__(self, now: Callable[[], float] | None = None) -> None:
         self.data = b""
         self.pieces: list[tuple[float, bytes]] = []
         self.losses: list[Exception] = []
         self._now = now or (lambda: 0.0)
-        self._news = asyncio.Event()
+        self._changed = asyncio.Event()
 
     def received(self, data: bytes) -> None:
         self.data += data
         self.pieces.append((self._now(), data))
-        self._news.set()
+        self._changed.set()
 
     def lost(self, error: Exception) -> None:
         self.losses.append(error)
-        self._news.set()
+        self._changed.set()
 
-    async def until(self, happened: Callable[["Heard"], bool]) -> None:
+    async def until(self, happened: Callable[["RecordingReceiver"], bool]) -> None:
         async with asyncio.timeout(PATIENCE):
             while not happened(self):
-                self._news.clear()
-                await self._news.wait()
+                self._changed.clear()
+                await self._changed.wait()
 
 
-class Master:
-    """Our end of a pty, while a port has the other."""
+class PtyMaster:
+    """The test's end of a pty; the port under test opens the other end."""
 
     def __init__(self) -> None:
         self.fd, self.slave = os.openpty()
@@ -52,7 +52,7 @@ class Master:
         self.path = os.ttyname(self.slave)
 
     def format(self) -> tuple[int, int]:
-        """The flags and the speed the port was set to."""
+        """Returns the flags and the speed that the port has set."""
         _, _, cflag, _, _, speed, _ = termios.tcgetattr(self.slave)
         return cflag, speed
 
@@ -61,13 +61,13 @@ class Master:
 
     async def read(self, count: int) -> bytes:
         loop, data = asyncio.get_running_loop(), b""
-        news = asyncio.Event()
-        loop.add_reader(self.fd, news.set)
+        readable = asyncio.Event()
+        loop.add_reader(self.fd, readable.set)
         try:
             async with asyncio.timeout(PATIENCE):
                 while len(data) < count:
-                    await news.wait()
-                    news.clear()
+                    await readable.wait()
+                    readable.clear()
                     try:
                         data += os.read(self.fd, 4096)
                     except BlockingIOError:
@@ -96,8 +96,8 @@ def free_port() -> int:
     return number
 
 
-class Says:
-    """A `Station` that answers everything with the same frames, and notes when it heard what."""
+class FixedStation:
+    """A `Station` that replies to every request with the same frames and keeps the requests."""
 
     def __init__(self, *frames: bytes, delay: float = 0.0) -> None:
         self.frames = list(frames)
@@ -110,33 +110,7 @@ class Says:
         return self.frames
 
 
-class _Counting(selectors.SelectSelector):
-    """Waits for nothing: the time a loop would wait is added to its clock."""
-
-    loop: "CountedLoop"
-
-    def select(self, timeout: float | None = None) -> list[Any]:
-        if timeout is None:
-            raise RuntimeError("nothing will ever happen")
-        self.loop.now += max(timeout, 0.0)
-        return []
-
-
-class CountedLoop(asyncio.SelectorEventLoop):
-    def __init__(self) -> None:
-        selector = _Counting()
-        super().__init__(selector)
-        selector.loop = self
-        self.now = 0.0
-
-    def time(self) -> float:
-        return getattr(self, "now", 0.0)
-
-    def run_in_executor(self, *_: Any) -> Any:
-        raise RuntimeError("no threads where time is only counted")
-
-
-def counted(play: Callable[[], Coroutine[Any, Any, T]]) -> T:
-    """Run `play` in counted time."""
-    with asyncio.Runner(loop_factory=CountedLoop) as runner:
+def run_from_zero(play: Callable[[], Coroutine[Any, Any, T]]) -> T:
+    """Runs `play` on a virtual clock that begins at 0."""
+    with asyncio.Runner(loop_factory=lambda: VirtualLoop(0.0)) as runner:
         return runner.run(play())

@@ -1,4 +1,4 @@
-"""uvloop as the event loop of the service: its clock is exact, ports and silences work on it."""
+"""uvloop as the event loop of the service: an exact clock, kept silences, working ports."""
 
 import asyncio
 import importlib
@@ -16,7 +16,7 @@ from gateway.protocols.driver import Span
 from gateway.protocols.modbus import ModbusRtu
 from gateway.transport import SerialPath, SerialSettings, loop, open_port
 from tests.conftest import lacking
-from tests.transport.ends import Heard, Master
+from tests.transport.ends import PtyMaster, RecordingReceiver
 from tests.vectors import vectors
 
 T = TypeVar("T")
@@ -44,7 +44,8 @@ def test_an_installed_uvloop_is_used_and_its_clock_moves_while_code_runs(
         assert isinstance(running, uvloop.Loop)
         begin = running.time()
         assert abs(begin - time.monotonic()) < 0.1
-        return max(running.time() - begin for _ in range(100))
+        latest: float = max(running.time() - begin for _ in range(100))
+        return latest
 
     assert 0 < run(within_one_callback()) < 0.1
 
@@ -60,28 +61,26 @@ def test_without_uvloop_asyncio_is_used(monkeypatch: pytest.MonkeyPatch) -> None
 
 @pytest.mark.usefixtures("uvloop")
 def test_the_silence_before_a_request_is_kept_although_timers_fire_early() -> None:
-    """They count whole milliseconds: 1.75 ms of RTU silence would be cut to 1 or less."""
+    """uvloop's timers count whole milliseconds: 1.75 ms of RTU silence would become 1 or less."""
     silence, wire = 0.00175, WireTiming(115200, 10)
     kept: list[float] = []
 
-    class Noting:
+    class SilentPort:
+        quiet_since = 0.0
+
         def write(self, data: bytes) -> None:
-            kept.append(asyncio.get_running_loop().time() - quiet_since)
+            kept.append(asyncio.get_running_loop().time() - self.quiet_since)
 
         async def close(self) -> None:
             pass
 
     async def broadcasts() -> None:
-        nonlocal quiet_since
-        driver, clock = ModbusRtu(station=0), Clock(spin=0.001)
+        port, driver, clock = SilentPort(), ModbusRtu(station=0), Clock(spin=0.001)
         for _ in range(100):
-            quiet_since = clock.quiet_since = asyncio.get_running_loop().time()
-            turn = Turn(
-                Noting(), driver.codec, wire, silence, 0.1, clock, Recorder("line"), station=0
-            )
+            port.quiet_since = clock.quiet_since = asyncio.get_running_loop().time()
+            turn = Turn(port, driver.codec, wire, silence, 0.1, clock, Recorder("line"), station=0)
             await driver.write(turn, Span("coil", 0, 1), [1])
 
-    quiet_since = 0.0
     run(broadcasts())
     assert len(kept) == 100
     assert min(kept) >= silence
@@ -89,15 +88,15 @@ def test_the_silence_before_a_request_is_kept_although_timers_fire_early() -> No
 
 @pytest.mark.usefixtures("uvloop")
 def test_a_serial_port_works_on_uvloop() -> None:
-    async def conversation() -> None:
-        plug, ear = Master(), Heard()
-        port = await open_port(SerialPath(plug.path), SerialSettings(19200, "7E1"), ear)
+    async def transaction() -> None:
+        plug, receiver = PtyMaster(), RecordingReceiver()
+        port = await open_port(SerialPath(plug.path), SerialSettings(19200, "7E1"), receiver)
         port.write(REQUEST)
         assert await plug.read(len(REQUEST)) == REQUEST
         plug.write(REPLY)
-        await ear.until(lambda e: len(e.data) >= len(REPLY))
+        await receiver.until(lambda r: len(r.data) >= len(REPLY))
         plug.unplug()
-        await ear.until(lambda e: bool(e.losses))
+        await receiver.until(lambda r: bool(r.losses))
         await port.close()
 
-    run(conversation())
+    run(transaction())

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from serial.rfc2217 import PortManager
+from serial.rfc2217 import PortManager  # type: ignore[import-untyped]  # has no stubs
 from structlog.testing import capture_logs
 
 from gateway.errors import LineDown
@@ -23,7 +23,7 @@ from gateway.transport import (
 )
 from gateway.transport.tcp import open_tcp
 from tests.conftest import needs
-from tests.transport.ends import PATIENCE, Heard, Master, free_port
+from tests.transport.ends import PATIENCE, PtyMaster, RecordingReceiver, free_port
 from tests.vectors import vectors
 
 REQUEST, REPLY = (vector.frame for vector in vectors("vigor")[:2])
@@ -34,7 +34,7 @@ IAC, SB, SE, WILL, DO, DONT, COM_PORT = 255, 250, 240, 251, 253, 254, 44
 
 @dataclass
 class FakeSerial:
-    """What pyserial's `PortManager` needs of a serial port."""
+    """The parts of a serial port that pyserial's `PortManager` uses."""
 
     baudrate: int = 9600
     bytesize: int = 8
@@ -54,7 +54,7 @@ class FakeSerial:
 
 
 class Server(asyncio.Protocol):
-    """A server written by a function: what it says at once, and what it answers."""
+    """A server with a greeting and a function that answers."""
 
     def __init__(self, greeting: bytes, answer: Callable[["Server", bytes], None]) -> None:
         self.greeting = greeting
@@ -79,7 +79,7 @@ async def serving(factory: Callable[[], asyncio.Protocol]) -> AsyncIterator[Rfc2
 
 
 class Managed(asyncio.Protocol):
-    """pyserial's server end over a fake serial port, which echoes what it gets."""
+    """pyserial's server over a fake serial port that echoes the data."""
 
     def __init__(self, port: FakeSerial) -> None:
         self.port = port
@@ -101,10 +101,10 @@ class Managed(asyncio.Protocol):
 async def test_pyserials_server_sets_baud_rate_and_format(
     settings: SerialSettings, parity: str, bits: int, stop: int
 ) -> None:
-    fake, ear = FakeSerial(), Heard()
+    fake, receiver = FakeSerial(), RecordingReceiver()
     async with serving(lambda: Managed(fake)) as where:
         with capture_logs() as logs:
-            port = await open_port(where, settings, ear)
+            port = await open_port(where, settings, receiver)
         assert logs == []
         assert (fake.baudrate, fake.parity, fake.bytesize, fake.stopbits) == (
             settings.baudrate, parity, bits, stop,
@@ -114,25 +114,25 @@ async def test_pyserials_server_sets_baud_rate_and_format(
 
 
 async def test_every_byte_value_passes_pyserials_server_both_ways() -> None:
-    managed, ear = Managed(FakeSerial()), Heard()
+    managed, receiver = Managed(FakeSerial()), RecordingReceiver()
     async with serving(lambda: managed) as where:
-        port = await open_port(where, SerialSettings(9600, "8N1"), ear)
+        port = await open_port(where, SerialSettings(9600, "8N1"), receiver)
         port.write(EVERYTHING)
-        await ear.until(lambda e: len(e.data) >= len(EVERYTHING))
+        await receiver.until(lambda r: len(r.data) >= len(EVERYTHING))
         assert managed.got == EVERYTHING
-        assert ear.data == EVERYTHING
+        assert receiver.data == EVERYTHING
         await port.close()
         await port.close()
-        assert ear.losses == []
+        assert receiver.losses == []
         with pytest.raises(LineDown):
             port.write(REQUEST)
 
 
 @pytest.fixture
-async def ser2net(tmp_path: Path) -> AsyncIterator[tuple[Rfc2217Address, Master]]:
+async def ser2net(tmp_path: Path) -> AsyncIterator[tuple[Rfc2217Address, PtyMaster]]:
     """ser2net with a pty for its serial port."""
     program = needs("ser2net")
-    master, number = Master(), free_port()
+    master, number = PtyMaster(), free_port()
     config = tmp_path / "ser2net.yaml"
     config.write_text(
         "connection: &a\n"
@@ -144,7 +144,7 @@ async def ser2net(tmp_path: Path) -> AsyncIterator[tuple[Rfc2217Address, Master]
     )
     async with asyncio.timeout(PATIENCE):
         while not listens(number):
-            await asyncio.sleep(0.02)  # it does not say when it is ready
+            await asyncio.sleep(0.02)  # it does not report when it is ready
     yield Rfc2217Address("127.0.0.1", number), master
     process.terminate()
     await process.wait()
@@ -152,56 +152,56 @@ async def ser2net(tmp_path: Path) -> AsyncIterator[tuple[Rfc2217Address, Master]
 
 
 def listens(number: int) -> bool:
-    """Whether anybody listens there: without connecting, as a port serves one at a time."""
+    """Returns True when the port listens. Does not connect: ser2net serves one connection."""
     listening = f"0100007F:{number:04X} 00000000:0000 0A"
     return listening in Path("/proc/net/tcp").read_text()
 
 
 async def test_ser2net_sets_the_speed_and_passes_every_byte_value(
-    ser2net: tuple[Rfc2217Address, Master],
+    ser2net: tuple[Rfc2217Address, PtyMaster],
 ) -> None:
     where, master = ser2net
-    ear = Heard()
-    port = await open_port(where, SerialSettings(19200, "8N1"), ear)
+    receiver = RecordingReceiver()
+    port = await open_port(where, SerialSettings(19200, "8N1"), receiver)
     port.write(EVERYTHING)
     assert await master.read(len(EVERYTHING)) == EVERYTHING
     master.write(EVERYTHING)
-    await ear.until(lambda e: len(e.data) >= len(EVERYTHING))
-    assert ear.data == EVERYTHING
+    await receiver.until(lambda r: len(r.data) >= len(EVERYTHING))
+    assert receiver.data == EVERYTHING
     _, speed = master.format()
     assert speed == termios.B19200
     await port.close()
 
 
 async def test_ser2net_at_7e1_and_its_end_is_reported_once(
-    ser2net: tuple[Rfc2217Address, Master],
+    ser2net: tuple[Rfc2217Address, PtyMaster],
 ) -> None:
     where, master = ser2net
-    ear = Heard()
-    port = await open_port(where, SEVEN_EVEN, ear)
+    receiver = RecordingReceiver()
+    port = await open_port(where, SEVEN_EVEN, receiver)
     port.write(REQUEST)
     assert await master.read(len(REQUEST)) == REQUEST
     master.unplug()
-    await ear.until(lambda e: bool(e.losses))
+    await receiver.until(lambda r: bool(r.losses))
     with pytest.raises(LineDown):
         port.write(REQUEST)
     await port.close()
-    assert len(ear.losses) == 1
+    assert len(receiver.losses) == 1
 
 
 async def refused(server: Server, timeout: float = 0.2) -> str:
-    ear = Heard()
+    receiver = RecordingReceiver()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(rfc2217, "LONGEST_WAIT", timeout)
-        return await _refused(server, ear, timeout)
+        return await _refused(server, receiver, timeout)
 
 
-async def _refused(server: Server, ear: Heard, timeout: float) -> str:
+async def _refused(server: Server, receiver: RecordingReceiver, timeout: float) -> str:
     async with serving(lambda: server) as where:
         with pytest.raises(LineDown) as caught:
-            await open_port(where, SEVEN_EVEN, ear, timeout=timeout)
-    assert ear.data == b""
-    assert ear.losses == []
+            await open_port(where, SEVEN_EVEN, receiver, timeout=timeout)
+    assert receiver.data == b""
+    assert receiver.losses == []
     return str(caught.value)
 
 
@@ -249,16 +249,16 @@ async def test_a_missing_acknowledgement_is_logged_and_the_port_is_used(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(rfc2217, "LONGEST_WAIT", 0.02)
-    ear, server = Heard(), Server(b"", agree)
+    receiver, server = RecordingReceiver(), Server(b"", agree)
     async with serving(lambda: server) as where:
         with capture_logs() as logs:
-            port: Port = await open_port(where, SEVEN_EVEN, ear)
+            port: Port = await open_port(where, SEVEN_EVEN, receiver)
         unanswered = [row["setting"] for row in logs if row["event"] == "setting not acknowledged"]
         assert unanswered == ["baudrate", "data_bits", "parity", "stop_bits", "purge"]
         assert bytes((IAC, SB, COM_PORT, 3, 3, IAC, SE)) in server.got  # parity even
         server.transport.write(REPLY)
-        await ear.until(lambda e: len(e.data) >= len(REPLY))
-        assert ear.data == REPLY
+        await receiver.until(lambda r: len(r.data) >= len(REPLY))
+        assert receiver.data == REPLY
         await port.close()
 
 
@@ -274,7 +274,7 @@ async def test_a_server_that_sets_something_else_is_logged(
 
     async with serving(lambda: Server(b"", eight_bits_only)) as where:
         with capture_logs() as logs:
-            port = await open_port(where, SEVEN_EVEN, Heard())
+            port = await open_port(where, SEVEN_EVEN, RecordingReceiver())
         await port.close()
     row = next(row for row in logs if row["event"] == "setting refused")
     assert (row["setting"], row["requested"], row["actual"]) == ("data_bits", 7, 8)
@@ -282,7 +282,7 @@ async def test_a_server_that_sets_something_else_is_logged(
 
 async def test_a_server_lost_with_its_last_acknowledgement_is_line_down() -> None:
     class Gone:
-        """A connection that ends with the answer to the last request."""
+        """A connection that ends with the reply to the last request."""
 
         name = "10.0.0.7:4001"
 
@@ -295,29 +295,30 @@ async def test_a_server_lost_with_its_last_acknowledgement_is_line_down() -> Non
             if number == 12:
                 port.lost(LineDown("gone"))
 
-    ear = Heard()
-    port: Any = rfc2217.Rfc2217Port(ear)
+    receiver = RecordingReceiver()
+    port: Any = rfc2217.Rfc2217Port(receiver)
     with pytest.raises(LineDown, match="gone"):
         await port.set_up(Gone(), SEVEN_EVEN, 1.0)
     assert not port.is_open
-    assert ear.losses == []
+    assert receiver.losses == []
 
 
 async def test_a_server_may_send_first(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rfc2217, "LONGEST_WAIT", 0.02)
     greeting = bytes((IAC, DO, COM_PORT, IAC, WILL, COM_PORT)) + REPLY
-    ear, server = Heard(), Server(greeting, lambda *_: None)
-    port = rfc2217.Rfc2217Port(ear)
+    receiver, server = RecordingReceiver(), Server(greeting, lambda *_: None)
+    port = rfc2217.Rfc2217Port(receiver)
     async with serving(lambda: server) as where:
         tcp = await open_tcp(TcpAddress(where.host, where.port), port)
         async with asyncio.timeout(PATIENCE):
-            while len(port._early) < len(greeting):  # before we have said anything
+            # Private: nothing else shows that the greeting arrived before the first byte is sent.
+            while len(port._early) < len(greeting):
                 await asyncio.sleep(0)
         with capture_logs():
             await port.set_up(tcp, SEVEN_EVEN, 0.1)
         assert bytes((IAC, DO, COM_PORT)) in server.got
         await port.close()
-    assert ear.data == b""  # of another baud rate, perhaps
+    assert receiver.data == b""  # may be of another baud rate
 
 
 async def test_a_cancelled_opening_closes_the_connection() -> None:
@@ -329,7 +330,7 @@ async def test_a_cancelled_opening_closes_the_connection() -> None:
 
     server = Watched(b"", lambda *_: None)
     async with serving(lambda: server) as where:
-        opening = asyncio.create_task(open_port(where, SEVEN_EVEN, Heard()))
+        opening = asyncio.create_task(open_port(where, SEVEN_EVEN, RecordingReceiver()))
         async with asyncio.timeout(PATIENCE):
             while not server.got:
                 await asyncio.sleep(0.001)

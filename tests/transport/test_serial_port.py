@@ -1,4 +1,4 @@
-"""A local serial port: opened exclusively, and its end told once."""
+"""A local serial port: opened exclusively, its loss reported once."""
 
 import asyncio
 import subprocess
@@ -14,7 +14,7 @@ import pytest
 from gateway.errors import LineDown
 from gateway.transport import SerialPath, SerialSettings, open_port
 from tests.conftest import needs
-from tests.transport.ends import PATIENCE, Heard, Master
+from tests.transport.ends import PATIENCE, PtyMaster, RecordingReceiver
 from tests.vectors import vectors
 
 REQUEST, REPLY = (vector.frame for vector in vectors("vigor")[:2])
@@ -22,14 +22,14 @@ SEVEN_EVEN = SerialSettings(19200, "7E1")
 
 
 @pytest.fixture
-def plug() -> Iterator[Master]:
-    master = Master()
+def plug() -> Iterator[PtyMaster]:
+    master = PtyMaster()
     yield master
     master.unplug()
 
 
 def open_files() -> set[str]:
-    """What this process has open, by number and name."""
+    """Returns the open files of this process, by number and name."""
     found = set()
     for entry in Path("/proc/self/fd").iterdir():
         try:
@@ -39,27 +39,27 @@ def open_files() -> set[str]:
     return found
 
 
-async def test_bytes_pass_both_ways_at_7e1(plug: Master) -> None:
-    ear = Heard()
-    port = await open_port(SerialPath(plug.path), SEVEN_EVEN, ear)
+async def test_bytes_pass_both_ways_at_7e1(plug: PtyMaster) -> None:
+    receiver = RecordingReceiver()
+    port = await open_port(SerialPath(plug.path), SEVEN_EVEN, receiver)
     port.write(REQUEST)
     assert await plug.read(len(REQUEST)) == REQUEST
     plug.write(REPLY)
-    await ear.until(lambda e: len(e.data) >= len(REPLY))
-    assert ear.data == REPLY
+    await receiver.until(lambda r: len(r.data) >= len(REPLY))
+    assert receiver.data == REPLY
     await port.close()
-    assert ear.losses == []
+    assert receiver.losses == []
 
 
-async def test_every_byte_value_passes_at_8n1(plug: Master) -> None:
-    ear = Heard()
-    port = await open_port(SerialPath(plug.path), SerialSettings(9600, "8N1"), ear)
+async def test_every_byte_value_passes_at_8n1(plug: PtyMaster) -> None:
+    receiver = RecordingReceiver()
+    port = await open_port(SerialPath(plug.path), SerialSettings(9600, "8N1"), receiver)
     everything = bytes(range(256))
     port.write(everything)
     assert await plug.read(256) == everything
     plug.write(everything)
-    await ear.until(lambda e: len(e.data) >= 256)
-    assert ear.data == everything
+    await receiver.until(lambda r: len(r.data) >= 256)
+    assert receiver.data == everything
     await port.close()
 
 
@@ -72,22 +72,22 @@ async def test_every_byte_value_passes_at_8n1(plug: Master) -> None:
     ],
 )
 async def test_speed_and_stop_bits_are_set(
-    plug: Master, settings: SerialSettings, speed: int, stop_bits: int
+    plug: PtyMaster, settings: SerialSettings, speed: int, stop_bits: int
 ) -> None:
     # Data bits and parity cannot be seen on a pty: it has always 8 and none.
-    port = await open_port(SerialPath(plug.path), settings, Heard())
+    port = await open_port(SerialPath(plug.path), settings, RecordingReceiver())
     flags, set_speed = plug.format()
     assert set_speed == speed
     assert flags & termios.CSTOPB == stop_bits
     await port.close()
 
 
-async def test_a_port_in_use_is_refused_until_it_is_closed(plug: Master) -> None:
-    first = await open_port(SerialPath(plug.path), SEVEN_EVEN, Heard())
+async def test_a_port_in_use_is_refused_until_it_is_closed(plug: PtyMaster) -> None:
+    first = await open_port(SerialPath(plug.path), SEVEN_EVEN, RecordingReceiver())
     with pytest.raises(LineDown, match=f"^{plug.path}: in use by another program$"):
-        await open_port(SerialPath(plug.path), SEVEN_EVEN, Heard())
+        await open_port(SerialPath(plug.path), SEVEN_EVEN, RecordingReceiver())
     await first.close()
-    second = await open_port(SerialPath(plug.path), SEVEN_EVEN, Heard())
+    second = await open_port(SerialPath(plug.path), SEVEN_EVEN, RecordingReceiver())
     await second.close()
 
 
@@ -102,11 +102,11 @@ async def test_a_port_in_use_is_refused_until_it_is_closed(plug: Master) -> None
 )
 async def test_a_path_without_a_serial_port_is_explained(path: str, sentence: str) -> None:
     with pytest.raises(LineDown) as caught:
-        await open_port(SerialPath(path), SEVEN_EVEN, Heard())
+        await open_port(SerialPath(path), SEVEN_EVEN, RecordingReceiver())
     assert str(caught.value) == f"{path}: {sentence}"
 
 
-OPEN_AS_NOBODY = """
+OPEN_WITHOUT_RIGHTS = """
 import asyncio, os, sys
 from gateway.errors import LineDown
 from gateway.transport import SerialPath, SerialSettings, open_port
@@ -117,7 +117,7 @@ async def told(path):
     except LineDown as error:
         return str(error)
 
-asyncio.run(told("/dev/null"))  # whatever is imported on the way is imported now
+asyncio.run(told("/dev/null"))  # imports all modules while root may still read them
 if os.geteuid() == 0:  # root may open everything
     os.setgroups([])
     os.setgid(65534)
@@ -131,7 +131,7 @@ def test_permission_denied_names_the_group() -> None:
         Path(folder).chmod(0o755)
         closed = Path(folder) / "tty"
         closed.touch(mode=0)
-        command = [sys.executable, "-c", OPEN_AS_NOBODY, str(closed)]
+        command = [sys.executable, "-c", OPEN_WITHOUT_RIGHTS, str(closed)]
         said = subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
     assert said == f"{closed}: permission denied: is the user in group dialout?"
 
@@ -139,82 +139,84 @@ def test_permission_denied_names_the_group() -> None:
 @pytest.mark.parametrize("path", ["a\0b", "x" * 5000])
 async def test_an_invalid_path_is_line_down(path: str) -> None:
     with pytest.raises(LineDown):
-        await open_port(SerialPath(path), SEVEN_EVEN, Heard())
+        await open_port(SerialPath(path), SEVEN_EVEN, RecordingReceiver())
 
 
-async def test_a_pty_can_be_opened_as_7e1_again_and_again(plug: Master) -> None:
+async def test_a_pty_can_be_opened_as_7e1_again_and_again(plug: PtyMaster) -> None:
     # Linux refuses 7 bits and parity on a pty from the second time on.
     for _ in range(3):
-        port = await open_port(SerialPath(plug.path), SEVEN_EVEN, Heard())
+        port = await open_port(SerialPath(plug.path), SEVEN_EVEN, RecordingReceiver())
         await port.close()
 
 
-async def test_unplugging_is_reported_once_and_later_writes_fail(plug: Master) -> None:
-    ear = Heard()
-    port = await open_port(SerialPath(plug.path), SEVEN_EVEN, ear)
+async def test_unplugging_is_reported_once_and_later_writes_fail(plug: PtyMaster) -> None:
+    receiver = RecordingReceiver()
+    port = await open_port(SerialPath(plug.path), SEVEN_EVEN, receiver)
     plug.unplug()
-    await ear.until(lambda e: bool(e.losses))
+    await receiver.until(lambda r: bool(r.losses))
     with pytest.raises(LineDown, match="unplugged"):
         port.write(REQUEST)
     await port.close()
     await port.close()
-    assert [type(error) for error in ear.losses] == [LineDown]
+    assert [type(error) for error in receiver.losses] == [LineDown]
 
 
-async def test_a_write_during_the_unplugging_fails(plug: Master) -> None:
-    ear = Heard()
-    port = await open_port(SerialPath(plug.path), SEVEN_EVEN, ear)
+async def test_a_write_during_the_unplugging_fails(plug: PtyMaster) -> None:
+    receiver = RecordingReceiver()
+    port = await open_port(SerialPath(plug.path), SEVEN_EVEN, receiver)
     plug.unplug()
-    with pytest.raises(LineDown):  # before the loop could hear of it
+    with pytest.raises(LineDown):  # before the loop notices
         port.write(REQUEST)
-    await ear.until(lambda e: bool(e.losses))
+    await receiver.until(lambda r: bool(r.losses))
     await port.close()
-    assert len(ear.losses) == 1
+    assert len(receiver.losses) == 1
 
 
-async def test_nothing_is_reported_after_close(plug: Master) -> None:
-    ear = Heard()
-    port = await open_port(SerialPath(plug.path), SEVEN_EVEN, ear)
+async def test_nothing_is_reported_after_close(plug: PtyMaster) -> None:
+    receiver = RecordingReceiver()
+    port = await open_port(SerialPath(plug.path), SEVEN_EVEN, receiver)
     await asyncio.gather(port.close(), port.close())
     plug.unplug()
     with pytest.raises(LineDown):
         port.write(REQUEST)
     await asyncio.sleep(0)
-    assert (ear.data, ear.losses) == (b"", [])
+    assert (receiver.data, receiver.losses) == (b"", [])
 
 
-async def test_a_port_that_accepts_no_data_is_down_and_keeps_no_old_requests(plug: Master) -> None:
-    ear = Heard()
-    port = await open_port(SerialPath(plug.path), SEVEN_EVEN, ear)
+async def test_a_port_that_accepts_no_data_is_down_and_keeps_no_old_requests(
+    plug: PtyMaster,
+) -> None:
+    receiver = RecordingReceiver()
+    port = await open_port(SerialPath(plug.path), SEVEN_EVEN, receiver)
 
     def keep_writing() -> None:
-        for _ in range(1000):  # nobody reads the pty
+        for _ in range(1000):  # the pty is not read
             port.write(REQUEST * 10)
 
     with pytest.raises(LineDown, match="accepts no data"):
         keep_writing()
-    await ear.until(lambda e: bool(e.losses))
+    await receiver.until(lambda r: bool(r.losses))
     await port.close()
-    assert len(ear.losses) == 1
+    assert len(receiver.losses) == 1
 
 
-async def test_bytes_from_before_the_opening_are_discarded(plug: Master) -> None:
+async def test_bytes_from_before_the_opening_are_discarded(plug: PtyMaster) -> None:
     plug.write(REPLY)
-    ear = Heard()
-    port = await open_port(SerialPath(plug.path), SEVEN_EVEN, ear)
+    receiver = RecordingReceiver()
+    port = await open_port(SerialPath(plug.path), SEVEN_EVEN, receiver)
     plug.write(REQUEST)
-    await ear.until(lambda e: len(e.data) >= len(REQUEST))
-    assert ear.data == REQUEST
+    await receiver.until(lambda r: len(r.data) >= len(REQUEST))
+    assert receiver.data == REQUEST
     await port.close()
 
 
-async def test_opening_and_closing_leaves_nothing_behind(plug: Master) -> None:
-    await (await open_port(SerialPath(plug.path), SEVEN_EVEN, Heard())).close()
+async def test_opening_and_closing_leaves_nothing_behind(plug: PtyMaster) -> None:
+    await (await open_port(SerialPath(plug.path), SEVEN_EVEN, RecordingReceiver())).close()
     files, tasks = open_files(), asyncio.all_tasks()
     for _ in range(5):
-        port = await open_port(SerialPath(plug.path), SEVEN_EVEN, Heard())
+        port = await open_port(SerialPath(plug.path), SEVEN_EVEN, RecordingReceiver())
         with pytest.raises(LineDown):
-            await open_port(SerialPath(plug.path), SEVEN_EVEN, Heard())
+            await open_port(SerialPath(plug.path), SEVEN_EVEN, RecordingReceiver())
         await port.close()
     assert open_files() == files
     await asyncio.sleep(0)
@@ -226,9 +228,9 @@ async def test_opening_and_closing_leaves_nothing_behind(plug: Master) -> None:
     )
 
 
-async def test_a_cancelled_opening_closes_the_port(plug: Master) -> None:
+async def test_a_cancelled_opening_closes_the_port(plug: PtyMaster) -> None:
     files = open_files()
-    opening = asyncio.create_task(open_port(SerialPath(plug.path), SEVEN_EVEN, Heard()))
+    opening = asyncio.create_task(open_port(SerialPath(plug.path), SEVEN_EVEN, RecordingReceiver()))
     await asyncio.sleep(0)
     opening.cancel()
     with pytest.raises(asyncio.CancelledError):
@@ -259,20 +261,20 @@ async def test_two_ports_on_a_cable_and_the_cable_pulled(
     cable: tuple[str, str, asyncio.subprocess.Process],
 ) -> None:
     left, right, socat = cable
-    ears = Heard(), Heard()
+    receivers = RecordingReceiver(), RecordingReceiver()
     ports = [
-        await open_port(SerialPath(path), SEVEN_EVEN, ear)
-        for path, ear in zip((left, right), ears, strict=True)
+        await open_port(SerialPath(path), SEVEN_EVEN, receiver)
+        for path, receiver in zip((left, right), receivers, strict=True)
     ]
     ports[0].write(REQUEST)
-    await ears[1].until(lambda e: len(e.data) >= len(REQUEST))
+    await receivers[1].until(lambda r: len(r.data) >= len(REQUEST))
     ports[1].write(REPLY)
-    await ears[0].until(lambda e: len(e.data) >= len(REPLY))
-    assert (ears[1].data, ears[0].data) == (REQUEST, REPLY)
+    await receivers[0].until(lambda r: len(r.data) >= len(REPLY))
+    assert (receivers[1].data, receivers[0].data) == (REQUEST, REPLY)
     socat.terminate()
-    for ear, port in zip(ears, ports, strict=True):
-        await ear.until(lambda e: bool(e.losses))
+    for receiver, port in zip(receivers, ports, strict=True):
+        await receiver.until(lambda r: bool(r.losses))
         with pytest.raises(LineDown):
             port.write(REQUEST)
         await port.close()
-        assert len(ear.losses) == 1
+        assert len(receiver.losses) == 1

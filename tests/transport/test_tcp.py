@@ -1,4 +1,4 @@
-"""A raw TCP port: refused, silent, reset, half-closed, and noticed when the other side is gone."""
+"""A raw TCP port: refused, silent, reset, half-closed, and a dead peer."""
 
 import asyncio
 import socket
@@ -12,7 +12,7 @@ from gateway.errors import LineDown
 from gateway.transport import Port, SerialSettings, TcpAddress, open_port
 from gateway.transport.os_errors import line_down
 from gateway.transport.stream import LONGEST_CLOSE, StreamPort
-from tests.transport.ends import PATIENCE, Heard, free_port, listening
+from tests.transport.ends import PATIENCE, RecordingReceiver, free_port, listening
 from tests.vectors import vectors
 
 REQUEST, REPLY = (vector.frame for vector in vectors("vigor")[:2])
@@ -20,12 +20,12 @@ ANY = SerialSettings()
 
 
 @asynccontextmanager
-async def connected(ear: Heard) -> AsyncIterator[tuple[Port, socket.socket]]:
-    """Our port and the other side's socket."""
+async def connected(receiver: RecordingReceiver) -> AsyncIterator[tuple[Port, socket.socket]]:
+    """Yields the port and the socket of the other side."""
     loop = asyncio.get_running_loop()
     with listening() as server:
         accepting = asyncio.create_task(loop.sock_accept(server))
-        port = await open_port(TcpAddress(*server.getsockname()), ANY, ear)
+        port = await open_port(TcpAddress(*server.getsockname()), ANY, receiver)
         peer, _ = await accepting
         peer.setblocking(False)
         with peer:
@@ -34,31 +34,31 @@ async def connected(ear: Heard) -> AsyncIterator[tuple[Port, socket.socket]]:
 
 
 def reset(peer: socket.socket) -> None:
-    """What a device server that has restarted answers with."""
+    """Resets the connection, as a device server does after a restart."""
     peer.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
     peer.close()
 
 
 async def test_every_byte_value_passes_both_ways() -> None:
-    ear, loop = Heard(), asyncio.get_running_loop()
+    receiver, loop = RecordingReceiver(), asyncio.get_running_loop()
     everything = bytes(range(256))
-    async with connected(ear) as (port, peer):
+    async with connected(receiver) as (port, peer):
         port.write(everything)
         assert await loop.sock_recv(peer, 1000) == everything
         await loop.sock_sendall(peer, everything)
-        await ear.until(lambda e: len(e.data) >= 256)
-    assert ear.data == everything
-    assert ear.losses == []
+        await receiver.until(lambda r: len(r.data) >= 256)
+    assert receiver.data == everything
+    assert receiver.losses == []
 
 
 async def test_a_closed_port_is_connection_refused() -> None:
     where = TcpAddress("127.0.0.1", free_port())
     with pytest.raises(LineDown, match=rf"^127.0.0.1:{where.port}: connection refused$"):
-        await open_port(where, ANY, Heard())
+        await open_port(where, ANY, RecordingReceiver())
 
 
 async def test_a_host_with_two_addresses_that_both_refuse() -> None:
-    # asyncio puts both into one text and leaves the number out.
+    # asyncio joins both errors in one text without a number.
     both = OSError(
         "Multiple exceptions: [Errno 111] Connect call failed ('::1', 1, 0, 0), "
         "[Errno 111] Connect call failed ('127.0.0.1', 1)"
@@ -74,18 +74,19 @@ async def test_an_unknown_host_is_explained() -> None:
 @pytest.mark.parametrize("host", ["a..b", "x" * 300])
 async def test_an_invalid_host_name_is_line_down(host: str) -> None:
     with pytest.raises(LineDown):
-        await open_port(TcpAddress(host, 4001), ANY, Heard())
+        await open_port(TcpAddress(host, 4001), ANY, RecordingReceiver())
 
 
 async def test_a_silent_host_times_out_and_the_loop_goes_on() -> None:
     loop = asyncio.get_running_loop()
     with listening(backlog=0) as server:
-        # A full backlog drops what comes, as a host does that is switched off.
+        # A full backlog drops packets, like a host that is switched off.
         first = [socket.socket() for _ in range(2)]
         for one in first:
             one.setblocking(False)
             one.connect_ex(server.getsockname())
         ticks = 0
+        timer: asyncio.Handle
 
         def tick() -> None:
             nonlocal ticks, timer
@@ -96,7 +97,9 @@ async def test_a_silent_host_times_out_and_the_loop_goes_on() -> None:
         begin = loop.time()
         async with asyncio.timeout(PATIENCE):
             with pytest.raises(LineDown, match="no answer"):
-                await open_port(TcpAddress(*server.getsockname()), ANY, Heard(), timeout=0.3)
+                await open_port(
+                    TcpAddress(*server.getsockname()), ANY, RecordingReceiver(), timeout=0.3
+                )
         took = loop.time() - begin
         timer.cancel()
         for one in first:
@@ -106,59 +109,59 @@ async def test_a_silent_host_times_out_and_the_loop_goes_on() -> None:
 
 
 async def test_a_reset_is_reported_once_and_later_writes_fail() -> None:
-    ear = Heard()
-    async with connected(ear) as (port, peer):
+    receiver = RecordingReceiver()
+    async with connected(receiver) as (port, peer):
         reset(peer)
-        await ear.until(lambda e: bool(e.losses))
+        await receiver.until(lambda r: bool(r.losses))
         with pytest.raises(LineDown, match="connection reset"):
             port.write(REQUEST)
         await port.close()
         await port.close()
-    assert [type(error) for error in ear.losses] == [LineDown]
-    assert "connection reset by the other side" in str(ear.losses[0])
+    assert [type(error) for error in receiver.losses] == [LineDown]
+    assert "connection reset by the other side" in str(receiver.losses[0])
 
 
 async def test_a_half_close_ends_the_port() -> None:
-    # A device server that stops talking will not answer, even if it would still listen.
-    ear, loop = Heard(), asyncio.get_running_loop()
-    async with connected(ear) as (port, peer):
+    # A device server that closes its sending side will send no more replies.
+    receiver, loop = RecordingReceiver(), asyncio.get_running_loop()
+    async with connected(receiver) as (port, peer):
         await loop.sock_sendall(peer, REPLY)
         peer.shutdown(socket.SHUT_WR)
-        await ear.until(lambda e: bool(e.losses))
+        await receiver.until(lambda r: bool(r.losses))
         with pytest.raises(LineDown, match="closed by the other side"):
             port.write(REQUEST)
-    assert ear.data == REPLY  # what came before it counts
-    assert len(ear.losses) == 1
+    assert receiver.data == REPLY  # received before the end
+    assert len(receiver.losses) == 1
 
 
 async def test_closing_sends_the_written_bytes_and_reports_nothing() -> None:
-    ear, loop = Heard(), asyncio.get_running_loop()
-    async with connected(ear) as (port, peer):
+    receiver, loop = RecordingReceiver(), asyncio.get_running_loop()
+    async with connected(receiver) as (port, peer):
         port.write(REQUEST)
         await port.close()
         assert await loop.sock_recv(peer, 1000) == REQUEST
         assert await loop.sock_recv(peer, 1000) == b""
         with pytest.raises(LineDown):
             port.write(REQUEST)
-    assert ear.losses == []
+    assert receiver.losses == []
 
 
 async def test_a_peer_that_accepts_no_data_is_down_and_keeps_no_old_requests() -> None:
-    ear = Heard()
-    async with connected(ear) as (port, _):
+    receiver = RecordingReceiver()
+    async with connected(receiver) as (port, _):
 
         def keep_writing() -> None:
-            for _ in range(10_000):  # nobody reads the other end
+            for _ in range(10_000):  # the other end is not read
                 port.write(REQUEST * 100)
 
         with pytest.raises(LineDown, match="accepts no data"):
             keep_writing()
-        await ear.until(lambda e: bool(e.losses))
-    assert len(ear.losses) == 1
+        await receiver.until(lambda r: bool(r.losses))
+    assert len(receiver.losses) == 1
 
 
 async def test_a_connection_reset_at_once_is_reported_once() -> None:
-    ear, loop = Heard(), asyncio.get_running_loop()
+    receiver, loop = RecordingReceiver(), asyncio.get_running_loop()
     with listening() as server:
 
         async def refuse() -> None:
@@ -167,20 +170,20 @@ async def test_a_connection_reset_at_once_is_reported_once() -> None:
 
         refusing = asyncio.create_task(refuse())
         try:
-            port = await open_port(TcpAddress(*server.getsockname()), ANY, ear)
+            port = await open_port(TcpAddress(*server.getsockname()), ANY, receiver)
         except LineDown:
-            assert ear.losses == []
+            assert receiver.losses == []
         else:
-            await ear.until(lambda e: bool(e.losses))
+            await receiver.until(lambda r: bool(r.losses))
             await port.close()
-            assert len(ear.losses) == 1
+            assert len(receiver.losses) == 1
         await refusing
 
 
 async def test_a_cancelled_opening_leaves_no_connection() -> None:
     with listening() as server:
         where = TcpAddress(*server.getsockname())
-        opening = asyncio.create_task(open_port(where, ANY, Heard()))
+        opening = asyncio.create_task(open_port(where, ANY, RecordingReceiver()))
         await asyncio.sleep(0)
         opening.cancel()
         with pytest.raises(asyncio.CancelledError):
@@ -189,8 +192,9 @@ async def test_a_cancelled_opening_leaves_no_connection() -> None:
 
 async def test_closing_does_not_wait_for_a_peer_that_accepts_no_data() -> None:
     loop = asyncio.get_running_loop()
-    async with connected(Heard()) as (port, peer):
+    async with connected(RecordingReceiver()) as (port, peer):
         assert isinstance(port, StreamPort)
+        # Private: only the transport knows how much it has not sent yet.
         assert port._transport is not None
         while port._transport.get_write_buffer_size() == 0:
             port.write(bytes(1000))
@@ -198,13 +202,14 @@ async def test_closing_does_not_wait_for_a_peer_that_accepts_no_data() -> None:
         await port.close()
         assert loop.time() - begin < LONGEST_CLOSE / 2
         arrived = 1
-        while arrived:  # what waited in the port was not sent after it was given back
+        while arrived:  # the buffer of the port is not sent after the close
             arrived = len(await loop.sock_recv(peer, 1_000_000))
 
 
 async def test_a_dead_peer_is_detected_within_a_minute_and_nothing_is_buffered() -> None:
-    async with connected(Heard()) as (port, _):
+    async with connected(RecordingReceiver()) as (port, _):
         assert isinstance(port, StreamPort)
+        # Private: the options of the socket are the subject, and a port has no access to them.
         assert port._transport is not None
         ours = port._transport.get_extra_info("socket")
         asked = [

@@ -87,7 +87,7 @@ def test_data_is_received_again_after_any_noise(noise: bytes, data: bytes) -> No
     telnet = begun()
     telnet.feed(noise)
     telnet.feed(bytes((IAC, SE, IAC, SE)))  # ends whatever had begun
-    telnet.feed(bytes(400))  # longer than any note
+    telnet.feed(bytes(400))  # longer than any subnegotiation
     heard = b"".join(e.data for e in telnet.feed(data) if isinstance(e, Received))
     assert heard == data
 
