@@ -1,13 +1,13 @@
-"""Simulated Vigor PLCs in a process of their own that do what they are told.
+"""Simulated Vigor PLCs in a process of their own, controlled by commands.
 
-`python -m tests.e2e.station 1,2 pty LINK` or `… tcp [HOST:]PORT`. It says `ready`, then obeys
-lines on its standard input and answers each with `ok …`:
+`python -m tests.e2e.station 1,2 pty LINK` or `… tcp [HOST:]PORT`. It prints `ready`, then executes
+commands from its standard input and prints `ok …` after each:
 
-    mute 1            obeys, but its answers are lost          speak 1     answers again
-    hole 1 D 700      this model lacks the device              fill 1 D 700
-    set 1 D 100 5     what its program would do                get 1 D 500
-    count 1 D 10      a register that counts ten a second      delay 1 0.3 slow to answer
-    deaf / hear       the port is closed, and opened again
+    mute 1            works, but its replies are lost           speak 1     replies again
+    hole 1 D 700      the address does not exist                fill 1 D 700
+    set 1 D 100 5     as the program of the PLC does            get 1 D 500
+    count 1 D 10      a register that counts ten a second       delay 1 0.3 replies late
+    deaf / hear       closes and opens the port
 """
 
 import asyncio
@@ -21,7 +21,7 @@ WIRE = WireTiming(19200, character_bits("7E1"))
 
 
 class Plant:
-    """The stations, and the port they are behind."""
+    """The stations and their port."""
 
     def __init__(self, numbers: list[int], kind: str, where: str) -> None:
         self.stations = {number: VigorStation(number) for number in numbers}
@@ -41,18 +41,20 @@ class Plant:
         if self._served is not None:
             await self._served.close()
 
-    async def obey(self, words: list[str]) -> object:
+    async def execute(self, words: list[str]) -> object:
         match words:
             case ["deaf"]:
-                return await self.close()
+                await self.close()
+                return ""
             case ["hear"]:
-                return await self.open()
+                await self.open()
+                return ""
             case [verb, number, *rest]:
-                return _obey(self.stations[int(number)], verb, rest)
+                return _execute(self.stations[int(number)], verb, rest)
         raise ValueError(words)
 
 
-def _obey(station: VigorStation, verb: str, rest: list[str]) -> object:
+def _execute(station: VigorStation, verb: str, rest: list[str]) -> object:
     match verb, *rest:
         case ["mute"]:
             station.mute = True
@@ -69,7 +71,7 @@ def _obey(station: VigorStation, verb: str, rest: list[str]) -> object:
         case ["count", area, number]:
             station.memory.animate(area, int(number), lambda now: int(now * 10) & 0x7FFF)
         case ["delay", seconds]:
-            station.delay = float(seconds)  # type: ignore[attr-defined]  # the wire looks for it
+            station.delay = float(seconds)  # type: ignore[attr-defined]  # the simulated wire reads it
         case _:
             raise ValueError((verb, rest))
     return ""
@@ -79,13 +81,12 @@ async def main(numbers: str, kind: str, where: str) -> None:
     plant = Plant([int(number) for number in numbers.split(",")], kind, where)
     await plant.open()
     print("ready", flush=True)
-    orders = asyncio.StreamReader()
+    commands = asyncio.StreamReader()
     await asyncio.get_running_loop().connect_read_pipe(
-        lambda: asyncio.StreamReaderProtocol(orders), sys.stdin
+        lambda: asyncio.StreamReaderProtocol(commands), sys.stdin
     )
-    async for line in orders:
-        answer = await plant.obey(line.decode().split())
-        print("ok", "" if answer is None else answer, flush=True)
+    async for line in commands:
+        print("ok", await plant.execute(line.decode().split()), flush=True)
     await plant.close()
 
 

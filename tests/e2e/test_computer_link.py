@@ -73,9 +73,9 @@ async def test_values_and_writes(oven: Oven) -> None:
                 for name, value in expected.items()
             )
         )
-        for name, value in (("setpoint", b"-7"), ("speed", b"1200")):
-            [done] = await client.get(f"plant/oven/{name}/@set", value)
-            assert done.ok, done.payload
+        for name, number in (("setpoint", b"-7"), ("speed", b"1200")):
+            [reply] = await client.get(f"plant/oven/{name}/@set", number)
+            assert reply.ok, reply.payload
         assert oven.plc.tell("get D0500") == str(65536 - 7)
         assert oven.plc.tell("get D0700") == "1200"
         oven.plc.tell("heard")
@@ -133,20 +133,20 @@ async def test_control(oven: Oven) -> None:
         await heard.next(lambda s: s.json.get("value") == 21.5)
         [model] = await client.get("plant/oven/@model")
         assert model.json["answer"] == "9D (FX2N)"
-        [said] = await client.get("plant/oven/@loopback", b"HELLO")
-        assert said.json["answer"] == "HELLO"
+        [loopback] = await client.get("plant/oven/@loopback", b"HELLO")
+        assert loopback.json["answer"] == "HELLO"
         for command in ("run", "stop"):
-            [done] = await client.get(f"plant/oven/@{command}")
-            assert done.json["answer"] == "acknowledged"
+            [reply] = await client.get(f"plant/oven/@{command}")
+            assert reply.json["answer"] == "acknowledged"
         [sent] = await client.get("plant/@gateway/demo/lines/hall/global", b"on")
         assert "none answers" in sent.json["answer"]
-        until(lambda: oven.plc.tell("get M8126") == "1", "the flag is heard")
+        until(lambda: oven.plc.tell("get M8126") == "1", "the flag changes")
     oven.gateway.says("command executed", "@stop")
     done = plc_gateway("control", oven.config, "oven", "loopback", "HI")
     assert (done.code, done.out) == (0, "HI\n")
     done = plc_gateway("control", oven.config, "oven", "global", "off")
     assert done.code == 0
-    until(lambda: oven.plc.tell("get M8126") == "0", "the flag is heard")
+    until(lambda: oven.plc.tell("get M8126") == "0", "the flag changes")
     oven.plc.tell("mute")
     assert plc_gateway("control", oven.config, "oven", "model").code == 1
 

@@ -52,8 +52,10 @@ def plant(tmp_path: Path) -> Iterator[Plant]:
 
 @pytest.fixture
 def busy_plant(tmp_path: Path) -> Iterator[Plant]:
-    """Asked for far more than 19200 baud carry: the wire is never quiet."""
-    tags = {f"d{i}": {"address": f"D{100 * i}", "every": "50ms"} for i in range(20)}
+    """A line with far more requests than 19200 baud can carry: the wire is always busy."""
+    tags: dict[str, dict[str, object]] = {
+        f"d{i}": {"address": f"D{100 * i}", "every": "50ms"} for i in range(20)
+    }
     tags["speed"] = {"address": "D10", "every": "50ms", "publish": "always"}
     tags |= {f"w{i}": {"address": f"D{3000 + i}", "write": True} for i in range(20)}
     yield from _plant(tmp_path, tags)

@@ -1,18 +1,20 @@
-"""Late replies in real time: what was proven on virtual time, on a pty."""
+"""Late replies in real time on a pty: the rule that other tests prove in virtual time."""
 
 import asyncio
 import random
 from dataclasses import dataclass
 from typing import Any
 
+from gateway.engine.device import Device
 from gateway.planning.wire_timing import WireTiming
 from gateway.protocols.driver import Timing
 from gateway.protocols.modbus import ModbusAscii, ModbusRtu
 from gateway.simulator.serve import serve_on_pty
 from gateway.stations.modbus import ModbusStation
 from gateway.transport import Receiver, SerialPath, SerialSettings, open_port
-from tests.line.test_line import Device, Witness
-from tests.sim.plant import Bench, Plant, Unruly, clock_word, make_tag, running
+from tests.line.test_line import Witness
+from tests.sim.bench import Bench, Unruly
+from tests.sim.plant import Plant, clock_word, make_tag, running
 
 WIRE = WireTiming(115200, 10)
 TIMEOUT, SECONDS = 0.05, 6.0
@@ -31,12 +33,12 @@ class PtyBench(Bench):
 
 
 async def test_late_replies_give_no_wrong_value_in_real_time() -> None:
-    """Both at once, on two lines: what they do is mostly waiting."""
+    """Both at once, on two lines, because they mostly wait."""
     await asyncio.gather(_no_wrong_value(ModbusRtu), _no_wrong_value(ModbusAscii))
 
 
 async def _no_wrong_value(kind: type[ModbusRtu | ModbusAscii]) -> None:
-    """A quarter of them, 50 to 150 ms beyond the time-out; blocks of the same and another size."""
+    """A quarter of the replies are 50 to 150 ms late; blocks have equal and different sizes."""
     driver = kind(station=1)
     tags = [
         make_tag(f"holding:{number}", driver, type="uint16", every=0.02)
@@ -62,8 +64,8 @@ async def _no_wrong_value(kind: type[ModbusRtu | ModbusAscii]) -> None:
         line = Plant([device], [station], PtyBench(path=served.address), WIRE)
         witness = Witness(line)
         async with running(line):
-            await asyncio.sleep(SECONDS)  # as long as it runs, not until something happens
-            async with asyncio.timeout(60):  # and on a slow machine until enough was seen
+            await asyncio.sleep(SECONDS)  # a fixed run
+            async with asyncio.timeout(60):  # and on a slow machine until it saw enough
                 while witness.right <= 100 or device.record.late <= 10:
                     await asyncio.sleep(0.1)
     finally:

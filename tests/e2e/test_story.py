@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
@@ -42,13 +43,17 @@ def set_up(folder: Path, zenoh: dict[str, object], client: str) -> Iterator[Stor
         yield Story(folder, path)
 
 
+def _all_good(path: Path) -> bool:
+    return plc_gateway("read", path).code == 0
+
+
 @pytest.fixture(scope="module")
 def beginning(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Story]:
     endpoint = free_endpoint()
     assert OPEN.count(ENDPOINT) == 1
     client = OPEN.replace(ENDPOINT, endpoint)
     for story in set_up(tmp_path_factory.mktemp("story"), {"listen": [endpoint]}, client):
-        until(lambda path=story.config: plc_gateway("read", path).code == 0, "every value is good")
+        until(partial(_all_good, story.config), "every value is good")
         yield story
 
 

@@ -1,9 +1,12 @@
-"""Every way to a PLC: a pty, a cable of two ptys, TCP, RFC 2217; PLC, gateway and Zenoh client
-are processes of their own."""
+"""Every kind of port: a pty, a cable of two ptys, TCP, RFC 2217.
+
+PLC, gateway and Zenoh client are processes of their own.
+"""
 
 import json
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -18,7 +21,7 @@ from tests.e2e.processes import (
     vigor_line,
     write_config,
 )
-from tests.zenoh_peer import ZenohPeer, free_endpoint
+from tests.zenoh_peer import Heard, Subscription, ZenohPeer, free_endpoint
 
 TAGS = {
     "speed": {"address": "D10", "scale": 0.1},
@@ -31,11 +34,11 @@ TAGS = {
     "run": {"address": "Y20", "write": True},
     "valve": {"address": "D7.3", "write": True},
 }
-Way = Callable[[ExitStack, Path], str]
+OpenPort = Callable[[ExitStack, Path], str]
 
 
 def _simulated_on_pty(stack: ExitStack, folder: Path) -> Path:
-    """`plc-gateway simulate` of the same devices; the link to its pty."""
+    """Simulates the same devices. Returns the link to their pty."""
     plan = write_config(folder / "plc.yaml", free_endpoint(), {"hall": vigor_line("COM1", TAGS)})
     simulated = stack.enter_context(gateway("simulate", plan, "--links", folder))
     assert str(folder / "hall") in simulated.says("line hall: stations 1 at")
@@ -75,22 +78,20 @@ def stack() -> Iterator[ExitStack]:
         yield stack
 
 
-@pytest.mark.parametrize("way", [_pty, _cable, _tcp, _rfc2217], ids=lambda way: way.__name__[1:])
+@pytest.mark.parametrize(
+    "open_port", [_pty, _cable, _tcp, _rfc2217], ids=lambda open_port: open_port.__name__[1:]
+)
 async def test_values_arrive_and_writes_are_done(
-    way: Way, stack: ExitStack, tmp_path: Path
+    open_port: OpenPort, stack: ExitStack, tmp_path: Path
 ) -> None:
     endpoint = free_endpoint()
-    port = way(stack, tmp_path)
+    port = open_port(stack, tmp_path)
     config = write_config(tmp_path / "config.yaml", endpoint, {"hall": vigor_line(port, TAGS)})
     stack.enter_context(started(config))
     async with ZenohPeer("client", connect=[endpoint]) as client:
-        heard = await client.subscribe("plant/**")
-        for name in ("speed", "level", "batches"):  # each is seen to move
-            key = f"plant/mixer/{name}"
-            first = await heard.next(lambda s, k=key: s.key == k and s.json["quality"] == "good")
-            await heard.next(
-                lambda s, f=first: s.key == f.key and s.json["value"] != f.json["value"]
-            )
+        samples = await client.subscribe("plant/**")
+        for name in ("speed", "level", "batches"):
+            await _wait_for_a_change(samples, f"plant/mixer/{name}")
 
         replies = await client.get("plant/mixer/**", consolidation="NONE")
         values = {reply.key: reply.json for reply in replies}
@@ -100,17 +101,22 @@ async def test_values_arrive_and_writes_are_done(
         assert isinstance(values["plant/mixer/door"]["value"], bool)
         assert values["plant/mixer/name"]["value"] == "SIMULATED"
 
-        asked = {"recipe": 7, "run": True, "valve": True, "name": "BATCH-7"}
-        for name, value in asked.items():
+        written = {"recipe": 7, "run": True, "valve": True, "name": "BATCH-7"}
+        for name, value in written.items():
             [reply] = await client.get(f"plant/mixer/{name}/@set", json.dumps(value).encode())
             assert reply.ok, reply
             assert reply.json["value"] == value
             assert reply.json["verified"] is (name == "recipe")
-            await heard.next(lambda s, n=name, v=value: _shows(s.key, s.json, n, v))
+            await samples.next(partial(_shows, name, value))
         [run] = await client.get("plant/mixer/run")
         assert run.json["value"] is True
-        assert all(sample.encoding == "application/json" for sample in heard.samples)
+        assert all(sample.encoding == "application/json" for sample in samples.samples)
 
 
-def _shows(key: str, document: dict[str, object], name: str, value: object) -> bool:
-    return key == f"plant/mixer/{name}" and document["value"] == value
+def _shows(name: str, value: object, sample: Heard) -> bool:
+    return sample.key == f"plant/mixer/{name}" and bool(sample.json["value"] == value)
+
+
+async def _wait_for_a_change(samples: Subscription, key: str) -> None:
+    first = await samples.next(lambda s: s.key == key and s.json["quality"] == "good")
+    await samples.next(lambda s: s.key == key and s.json["value"] != first.json["value"])

@@ -1,4 +1,4 @@
-"""The peers of these tests; what is not installed is skipped, or failed (see `tests.conftest`)."""
+"""The peers of these tests. A missing peer skips the test, or fails it (see `tests.conftest`)."""
 
 import subprocess
 from pathlib import Path
@@ -16,7 +16,7 @@ def socat() -> str:
 
 @pytest.fixture
 def modbus_serial() -> str:
-    """npm's modbus-serial: the program that runs it."""
+    """The program that runs npm's modbus-serial."""
     node = needs("node")
     if not (HERE / "node_modules" / "modbus-serial").is_dir():
         lacking("npm's modbus-serial is not installed (npm ci in tests/interop)")
@@ -35,6 +35,6 @@ def libmodbus(tmp_path_factory: pytest.TempPathFactory) -> Path:
         lacking("libmodbus-dev is not installed")
     for name in ("modbus_slave", "modbus_master"):
         source = HERE / f"{name}.c"
-        command = [compiler, "-O2", "-Wall", "-o", folder / name, source, *flags.stdout.split()]
-        subprocess.run(command, check=True)
+        command = [compiler, "-O2", "-Wall", "-o", str(folder / name), str(source)]
+        subprocess.run([*command, *flags.stdout.split()], check=True)
     return folder

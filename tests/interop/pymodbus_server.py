@@ -23,6 +23,7 @@ def device() -> SimDevice:
 
 async def main(framer: str, *where: str) -> None:
     kind = FramerType[framer.upper()]
+    server: ModbusTcpServer | ModbusSerialServer
     if where[0] == "tcp":
         server = ModbusTcpServer(
             [device()],

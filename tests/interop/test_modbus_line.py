@@ -1,4 +1,4 @@
-"""A whole line of the gateway beside Modbus slaves nobody here wrote, and its commands too."""
+"""A whole line of the gateway, and its commands, with Modbus slaves of other authors."""
 
 import asyncio
 import json
@@ -18,7 +18,8 @@ from gateway.tags import Quality, Reason, WriteResult, WriteRule
 from gateway.transport import Receiver, SerialPath, SerialSettings, TcpAddress, open_port
 from tests.e2e.processes import plc_gateway, write_config
 from tests.interop.peers import HERE, free_port, pty_pair, running
-from tests.sim.plant import Bench, Outcome, Plant, made_device, make_tag
+from tests.sim.bench import Bench
+from tests.sim.plant import Outcome, Plant, made_device, make_tag
 from tests.sim.plant import running as serving
 from tests.zenoh_peer import free_endpoint
 
@@ -30,7 +31,7 @@ NETWORK = WireTiming(NETWORK_BAUD, 10)
 
 @dataclass
 class RealPort(Bench):
-    """What passes is kept; the port is a real one."""
+    """A real port that keeps the bytes."""
 
     where: Where = SerialPath("")  # noqa: RUF009 - immutable
 
@@ -89,7 +90,7 @@ PEERS = {
     "pymodbus-rtu-over-tcp": (ModbusRtu(station=1), pymodbus("rtu", tcp=True)),
     "pymodbus-ascii-over-tcp": (ModbusAscii(station=1), pymodbus("ascii", tcp=True)),
     "pymodbus-tcp": (ModbusTcp(), pymodbus("socket", tcp=True)),
-    # No window with pymodbus: its server forgets what else has come when it answers.
+    # No window with pymodbus: its server drops other received requests when it replies.
     "libmodbus-pty": (ModbusRtu(station=1), libmodbus(tcp=False)),
     "libmodbus-tcp": (ModbusTcp(), libmodbus(tcp=True)),
     "libmodbus-tcp-window": (ModbusTcp(window=8), libmodbus(tcp=True)),
@@ -123,6 +124,16 @@ def expected(text: str) -> int | bool:
     return number % 3 == 0
 
 
+async def _write_and_read(line: Plant, device: Device, text: str, value: int) -> None:
+    tag = next(tag for tag in device.tags if tag.text == text)
+    outcome = Outcome(0.0)
+    line.line.submit(device, tag, tag.encode(value), outcome)
+    await until(lambda: bool(outcome.outcomes))
+    assert isinstance(outcome.once, WriteResult)
+    assert outcome.once.verified
+    await until(lambda: line.now[tag].value == value)
+
+
 async def until(happened: Callable[[], bool]) -> None:
     async with asyncio.timeout(10):
         while not happened():
@@ -132,7 +143,7 @@ async def until(happened: Callable[[], bool]) -> None:
 @pytest.mark.usefixtures("socat")
 @pytest.mark.parametrize("name", PEERS)
 async def test_a_whole_line_with(name: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
-    """Every value is right, the register that is not there is found, writes are read back."""
+    """Every value is right, the missing register is found, writes are read back."""
     driver, peer = PEERS[name]
     async with peer(request, tmp_path) as where:
         wire = NETWORK if isinstance(where, TcpAddress) else SERIAL
@@ -147,13 +158,7 @@ async def test_a_whole_line_with(name: str, request: pytest.FixtureRequest, tmp_
                 tag.text: expected(tag.text) for tag in there
             }
             for text, value in (("holding:100", 0xBEEF), ("coil:4", True), ("coil:3", False)):
-                tag = next(tag for tag in device.tags if tag.text == text)
-                outcome = Outcome(0.0)
-                line.line.submit(device, tag, tag.encode(value), outcome)
-                await until(lambda outcome=outcome: bool(outcome.outcomes))
-                assert isinstance(outcome.once, WriteResult)
-                assert outcome.once.verified
-                await until(lambda tag=tag, value=value: line.now[tag].value == value)
+                await _write_and_read(line, device, text, value)
         assert device.record.failures == {}
         assert device.record.exchanges > 20
 
@@ -162,7 +167,7 @@ async def test_a_whole_line_with(name: str, request: pytest.FixtureRequest, tmp_
 async def test_direct_commands_read_and_write_a_slave(
     request: pytest.FixtureRequest, tmp_path: Path
 ) -> None:
-    """In a process of their own, from the file to the exit code."""
+    """In a process of its own, from the file to the exit code."""
     async with libmodbus(tcp=False)(request, tmp_path) as where:
         assert isinstance(where, SerialPath)
         tags = {

@@ -1,7 +1,8 @@
-"""Lists registered in the PLC: chosen where cheaper, registered anew after any trouble."""
+"""Monitor lists: chosen if they cost less, registered again after every fault."""
 
 import asyncio
 import random
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -11,6 +12,7 @@ from gateway.planning.monitor_lists import with_monitor_list
 from gateway.planning.planner import Block
 from gateway.protocols.computer_link import ComputerLink, Nak
 from gateway.protocols.vigor import Vigor
+from gateway.stations.computer_link import ComputerLinkStation
 from gateway.stations.computer_link.devices import Cells, Kind
 from gateway.tags import Quality, Reason, Sample
 from tests.sim.links import commands, link_device, link_plant, spelt
@@ -50,11 +52,11 @@ def test_scattered_addresses_are_read_by_a_list(addresses: list[str]) -> None:
     ("addresses", "settings"),
     [
         ([f"D{n}" for n in range(40)], {}),  # neighbours
-        (["D0"], {}),  # one: a list saves no exchange
+        (["D0"], {}),  # one: a list saves no transaction
         (["C200", "C240"], {}),  # 32 bits: MN cannot
         (SCATTERED, {"monitor": False}),
     ],
-    ids=["neighbours", "a single one", "32 bits", "not wanted"],
+    ids=["neighbours", "a single one", "32 bits", "disabled"],
 )
 def test_no_list_if_it_saves_nothing_or_is_disabled(
     addresses: list[str], settings: dict[str, Any]
@@ -124,12 +126,12 @@ async def test_a_list_is_registered_once_and_then_read() -> None:
 
 
 async def _lost(line: Plant) -> None:
-    line.stations[0].inner.forget_monitor()  # type: ignore[attr-defined]
+    _link_station(line).forget_monitor()
 
 
 async def _power_cycle(line: Plant) -> None:
     line.stations[0].mute = True
-    line.stations[0].inner.power_cycle()  # type: ignore[attr-defined]
+    _link_station(line).power_cycle()
     await asyncio.sleep(0.7)
     line.stations[0].mute = False
 
@@ -143,15 +145,16 @@ async def _timed_out(line: Plant) -> None:
 
 
 async def _line_lost(line: Plant) -> None:
-    """Another computer used the port meanwhile, and left a list of the same length."""
+    """Another computer uses the port meanwhile and leaves a list of the same length."""
     line.bench.vanish()
     _other_list(line)
     await asyncio.sleep(1)
     line.bench.come_back()
 
 
-async def _somebody_else_spoke(line: Plant) -> None:
-    """Another computer on the wire registered a list of the same length, and was heard."""
+async def _other_computer(line: Plant) -> None:
+    """Another computer on the wire registers a list of the same length; the line receives it."""
+    # Private: nothing outside shows that no transaction is open.
     while line.line._turn is not None:
         await asyncio.sleep(0.001)
     _other_list(line)
@@ -159,16 +162,37 @@ async def _somebody_else_spoke(line: Plant) -> None:
 
 
 def _other_list(line: Plant) -> None:
-    station = line.stations[0].inner
-    station._words = [Cells("D", 3900 + i, 1, Kind.WORDS) for i in range(len(SCATTERED))]  # type: ignore[attr-defined]
+    # Private: a frame of another computer would also reach the line under test.
+    _link_station(line)._words = [
+        Cells("D", 3900 + i, 1, Kind.WORDS) for i in range(len(SCATTERED))
+    ]
 
 
-TROUBLES = [_lost, _power_cycle, _timed_out, _line_lost, _somebody_else_spoke]
+def _link_station(line: Plant) -> ComputerLinkStation:
+    station: object = line.stations[0].inner
+    assert isinstance(station, ComputerLinkStation)
+    return station
 
 
-@pytest.mark.parametrize("trouble", TROUBLES, ids=lambda trouble: trouble.__name__[1:])
+def _intercept(line: Plant, reply: Callable[[str], object]) -> None:
+    """Lets `reply` answer; for NotImplemented the station itself answers."""
+    station: Any = _link_station(line)
+    # Private: no setting of the station refuses or loses single commands.
+    answer = station._answer
+
+    def intercepted(text: str, at: float) -> object:
+        found = reply(text)
+        return answer(text, at) if found is NotImplemented else found
+
+    station._answer = intercepted
+
+
+FAULTS = [_lost, _power_cycle, _timed_out, _line_lost, _other_computer]
+
+
+@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.__name__[1:])
 @on_virtual_time
-async def test_after_every_fault_the_list_is_registered_again(trouble: Any) -> None:
+async def test_after_every_fault_the_list_is_registered_again(fault: Any) -> None:
     line, dev = one(*SCATTERED)
     station = line.stations[0]
     clockwork(station.memory, [int(text[1:]) for text in SCATTERED])
@@ -177,7 +201,7 @@ async def test_after_every_fault_the_list_is_registered_again(trouble: Any) -> N
         await asyncio.sleep(5)
         assert commands(station).count("WM") == 1
         since = now()
-        await trouble(line)
+        await fault(line)
         await asyncio.sleep(10)
         assert line.good(dev)
         assert dev.lists
@@ -185,30 +209,21 @@ async def test_after_every_fault_the_list_is_registered_again(trouble: Any) -> N
         again = commands(station, since)
         assert again.count("WM") == 1
         assert again[-1] == "MN"
-        told = [sample for at, sample in line.told if at >= since]
-        assert 7777 not in {sample.value for sample in told}
-        assert not [s for s in told if s.reason is Reason.REFUSED]
+        published = [sample for at, sample in line.told if at >= since]
+        assert 7777 not in {sample.value for sample in published}
+        assert not [s for s in published if s.reason is Reason.REFUSED]
 
 
 @on_virtual_time
 async def test_a_registration_without_an_acknowledgement_is_repeated() -> None:
-    """Two lists of one length: the PLC still holds the other."""
+    """The PLC still holds another list of the same length."""
     line, dev = one(*SCATTERED)
     station = line.stations[0]
     clockwork(station.memory, [int(text[1:]) for text in SCATTERED])
     station.memory.write("D", 3900, [7777] * len(SCATTERED))
     _other_list(line)
-    original = station.inner._answer
-    deaf = 2
-
-    def sometimes(text: str, at: float) -> Any:
-        nonlocal deaf
-        if text[4:6] == "WM" and deaf:
-            deaf -= 1
-            return None
-        return original(text, at)
-
-    station.inner._answer = sometimes  # type: ignore[method-assign,assignment]
+    lost = [None, None]
+    _intercept(line, lambda text: lost.pop() if text[4:6] == "WM" and lost else NotImplemented)
     async with running(line):
         await asyncio.sleep(20)
         assert line.good(dev)
@@ -246,12 +261,8 @@ async def test_a_bad_address_is_found_and_the_others_are_listed_again() -> None:
 async def test_a_plc_without_these_commands_is_read_without_lists() -> None:
     line, dev = one(*SCATTERED)
     station = line.stations[0]
-    original = station.inner._answer
-    station.inner._answer = (
-        lambda text, at: (  # type: ignore[method-assign]
-            Nak(5, "03") if text[4:6] == "WM" else original(text, at)
-        )
-    )
+    refused = Nak(5, "03")
+    _intercept(line, lambda text: refused if text[4:6] == "WM" else NotImplemented)
     async with running(line):
         await asyncio.sleep(10)
         assert line.good(dev)
@@ -262,11 +273,12 @@ async def test_a_plc_without_these_commands_is_read_without_lists() -> None:
 
 @on_virtual_time
 async def test_a_change_of_blocks_keeps_the_age_of_the_values() -> None:
-    """When the device fails before the new requests were asked once, old values still turn bad."""
+    """Old values become bad also when the device fails before the first read of the new blocks."""
     line, dev = one(*SCATTERED, every=2.0, reply_timeout=1.0, guard=1.0, retries=20)
     async with running(line):
         await asyncio.sleep(5)
         assert line.good(dev)
+        # Private: no frame makes the line plan again without a change of blocks.
         line.line._then._replan(dev)
         dev.lists = False
         line.line._then._replan(dev)
@@ -275,17 +287,17 @@ async def test_a_change_of_blocks_keeps_the_age_of_the_values() -> None:
         assert {line.now[tag].quality for tag in dev.tags} == {Quality.BAD}
 
 
-# All of it at once
+# All faults at once
 
 
 class Witness:
-    """Checks every good value against the clock during the exchange that fetched it."""
+    """Checks every good value against the clock during the transaction that read it."""
 
     def __init__(self, plant: Plant) -> None:
         self.plant = plant
         self.right = 0
         self.wrong: list[tuple[float, str, int]] = []
-        plant.line._sink = self
+        plant.line._sink = self  # private: the plant of these tests has one sink
 
     def online(self, device: Device, online: bool) -> None: ...
 
@@ -317,7 +329,7 @@ async def test_no_fault_of_the_list_gives_a_wrong_good_value(seed: int) -> None:
     async with running(line):
         for _ in range(150):
             await asyncio.sleep(chance.uniform(0.1, 6))
-            await chance.choice([_lost, _power_cycle, _line_lost, _somebody_else_spoke])(line)
+            await chance.choice([_lost, _power_cycle, _line_lost, _other_computer])(line)
         station.late, station.lose = (lambda _: 0.0), 0.0
         await asyncio.sleep(60)
         before = witness.right

@@ -13,7 +13,8 @@ from gateway.errors import NoReply
 from gateway.tags import Publish, Quality, Reason, Sample, Tag, bad, good
 from gateway.tags.mirror import Mirror
 from gateway.tags.unchanged import Unchanged
-from tests.sim.plant import WIRE, device, make_tag
+from tests.sim.bench import WIRE
+from tests.sim.plant import device, make_tag
 from tests.sim.virtual import on_virtual_time
 
 
