@@ -1,4 +1,4 @@
-"""What is read again as it was: its time goes on, nothing else does, and no change is missed."""
+"""Repeated equal reads: only the time moves, and no change is missed."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import fields
@@ -6,48 +6,70 @@ from typing import Any
 
 import pytest
 
-from gateway.engine.device import Device
-from gateway.engine.jobs import Poll
-from gateway.engine.schedule import Schedule
+from gateway.engine.effects import Effect, Samples
+from gateway.engine.engine import Engine
+from gateway.engine.jobs import (
+    Poll,
+    Probe,
+    Result,
+    Resynced,
+    Settle,
+    Settled,
+    Traffic,
+    Transacted,
+)
 from gateway.errors import NoReply
 from gateway.tags import Publish, Quality, Reason, Sample, Tag, bad, good
 from gateway.tags.mirror import Mirror
 from gateway.tags.unchanged import Unchanged
 from tests.sim.bench import WIRE
 from tests.sim.plant import device, make_tag
-from tests.sim.virtual import on_virtual_time
 
 
 class Reader:
-    """A device that is read by hand into a mirror, a second between two readings."""
+    """An engine with one device, read into a mirror step by step, once a second."""
 
     def __init__(self, *tags: Tag) -> None:
-        self.device: Device = device(list(tags))
+        self.device = device(list(tags))
+        self.engine = Engine("line", [self.device], WIRE)
         self.mirror = Mirror(tags, 0)
         self.time = 0
-        self.news: list[Sample] = []
-        self.passed: Sequence[Sample] = ()
-        self.schedule = Schedule([self.device], 0.0)
-        self.then = Consequences("line", self.schedule, self, lambda: self.time)
-        self.device.health.answered()
-        self.schedule.plan(self.device, 0.0)
-        self.device.turnaround = WIRE.character  # set: not planned anew
+        self.published: list[Sample] = []
+        self.samples: Sequence[Sample] = ()
+        self.take(self.engine.opened(0.0))
 
-    def samples(self, samples: Sequence[Sample]) -> None:
-        self.passed = samples
-        self.news = self.mirror.update(samples)
+    def take(self, effects: Sequence[Effect]) -> None:
+        for effect in effects:
+            if isinstance(effect, Samples):
+                self.samples = effect.samples
+                self.published = self.mirror.update(effect.samples)
 
-    def online(self, device: Device, online: bool) -> None:
-        raise AssertionError("nobody asked for it")
+    def next(self) -> Poll:
+        """Returns the poll of the block. Answers the probes before it."""
+        now = float(self.time)
+        self.engine.expedite(self.device, self.device.tags[0])
+        job = self.engine.next(now)
+        while isinstance(job, Probe):
+            self.conclude(job, Resynced(99))
+            self.engine.expedite(self.device, self.device.tags[0])
+            job = self.engine.next(now)
+        assert isinstance(job, Poll)
+        return job
 
-    @property
-    def poll(self) -> Poll:
-        (poll,) = self.schedule.polls(self.device)
-        return poll
+    def conclude(self, job: Transacted, result: Result) -> None:
+        self.take(self.engine.conclude(job, result, Traffic(), float(self.time), self.time))
 
     def read(self, *units: int) -> None:
         self.time += 1
-        self.then.read(self.poll, units, float(self.time))
+        self.conclude(self.next(), units)
+
+    def fail(self) -> None:
+        """One poll without a reply."""
+        self.time += 1
+        self.conclude(self.next(), NoReply("no reply"))
+        settle = self.engine.next(float(self.time))
+        assert isinstance(settle, Settle)
+        self.conclude(settle, Settled(None))
 
 
 TWO = ("D0", "D1")
@@ -58,12 +80,12 @@ def test_the_third_equal_read_only_moves_the_time() -> None:
     reader = Reader(*tags)
     for _ in range(3):
         reader.read(7, 8)
-    assert isinstance(reader.passed, Unchanged)
-    assert reader.news == []
+    assert isinstance(reader.samples, Unchanged)
+    assert reader.published == []
     assert [reader.mirror[a], reader.mirror[b]] == [good(a, 7, 3), good(b, 8, 3)]
     assert list(reader.mirror.samples()) == [good(a, 7, 3), good(b, 8, 3)]
-    assert list(reader.passed) == [good(a, 7, 3), good(b, 8, 3)]
-    assert reader.passed[1:] == [good(b, 8, 3)]
+    assert list(reader.samples) == [good(a, 7, 3), good(b, 8, 3)]
+    assert reader.samples[1:] == [good(b, 8, 3)]
 
 
 def test_a_change_after_any_number_of_equal_reads_is_published() -> None:
@@ -74,7 +96,7 @@ def test_a_change_after_any_number_of_equal_reads_is_published() -> None:
             reader.read(7, 8)
         reader.read(7, count)
         assert reader.mirror[b] == good(b, count, reader.time)
-        assert reader.news[-1] == good(b, count, reader.time)
+        assert reader.published[-1] == good(b, count, reader.time)
         assert reader.mirror[a] == good(a, 7, reader.time)
 
 
@@ -86,7 +108,7 @@ def test_a_bad_value_becomes_good_again_with_equal_words(
     reader = Reader(*tags)
     for _ in range(before):
         reader.read(7, 8)
-    reader.then.bad([b], Reason.NO_REPLY, "gone")
+    reader.mirror.update([bad(b, Reason.NO_REPLY, before)])
     assert reader.mirror[b].quality is Quality.BAD
     assert reader.mirror[a] == good(a, 7, before)
     for _ in range(3):
@@ -96,13 +118,13 @@ def test_a_bad_value_becomes_good_again_with_equal_words(
 
 
 def test_another_value_in_between_is_replaced() -> None:
-    """A block read late, when another that holds its tags was asked for already."""
+    """From another block with the tag, or from an unsolicited frame."""
     a, b = tags = [make_tag(text) for text in TWO]
     reader = Reader(*tags)
     for before in (1, 2, 3):
         for _ in range(before):
             reader.read(7, 8)
-        reader.samples([good(a, 666, reader.time)])
+        reader.mirror.update([good(a, 666, reader.time)])
         for _ in range(2):
             reader.read(7, 8)
             assert reader.mirror[a] == good(a, 7, reader.time)
@@ -125,11 +147,11 @@ def test_words_without_a_value_keep_the_time_they_became_bad() -> None:
 def test_heartbeat_and_always_publish_equal_reads(settings: dict[str, Any]) -> None:
     eager, quiet = make_tag("D0", **settings), make_tag("D1")
     reader = Reader(eager, quiet)
-    told = []
+    published = []
     for _ in range(9):
         reader.read(7, 8)
-        told += [sample.time for sample in reader.news if sample.tag is eager]
-    assert told == (list(range(1, 10)) if "publish" in settings else [1, 3, 5, 7, 9])
+        published += [sample.time for sample in reader.published if sample.tag is eager]
+    assert published == (list(range(1, 10)) if "publish" in settings else [1, 3, 5, 7, 9])
 
 
 def test_new_blocks_share_no_samples_with_old_ones() -> None:
@@ -137,20 +159,22 @@ def test_new_blocks_share_no_samples_with_old_ones() -> None:
     reader = Reader(*tags)
     for _ in range(3):
         reader.read(7, 8)
-    old = reader.poll
+    reader.time += 1
+    old = reader.next()
     reader.device.plan()
-    reader.schedule.plan(reader.device, 3.0)
-    assert reader.poll is not old
+    reader.engine.schedule.plan(reader.device, float(reader.time))
+    reader.conclude(old, (7, 8))
     for _ in range(3):
         reader.read(9, 9)
-    reader.then.read(old, (7, 8), 6.0)  # it had been asked before
+        assert [reader.mirror[tag].value for tag in (a, b)] == [9, 9]
+    reader.conclude(old, (7, 8))  # again, after reads of the new block
     for _ in range(3):
         reader.read(9, 9)
         assert [reader.mirror[tag].value for tag in (a, b)] == [9, 9]
 
 
 class Interrupted(Tag):
-    """A tag; whoever looks it up in a dict is interrupted by the last of `by`."""
+    """A tag: each look-up in a dict calls the last function of `by` first."""
 
     by: list[Callable[[], None]] = []  # noqa: RUF012  (emptied by each test)
 
@@ -161,14 +185,14 @@ class Interrupted(Tag):
 
 
 def interrupted(again: int) -> tuple[Tag, Mirror]:
-    """A tag that was 1 at 1000, and still when it was read `again`."""
+    """A tag that was 1 at 1000, and still 1 at the read `again`."""
     plain = make_tag("D0")
     tag = Interrupted(**{f.name: getattr(plain, f.name) for f in fields(plain) if f.init})
     mirror = Mirror([tag], 0)
-    told = [good(tag, 1, 1000)]
-    mirror.update(told)
+    samples = [good(tag, 1, 1000)]
+    mirror.update(samples)
     if again > 1000:
-        mirror.update(Unchanged(told, again))
+        mirror.update(Unchanged(samples, again))
     return tag, mirror
 
 
@@ -183,13 +207,13 @@ def at_look_up(number: int, do: Callable[[], None]) -> None:
 @pytest.mark.parametrize("again", [1000, 1500])
 @pytest.mark.parametrize("number", [1, 2, 3])
 def test_a_change_during_a_look_up_never_mixes_value_and_time(number: int, again: int) -> None:
-    """As an answering thread is by the event loop, wherever it likes."""
+    """The event loop may change the sample during a look-up by an answering thread."""
     tag, mirror = interrupted(again)
 
     def change() -> None:
-        told = [good(tag, 2, 2000)]
-        mirror.update(told)
-        mirror.update(Unchanged(told, 3000))
+        samples = [good(tag, 2, 2000)]
+        mirror.update(samples)
+        mirror.update(Unchanged(samples, 3000))
 
     at_look_up(number, change)
     seen = mirror[tag]
@@ -210,14 +234,13 @@ def test_a_look_up_during_a_change_finds_the_old_or_the_new_sample(number: int, 
     assert seen[0] in [good(tag, 1, again), good(tag, 2, 2000)]
 
 
-@on_virtual_time
-async def test_a_failure_between_two_equal_reads_makes_the_value_bad() -> None:
+def test_a_failure_between_two_equal_reads_makes_the_value_bad() -> None:
     tag = make_tag("D0")
     reader = Reader(tag)
     for _ in range(3):
         reader.read(7)
-    reader.poll.tries = 99
-    reader.then.unread(reader.poll, NoReply("no reply"))
+    while reader.mirror[tag].quality is Quality.GOOD:
+        reader.fail()
     assert reader.mirror[tag].quality is Quality.BAD
     reader.read(7)
-    assert reader.news == [good(tag, 7, 4)]
+    assert reader.published == [good(tag, 7, reader.time)]
