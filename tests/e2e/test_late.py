@@ -12,9 +12,9 @@ from gateway.protocols.modbus import ModbusAscii, ModbusRtu
 from gateway.simulator.serve import serve_on_pty
 from gateway.stations.modbus import ModbusStation
 from gateway.transport import Receiver, SerialPath, SerialSettings, open_port
-from tests.line.test_line import Witness
 from tests.sim.bench import Bench, Unruly
 from tests.sim.plant import Plant, clock_word, make_tag, running
+from tests.sim.witness import Witness
 
 WIRE = WireTiming(115200, 10)
 TIMEOUT, SECONDS = 0.05, 6.0

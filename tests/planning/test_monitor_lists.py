@@ -14,10 +14,11 @@ from gateway.protocols.computer_link import ComputerLink, Nak
 from gateway.protocols.vigor import Vigor
 from gateway.stations.computer_link import ComputerLinkStation
 from gateway.stations.computer_link.devices import Cells, Kind
-from gateway.tags import Quality, Reason, Sample
+from gateway.tags import Quality, Reason
 from tests.sim.links import commands, link_device, link_plant, spelt
-from tests.sim.plant import Plant, clock_word, clockwork, running
+from tests.sim.plant import Plant, clockwork, running
 from tests.sim.virtual import on_virtual_time
+from tests.sim.witness import Witness
 
 SCATTERED = [f"D{n}" for n in range(0, 3000, 400)]
 POINTS = [f"M{n}" for n in range(0, 1000, 100)]
@@ -85,11 +86,11 @@ def test_a_list_never_costs_more_and_every_tag_is_read_once() -> None:
 
 def test_refused_addresses_are_in_no_list() -> None:
     _, dev = one(*SCATTERED)
-    dev.lists = False
+    dev.allow_lists(False)
     dev.plan()
     bad = next(block for block in dev.blocks if block.tags[0].text == "D800")
     dev.bad_addresses.refused(bad, 0, "06")
-    dev.lists = True
+    dev.allow_lists(True)
     dev.plan()
     [block] = listed(dev)
     assert {tag.text for tag in block.tags} == set(SCATTERED) - {"D800"}
@@ -139,7 +140,7 @@ async def _power_cycle(line: Plant) -> None:
 async def _timed_out(line: Plant) -> None:
     station = line.stations[0]
     station.late = lambda _: 0.4
-    while not line.engine.devices[0].failures:
+    while not line.devices[0].health.consecutive_failures:
         await asyncio.sleep(0.01)
     station.late = lambda _: 0.0
 
@@ -155,7 +156,7 @@ async def _line_lost(line: Plant) -> None:
 async def _other_computer(line: Plant) -> None:
     """Another computer on the wire registers a list of the same length; the line receives it."""
     # Private: nothing outside shows that no transaction is open.
-    while line.line._turn is not None:
+    while line.line._transaction is not None:
         await asyncio.sleep(0.001)
     _other_list(line)
     line.bench.received(b"\x0505FFWM0")
@@ -204,8 +205,9 @@ async def test_after_every_fault_the_list_is_registered_again(fault: Any) -> Non
         await fault(line)
         await asyncio.sleep(10)
         assert line.good(dev)
-        assert dev.lists
         assert listed(dev)
+        dev.plan()
+        assert listed(dev)  # lists are still allowed
         again = commands(station, since)
         assert again.count("WM") == 1
         assert again[-1] == "MN"
@@ -278,42 +280,16 @@ async def test_a_change_of_blocks_keeps_the_age_of_the_values() -> None:
     async with running(line):
         await asyncio.sleep(5)
         assert line.good(dev)
-        # Private: no frame makes the line plan again without a change of blocks.
-        line.line._then._replan(dev)
-        dev.lists = False
-        line.line._then._replan(dev)
+        for lists in (True, False):
+            dev.allow_lists(lists)
+            dev.plan()
+            line.line.engine.schedule.plan(dev, now())
         line.stations[0].mute = True
         await asyncio.sleep(8)
         assert {line.now[tag].quality for tag in dev.tags} == {Quality.BAD}
 
 
 # All faults at once
-
-
-class Witness:
-    """Checks every good value against the clock during the transaction that read it."""
-
-    def __init__(self, plant: Plant) -> None:
-        self.plant = plant
-        self.right = 0
-        self.wrong: list[tuple[float, str, int]] = []
-        plant.line._sink = self  # private: the plant of these tests has one sink
-
-    def online(self, device: Device, online: bool) -> None: ...
-
-    def samples(self, samples: Any) -> None:
-        sample: Sample
-        began = self.plant.bench.sent[-1][0] if self.plant.bench.sent else 0.0
-        for sample in samples:
-            if sample.quality is not Quality.GOOD:
-                continue
-            n, value = sample.tag.address.number, sample.value
-            assert isinstance(value, int)
-            age = (clock_word(now(), n) - value) % 65536
-            if age <= (now() - began) * 1000 + 1:
-                self.right += 1
-            else:
-                self.wrong.append((now(), sample.tag.key, age))
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
