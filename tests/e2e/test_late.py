@@ -5,7 +5,6 @@ import random
 from dataclasses import dataclass
 from typing import Any
 
-from gateway.engine.device import Device
 from gateway.planning.wire_timing import WireTiming
 from gateway.protocols.driver import Timing
 from gateway.protocols.modbus import ModbusAscii, ModbusRtu
@@ -13,7 +12,7 @@ from gateway.simulator.serve import serve_on_pty
 from gateway.stations.modbus import ModbusStation
 from gateway.transport import Receiver, SerialPath, SerialSettings, open_port
 from tests.sim.bench import Bench, Unruly
-from tests.sim.plant import Plant, clock_word, make_tag, running
+from tests.sim.plant import Plant, clock_word, made_device, make_tag, running
 from tests.sim.witness import Witness
 
 WIRE = WireTiming(115200, 10)
@@ -51,7 +50,7 @@ async def _no_wrong_value(kind: type[ModbusRtu | ModbusAscii]) -> None:
         inner.memory.animate("holding", n, lambda at, n=n: clock_word(at, n))
     station = Unruly(inner, 3, late=late, wire=WIRE)
     timing: Timing = driver.timing
-    device = Device(
+    device = made_device(
         "slave",
         driver,
         WIRE,

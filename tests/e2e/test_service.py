@@ -1,4 +1,4 @@
-"""What a gateway does with its files and its wire: begun twice, begun again, with a broken part."""
+"""The files and the wire of a gateway: started twice, started again, with a broken part."""
 
 import asyncio
 import json
@@ -7,7 +7,7 @@ import os
 import socket
 import sys
 import time
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Iterator, Sequence
 from contextlib import asynccontextmanager, contextmanager
 from pathlib import Path
 from typing import Any
@@ -15,9 +15,11 @@ from typing import Any
 import pytest
 
 from gateway import service
+from gateway.app import Gateway
+from gateway.config import load
 from gateway.history import Historian
 from gateway.northbound.inbox import Inbox
-from gateway.tags import good
+from gateway.tags import Sample, good
 from tests.e2e.processes import (
     Program,
     free_port,
@@ -28,14 +30,14 @@ from tests.e2e.processes import (
     vigor_line,
     write_config,
 )
-from tests.history_writer import WEEK, tag
+from tests.history_writer import WEEK
 from tests.history_writer import until as history_says
 from tests.zenoh_peer import ZenohPeer, free_endpoint
 
 TAGS = {f"d{n}": {"address": f"D{n}"} for n in range(700, 708)}
-# The command itself; only that the state is written at once when there is news.
+# The command itself, with a state file that is written more often.
 SOON = "import gateway.service as s; s.KEEP_EVERY = 0.05; from gateway.cli.main import main; main()"
-# The command itself, with a history that fails as soon as there is something to store.
+# The command itself, with a history that fails at the first sample.
 BROKEN = """
 from gateway.history.file import HistoryFile
 def store(self, run, start, samples): raise IndexError("the history is broken")
@@ -45,7 +47,7 @@ from gateway.cli.main import main; main()
 
 
 class Wire:
-    """A device server that nobody answers from: whether anybody connected."""
+    """A device server without a PLC. `touched`: a client has connected."""
 
     def __init__(self) -> None:
         self.touched = False
@@ -64,7 +66,7 @@ async def wire(number: int) -> AsyncIterator[Wire]:
 
 @contextmanager
 def taken(endpoint: str) -> Iterator[None]:
-    """As a gateway that runs already has it."""
+    """Keeps the port of the endpoint, as a running gateway does."""
     with socket.create_server(("127.0.0.1", int(endpoint.rpartition(":")[2]))):
         yield
 
@@ -103,7 +105,7 @@ def test_a_client_keeps_history_while_it_waits_for_its_router(tmp_path: Path) ->
     with gateway("run", path) as program:
         program.says("no Zenoh router yet")
         program.says("history ready")
-        program.says("device answers")
+        program.says("device online")
         assert program.end() == 0
 
 
@@ -185,34 +187,41 @@ async def test_a_failing_history_does_not_stop_publishing(tmp_path: Path) -> Non
 
 
 async def test_a_published_value_is_found_by_the_next_query(tmp_path: Path) -> None:
-    """One turn of the loop: a line tells something, then what has arrived is taken."""
-    speed = tag("speed")
+    """In one turn of the loop a line has a sample, and then the inbox takes the queries."""
+    lines = {"hall": vigor_line("simulator", {"speed": {"address": "D10", "history": True}})}
+    path = write_config(tmp_path / "config.yaml", free_endpoint(), lines, history={"path": "h.db"})
+    whole = Gateway(load(path))
+    speed = whole.tag("mixer/speed")
+    assert speed is not None
     found: dict[str, list[object]] = {}
 
-    def answer(question: str) -> None:
-        found[question] = [sample.value for sample in historian.samples(speed, "[..]", None)]
+    def answer(query: str) -> None:
+        found[query] = [sample.value for sample in historian.samples(speed, "[..]", None)]
 
     class Network:
-        def publish(self, _news: object) -> None:
-            inbox("of who has just seen it")
+        def publish(self, samples: Sequence[Sample]) -> None:
+            inbox("after the sample")
+
+        def set_online(self, device: str, online: bool) -> None: ...
 
     historian = Historian(tmp_path / "h.db", WEEK, 10**8)
     historian.start()
     await asyncio.to_thread(history_says, historian, state="ok")
     inbox = Inbox(answer, lambda _: None)
-    network: Any = Network()
-    loop = asyncio.get_running_loop()
-    loop.call_soon(service._both(historian, network), [good(speed, 1, time.time_ns())])
-    inbox("an earlier one")  # so that those that come now are taken in the same turn
+    whole.subscribe(Network())
+    # Private: the service subscribes it after Zenoh, and that order is the subject.
+    whole.subscribe(service._Recording(historian))
+    asyncio.get_running_loop().call_soon(whole.samples, [good(speed, 1, time.time_ns())])
+    inbox("before the sample")  # the inbox takes both in the same turn of the loop
     for _ in range(3):
         await asyncio.sleep(0)
-    assert found == {"an earlier one": [1], "of who has just seen it": [1]}
+    assert found == {"before the sample": [1], "after the sample": [1]}
     assert await asyncio.to_thread(historian.close)
 
 
 def test_a_stalled_disk_does_not_delay_the_end(tmp_path: Path) -> None:
     path, _, _ = _plant(tmp_path)
-    os.mkfifo(tmp_path / "state.json.new")  # whose writer waits for a reader
+    os.mkfifo(tmp_path / "state.json.new")  # a pipe: the write waits for a reader
     with Program(sys.executable, "-c", SOON, "run", path) as program:
         program.says("Zenoh session ready")
         assert program.end() == 0
@@ -221,7 +230,7 @@ def test_a_stalled_disk_does_not_delay_the_end(tmp_path: Path) -> None:
 
 
 async def test_history_gets_the_time_that_zenoh_leaves() -> None:
-    """Together less than the 2 s in which the gateway ends."""
+    """The gateway ends within 2 s in all."""
     zenoh_takes = 0.3
 
     class Disk:
@@ -237,11 +246,12 @@ async def test_history_gets_the_time_that_zenoh_leaves() -> None:
         finally:
             await asyncio.sleep(zenoh_takes)
 
-    history, notebook = Disk(), Disk()
+    history, state_file = Disk(), Disk()
     as_history: Any = history
-    as_notebook: Any = notebook
+    as_state_file: Any = state_file
     face = asyncio.create_task(zenoh())
     await asyncio.sleep(0)
-    await service._put_away(face, as_history, as_notebook)
+    # Private: the order and the times of the end are the subject; `run` needs signals and ports.
+    await service._put_away(face, as_history, as_state_file)
     assert history.given <= service.END_WITHIN - zenoh_takes < 2
-    assert notebook.given <= service.KEPT_WITHIN
+    assert state_file.given <= service.KEPT_WITHIN

@@ -39,7 +39,7 @@ def set_up(folder: Path, zenoh: dict[str, object], client: str) -> Iterator[Stor
     (folder / "scada.json5").write_text(client, encoding="utf-8")
     with started(path) as program:
         for _ in range(3):
-            program.says("device answers")
+            program.says("device online")
         yield Story(folder, path)
 
 

@@ -167,7 +167,7 @@ def test_restarts_leave_nothing_behind(tmp_path: Path) -> None:
         for number in range(RESTARTS):
             kindly = number % 2 == 1
             with started(config) as service:
-                service.says("device answers")
+                service.says("device online")
                 assert not service.has_said("line down")
                 assert not service.has_said("history failed")
                 pid = service.pid

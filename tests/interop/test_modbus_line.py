@@ -14,12 +14,12 @@ import pytest
 from gateway.engine.device import Device
 from gateway.planning.wire_timing import NETWORK_BAUD, WireTiming
 from gateway.protocols.modbus import ModbusAscii, ModbusRtu, ModbusTcp
-from gateway.tags import Quality, Reason, WriteResult, WriteRule
+from gateway.tags import Quality, Reason, WriteRule
 from gateway.transport import Receiver, SerialPath, SerialSettings, TcpAddress, open_port
 from tests.e2e.processes import plc_gateway, write_config
 from tests.interop.peers import HERE, free_port, pty_pair, running
 from tests.sim.bench import Bench
-from tests.sim.plant import Outcome, Plant, made_device, make_tag
+from tests.sim.plant import Plant, made_device, make_tag
 from tests.sim.plant import running as serving
 from tests.zenoh_peer import free_endpoint
 
@@ -126,11 +126,9 @@ def expected(text: str) -> int | bool:
 
 async def _write_and_read(line: Plant, device: Device, text: str, value: int) -> None:
     tag = next(tag for tag in device.tags if tag.text == text)
-    outcome = Outcome(0.0)
-    line.line.submit(device, tag, tag.encode(value), outcome)
-    await until(lambda: bool(outcome.outcomes))
-    assert isinstance(outcome.once, WriteResult)
-    assert outcome.once.verified
+    async with asyncio.timeout(10):
+        result = await line.line.write(device, tag, tag.encode(value))
+    assert result.verified
     await until(lambda: line.now[tag].value == value)
 
 

@@ -4,18 +4,20 @@ import asyncio
 import importlib
 import time
 from collections.abc import Coroutine
+from dataclasses import replace
 from typing import Any, TypeVar
 
 import pytest
-from gateway.line.clock import Clock
 
-from gateway.line.transaction import Turn
-from gateway.line.wire_log import Recorder
+from gateway.line.channel import Channel
+from gateway.line.transaction import Transaction
+from gateway.line.wire_log import WireLog
 from gateway.planning.wire_timing import WireTiming
 from gateway.protocols.driver import Span
 from gateway.protocols.modbus import ModbusRtu
 from gateway.transport import SerialPath, SerialSettings, loop, open_port
 from tests.conftest import lacking
+from tests.sim.plant import made_device, make_tag
 from tests.transport.ends import PtyMaster, RecordingReceiver
 from tests.vectors import vectors
 
@@ -75,11 +77,13 @@ def test_the_silence_before_a_request_is_kept_although_timers_fire_early() -> No
             pass
 
     async def broadcasts() -> None:
-        port, driver, clock = SilentPort(), ModbusRtu(station=0), Clock(spin=0.001)
+        port, driver = SilentPort(), ModbusRtu(station=0)
+        timing = replace(driver.timing, silence=silence, silence_chars=0.0)
+        device = made_device("all", driver, wire, timing, [make_tag("coil:0", driver)])
+        channel = Channel(port, wire, WireLog("line"), None)
         for _ in range(100):
-            port.quiet_since = clock.quiet_since = asyncio.get_running_loop().time()
-            turn = Turn(port, driver.codec, wire, silence, 0.1, clock, Recorder("line"), station=0)
-            await driver.write(turn, Span("coil", 0, 1), [1])
+            port.quiet_since = channel.quiet_since = asyncio.get_running_loop().time()
+            await driver.write(Transaction(channel, device), Span("coil", 0, 1), [1])
 
     run(broadcasts())
     assert len(kept) == 100
