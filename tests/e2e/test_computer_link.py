@@ -95,7 +95,7 @@ async def test_a_plc_that_loses_its_list_and_sends_unsolicited_frames(oven: Oven
         await heard.next(lambda s: s.json.get("value") == 21.5)
         assert {"MB", "MN"} & set(oven.plc.tell("heard").split())
         oven.plc.tell("say 7777")
-        assert "on-demand data of station 5: 7777" in oven.gateway.says("nobody asked for this")
+        assert "on-demand data of station 5: 7777" in oven.gateway.says("stray frame")
         oven.plc.tell("forget")
         oven.plc.tell("set D0100 300")
         await heard.next(lambda s: s.json.get("value") == 30.0)
@@ -120,7 +120,7 @@ async def test_a_bad_address_and_an_offline_plc(oven: Oven) -> None:
         await heard.next(
             lambda s: s.key.endswith("temperature") and s.json.get("reason") == "no-reply"
         )
-        oven.gateway.says("device silent", "6306", "D8121")
+        oven.gateway.says("device offline", "6306", "D8121")
         oven.plc.tell("speak")
         heard.forget()
         await heard.next(lambda s: s.json.get("value") == 21.5, timeout=20)

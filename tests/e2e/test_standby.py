@@ -20,7 +20,7 @@ election.SETTLE_TIME = 2.0
 from gateway.cli.main import main
 main()
 """
-HOLD, CLAIM = 2.0, 1.5
+SETTLE_TIME, CLAIM_TIME = 2.0, 1.5
 
 
 class Wire:
@@ -101,7 +101,7 @@ async def test_two_gateways_of_a_group_share_one_wire(tmp_path: Path) -> None:
                 # The network goes and comes: nobody moves.
                 await router.kill()
                 async with ZenohPeer("router", listen=[router_at]):
-                    await asyncio.sleep(HOLD + CLAIM + 1)
+                    await asyncio.sleep(SETTLE_TIME + CLAIM_TIME + 1)
                     await stand_so(client, "active waiting")
                     assert (line.open, line.most) == (1, 1)
                     # A crash.
@@ -111,7 +111,7 @@ async def test_two_gateways_of_a_group_share_one_wire(tmp_path: Path) -> None:
                     # Whoever comes back later stands by, until the other is ended in order.
                     a = programs.enter_context(gateway(tmp_path, "a", router_at, port))
                     await stand_so(client, "waiting active")
-                    await asyncio.sleep(CLAIM + 1)
+                    await asyncio.sleep(CLAIM_TIME + 1)
                     await stand_so(client, "waiting active")
                     assert await asyncio.to_thread(b.end) == 0
                     await line.until(1, within=3)
