@@ -16,7 +16,7 @@ def lrc(data: bytes) -> int:
 
 
 def _crc_table() -> "array[int]":
-    """What each remainder becomes by two bytes of zeros: the sum of what its bits become."""
+    """Returns the remainder after two bytes, for each remainder: the sum of those of its bits."""
     table = array("H", [0])
     for bit in range(16):
         crc = 1 << bit
@@ -29,7 +29,7 @@ def _crc_table() -> "array[int]":
 _CRC = _crc_table()
 
 
-@lru_cache(maxsize=256)  # what is asked and answered is often what it was the last time
+@lru_cache(maxsize=256)  # requests and replies often repeat
 def crc16(data: bytes) -> bytes:
     """Modbus RTU: CRC-16, initial value FFFFh, polynomial A001h reflected; low byte first."""
     crc = 0xFFFF

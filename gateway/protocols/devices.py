@@ -1,7 +1,7 @@
-"""PLC device addresses as their makers write them (`D100`, `X17` octal, `D7.3`), read over a table.
+"""Parses PLC device addresses as their makers write them: `D100`, `X17` (octal), `D7.3`.
 
-The table lists the letters a device is written with and the areas they stand for, told
-apart by number: Vigor's `C` is a 16-bit word up to C199 and a 32-bit one from C200 on.
+A table lists the letters of a device and their areas, which differ by number: Vigor's `C` is a
+16-bit word up to C199 and a 32-bit one from C200 on.
 """
 
 import re
@@ -18,10 +18,10 @@ _DEVICE = re.compile(r"([A-Za-z]+)([0-9]{1,9})(?:\.([0-9]{1,9}))?")
 
 
 def parse_device(text: str, table: DeviceTable) -> Address:
-    """The address `text` names. Either case and leading zeros are accepted, nothing else is.
+    """Parses an address. Either case and leading zeros are accepted.
 
-    Numbers of octal areas come out as plain integers: X17 is number 15.
-    Raises `ConfigError` saying what would be right.
+    Numbers of octal areas become plain integers: X17 is number 15.
+    Raises `ConfigError` with a correct example.
     """
     match = _DEVICE.fullmatch(text)
     if match is None:
@@ -41,7 +41,7 @@ def parse_device(text: str, table: DeviceTable) -> Address:
 
 
 def spell_device(address: Address, table: DeviceTable) -> str:
-    """The maker's spelling: the inverse of `parse_device`."""
+    """Writes an address as its maker does: the inverse of `parse_device`."""
     for letters, areas in table.items():
         for area in areas:
             if area.name == address.area:
@@ -79,7 +79,7 @@ def _digits(number: int, area: Area) -> str:
 
 
 def _ranges(letters: str, areas: Sequence[Area]) -> str:
-    """`D0 to D8191 and D9000 to D9255`; areas that follow each other are told as one."""
+    """Returns `D0 to D8191 and D9000 to D9255`; adjacent areas are joined."""
     runs: list[tuple[int, int]] = []
     for area in sorted(areas, key=lambda area: area.first):
         if runs and runs[-1][1] + 1 == area.first:

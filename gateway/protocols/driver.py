@@ -1,4 +1,4 @@
-"""The driver contract: what a protocol must provide, and the only things it may do.
+"""The driver contract: the duties of a protocol, and the only things it may do.
 
 Two levels, neither of which does I/O. A `Codec` turns bytes into frames and back,
 synchronously. A `Driver` turns frames into words with `async def`; it can only send and
@@ -43,7 +43,7 @@ class Address(NamedTuple):
 
 
 class Span(NamedTuple):
-    """`size` neighbouring addresses of one area: what one request reads or writes."""
+    """`size` neighbouring addresses of one area: the data of one request."""
 
     area: str
     start: int
@@ -132,7 +132,7 @@ class Talk(Protocol[F]):
         reply are counted and skipped until the time-out. Several requests may be outstanding in
         one transaction (where replies carry a number); a frame goes to the first that takes it.
 
-        Raises `NoReply`, `Garbled`, `LineDown`, and what `answers` raises.
+        Raises `NoReply`, `Garbled`, `LineDown`, and the errors of `answers`.
         """
 
 
@@ -164,7 +164,7 @@ class Driver(Protocol[F]):
     def cost(self, span: Span) -> Cost | None:
         """Returns the cost of reading `span` in one request; None if that is impossible.
 
-        Exact, including what must be read around the span (bits are read in eights). If a span
+        Exact, with all that must be read around the span (bits are read in eights). If a span
         cannot be read in one request, no longer span around it can.
         """
 
@@ -279,10 +279,10 @@ class EchoConflict(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScanHints:
-    """How `scan` looks for stations of a protocol."""
+    """Settings of `scan` for a protocol."""
 
     formats: Sequence[str] = ("8N1",)  # of a serial line, the most likely first
-    stations: range = range(1, 32)  # that it asks unless told otherwise
+    stations: range = range(1, 32)  # default of the command
     variants: Sequence[Mapping[str, object]] = ({},)  # YAML settings to try at each station
 
 

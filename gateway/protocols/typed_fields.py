@@ -1,6 +1,6 @@
-"""Typed fields: addresses whose type and access the driver itself knows, such as those of frames.
+"""Typed fields: addresses with a type and access that the driver itself knows, as in frames.
 
-A driver may have this capability. A read of such an address returns its value, not words, or
+A driver may have this capability. A read of a typed field returns its value, not words, or
 the `Garbled` that hides it; a write sends the bytes of the value.
 """
 

@@ -12,7 +12,7 @@ from gateway.values import Kind, Value
 
 
 def station_for(driver: AnyDriver, tags: Iterable[Tag]) -> Station:
-    """A simulated PLC that the driver can talk to, whose tags move unless they can be written."""
+    """Returns a simulated PLC for the driver; its tags move unless they are writable."""
     station = station_of(driver)
     for number, tag in enumerate(tags):
         _animate(station.memory, tag, number)
@@ -31,7 +31,7 @@ def _animate(memory: Memory, tag: Tag, number: int) -> None:
     try:
         units = tag.encode(motion(0.0))
     except BadValue:
-        return  # the tag's own limits leave no room to move in
+        return  # the limits of the tag exclude this value
     if tag.write is not None or tag.layout.type.kind is Kind.STRING:
         memory.write(area, start, units)
         return
@@ -44,7 +44,7 @@ def _unit(tag: Tag, motion: Callable[[float], Value], i: int) -> Callable[[float
 
 
 def _motion(tag: Tag, number: int) -> Callable[[float], Value]:
-    """What the tag shows at a time, in its own units; no two tags move alike."""
+    """Returns the value of the tag as a function of time; each tag moves differently."""
     period = 20.0 + 7 * (number % 11)
     kind = tag.layout.type.kind
     if kind is Kind.STRING:

@@ -1,4 +1,4 @@
-"""A simulated half-duplex wire with stations on it: characters take their time, and collide."""
+"""A simulated half-duplex line with stations: characters take time, and collide."""
 
 import asyncio
 from collections.abc import Callable, Sequence
@@ -9,26 +9,26 @@ from gateway.planning.wire_timing import WireTiming
 from gateway.stations.station import Station
 from gateway.transport.port import Port, Receiver
 
-# Two characters that overlap by less than this part of one leave each other whole: a UART looks at
-# the middle of its bits, and a timer is never exact.
+# An overlap of two characters by less than this part does no damage: a UART samples the middle of
+# its bits, and a timer is never exact.
 _UNNOTICED = 0.1
-FIFO = 16  # characters that a UART gathers before it tells
+FIFO = 16  # characters that a UART collects before it reports them
 
 
 async def open_simulator(
     stations: Sequence[Station],
     wire: WireTiming,
-    ear: Receiver,
+    receiver: Receiver,
     *,
     turnaround: float = 0.005,
     paced: bool = True,
 ) -> Port:
-    """Stations on a wire in memory. `turnaround`: seconds from request to reply.
+    """Opens a line in memory with stations. `turnaround`: seconds from request to reply.
 
-    A station may take longer: `delay`, an attribute of it in seconds, is added. With
-    `paced=False` nothing takes any time but that.
+    The attribute `delay` of a station, in seconds, is added. With `paced=False` only this delay
+    takes time.
     """
-    return SimulatedPort(HalfDuplex(stations, wire, ear.received, turnaround, paced=paced))
+    return SimulatedPort(HalfDuplex(stations, wire, receiver.received, turnaround, paced=paced))
 
 
 class SimulatedPort:
@@ -46,22 +46,22 @@ class SimulatedPort:
 
 @dataclass(slots=True, eq=False)
 class _Sending:
-    """Characters of one sender on the wire between two moments."""
+    """Characters of one sender on the line."""
 
     start: float
     end: float
     data: bytes
-    damaged: bytearray | None = None  # FF where somebody else was sending too
+    damaged: bytearray | None = None  # FF where another sender collides
 
     def heard(self, first: int = 0, last: int | None = None) -> bytes:
-        """What arrives of a piece of it; where two spoke at once, with all bits turned."""
+        """Returns a piece as it is received: collisions invert all bits."""
         piece = self.data[first:last]
         if self.damaged is None:
             return piece
         return bytes(a ^ b for a, b in zip(piece, self.damaged[first:last], strict=True))
 
     def damage(self, start: float, end: float, character: float) -> None:
-        """Somebody else is sending from `start` to `end`: every character touched is spoilt."""
+        """Damages the characters that another sender overlaps from `start` to `end`."""
         if self.damaged is None:
             self.damaged = bytearray(len(self.data))
         start += character * _UNNOTICED
@@ -73,10 +73,10 @@ class _Sending:
 
 
 class HalfDuplex:
-    """The wire: the master's bytes to every station, their replies to `deliver`.
+    """The line: bytes of the master go to every station, their replies to `deliver`.
 
-    All moments are reckoned from the moment of the request, not from when the loop came to it: a
-    late loop delivers late, but the wire does not drift.
+    All times count from the time of the request, not from the time of the callback: a late loop
+    delivers late, but the line does not drift.
     """
 
     def __init__(
@@ -95,10 +95,10 @@ class HalfDuplex:
         self._character = wire.character if paced else 0.0
         self._turnaround = turnaround if paced else 0.0
         self._sendings: list[_Sending] = []
-        self._master_until = 0.0  # the master's bytes follow each other, they do not collide
+        self._master_until = 0.0  # bytes of the master follow each other, without collision
 
     def send(self, data: bytes) -> None:
-        """The master puts bytes on the wire."""
+        """Sends bytes of the master."""
         if self.cut or not data:
             return
         start = max(self._loop.time(), self._master_until)
@@ -107,12 +107,12 @@ class HalfDuplex:
         self._at(sending.end, lambda: self._reach_stations(sending), self._loop.time())
 
     def close(self) -> None:
-        """Nobody hears anything any more."""
+        """Ends all traffic."""
         self.cut = True
         self._sendings.clear()
 
     def _put(self, data: bytes, start: float) -> _Sending:
-        """Find out whom it collides with. What is over by now can collide with nothing."""
+        """Adds a sending, and damages those that overlap it."""
         now = min(self._loop.time(), start)
         self._sendings = [other for other in self._sendings if other.end > now]
         sending = _Sending(start, start + len(data) * self._character, data)
@@ -134,7 +134,7 @@ class HalfDuplex:
     def _reply(self, data: bytes, start: float) -> None:
         sending = self._put(data, start)
         chunk = FIFO if self._character else len(data)
-        now = self._loop.time()  # one for all pieces: what is due overtakes what is not yet
+        now = self._loop.time()  # the same for all pieces, so that they keep their order
         for first in range(0, len(data), chunk):
             self._deliver_later(sending, first, min(first + chunk, len(data)), now)
 

@@ -21,7 +21,7 @@ class Served(Protocol):
 
     @property
     def address(self) -> str:
-        """What to write after `port:` to reach them."""
+        """The text after `port:` that reaches them."""
 
     async def close(self) -> None: ...
 
@@ -34,7 +34,7 @@ async def serve_on_pty(
     turnaround: float = 0.005,
     paced: bool = True,
 ) -> Served:
-    """Stations on a pseudo terminal, at the wire's speed; `link` is a symbolic link to make to it.
+    """Serves stations on a pseudo terminal, at the speed of the line; `link` is a link to it.
 
     A link that points elsewhere is replaced, anything else at that path is left alone.
     Raises `LineDown`.
@@ -88,7 +88,7 @@ class _Pty:
             self._bus.send(os.read(self._master, _MOST_READ))
 
     def _deliver(self, data: bytes) -> None:
-        # Nobody reads and the terminal is full: lost, as on a wire.
+        # The terminal is full because no program reads it: lost, as on a line.
         with suppress(BlockingIOError):
             os.write(self._master, data)
 
@@ -101,7 +101,7 @@ class _Pty:
         os.close(self._slave)
         if self._link is not None:
             with suppress(OSError):
-                if self._link.readlink() == Path(self._name):  # not somebody else's by now
+                if self._link.readlink() == Path(self._name):  # unless another program replaced it
                     self._link.unlink()
 
 
@@ -114,10 +114,10 @@ async def serve_on_tcp(
     turnaround: float = 0.005,
     paced: bool = True,
 ) -> Served:
-    """Stations on a TCP port; port 0 takes a free one. Raises `LineDown`.
+    """Serves stations on a TCP port; port 0 takes a free one. Raises `LineDown`.
 
-    Paced, there is one wire behind the port as behind a device server: what a station says goes
-    to everybody connected. Not paced (a network protocol), every connection has its own.
+    Paced, one line is behind the port as behind a device server: replies go to every connection.
+    Not paced (a network protocol), every connection has its own line.
     """
     served = _Tcp(stations, wire, turnaround, paced=paced)
     try:

@@ -1,1 +1,1 @@
-"""The other side: simulated PLCs, pure state machines that answer bytes with bytes."""
+"""The replying side of each protocol: simulated PLCs, pure state machines on bytes."""

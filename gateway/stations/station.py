@@ -1,14 +1,13 @@
-"""What a simulated PLC is to the wire it hangs on, and the memory it answers from."""
+"""The contract of a simulated PLC, and its memory."""
 
 from collections.abc import Callable, Iterable
 from typing import Protocol
 
 
 class Memory:
-    """A PLC's device memory by area name: units of an area in one list, index = number - first.
+    """The device memory of a PLC by area name; index = number - first number of the area.
 
-    Cells may move by themselves: `animate` gives a cell a function of time. A cell that
-    somebody writes keeps what was written.
+    `animate` makes a cell a function of time, until it is written.
     """
 
     def __init__(self, areas: Iterable[tuple[str, int, int]]) -> None:
@@ -21,14 +20,14 @@ class Memory:
             self._cells[name] = [0] * (last - first + 1)
 
     def holds(self, area: str, start: int, count: int = 1) -> bool:
-        """Whether all of the range exists."""
+        """Returns True when the whole range exists."""
         if area not in self._cells or count < 1:
             return False
         offset = start - self._first[area]
         return offset >= 0 and offset + count <= len(self._cells[area])
 
     def read(self, area: str, start: int, count: int = 1, now: float = 0.0) -> list[int]:
-        """The units `start` .. `start + count - 1` as they are at `now`."""
+        """Returns the units `start` .. `start + count - 1` at the time `now`."""
         offset = start - self._first[area]
         values = self._cells[area][offset : offset + count]
         if self._moving:
@@ -44,15 +43,15 @@ class Memory:
             self._moving.pop((area, start + i), None)
 
     def animate(self, area: str, index: int, motion: Callable[[float], int]) -> None:
-        """From now on the unit is `motion(now)`, until it is written."""
+        """Makes the unit `motion(now)`, until it is written."""
         self._moving[area, index] = motion
 
 
 class Station(Protocol):
-    """A simulated PLC: bytes from the wire in, whole frames out."""
+    """A simulated PLC: bytes in, whole frames out."""
 
     @property
     def memory(self) -> Memory: ...
 
     def hear(self, data: bytes, now: float) -> list[bytes]:
-        """The frames to send because of `data`, which may be any piece of what is on the wire."""
+        """Returns the frames to send after `data`, any piece of the bytes on the line."""

@@ -1,6 +1,6 @@
-"""A simulated Vigor M, VB or VH PLC: answers computer link requests from its device memory.
+"""A simulated Vigor M, VB or VH PLC: replies to computer link requests from its device memory.
 
-It reckons from byte addresses to devices by the address map of the manual (B-5-3), on its own.
+It finds devices by the address map of the manual (B-5-3), independent of the driver.
 """
 
 from collections.abc import Iterable
@@ -23,7 +23,7 @@ class _Stretch(NamedTuple):
     width: int  # bytes of a device; 0 where a byte holds eight bits
 
     def devices(self, byte: int) -> range:
-        """The devices a byte has a part of."""
+        """Returns the devices in a byte."""
         offset = byte - self.first
         if self.width:
             at = self.number + offset // self.width
@@ -32,7 +32,7 @@ class _Stretch(NamedTuple):
         return range(at, at + 8)
 
     def shift(self, byte: int) -> int:
-        """Where the byte stands in its register, in bits."""
+        """The place of the byte in its register, in bits."""
         return 8 * ((byte - self.first) % self.width)
 
 
@@ -67,12 +67,12 @@ class VigorStation:
     """
 
     def __init__(self, station: int, holes: Iterable[tuple[str, int]] = ()) -> None:
-        """`holes`: devices (area, number) that this model lacks; they are answered with 28."""
+        """`holes`: devices (area, number) that this model lacks; the reply is 28."""
         if not 0 <= station <= 255:
             raise ValueError(f"station {station} is not 0..255")
         self.station = station
         self.holes = set(holes)
-        self.mute = False  # obeys, but its answers are lost
+        self.mute = False  # carries out requests, but its replies are lost
         self._reader = RequestReader()
         self._memory = Memory(
             (place.area, place.number, place.devices(place.last)[-1]) for place in _STRETCHES
@@ -83,12 +83,12 @@ class VigorStation:
         return self._memory
 
     def hear(self, data: bytes, now: float) -> list[bytes]:
-        """The replies to the requests that `data` completes."""
+        """Returns the replies to the requests that `data` completes."""
         replies = [self._answer(request, now) for request in self._reader.feed(data)]
         return [] if self.mute else [encode(reply) for reply in replies if reply is not None]
 
     def _answer(self, request: bytes, now: float) -> Reply | None:
-        """None for another station's request, or one too damaged to be anybody's."""
+        """Returns None for a request to another station, or one too damaged for any station."""
         station, command = request[1:3], request[3:5].upper()
         content, check = request[1:-3], request[-2:]
         if len(content) < 4 or station.strip(_ANY_CASE) or int(station, 16) != self.station:
@@ -99,11 +99,11 @@ class VigorStation:
         elif byte_sum(request[1:-2]) != check:
             status = _BAD_SUM
         else:
-            status, data = self._obey(command, content[4:], now)
+            status, data = self._carry_out(command, content[4:], now)
         return Reply(self.station, command.decode("latin-1"), status, data)
 
-    def _obey(self, command: bytes, body: bytes, now: float) -> tuple[str, bytes]:
-        """Status and data of a request that arrived whole."""
+    def _carry_out(self, command: bytes, body: bytes, now: float) -> tuple[str, bytes]:
+        """Returns status and data for a whole request."""
         match command:
             case b"51":
                 return self._read(body, now)
@@ -150,7 +150,7 @@ class VigorStation:
         return _DONE
 
     def _places(self, body: bytes) -> list[tuple[_Stretch, int]] | None:
-        """The bytes a 51 or 61 names; None if there are none, too many, or some do not exist."""
+        """Returns the bytes of a 51 or 61; None for zero, too many, or some that do not exist."""
         address, count = int(body[:4], 16), int(body[4:6], 16)
         if not 1 <= count <= 128:
             return None
@@ -189,5 +189,5 @@ def vigor_station(driver: Vigor) -> VigorStation:
 
 @cache
 def _stretch(byte: int) -> _Stretch | None:
-    """The stretch a byte address lies in; None for the holes between them."""
+    """Returns the stretch of a byte address; None between two stretches."""
     return next((place for place in _STRETCHES if place.first <= byte <= place.last), None)

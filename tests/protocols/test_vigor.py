@@ -446,7 +446,7 @@ async def test_what_cannot_be_written_is_refused_before_anything_is_sent(
 
 
 async def test_what_cannot_be_read_is_refused_before_anything_is_sent() -> None:
-    with pytest.raises(ConfigError, match="not in one exchange"):
+    with pytest.raises(ConfigError, match="not in one request"):
         await Vigor().read(Script(Vigor()), Span("D", 0, 65))
 
 

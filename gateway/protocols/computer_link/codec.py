@@ -16,7 +16,7 @@ STX, ETX, EOT, ENQ, ACK, CL, NAK = 0x02, 0x03, 0x04, 0x05, 0x06, 0x0C, 0x15
 CRLF = b"\r\n"
 
 ALL_STATIONS = 0xFF  # for the global flag alone
-PC = "FF"  # the PC number of every question and answer
+PC = "FF"  # the PC number of every request and reply
 PC_ON_DEMAND = "FE"  # the PC number of data that the PLC sends by itself
 
 LONGEST_DATA = 256  # characters between PC number and ETX: 64 words, 256 bits, a loopback of 254
@@ -53,7 +53,7 @@ class Ack:
 
 @dataclass(frozen=True, slots=True)
 class Nak:
-    """A refusal with its error code; the computer's own NAK has none."""
+    """An error reply with its code; a NAK of the computer has no code."""
 
     station: int
     code: str = ""
@@ -64,9 +64,9 @@ Frame = Enquiry | Text | Ack | Nak
 
 
 class LinkCodec:
-    """Bytes <-> blocks of one turn, as the computer sends and hears them.
+    """Bytes <-> blocks of one transaction, on the side of the computer.
 
-    Heard are STX, ACK and NAK blocks, and the echo of what this codec sent last.
+    It receives STX, ACK and NAK blocks, and the echo of the last block that it encoded.
     """
 
     def __init__(self, frame_format: FrameFormat = 1, sum_check: bool = True) -> None:
@@ -91,11 +91,11 @@ class LinkCodec:
                 return bytes([NAK]) + f"{station:02X}{pc}{code}".encode("ascii") + self._end
 
     def feed(self, data: bytes) -> list[Frame]:
-        """The blocks completed by `data`; what is no block is passed over.
+        """Returns the blocks completed by `data`; skips other bytes.
 
         Raises `Garbled`: CHECKSUM for a wrong sum, SHAPE for a block whose end belongs to
-        another setting of format or sum check, TRUNCATED for data without end. Blocks that
-        came whole before the damage are handed out first.
+        another setting of format or sum check, TRUNCATED for data without end. Whole blocks
+        before the damage are returned first.
         """
         self._buffer += data
         frames: list[Frame] = []
@@ -103,7 +103,7 @@ class LinkCodec:
             try:
                 taken = self._take()
             except Garbled:
-                if frames:  # the damage stays in the buffer: the next feed tells of it
+                if frames:  # the damage stays in the buffer: the next feed raises it
                     break
                 raise
             if taken == 0:
@@ -116,9 +116,9 @@ class LinkCodec:
         return frames
 
     def _take(self) -> int | tuple[Frame, int]:
-        """The block at the head of the buffer and its size; or how many bytes are none.
+        """Returns the first block of the buffer and its size, or the bytes to skip.
 
-        Zero: the block is not complete yet.
+        Zero: the block is incomplete.
         """
         match self._buffer[0]:
             case start if start == STX:
@@ -138,7 +138,7 @@ class LinkCodec:
         for etx, byte in enumerate(buffer):
             if byte == ETX:
                 break
-            if etx and not 0x20 <= byte < 0x7F:  # a block that broke off: look for the next
+            if etx and not 0x20 <= byte < 0x7F:  # the block broke off: look for the next
                 return 1
             if etx > _ROUTE + LONGEST_DATA:
                 raise Garbled(
@@ -189,7 +189,7 @@ class LinkCodec:
         return True
 
     def _ends_at(self, size: int) -> bool:
-        """Whether CR LF, where the format has it, has come; False while it is arriving."""
+        """Returns True after the CR LF of the format; False while it is arriving."""
         heard = bytes(self._buffer[size - len(self._end) : size])
         if heard == self._end:
             return True

@@ -1,4 +1,4 @@
-"""What Liyan and Mitsubishi FX PLCs have: device ranges, limits of the commands, names on the wire.
+"""Liyan and Mitsubishi FX PLCs: device ranges, limits of the commands, names on the wire.
 
 Liyan Computer Link manual 1-5 and chapter 2; Mitsubishi's ranges and limits after JY992D69901.
 """
@@ -99,6 +99,6 @@ _CODES = {"M8": "M", "D8": "D", "T": "TN", "C": "CN", "C32": "CN"}
 
 
 def wire_name(area: Area, number: int) -> str:
-    """The five characters of a device: X0017, M8030, TN123 (manual 1-5)."""
+    """Returns the five characters of a device: X0017, M8030, TN123 (manual 1-5)."""
     code = _CODES.get(area.name, area.name)
     return f"{code}{number:0{DEVICE - len(code)}{'o' if area.octal else 'd'}}"

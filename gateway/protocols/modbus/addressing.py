@@ -1,6 +1,6 @@
-"""What each kind of Modbus slave calls its data, and the wire addresses behind the names.
+"""The names of data in each kind of Modbus slave, and their wire addresses.
 
-Wire addresses count from zero, whatever the device names count from.
+Wire addresses always count from zero; device names may not.
 """
 
 import re
@@ -14,7 +14,7 @@ from gateway.protocols.driver import Address, Area, Unit
 
 
 class Place(NamedTuple):
-    """Where an area lies: the wire address of its first unit, and the function that reads it."""
+    """The place of an area: the wire address of its first unit, and the function that reads it."""
 
     area: Area
     wire: int
@@ -30,7 +30,7 @@ class Place(NamedTuple):
 
 
 class Limits(NamedTuple):
-    """The most units that fit one exchange."""
+    """The most units of one request."""
 
     read_words: int = 125
     read_bits: int = 2000
@@ -40,7 +40,7 @@ class Limits(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Dialect:
-    """How one kind of slave is addressed, and what it can take."""
+    """The addresses and the limits of one kind of slave."""
 
     places: Mapping[str, Place]
     address: Callable[[str], Address]
@@ -50,8 +50,8 @@ class Dialect:
     limits: Limits = Limits()  # noqa: RUF009 - an immutable tuple
     ascii_limits: Limits = Limits()  # noqa: RUF009 - an immutable tuple
     single_writes: bool = True  # functions 05 and 06 are served
-    rtu_silence: float = 0.0  # seconds, where the device asks for more than the standard
-    forgets_address: bool = False  # answers to function 06 may carry address 0
+    rtu_silence: float = 0.0  # seconds, where the device needs more than the standard
+    forgets_address: bool = False  # replies to function 06 may have address 0
 
 
 def _by_name(*places: Place) -> dict[str, Place]:
@@ -199,7 +199,7 @@ VIGOR = Dialect(
 
 # ---- LG/LS MASTER-K120S ------------------------------------------------------------------
 # P, M, L, K, F are 16-bit words whose bits have numbers of their own: M0010 is word 001, bit 0.
-# The map has room for 256 words of each; how many there are, the PLC says (exception 02).
+# The map has 256 words of each; the PLC refuses those that it does not have (exception 02).
 
 _RELAYS = "PMLKF"
 

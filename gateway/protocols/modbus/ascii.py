@@ -12,22 +12,22 @@ _LONGEST = 513
 
 
 def chars(pdu_length: int) -> int:
-    """The characters of a frame with a PDU of that length."""
+    """Returns the characters of a frame around a PDU."""
     return 2 * pdu_length + _WRAPPING
 
 
 class AsciiCodec:
     """Bytes <-> frames, on either side of the line.
 
-    Digits are sent in upper case and read in either. A colon always begins anew. A broken frame
-    is passed over as noise, unless it is as long as the answer to what was sent and begins
-    like it: then it is `Garbled`.
+    Digits are sent in upper case and received in either. A colon always begins another frame. A
+    broken frame is skipped as noise, unless it has the length and the beginning of the expected
+    reply: then it is `Garbled`.
     """
 
     def __init__(self) -> None:
         self._heard = b""
-        self._head = b""  # of the answer: colon, station, function
-        self._size = 0  # of the answer
+        self._head = b""  # of the reply: colon, station, function
+        self._size = 0  # of the reply
         self._damage: Garbled | None = None
 
     def encode(self, frame: Frame) -> bytes:
@@ -38,8 +38,8 @@ class AsciiCodec:
         return text
 
     def feed(self, data: bytes) -> list[Frame]:
-        """The frames completed by `data`, of any station. Raises `Garbled`, after the frames
-        before the damage."""
+        """Returns the frames completed by `data`, of any station. Raises `Garbled`, after the
+        frames before the damage."""
         *lines, self._heard = (self._heard + data).split(b"\n")
         self._heard = self._heard[-_LONGEST:]
         frames = []
@@ -48,20 +48,18 @@ class AsciiCodec:
             body = _body(text)
             if body and self._damage is None:
                 frames.append(Frame(body[0], body[1:]))
-            elif not body and self._is_answer(text):
-                self._damage = Garbled(
-                    "an answer with a wrong LRC", text, evidence=Evidence.CHECKSUM
-                )
+            elif not body and self._is_reply(text):
+                self._damage = Garbled("a reply with a wrong LRC", text, evidence=Evidence.CHECKSUM)
         if self._damage is not None and not frames:
             raise self._damage
         return frames
 
-    def _is_answer(self, text: bytes) -> bool:
+    def _is_reply(self, text: bytes) -> bool:
         return len(text) == self._size and text.upper().startswith(self._head)
 
 
 def _body(text: bytes) -> bytes:
-    """Station and PDU of a frame from colon to line feed; empty when it is no good frame."""
+    """Returns station and PDU of a frame from colon to line feed; empty for a bad frame."""
     if not text.startswith(b":") or not text.endswith(b"\r\n"):
         return b""
     try:

@@ -184,7 +184,7 @@ def _master(device: _Modbus) -> Master:
 
 
 def _limits(device: _Modbus, usual: Limits) -> Limits:
-    """Returns the limits of the file, and those of the dialect where the file has none."""
+    """Returns the limits of the file, and those of the dialect for those not in the file."""
     own = (
         device.max_read_words,
         device.max_read_bits,

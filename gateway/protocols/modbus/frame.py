@@ -1,10 +1,10 @@
-"""A Modbus frame without its wrapping: who is spoken to, and the PDU (function code and data)."""
+"""A Modbus frame without framing: station and PDU (function code and data)."""
 
 from typing import NamedTuple
 
 
 class Frame(NamedTuple):
-    """One question or answer. `transaction` numbers it on Modbus TCP and is 0 elsewhere."""
+    """One request or reply. `transaction` is its number on Modbus TCP, and 0 elsewhere."""
 
     station: int
     pdu: bytes
@@ -16,11 +16,11 @@ READ_WORDS = (3, 4)
 WRITE_SINGLE = (5, 6)
 WRITE_MANY = (15, 16)
 DIAGNOSTICS = 8
-EXCEPTION = 0x80  # added to the function code of the question
+EXCEPTION = 0x80  # added to the function code of the request
 
 
 def answer_length(request: bytes) -> int:
-    """The bytes of the PDU that answers `request`, when the answer is not an exception."""
+    """Returns the length of the PDU that replies to `request`, without an exception."""
     function = request[0]
     count = int.from_bytes(request[3:5], "big")
     if function in READ_BITS:

@@ -1,4 +1,4 @@
-"""Modbus TCP frames (messaging guide V1.0b, 3.1): the MBAP header numbers each question."""
+"""Modbus TCP frames (messaging guide V1.0b, 3.1): the MBAP header numbers each request."""
 
 from struct import Struct
 
@@ -10,15 +10,15 @@ _UNIT_AND_PDU = range(2, 255)
 
 
 def chars(pdu_length: int) -> int:
-    """The bytes of a frame with a PDU of that length."""
+    """Returns the bytes of a frame around a PDU."""
     return pdu_length + _HEADER.size
 
 
 class MbapCodec:
     """Bytes <-> frames, on either side of the connection.
 
-    TCP loses and invents nothing, so bytes that are no frame mean that the other side is no
-    Modbus TCP device, or out of step for good.
+    TCP neither loses nor adds bytes: bytes that are no frame show that the other side is no
+    Modbus TCP device, or permanently out of step.
     """
 
     def __init__(self) -> None:
@@ -29,7 +29,7 @@ class MbapCodec:
         return header + frame.pdu
 
     def feed(self, data: bytes) -> list[Frame]:
-        """The frames completed by `data`. Raises `Garbled`, after the frames before it."""
+        """Returns the frames completed by `data`. Raises `Garbled`, after the frames before it."""
         heard = self._heard + data if self._heard else data
         frames: list[Frame] = []
         while len(heard) >= _HEADER.size:

@@ -1,4 +1,4 @@
-"""Modbus PDUs (application protocol V1.1b3, 6): requests by pymodbus, answers by `struct`."""
+"""Modbus PDUs (application protocol V1.1b3, 6): requests by pymodbus, replies by `struct`."""
 
 from collections.abc import Callable, Sequence
 from itertools import chain
@@ -38,7 +38,7 @@ _EXCEPTIONS = {
     6: ("device busy", Refusal.BUSY),
     10: ("a gateway on the way has no path to the device", Refusal.BUSY),
 }
-_NO_RESPONSE_BEHIND = 11  # a Modbus TCP gateway got no answer from the device behind it
+_NO_RESPONSE_BEHIND = 11  # a Modbus TCP gateway got no reply from the device behind it
 
 _BITS = tuple(tuple(byte >> bit & 1 for bit in range(8)) for byte in range(256))
 
@@ -69,7 +69,7 @@ def _encode(pdu: ModbusPDU) -> bytes:
 
 
 def bits_in(count: int) -> Callable[[bytes], Sequence[int]]:
-    """What takes `count` bits out of an answer to function 01 or 02: lowest bit first."""
+    """Returns a decoder of `count` bits in a reply to function 01 or 02: lowest bit first."""
 
     def unpack(pdu: bytes) -> Sequence[int]:
         return list(chain.from_iterable(_BITS[byte] for byte in pdu[2:]))[:count]
@@ -78,7 +78,7 @@ def bits_in(count: int) -> Callable[[bytes], Sequence[int]]:
 
 
 def words_in(count: int) -> Callable[[bytes], Sequence[int]]:
-    """What takes `count` words out of an answer to function 03 or 04: high byte first."""
+    """Returns a decoder of `count` words in a reply to function 03 or 04: high byte first."""
     words = Struct(f">{count}H")
 
     def unpack(pdu: bytes) -> Sequence[int]:
@@ -88,7 +88,7 @@ def words_in(count: int) -> Callable[[bytes], Sequence[int]]:
 
 
 def dwords_in(count: int, *, low_first: bool) -> Callable[[bytes], Sequence[int]]:
-    """What takes `count` pairs of words out of an answer to function 03."""
+    """Returns a decoder of `count` pairs of words in a reply to function 03."""
     words = Struct(f">{2 * count}H")
     low, high = (0, 1) if low_first else (1, 0)
 
@@ -100,23 +100,22 @@ def dwords_in(count: int, *, low_first: bool) -> Callable[[bytes], Sequence[int]
 
 
 def words_of(dwords: Sequence[int], *, low_first: bool) -> list[int]:
-    """The words that carry these 32-bit units."""
+    """Returns the words of these 32-bit units."""
     pairs = ((dword & 0xFFFF, dword >> 16) for dword in dwords)
     return [word for low, high in pairs for word in ((low, high) if low_first else (high, low))]
 
 
 _ACCEPTED = 5
 _WRITES = (5, 6, 15, 16)
-_NOT_DONE = (1, 2, 3, 6, 10)  # exceptions that come before anything is done
+_NOT_DONE = (1, 2, 3, 6, 10)  # exceptions without any effect
 
 
 def raise_refusal(pdu: bytes, function: int) -> None:
-    """Raise what `pdu` says if it is an exception to a question of that function.
+    """Raises the error of an exception reply to `function`; ignores other PDUs.
 
-    `Refused` with the exception code in hex; `NoReply` for 0B, by which a gateway tells that
-    the device behind it kept silent: nobody knows then whether a write was done. `Unclear` for
-    05 to a write, which was accepted and may be done later, and for every other exception to
-    one that does not say that nothing was done.
+    `Refused` with the exception code in hex; `NoReply` for 0B, from a gateway whose device did
+    not reply: a write may have been done. `Unclear` for 05 to a write, which was accepted and
+    may be done later, and for every other exception to a write after which part may be done.
     """
     if len(pdu) != 2 or pdu[0] != function | EXCEPTION:
         return

@@ -1,7 +1,7 @@
 """Modbus RTU frames (serial line guide V1.02, 2.5.1), found by header, length and CRC.
 
-Not by silence: behind a USB adapter or a device server it cannot be seen, they cut and join the
-stream as they like. The length of a frame follows from its function code and byte count.
+Not by silence: USB adapters and device servers split and join the bytes, so silence cannot be
+seen behind them. The length of a frame follows from its function code and byte count.
 """
 
 from gateway.errors import Evidence, Garbled
@@ -19,30 +19,30 @@ from gateway.protocols.modbus.frame import (
 
 _WRAPPING = 3  # characters around the PDU: station and CRC
 _SHORTEST = 5  # an exception
-_KEPT = 520  # no frame is longer than 260; what is older than two of them is noise
+_KEPT = 520  # no frame is longer than 260; bytes before the last two frames are noise
 _FIXED = (*WRITE_SINGLE, *WRITE_MANY, DIAGNOSTICS)
-_ECHOED = (*WRITE_SINGLE, DIAGNOSTICS)  # the good answer is the question itself
+_ECHOED = (*WRITE_SINGLE, DIAGNOSTICS)  # the good reply is equal to the request
 _KNOWN = (*READ_BITS, *READ_WORDS, *_FIXED)
 
 
 def chars(pdu_length: int) -> int:
-    """The characters of a frame with a PDU of that length."""
+    """Returns the characters of a frame around a PDU."""
     return pdu_length + _WRAPPING
 
 
 class RtuCodec:
-    """Bytes <-> frames on the master's side.
+    """Bytes <-> frames on the side of the master.
 
-    It remembers what it sent, because only that tells which bytes are the answer: a frame that
-    can be the answer and is not whole yet is waited for; anything else is noise until its CRC
-    proves otherwise. An echo of the request is noise as well, except of functions 05, 06 and 08,
-    which are answered with the very same bytes: only the line knows whether it echoes.
+    It remembers the request, which decides what can be the reply: it waits for the rest of a
+    possible reply; all else is noise until its CRC is right. An echo of the request is noise as
+    well, except for functions 05, 06 and 08, where the reply is equal to the request: only the
+    line knows whether it echoes.
     """
 
     def __init__(self) -> None:
         self._heard = bytearray()
         self._sent = b""
-        self._size = 0  # of the whole answer, unless it is an exception
+        self._size = 0  # of the whole reply, unless it is an exception
         self._damage: Garbled | None = None
 
     def encode(self, frame: Frame) -> bytes:
@@ -52,13 +52,13 @@ class RtuCodec:
         return self._sent
 
     def feed(self, data: bytes) -> list[Frame]:
-        """The frames completed by `data`, of any station.
+        """Returns the frames completed by `data`, of any station.
 
-        Raises `Garbled` when what was surely the answer has a wrong CRC. Frames that were whole
-        before it are handed out first.
+        Raises `Garbled` when a certain reply has a wrong CRC. Whole frames before it are
+        returned first.
         """
         if not self._heard and _whole_reply(data):
-            return [Frame(data[0], data[1:-2])]  # as most answers come
+            return [Frame(data[0], data[1:-2])]  # the usual case
         self._heard += data
         frames: list[Frame] = []
         while self._damage is None and (frame := self._take()) is not None:
@@ -81,32 +81,32 @@ class RtuCodec:
             if whole[:2] != self._sent[:2] or self._may_be_echo(heard[start:]):
                 continue
             if len(whole) < size:
-                return None  # the answer, still on its way
+                return None  # the reply, still arriving
             if size == self._size:
                 self._damage = Garbled(
-                    "an answer with a wrong CRC", whole, evidence=Evidence.CHECKSUM
+                    "a reply with a wrong CRC", whole, evidence=Evidence.CHECKSUM
                 )
                 return None
         return None
 
     def _may_be_echo(self, heard: bytearray) -> bool:
-        """Whether what was heard is the request, as far as it goes."""
+        """True when the received bytes are equal to the request so far."""
         sent = self._sent
         return sent[1] not in _ECHOED and sent.startswith(heard[: len(sent)])
 
 
 def _is_sound(whole: bytes) -> bool:
-    """Whether a frame ends with its CRC."""
+    """Returns True when a frame ends with its CRC."""
     return crc16(whole[:-2]) == whole[-2:]
 
 
 def _whole_reply(data: bytes) -> bool:
-    """Whether it is one answer, from its first byte to its last."""
+    """Returns True for exactly one whole reply."""
     return len(data) >= _SHORTEST and _reply_size(data, 0) == len(data) and _is_sound(data)
 
 
 def _reply_size(heard: bytes | bytearray, start: int) -> int:
-    """The length of the answer that begins at `start`; 0 when none can."""
+    """Returns the length of a reply that begins at `start`; 0 where no reply can begin."""
     function, third = heard[start + 1], heard[start + 2]
     if function in _FIXED:
         return 8
@@ -118,11 +118,11 @@ def _reply_size(heard: bytes | bytearray, start: int) -> int:
 
 
 class RtuSlaveCodec:
-    """What a slave hears: the requests on the line.
+    """Bytes <-> frames on the side of a slave.
 
-    A request to this station (or to all) that is not whole yet is waited for; whoever has a
-    clock makes a new ear after a silence. An unknown function has no known length: it is taken
-    for a request when its CRC closes all that has been heard.
+    It waits for the rest of a request to this station or to all; after a silence the caller
+    makes a new codec. An unknown function has no known length: it is a request when all
+    received bytes end with its CRC.
     """
 
     def __init__(self, station: int) -> None:
@@ -169,7 +169,7 @@ class RtuSlaveCodec:
 
 
 def _request_size(heard: bytearray, start: int) -> int:
-    """The length of the request that begins at `start`; 0 when none can."""
+    """Returns the length of a request that begins at `start`; 0 where no request can begin."""
     function = heard[start + 1]
     if function in WRITE_MANY:
         return 9 + heard[start + 6]

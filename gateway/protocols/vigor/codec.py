@@ -1,4 +1,4 @@
-"""The frames of the Vigor computer link (manual B-5-2): STX asks, ACK answers, good or bad."""
+"""The frames of the Vigor computer link (manual B-5-2): STX begins a request, ACK a reply."""
 
 import re
 from binascii import unhexlify
@@ -21,7 +21,7 @@ LONGEST_REQUEST = 14 + 2 * MOST_BYTES
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """A frame to the PLC; `body` is what stands between command and ETX, as characters."""
+    """A frame to the PLC; `body` is the text between command and ETX."""
 
     station: int
     command: str
@@ -42,9 +42,9 @@ Frame = Request | Reply
 
 
 def encode(frame: Frame) -> bytes:
-    """The frame as it goes on the wire. The sum runs from the station to ETX.
+    """Returns the bytes of the frame. The sum runs from the station to ETX.
 
-    A station echoes a damaged command as it came, hence any character.
+    A station repeats a damaged command in its reply: so a command may have any character.
     """
     match frame:
         case Request(station, command, body):
@@ -55,8 +55,8 @@ def encode(frame: Frame) -> bytes:
     return start + summed + byte_sum(summed)
 
 
-# What follows ACK: station, command, status; data; then ETX and the sum, or the character that
-# should not be there. An ACK not followed by six digits was noise, one inside a frame begins anew.
+# ACK; station, command, status; data; then ETX and the sum, or a wrong character. An ACK without
+# six digits behind it is noise; an ACK inside a frame begins another frame.
 _REPLY = re.compile(
     rb"\x06([0-9A-F]{6})([0-9A-F]{0,256}+)(?:\x03([^\x06]{2})|([^\x03\x06]))", re.DOTALL
 )
@@ -64,9 +64,9 @@ _REQUEST = re.compile(rb"\x02[^\x02\x03]{0,266}+\x03[^\x02]{2}", re.DOTALL)
 
 
 class VigorCodec:
-    """Bytes <-> frames on the master's side: hears replies, passes over everything else.
+    """Bytes <-> frames on the side of the master: receives replies, skips other bytes.
 
-    What it makes of a stream does not depend on how the stream was cut into pieces.
+    The result does not depend on the pieces in which the bytes arrive.
     """
 
     def __init__(self) -> None:
@@ -77,10 +77,10 @@ class VigorCodec:
         return encode(frame)
 
     def feed(self, data: bytes) -> list[Frame]:
-        """The replies completed by `data`.
+        """Returns the replies completed by `data`.
 
-        Raises `Garbled` for a reply that is damaged after its header. Replies that came
-        whole before the damage are handed out first.
+        Raises `Garbled` for a reply that is damaged after its header. Whole replies before the
+        damage are returned first.
         """
         self._buffer += data
         frames: list[Frame] = []
@@ -112,13 +112,13 @@ def _reply(match: re.Match[bytes]) -> Reply:
 
 
 class RequestReader:
-    """The PLC's ear: cuts requests out of a stream, right or wrong, from STX to the sum."""
+    """The side of the PLC: finds requests, correct or not, from STX to the sum."""
 
     def __init__(self) -> None:
         self._buffer = b""
 
     def feed(self, data: bytes) -> list[bytes]:
-        """The requests completed by `data`. A new STX begins anew; endless ones are dropped."""
+        """Returns the requests completed by `data`. A new STX begins another request."""
         self._buffer += data
         requests = []
         while match := _REQUEST.search(self._buffer):
@@ -129,6 +129,6 @@ class RequestReader:
 
 
 def _unfinished(buffer: bytes, start: bytes, longest: int) -> bytes:
-    """The part of the buffer that may still become a frame."""
+    """Returns the part of the buffer that may still become a frame."""
     begin = buffer.rfind(start)
     return buffer[begin:] if 0 <= begin > len(buffer) - longest else b""

@@ -1,4 +1,4 @@
-"""The devices of a Vigor PLC and where they lie in its byte addresses (manual B-5-3)."""
+"""The devices of a Vigor PLC and their byte addresses (manual B-5-3)."""
 
 import struct
 from collections.abc import Sequence
@@ -30,10 +30,10 @@ _PLACES = (
 AREAS = {area.name: area for area, _ in _PLACES}
 _BASES = {area.name: base for area, base in _PLACES}
 
-# The areas the manual lets 70 and 71 force; bits of T and C are reached by whole bytes alone.
+# The areas for 70 and 71 in the manual; bits of T and C can only be written as whole bytes.
 FORCIBLE = frozenset({"X", "Y", "M", "S", "M9"})
 
-# How the devices are written. The bit devices of M and the words of D go on at 9000, after a gap.
+# The letters of the devices. M and D continue at 9000, after a gap.
 DEVICES: DeviceTable = {
     letters: tuple(AREAS[name] for name in names)
     for letters, names in {
@@ -55,7 +55,7 @@ DEVICES: DeviceTable = {
 
 
 class Cover(NamedTuple):
-    """The bytes one exchange must carry for a span."""
+    """The bytes of one request for a span."""
 
     address: int
     size: int
@@ -65,7 +65,7 @@ class Cover(NamedTuple):
 
 @lru_cache(maxsize=4096)
 def cover(span: Span) -> Cover | None:
-    """The bytes that hold `span`; None if they are too many, or the span is not in its area."""
+    """Returns the bytes that hold `span`; None for too many, or a span outside its area."""
     area = AREAS.get(span.area)
     if area is None or span.size < 1 or span.start < area.first:
         return None
@@ -85,7 +85,7 @@ def cover(span: Span) -> Cover | None:
 
 
 def bit_address(area: str, number: int) -> int:
-    """What 70 and 71 call a bit: its byte address times eight, plus its place in the byte."""
+    """Returns the address of a bit for 70 and 71: byte address times eight, plus its place."""
     return 8 * _BASES[area] + number - AREAS[area].first
 
 
@@ -93,7 +93,7 @@ _BITS = tuple(tuple(byte >> place & 1 for place in range(8)) for byte in range(2
 
 
 def bits_from_bytes(data: bytes) -> list[int]:
-    """Eight bits of each byte, the lowest device first."""
+    """Returns eight bits of each byte, the lowest device first."""
     return list(chain.from_iterable(map(_BITS.__getitem__, data)))
 
 
@@ -106,7 +106,7 @@ def bytes_from_bits(bits: Sequence[int]) -> bytes:
 
 
 def words_from_bytes(data: bytes, unit: Unit) -> tuple[int, ...]:
-    """Words or double words, their low byte first."""
+    """Returns words or double words, low byte first."""
     if unit is Unit.DWORD:
         return struct.unpack(f"<{len(data) // 4}I", data)
     return struct.unpack(f"<{len(data) // 2}H", data)

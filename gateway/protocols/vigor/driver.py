@@ -84,20 +84,20 @@ class Vigor:
         return _TIMING
 
     def address(self, text: str) -> Address:
-        """`X17` and `Y20` (octal), `M12`, `S5`, `D100`, `D7.3`, `M9003`, `D9001`; timers and
-        counters: `T5` the value, `TS5` the contact, `TC5` the coil. Raises `ConfigError`."""
+        """Parses `X17` and `Y20` (octal), `M12`, `S5`, `D100`, `D7.3`, `M9003`, `D9001`; timers
+        and counters: `T5` the value, `TS5` the contact, `TC5` the coil. Raises `ConfigError`."""
         return parse_device(text, DEVICES)
 
     def spell(self, address: Address) -> str:
         return spell_device(address, DEVICES)
 
     def cost(self, span: Span) -> Cost | None:
-        """One 51: whole bytes, 128 at most."""
+        """The cost of one 51: whole bytes, 128 at most."""
         covered = cover(span)
         return None if covered is None else _read_cost(covered)
 
     def write_cost(self, span: Span) -> Cost | None:
-        """One 70, 71 or 61; a 51 and a 61 for bits that do not fill their bytes."""
+        """The cost of one 70, 71 or 61; of a 51 and a 61 for bits that do not fill their bytes."""
         covered = cover(span)
         if covered is None:
             return None
@@ -113,10 +113,10 @@ class Vigor:
         return VigorCodec()
 
     async def read(self, talk: Talk[Frame], span: Span) -> Sequence[int]:
-        """The units of `span`. Raises `ConfigError` for a span that `cost` calls impossible."""
+        """Returns the units of `span`. Raises `ConfigError` for a span without `cost`."""
         covered = cover(span)
         if covered is None:
-            raise ConfigError(f"{span.size} of {span.area} from {span.start}: not in one exchange")
+            raise ConfigError(f"{span.size} of {span.area} from {span.start}: not in one request")
         data = await self._read_bytes(talk, covered.address, covered.size)
         unit = AREAS[span.area].unit
         if unit is Unit.BIT:
@@ -124,10 +124,10 @@ class Vigor:
         return words_from_bytes(data, unit)
 
     async def write(self, talk: Talk[Frame], span: Span, units: Sequence[int]) -> bool:
-        """Write and hear that it was done.
+        """Writes, and waits for the acknowledgement.
 
-        Bits that do not fill their bytes, unless it is a single one that can be forced, take
-        their neighbours along: these are read just before, and written back as they were.
+        A single bit is forced where the area permits it. Other bits are written in whole bytes:
+        their neighbours are read just before, and written back.
         """
         covered = cover(span)
         if covered is None or len(units) != span.size:
@@ -173,7 +173,7 @@ class Vigor:
     async def _with_neighbours(
         self, talk: Talk[Frame], covered: Cover, units: Sequence[int]
     ) -> Sequence[int]:
-        """The bits that fill the covered bytes."""
+        """Returns the bits of whole bytes."""
         if not covered.ahead and not covered.behind:
             return units
         bits = bits_from_bytes(await self._read_bytes(talk, covered.address, covered.size))
@@ -196,7 +196,7 @@ def _read_request(station: int, address: int, count: int) -> Request:
 
 @lru_cache(maxsize=1024)
 def _answers(station: int, command: str, count: int) -> Callable[[Frame], bytes | None]:
-    """What takes the answer to a question: the `count` bytes it carries, or its refusal."""
+    """Returns the acceptance of a reply: its `count` bytes of data, or its error code."""
 
     def answers(frame: Frame) -> bytes | None:
         if not isinstance(frame, Reply) or frame.station != station or frame.command != command:

@@ -33,7 +33,7 @@ class No(Exception):
 
 
 class Kind(StrEnum):
-    """How devices are counted and written in a request."""
+    """The counting and writing of devices in a request."""
 
     BITS = "bits"
     SIXTEENS = "sixteens"  # bit devices in words
@@ -75,7 +75,7 @@ def limits(profile: Profile) -> Limits:
 
 
 def areas(profile: Profile) -> list[tuple[str, int, int]]:
-    """(area, first, last) of all that a PLC of this profile has."""
+    """Returns (area, first, last) of all devices of this profile."""
     last_xy, last_m, last_d = _LAST[profile]
     return [
         ("X", 0, last_xy),
@@ -112,7 +112,7 @@ class Cells:
         return self.size // points * _DIGITS[self.kind]
 
     def encode(self, units: Sequence[int]) -> str:
-        """The data characters; in a word of points the head device is the lowest bit."""
+        """Returns the data characters; in a word of points the head device is the lowest bit."""
         if self.kind is Kind.BITS:
             return "".join(str(unit & 1) for unit in units)
         if self.kind is Kind.SIXTEENS:
@@ -133,7 +133,7 @@ class Cells:
 
 
 def locate(name: str, in_words: bool, count: int) -> Cells:
-    """`count` devices from the five-character `name` on. Raises `No` 06 for what is none."""
+    """Returns `count` devices from the five-character `name` on. Raises `No` 06."""
     area, number = _device(name)
     is_bit = area in _BIT_AREAS or area in _CONTACTS
     if in_words and is_bit:

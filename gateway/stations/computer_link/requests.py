@@ -1,4 +1,4 @@
-"""The ear of a simulated Computer Link PLC: where a request begins and where it ends."""
+"""The receiving side of a simulated Computer Link PLC: finds the end of each request."""
 
 from gateway.protocols.checksums import byte_sum
 from gateway.protocols.computer_link.codec import ACK, CL, ENQ, EOT, NAK, FrameFormat
@@ -12,11 +12,11 @@ _HEX = frozenset("0123456789ABCDEF")
 
 
 class RequestReader:
-    """Cuts the requests out of what is on the wire, right or wrong, to whichever station.
+    """Finds the requests on the line, correct or not, to any station.
 
-    ENQ begins a request; EOT, CL, ACK and NAK end the hearing of it. In format 4 it ends with
-    CR LF. In format 1 command and count tell its length; where they cannot (an unknown
-    command), it ends where the sum is right, or, without sum check, with the piece heard.
+    ENQ begins a request; EOT, CL, ACK and NAK cancel it. In format 4 it ends with CR LF. In
+    format 1 command and count give its length; an unknown command ends where the sum is right,
+    or, without sum check, with the received piece.
     """
 
     def __init__(self, frame_format: FrameFormat, sum_check: bool) -> None:
@@ -26,7 +26,7 @@ class RequestReader:
         self._heard = 0.0
 
     def feed(self, data: bytes, now: float) -> list[str]:
-        """The requests completed by `data`, from station to sum."""
+        """Returns the requests completed by `data`, from station to sum."""
         self._heard = now
         requests: list[str] = []
         for byte in data:
@@ -41,7 +41,7 @@ class RequestReader:
         return requests
 
     def expire(self, now: float, time_out: float) -> str:
-        """The beginning of a request that was not finished in time, or ""."""
+        """Returns the beginning of a request that did not end in time, or ""."""
         block = self._block
         late = now - self._heard > time_out
         if block is None or not (late or len(block) > _LONGEST):
@@ -68,7 +68,7 @@ class RequestReader:
 
 
 def _area_length(text: str) -> int:
-    """The characters of the area; _NOT_YET while they cannot be told, _NEVER if they never can."""
+    """Returns the characters of the area; _NOT_YET before, _NEVER for an unknown command."""
     command, area = text[4:6], text[_HEADER:]
     if len(text) < _HEADER:
         return _NOT_YET

@@ -1,6 +1,6 @@
-"""A simulated Liyan EX or Mitsubishi FX PLC: answers Computer Link requests from its memory.
+"""A simulated Liyan EX or Mitsubishi FX PLC: replies to Computer Link requests from its memory.
 
-It finds its devices by itself, from the tables of the Liyan manual 1-5 and chapter 2.
+It finds its devices independent of the driver: tables of the Liyan manual 1-5 and chapter 2.
 """
 
 from collections.abc import Callable, Iterable
@@ -37,7 +37,7 @@ class ComputerLinkStation:
 
     Memory areas are the driver's: X Y M S TS CS bits (octal numbers as plain integers), T C D
     words, C32 the counters from C200 on (32 bits), M8 and D8 the special devices from 8000 on.
-    D8120 and D8121 are taken at `power_cycle` only; D8129 at once.
+    `power_cycle` applies D8120 and D8121; D8129 applies at once.
     """
 
     def __init__(
@@ -50,15 +50,15 @@ class ComputerLinkStation:
         holes: Iterable[tuple[str, int]] = (),
         model: str = "9E",
     ) -> None:
-        """`holes`: devices (area, number) that this model lacks; `model`: the answer to PC."""
+        """`holes`: devices (area, number) that this model lacks; `model`: the reply to PC."""
         self.station = station
         self.frame_format: FrameFormat = frame_format
         self.sum_check = sum_check
         self.holes = set(holes)
         self.model = model
-        self.mute = False  # obeys, but its answers are lost
+        self.mute = False  # carries out requests, but its replies are lost
         self.switch_at_run = False  # the RUN/STOP switch; remote RUN works at STOP only
-        self.delay = 0.0  # seconds the last request wanted its answer to wait
+        self.delay = 0.0  # seconds of message wait in the last request
         self._speaks = True
         self._limits = limits(profile)
         self._memory = Memory(areas(profile))
@@ -78,11 +78,11 @@ class ComputerLinkStation:
         return self.switch_at_run or self._memory.read("M8", 8035, 2) == [1, 1]
 
     def forget_monitor(self) -> None:
-        """Lose what BM and WM registered, as at power-off."""
+        """Loses the lists of BM and WM, as at power-off."""
         self._bits, self._words = [], []
 
     def power_cycle(self) -> None:
-        """Off and on again: D8120 and D8121 are taken, flags and registered lists are gone."""
+        """Switches off and on: applies D8120 and D8121, loses flags and registered lists."""
         procedure, station = self._memory.read("D8", 8120, 2)
         self.frame_format = 4 if procedure & _FORMAT_4 else 1
         self.sum_check = bool(procedure & _SUM)
@@ -93,12 +93,12 @@ class ComputerLinkStation:
         self.forget_monitor()
 
     def on_demand(self, data: str) -> bytes:
-        """The block the PLC sends by itself, with PC number FE."""
+        """Returns an unsolicited block of the PLC, with PC number FE."""
         return self._encode(Text(self.station, data, "FE"))
 
     def hear(self, data: bytes, now: float) -> list[bytes]:
-        """The answers to what `data` completes; `delay` says how long the last one has to wait."""
-        self._hear_incomplete(now)
+        """Returns the replies to the requests that `data` completes; the last waits for `delay`."""
+        self._expire(now)
         answers = [self._answer(text, now) for text in self._reader.feed(data, now)]
         return (
             []
@@ -106,8 +106,8 @@ class ComputerLinkStation:
             else [self._encode(frame) for frame in answers if frame is not None]
         )
 
-    def _hear_incomplete(self, now: float) -> None:
-        """Give up a message that was not finished within D8129; nobody is told."""
+    def _expire(self, now: float) -> None:
+        """Discards a message that did not end within D8129, without a reply."""
         time_out = self._memory.read("D8", 8129)[0] / 100 or _TIME_OUT
         if self._reader.expire(now, time_out)[:2] == f"{self.station:02X}":
             self._fault(_INCOMPLETE)
@@ -120,7 +120,7 @@ class ComputerLinkStation:
         for name, value in flags.items():
             self._memory.write("M8", int(name[1:]), [value])
 
-    # What is answered
+    # Replies
 
     def _answer(self, text: str, now: float) -> Frame | None:
         if text[:2] == "FF":
@@ -129,12 +129,12 @@ class ComputerLinkStation:
         if text[:2] != f"{self.station:02X}":
             return None
         try:
-            return self._obey(text, now)
+            return self._carry_out(text, now)
         except No as refusal:
             return Nak(self.station, refusal.code)
 
-    def _obey(self, text: str, now: float) -> Frame | None:
-        """Checks in the order of the error codes: 02, 03, 06, 07, 10, 18."""
+    def _carry_out(self, text: str, now: float) -> Frame | None:
+        """Carries out a request; checks in the order of the error codes: 02, 03, 06, 07, 10, 18."""
         self.delay = 0.0
         body = self._body(text)
         pc, command, wait, area = body[2:4], body[4:6], body[6:7], body[7:]
@@ -146,13 +146,13 @@ class ComputerLinkStation:
         if command == "GW":
             self._global(area)
             return None
-        act = self._understand(command, area)
+        act = self._action(command, area)
         if pc != "FF":
             raise No("10")
         return act(now)
 
     def _body(self, text: str) -> str:
-        """The block without its sum."""
+        """Returns the block without its sum."""
         if not self.sum_check:
             return text
         if byte_sum(text[:-2].encode("latin-1")).decode() != text[-2:]:
@@ -160,7 +160,7 @@ class ComputerLinkStation:
         return text[:-2]
 
     def _all_stations(self, text: str) -> None:
-        """Only the global flag may go to station FF, and nothing is answered."""
+        """Accepts only the global flag for station FF, without a reply."""
         try:
             body = self._body(text)
         except No:
@@ -171,11 +171,11 @@ class ComputerLinkStation:
             self._fault(_BAD_STATION)
 
     def _global(self, area: str) -> None:
-        """Never answered, not even where it is wrong."""
+        """Sets the global flag; there is no reply, not even to a wrong request."""
         if area in ("0", "1"):
             self._flags(M8126=int(area))
 
-    def _understand(self, command: str, area: str) -> Act:
+    def _action(self, command: str, area: str) -> Act:
         match command:
             case "BR" | "WR" | "BW" | "WW":
                 return self._batch(command, area)
@@ -254,7 +254,7 @@ class ComputerLinkStation:
             raise No("06")
         return cells
 
-    # What is done
+    # Actions
 
     def _text(self, cells: list[Cells], now: float) -> Text:
         data = "".join(

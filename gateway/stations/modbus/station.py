@@ -1,6 +1,6 @@
-"""How a simulated Modbus slave answers (application protocol V1.1b3, 6 and 7).
+"""A simulated Modbus slave (application protocol V1.1b3, 6 and 7).
 
-Silent on a wrong CRC or LRC, on other stations' frames and on broadcasts. Exceptions come in
+No reply to a wrong CRC or LRC, to frames of other stations and to broadcasts. Exceptions come in
 the standard's order: 01 for the function, 03 for counts and values, 02 for the addresses.
 """
 
@@ -58,8 +58,8 @@ _REQUESTS: dict[int, type[ModbusPDU]] = {
     15: WriteMultipleCoilsRequest,
     16: WriteMultipleRegistersRequest,
 }
-_BIT_ANSWERS: dict[int, type[ModbusPDU]] = {1: ReadCoilsResponse, 2: ReadDiscreteInputsResponse}
-_WORD_ANSWERS: dict[int, type[ModbusPDU]] = {
+_BIT_REPLIES: dict[int, type[ModbusPDU]] = {1: ReadCoilsResponse, 2: ReadDiscreteInputsResponse}
+_WORD_REPLIES: dict[int, type[ModbusPDU]] = {
     3: ReadHoldingRegistersResponse,
     4: ReadInputRegistersResponse,
 }
@@ -76,9 +76,9 @@ class _Malformed(Exception):
 class ModbusStation:
     """One slave on a line, or behind one TCP connection.
 
-    `holes` are (area, first, last) this device does not have: exception 02. `mute` is a station
-    whose cable is out. `diagnostics`: it has function 08, sub-function 0. `gap` is the silence
-    in seconds after which half a request is forgotten.
+    `holes` are (area, first, last) that this device lacks: exception 02. `mute` is a station
+    without its cable. `diagnostics`: it has function 08, sub-function 0. `gap` is the silence in
+    seconds that discards half a request.
     """
 
     station: int = 1
@@ -103,7 +103,7 @@ class ModbusStation:
         return self._store.memory
 
     def hear(self, data: bytes, now: float) -> list[bytes]:
-        """The frames to send because of `data`. With `tcp` the data of one connection."""
+        """Returns the frames to send after `data`. With `tcp` the data of one connection."""
         if self.framing == "rtu" and now - self._heard_at > self.gap:
             self._codec = self._new_codec()
         self._heard_at = now
@@ -134,7 +134,7 @@ class ModbusStation:
         return None if to_all or not answer else Frame(frame.station, answer, frame.transaction)
 
     def _serve(self, pdu: bytes, now: float) -> bytes:
-        """The PDU that answers `pdu`; empty for what is no request at all."""
+        """Returns the PDU of the reply to `pdu`; empty where `pdu` is no request."""
         function = pdu[0]
         if function >= 0x80:
             return b""
@@ -152,7 +152,7 @@ class ModbusStation:
         return self._do(function, request, count, now)
 
     def _decode(self, pdu: bytes) -> ModbusPDU:
-        """The request, in itself right. Raises what pymodbus raises, or `_Malformed`."""
+        """Returns a consistent request. Raises the errors of pymodbus, or `_Malformed`."""
         function = pdu[0]
         request = _REQUESTS[function]()
         request.decode(pdu[1:])
@@ -175,10 +175,10 @@ class ModbusStation:
         match function:
             case 1 | 2:
                 bits = [bool(bit) for bit in self._store.read(function, address, count, now)]
-                return _encode(_BIT_ANSWERS[function](bits=bits))
+                return _encode(_BIT_REPLIES[function](bits=bits))
             case 3 | 4:
                 words = [word & 0xFFFF for word in self._store.read(function, address, count, now)]
-                return _encode(_WORD_ANSWERS[function](registers=words))
+                return _encode(_WORD_REPLIES[function](registers=words))
             case 5 | 15:
                 self._store.write(function, address, [int(bit) for bit in request.bits], now)
             case _:
@@ -188,7 +188,7 @@ class ModbusStation:
                 return _encode(WriteMultipleCoilsResponse(address=address, count=count))
             case 16:
                 return _encode(WriteMultipleRegistersResponse(address=address, count=count))
-        return _encode(request)  # 05 and 06 are answered with themselves
+        return _encode(request)  # the reply to 05 and 06 is equal to the request
 
 
 def modbus_station(driver: ModbusRtu | ModbusAscii | ModbusTcp) -> ModbusStation:

@@ -1,6 +1,6 @@
 """The data of a simulated Modbus slave: wire addresses in front, the PLC's own memory behind.
 
-Written from the manuals' tables a second time, so that it can prove the driver's wrong.
+Written from the tables of the manuals independent of the driver, to find mistakes of either.
 """
 
 from collections.abc import Iterator, Sequence
@@ -59,7 +59,7 @@ _K120S_WORDS = (
     Run(8 * 0x1000, 5000, "D"),
 )
 
-# Dialect -> function code -> what it reads or writes. Other functions are not served.
+# Dialect -> function code -> its data. Other functions are not served.
 _SERVED: dict[str, dict[int, Runs]] = {
     "plain": {
         1: (Run(0, 65536, "coil"),),
@@ -85,7 +85,7 @@ class Store:
     def __init__(
         self, dialect: str, holes: Sequence[tuple[str, int, int]], *, low_first: bool
     ) -> None:
-        """`holes`: (area, first, last) of what this device does not have."""
+        """`holes`: (area, first, last) that this device lacks."""
         served = _SERVED[dialect]
         self._runs = served | {
             write: served[read] for write, read in _WRITES.items() if read in served
@@ -104,7 +104,7 @@ class Store:
         return function in self._runs
 
     def holds(self, function: int, wire: int, count: int) -> bool:
-        """Whether the function may do that: the addresses exist and, if it writes, take it."""
+        """Returns True when the addresses exist and, for a write, are writable."""
         parts = list(self._parts(function, wire, count))
         return (
             sum(part.size for part in parts) == count
@@ -139,7 +139,7 @@ class Store:
             self._reconcile(part, now)
 
     def _parts(self, function: int, wire: int, count: int) -> Iterator[Part]:
-        """The pieces of the range that exist, in order."""
+        """Yields the pieces of the range that exist, in order."""
         for run in sorted(self._runs[function]):
             start, end = max(wire, run.wire), min(wire + count, run.wire + run.size)
             if start < end:
@@ -165,7 +165,7 @@ class Store:
         return [a | b << 16 for a, b in zip(words[low::2], words[high::2], strict=True)]
 
     def _reconcile(self, part: Part, now: float) -> None:
-        """K120S relays are words whose bits have names too: carry over what changed in one view."""
+        """Copies changes between the words and the bits of K120S relays."""
         letter = part.run.area[0]
         if letter not in self._relays or part.run.area not in (letter, f"{letter}W"):
             return
@@ -184,7 +184,7 @@ class Store:
 
 
 def _units(part: Part) -> tuple[int, int]:
-    """First unit and number of units a part touches."""
+    """Returns first unit and number of units of a part."""
     if not part.run.halves:
         return part.run.first + part.ahead, part.size
     first, last = part.ahead // 2, (part.ahead + part.size - 1) // 2
