@@ -21,7 +21,7 @@ KEEPALIVE = {
 
 
 async def open_tcp(where: TcpAddress, receiver: Receiver, *, timeout: float = 5.0) -> StreamPort:
-    """Connects to a device server or Modbus TCP device. Raises `LineDown`."""
+    """Connects to a device server or network device. Raises `LineDown`."""
     name = f"{where.host}:{where.port}"
     port = StreamPort(name, receiver)
     try:
