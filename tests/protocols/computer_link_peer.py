@@ -5,11 +5,15 @@ five-character names; nothing is forgiven.
 """
 
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 from gateway.errors import Garbled, NoReply
 
 T = TypeVar("T")
+
+FrameFormat = Literal[1, 4]
+Procedure = tuple[FrameFormat, bool]  # the second: sum check
+PROCEDURES: list[Procedure] = [(1, True), (1, False), (4, True), (4, False)]
 
 
 def summed(block: bytes) -> bytes:

@@ -1,7 +1,9 @@
 """The Computer Link driver, against the examples of the Liyan manual, chapter 2."""
 
 import re
+from collections.abc import Awaitable, Callable
 from pathlib import Path
+from typing import Any, TypeVar
 
 import pytest
 from hypothesis import given, settings
@@ -11,6 +13,7 @@ from pydantic import TypeAdapter, ValidationError
 from gateway.config import load
 from gateway.errors import BadValue, ConfigError, DeviceError, Garbled, NoReply, Refusal, Refused
 from gateway.protocols.computer_link import NO_REPLY_CAUSES, ComputerLink, Enquiry, Frame, Text
+from gateway.protocols.computer_link.devices import ProfileName
 from gateway.protocols.driver import (
     Address,
     Controllable,
@@ -21,7 +24,7 @@ from gateway.protocols.driver import (
     Span,
 )
 from tests.doubles import Script
-from tests.protocols.computer_link_peer import Peer
+from tests.protocols.computer_link_peer import PROCEDURES, FrameFormat, Peer, Procedure
 from tests.vectors import vectors
 
 VECTORS = {vector.id: vector.frame for vector in vectors("fxlink")}
@@ -46,7 +49,7 @@ def vector(number: str) -> bytes:
     ("frame_format", "sum_check", "reply"), [(1, True, "057"), (1, False, "059"), (4, False, "076")]
 )
 async def test_2_1_reads_five_points_with_100_ms_wait(
-    frame_format: int, sum_check: bool, reply: str
+    frame_format: FrameFormat, sum_check: bool, reply: str
 ) -> None:
     driver = ComputerLink(
         station=5, frame_format=frame_format, sum_check=sum_check, message_wait=0.1
@@ -62,7 +65,7 @@ async def test_2_1_reads_five_points_with_100_ms_wait(
     ("frame_format", "sum_check", "number"), [(1, True, "001"), (1, False, "002"), (4, True, "003")]
 )
 async def test_2_1_the_five_points_m10_to_m14_cost_less_as_one_word_from_m8(
-    frame_format: int, sum_check: bool, number: str
+    frame_format: FrameFormat, sum_check: bool, number: str
 ) -> None:
     driver = ComputerLink(
         station=5, frame_format=frame_format, sum_check=sum_check, message_wait=0.1
@@ -81,7 +84,7 @@ async def test_2_1_the_five_points_m10_to_m14_cost_less_as_one_word_from_m8(
     ("frame_format", "sum_check", "number"), [(1, True, "005"), (1, False, "006"), (4, True, "007")]
 )
 async def test_2_2_example_1_reads_m40_to_m71_as_two_words(
-    frame_format: int, sum_check: bool, number: str
+    frame_format: FrameFormat, sum_check: bool, number: str
 ) -> None:
     driver = ComputerLink(
         station=5, frame_format=frame_format, sum_check=sum_check, message_wait=0.1
@@ -110,7 +113,7 @@ async def test_2_2_example_3_reads_d100_and_d101_of_station_15() -> None:
 
 @pytest.mark.parametrize(("frame_format", "reply"), [(1, "063"), (4, "080")])
 async def test_1_6_2_c200_is_one_device_with_its_high_word_first(
-    frame_format: int, reply: str
+    frame_format: FrameFormat, reply: str
 ) -> None:
     driver, peer = ComputerLink(frame_format=frame_format), Peer(0, frame_format, True)
     talk = Script(driver, sends(peer.enq("00FFWR0CN20001")), hears(vector(reply)))
@@ -131,7 +134,7 @@ async def test_2_3_a_writes_m903_to_m907() -> None:
     [(1, True, "009"), (1, False, "010"), (4, True, "011"), (4, False, "012")],
 )
 async def test_2_3_b_writes_m8030_and_m8031_of_station_8(
-    frame_format: int, sum_check: bool, number: str
+    frame_format: FrameFormat, sum_check: bool, number: str
 ) -> None:
     driver = ComputerLink(
         station=8, frame_format=frame_format, sum_check=sum_check, message_wait=0.01
@@ -161,7 +164,7 @@ async def test_2_4_example_2_writes_d0_and_d1() -> None:
     [(1, True, "013"), (1, False, "014"), (4, True, "015"), (4, False, "016")],
 )
 async def test_2_4_example_3_writes_d8130_and_d8131(
-    frame_format: int, sum_check: bool, number: str
+    frame_format: FrameFormat, sum_check: bool, number: str
 ) -> None:
     driver = ComputerLink(frame_format=frame_format, sum_check=sum_check)
     talk = Script(driver, sends(vector(number)), hears(Peer(0, frame_format, sum_check).ack()))
@@ -188,7 +191,7 @@ async def test_2_5_sets_m50_resets_s100_sets_y1_in_one_bt() -> None:
     ("frame_format", "sum_check", "number"), [(1, False, "018"), (4, True, "019")]
 )
 async def test_2_5_x_and_y_are_numbered_in_octal(
-    frame_format: int, sum_check: bool, number: str
+    frame_format: FrameFormat, sum_check: bool, number: str
 ) -> None:
     driver = ComputerLink(station=5, frame_format=frame_format, sum_check=sum_check)
     talk = Script(driver, sends(vector(number)), hears(Peer(5, frame_format, sum_check).ack()))
@@ -217,7 +220,7 @@ async def test_2_6_writes_d500_y100_to_y117_and_c100_in_one_wt() -> None:
     [(1, True, "021"), (1, False, "022"), (4, True, "023"), (4, False, "024")],
 )
 async def test_2_6_a_word_and_sixteen_states_go_in_one_wt(
-    frame_format: int, sum_check: bool, number: str
+    frame_format: FrameFormat, sum_check: bool, number: str
 ) -> None:
     driver = ComputerLink(station=5, frame_format=frame_format, sum_check=sum_check)
     talk = Script(driver, sends(vector(number)), hears(Peer(5, frame_format, sum_check).ack()))
@@ -234,7 +237,9 @@ WORDS = [Span("D", 500, 1), Span("Y", 0o100, 16), Span("C", 100, 1)]
     ("frame_format", "sum_check", "number"),
     [(1, True, "025"), (1, False, "026"), (4, False, "028")],
 )
-async def test_2_7_registers_three_points(frame_format: int, sum_check: bool, number: str) -> None:
+async def test_2_7_registers_three_points(
+    frame_format: FrameFormat, sum_check: bool, number: str
+) -> None:
     driver = ComputerLink(station=5, frame_format=frame_format, sum_check=sum_check, monitor=True)
     talk = Script(driver, sends(vector(number)), hears(Peer(5, frame_format, sum_check).ack()))
     await driver.register(talk, BITS)
@@ -245,7 +250,9 @@ async def test_2_7_registers_three_points(frame_format: int, sum_check: bool, nu
     ("frame_format", "sum_check", "number"),
     [(1, True, "029"), (1, False, "030"), (4, True, "031"), (4, False, "032")],
 )
-async def test_2_8_registers_three_words(frame_format: int, sum_check: bool, number: str) -> None:
+async def test_2_8_registers_three_words(
+    frame_format: FrameFormat, sum_check: bool, number: str
+) -> None:
     driver = ComputerLink(station=5, frame_format=frame_format, sum_check=sum_check, monitor=True)
     talk = Script(driver, sends(vector(number)), hears(Peer(5, frame_format, sum_check).ack()))
     await driver.register(talk, WORDS)
@@ -256,7 +263,7 @@ async def test_2_8_registers_three_words(frame_format: int, sum_check: bool, num
     ("frame_format", "request_", "reply"), [(1, "033", "061"), (4, "035", "078")]
 )
 async def test_2_9_reads_the_registered_points(
-    frame_format: int, request_: str, reply: str
+    frame_format: FrameFormat, request_: str, reply: str
 ) -> None:
     driver = ComputerLink(station=8, frame_format=frame_format, monitor=True)
     talk = Script(driver, sends(vector(request_)), hears(vector(reply)))
@@ -270,7 +277,7 @@ async def test_2_9_reads_the_registered_points(
     [(1, False, "038", "060"), (4, True, "039", "075"), (4, False, "040", "077")],
 )
 async def test_2_10_reads_the_registered_words(
-    frame_format: int, sum_check: bool, request_: str, reply: str
+    frame_format: FrameFormat, sum_check: bool, request_: str, reply: str
 ) -> None:
     driver = ComputerLink(station=8, frame_format=frame_format, sum_check=sum_check, monitor=True)
     spans = [Span("D", 500, 1), Span("C", 100, 1), Span("D", 7, 1)]
@@ -349,7 +356,7 @@ async def test_2_11_remote_run_of_station_5_and_stop_of_station_0(command: str, 
     ],
 )
 async def test_2_11_remote_run_and_stop_of_station_31(
-    frame_format: int, sum_check: bool, command: str, number: str
+    frame_format: FrameFormat, sum_check: bool, command: str, number: str
 ) -> None:
     driver = ComputerLink(station=31, frame_format=frame_format, sum_check=sum_check)
     talk = Script(driver, sends(vector(number)), hears(Peer(31, frame_format, sum_check).ack()))
@@ -369,7 +376,7 @@ async def test_2_11_remote_run_while_running_is_refused_with_18() -> None:
     ("frame_format", "sum_check", "number"), [(1, True, "049"), (1, False, "050"), (4, True, "051")]
 )
 async def test_2_12_the_global_flag_goes_to_all_stations_and_nobody_answers(
-    frame_format: int, sum_check: bool, number: str
+    frame_format: FrameFormat, sum_check: bool, number: str
 ) -> None:
     driver = ComputerLink(station=3, frame_format=frame_format, sum_check=sum_check)
     talk = Script(driver, sends(vector(number)))
@@ -396,7 +403,7 @@ async def test_2_13_loopback_of_abcde() -> None:
     ("frame_format", "request_", "reply"), [(1, "053", "062"), (4, "055", "079")]
 )
 async def test_2_13_loopback_of_ten_characters(
-    frame_format: int, request_: str, reply: str
+    frame_format: FrameFormat, request_: str, reply: str
 ) -> None:
     driver = ComputerLink(station=1, frame_format=frame_format)
     talk = Script(driver, sends(vector(request_)), hears(vector(reply)))
@@ -455,7 +462,7 @@ def test_x100_to_x177_would_be_64_points_of_br_and_go_as_four_words() -> None:
 )
 @pytest.mark.parametrize("frame_format", [1, 4])
 async def test_a_nak_is_refused_with_its_code_and_meaning(
-    number: str, refusal: Refusal, frame_format: int
+    number: str, refusal: Refusal, frame_format: FrameFormat
 ) -> None:
     block = vector(number if frame_format == 1 else f"{int(number) + 17:03}")
     code = block[5:7].decode()
@@ -541,8 +548,13 @@ async def test_no_answer_to_a_resync_can_be_taken_for_a_value(
         await driver.read(Answer(driver, peer.stx(f"05Z{salt:04X}")), Span(area, first, size))
 
 
+T = TypeVar("T")
+
+
 class Answer:
-    """A `Talk` that hears the same bytes whatever is asked."""
+    """A `Talk` that receives the same bytes after every request."""
+
+    may_echo = False
 
     def __init__(self, driver: ComputerLink, *pieces: bytes) -> None:
         self._codec, self._pieces = driver.codec(), pieces
@@ -550,7 +562,7 @@ class Answer:
     async def tell(self, frame: Frame) -> None:
         self._codec.encode(frame)
 
-    async def ask(self, frame, reply, answers):
+    async def ask(self, frame: Frame, reply: int, answers: Callable[[Frame], T | None]) -> T:
         self._codec.encode(frame)
         for piece in self._pieces:
             for got in self._codec.feed(piece):
@@ -572,7 +584,8 @@ BLOCKS = st.builds(
     st.integers(4, 5),
     st.text("01239AFZ", max_size=12),
 )
-CONVERSATIONS = [
+Converse = Callable[[ComputerLink, Answer], Awaitable[Any]]
+CONVERSATIONS: list[Converse] = [
     lambda driver, talk: driver.read(talk, Span("D", 100, 2)),
     lambda driver, talk: driver.read(talk, Span("M", 10, 2)),
     lambda driver, talk: driver.read(talk, Span("M", 0, 30)),
@@ -593,10 +606,10 @@ CONVERSATIONS = [
 @given(
     st.lists(st.one_of(BLOCKS, st.binary(max_size=8)), max_size=4),
     st.sampled_from(CONVERSATIONS),
-    st.sampled_from([(1, True), (1, False), (4, True), (4, False)]),
+    st.sampled_from(PROCEDURES),
 )
 async def test_whatever_comes_back_is_a_value_or_a_device_error(
-    pieces, converse, procedure
+    pieces: list[bytes], converse: Converse, procedure: Procedure
 ) -> None:
     driver = ComputerLink(
         station=5, frame_format=procedure[0], sum_check=procedure[1], monitor=True
@@ -629,7 +642,7 @@ async def test_whatever_comes_back_is_a_value_or_a_device_error(
     ],
     ids=str,
 )
-def test_a_setting_out_of_range_is_a_config_error(settings_, says: str) -> None:
+def test_a_setting_out_of_range_is_a_config_error(settings_: dict[str, Any], says: str) -> None:
     with pytest.raises(ConfigError, match=says):
         ComputerLink(**settings_)
 
@@ -798,7 +811,9 @@ def test_an_address_the_plc_does_not_have_says_what_would_be_right(text: str, sa
         ("fx", ["X267", "M3071", "D7999"], ["X270", "M3072", "D8000.16", "D8256"]),
     ],
 )
-def test_1_5_each_profile_has_its_ranges(profile, has: list[str], has_not: list[str]) -> None:
+def test_1_5_each_profile_has_its_ranges(
+    profile: ProfileName, has: list[str], has_not: list[str]
+) -> None:
     driver = ComputerLink(profile=profile)
     for text in has:
         assert driver.spell(driver.address(text)) == text

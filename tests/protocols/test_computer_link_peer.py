@@ -6,10 +6,10 @@ from hypothesis import strategies as st
 
 from gateway.errors import Refused
 from gateway.protocols.computer_link import ComputerLink
+from gateway.protocols.computer_link.devices import ProfileName
 from gateway.protocols.driver import Cost, Span, Unit
-from tests.protocols.computer_link_peer import Peer, PeerTalk
+from tests.protocols.computer_link_peer import PROCEDURES, Peer, PeerTalk, Procedure
 
-PROCEDURES = [(1, True), (1, False), (4, True), (4, False)]
 LETTERS = {"M8": "M", "D8": "D", "T": "TN", "C": "CN", "C32": "CN"}
 
 drivers = st.builds(
@@ -64,9 +64,9 @@ def neighbours(draw: st.DrawFn, driver: ComputerLink) -> list[Span]:
     return found
 
 
-def values(draw: st.DrawFn, driver: ComputerLink, span: Span) -> list[int]:
+def values(data: st.DataObject, driver: ComputerLink, span: Span) -> list[int]:
     top = {Unit.BIT: 1, Unit.WORD: 0xFFFF, Unit.DWORD: 0xFFFFFFFF}[driver.areas[span.area].unit]
-    return draw(st.lists(st.integers(0, top), min_size=span.size, max_size=span.size))
+    return data.draw(st.lists(st.integers(0, top), min_size=span.size, max_size=span.size))
 
 
 @settings(max_examples=120, deadline=None)
@@ -76,7 +76,7 @@ async def test_a_read_gives_the_devices_and_costs_what_was_said(
 ) -> None:
     span = data.draw(spans(driver))
     peer = peer_of(driver)
-    units = values(data.draw, driver, span)
+    units = values(data, driver, span)
     peer.devices = dict(zip(names(peer, span), units, strict=True))
     wire = PeerTalk(driver, peer.hear, pieces)
     cost = driver.cost(span)
@@ -96,7 +96,7 @@ async def test_a_write_changes_its_devices_and_no_other_and_costs_what_was_said(
 ) -> None:
     span = data.draw(spans(driver, 170))
     peer = peer_of(driver)
-    units = values(data.draw, driver, span)
+    units = values(data, driver, span)
     wire = PeerTalk(driver, peer.hear)
     cost = driver.write_cost(span)
     if cost is None:
@@ -113,7 +113,7 @@ async def test_a_write_changes_its_devices_and_no_other_and_costs_what_was_said(
 async def test_a_scattered_write_changes_its_devices_and_no_other(
     data: st.DataObject, driver: ComputerLink
 ) -> None:
-    parts = [(span, values(data.draw, driver, span)) for span in data.draw(neighbours(driver))]
+    parts = [(span, values(data, driver, span)) for span in data.draw(neighbours(driver))]
     peer = peer_of(driver)
     wire = PeerTalk(driver, peer.hear)
     cost = driver.scattered_write_cost([span for span, _ in parts])
@@ -137,7 +137,7 @@ async def test_registered_devices_are_read_in_their_order(
     asked = data.draw(neighbours(driver))
     peer = peer_of(driver)
     for span in asked:
-        units = values(data.draw, driver, span)
+        units = values(data, driver, span)
         peer.devices |= dict(zip(names(peer, span), units, strict=True))
     cost = driver.monitor_cost(asked)
     if cost is None:
@@ -188,7 +188,7 @@ def fits(driver: ComputerLink, area: str, start: int, *, write: bool = False) ->
     ],
 )
 def test_one_exchange_takes_what_the_profile_allows(
-    profile, read: dict[str, int], write: dict[str, int]
+    profile: ProfileName, read: dict[str, int], write: dict[str, int]
 ) -> None:
     driver = ComputerLink(profile=profile)
     for area, size in read.items():
@@ -258,7 +258,7 @@ def test_a_span_outside_the_device_cannot_be_asked_for(span: Span) -> None:
 
 
 @pytest.mark.parametrize("procedure", PROCEDURES)
-async def test_every_control_is_understood(procedure: tuple[int, bool]) -> None:
+async def test_every_control_is_understood(procedure: Procedure) -> None:
     driver = ComputerLink(station=5, frame_format=procedure[0], sum_check=procedure[1])
     peer = peer_of(driver)
     wire = PeerTalk(driver, peer.hear)
@@ -269,5 +269,10 @@ async def test_every_control_is_understood(procedure: tuple[int, bool]) -> None:
     assert await driver.control(wire, "loopback", text) == text
     await driver.resync(wire, None, 70000)
     heard: list[bytes] = []
-    await driver.control(PeerTalk(driver, lambda data: heard.append(data) or b""), "global", "on")
+
+    def silent(data: bytes) -> bytes:
+        heard.append(data)
+        return b""
+
+    await driver.control(PeerTalk(driver, silent), "global", "on")
     assert heard == [peer.enq("FFFFGW01")]

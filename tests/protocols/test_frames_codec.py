@@ -45,7 +45,8 @@ sizes = st.lists(st.integers(1, 9), min_size=1, max_size=8)
 
 
 def pieces(data: bytes, cuts: list[int]) -> list[bytes]:
-    found, at = [], 0
+    found: list[bytes] = []
+    at = 0
     while at < len(data):
         size = cuts[len(found) % len(cuts)]
         found.append(data[at : at + size])

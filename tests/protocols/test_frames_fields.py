@@ -76,7 +76,7 @@ def test_a_float_comes_back_as_it_was_put(value: float) -> None:
 def test_a_decimal_comes_back_as_it_was_put(whole: int, hundredths: int) -> None:
     value = float(f"{whole}.{hundredths:02d}")
     for point in (".", ","):
-        field = Field(type="decimal", format="08.2f", decimal_point=point)  # type: ignore[arg-type]
+        field = Field(type="decimal", format="08.2f", decimal_point=point)
         raw = field.put(value)
         assert len(raw) == 8
         assert field.take(raw) == value

@@ -1,5 +1,7 @@
 """The Modbus drivers against pymodbus: what we send it reads, what it answers we read."""
 
+from typing import Any
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -10,6 +12,7 @@ from pymodbus.pdu.bit_message import (
     WriteSingleCoilResponse,
 )
 from pymodbus.pdu.exceptionresponse import ExceptionResponse
+from pymodbus.pdu.pdu import ModbusPDU
 from pymodbus.pdu.register_message import (
     ReadHoldingRegistersResponse,
     ReadInputRegistersResponse,
@@ -64,7 +67,8 @@ async def test_writes_are_the_oracles_writes(
     units = data.draw(st.lists(unit, min_size=1, max_size=room))
     driver = kind(station=station, write_single=single)
     span = Span("coil" if bits else "holding", start, len(units))
-    shared = {"dev_id": station, "transaction_id": 1, "address": start}
+    shared: dict[str, Any] = {"dev_id": station, "transaction_id": 1, "address": start}
+    answer: ModbusPDU
     if single and len(units) == 1:
         answer = (
             WriteSingleCoilResponse(bits=[bool(units[0])], **shared)

@@ -51,7 +51,9 @@ def play(coroutine: Coroutine[Any, Any, T]) -> T:
 
 
 class Bus:
-    """A `Talk` over something that hears bytes and sends frames; counts the characters."""
+    """A `Talk` over a function from bytes to frames; counts the characters."""
+
+    may_echo = False
 
     def __init__(self, hear: Callable[[bytes], list[bytes]]) -> None:
         self._hear = hear

@@ -2,6 +2,7 @@
 
 import asyncio
 import itertools
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -23,6 +24,11 @@ def turned(data: bytes) -> bytes:
     return bytes(byte ^ 0xFF for byte in data)
 
 
+def near(seconds: float) -> Any:
+    """A time, but for rounding."""
+    return pytest.approx(seconds)
+
+
 def test_a_request_is_heard_when_its_last_character_is_through_by_every_station() -> None:
     async def play() -> tuple[Says, Says]:
         one, other = Says(), Says()
@@ -32,7 +38,7 @@ def test_a_request_is_heard_when_its_last_character_is_through_by_every_station(
         return one, other
 
     for station in counted(play):
-        assert station.heard == [(pytest.approx(len(REQUEST) * C), REQUEST)]
+        assert station.heard == [(near(len(REQUEST) * C), REQUEST)]
 
 
 def test_a_reply_comes_in_fifo_chunks_each_at_its_time() -> None:
@@ -47,9 +53,9 @@ def test_a_reply_comes_in_fifo_chunks_each_at_its_time() -> None:
 
     begin = len(REQUEST) * C + 0.004
     assert counted(play).pieces == [
-        (pytest.approx(begin + FIFO * C), reply[:FIFO]),
-        (pytest.approx(begin + 2 * FIFO * C), reply[FIFO : 2 * FIFO]),
-        (pytest.approx(begin + 40 * C), reply[2 * FIFO :]),
+        (near(begin + FIFO * C), reply[:FIFO]),
+        (near(begin + 2 * FIFO * C), reply[FIFO : 2 * FIFO]),
+        (near(begin + 40 * C), reply[2 * FIFO :]),
     ]
 
 
@@ -89,7 +95,7 @@ def test_a_slow_station_answers_later_by_its_delay() -> None:
         await asyncio.sleep(1)
         return ear
 
-    assert counted(play).pieces == [(pytest.approx((len(REQUEST) + 1) * C + 0.305), b"A")]
+    assert counted(play).pieces == [(near((len(REQUEST) + 1) * C + 0.305), b"A")]
 
 
 def test_two_writes_at_once_follow_each_other() -> None:
@@ -102,8 +108,8 @@ def test_two_writes_at_once_follow_each_other() -> None:
         return station
 
     assert counted(play).heard == [
-        (pytest.approx(len(REQUEST) * C), REQUEST),
-        (pytest.approx(len(REQUEST + REPLY) * C), REPLY),
+        (near(len(REQUEST) * C), REQUEST),
+        (near(len(REQUEST + REPLY) * C), REPLY),
     ]
 
 

@@ -2,6 +2,7 @@
 
 import asyncio
 import os
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -123,13 +124,17 @@ class Echo(Says):
         return [data]
 
 
+def ends_with(last: bytes, heard: Heard) -> bool:
+    return heard.data.endswith(last)
+
+
 async def test_network_stations_answer_each_connection_alone() -> None:
     served = await serve_on_tcp([Echo()], WireTiming(NETWORK_BAUD), "127.0.0.1", 0, paced=False)
     ears = Heard(), Heard()
     ports = [await reach(served.address, ear) for ear in ears]
     for who, question in ((0, b"a"), (1, b"b"), (0, b"c")):
         ports[who].write(question)
-        await ears[who].until(lambda e, last=question: e.data.endswith(last))
+        await ears[who].until(partial(ends_with, question))
     assert (ears[0].data, ears[1].data) == (b"ac", b"b")
     await ports[0].close()
     await served.close()

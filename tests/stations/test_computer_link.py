@@ -6,16 +6,16 @@ from hypothesis import strategies as st
 
 from gateway.errors import Refused
 from gateway.protocols.computer_link import ComputerLink, Enquiry, Frame, LinkCodec, Nak, Text
+from gateway.protocols.computer_link.devices import ProfileName
 from gateway.protocols.driver import Span
 from gateway.stations.computer_link import ComputerLinkStation
 from gateway.stations.station import Station
-from tests.protocols.computer_link_peer import Peer, PeerTalk
+from tests.protocols.computer_link_peer import PROCEDURES, FrameFormat, Peer, PeerTalk, Procedure
 from tests.vectors import Vector, vectors
 
 LINK = vectors("fxlink")
 VECTORS = {vector.id: vector.frame for vector in LINK}
 REQUESTS = [vector for vector in LINK if vector.valid and "command" in vector.fields]
-PROCEDURES = [(1, True), (1, False), (4, True), (4, False)]
 
 
 def station_of(vector: Vector) -> ComputerLinkStation:
@@ -104,7 +104,7 @@ def test_2_1_m10_to_m14_are_answered_as_in_the_vector(
 
 
 @pytest.mark.parametrize(("number", "frame_format"), [("063", 1), ("080", 4)])
-def test_c200_is_answered_as_in_the_vector(number: str, frame_format: int) -> None:
+def test_c200_is_answered_as_in_the_vector(number: str, frame_format: FrameFormat) -> None:
     station = ComputerLinkStation(0, frame_format=frame_format)
     station.memory.write("C32", 200, [0x12345678])
     block = Peer(0, frame_format, True).enq("00FFWR0CN20001")
@@ -115,7 +115,7 @@ def test_c200_is_answered_as_in_the_vector(number: str, frame_format: int) -> No
     ("number", "frame_format", "sum_check"), [("058", 1, True), ("060", 1, False), ("075", 4, True)]
 )
 def test_2_10_registered_words_are_answered_as_in_the_vector(
-    number: str, frame_format: int, sum_check: bool
+    number: str, frame_format: FrameFormat, sum_check: bool
 ) -> None:
     station = ComputerLinkStation(8, "liyan", frame_format, sum_check)
     station.memory.write("D", 500, [0x1234])
@@ -185,7 +185,7 @@ def test_2_10_registered_words_are_answered_as_in_the_vector(
 )
 @pytest.mark.parametrize("procedure", PROCEDURES)
 def test_the_lowest_error_code_that_applies_is_sent(
-    text: str, expected: str | None, procedure: tuple[int, bool]
+    text: str, expected: str | None, procedure: Procedure
 ) -> None:
     if expected is None:  # a character too many: only format 4 can tell
         expected = "06" if procedure[0] == 4 else ("02" if procedure[1] else "")
@@ -207,7 +207,7 @@ def test_fx_takes_256_points_as_00_and_has_no_monitor() -> None:
 
 
 @pytest.mark.parametrize("procedure", PROCEDURES)
-def test_a_hole_is_refused_with_06_and_only_where_it_is(procedure: tuple[int, bool]) -> None:
+def test_a_hole_is_refused_with_06_and_only_where_it_is(procedure: Procedure) -> None:
     station = ComputerLinkStation(5, "liyan", *procedure, holes=[("D", 12), ("M", 20)])
     assert code(station, "05FFWR0D001003") == "06"
     assert code(station, "05FFWR0D001002") == ""
@@ -257,7 +257,7 @@ def test_an_endless_message_is_dropped() -> None:
 
 
 @pytest.mark.parametrize("procedure", PROCEDURES)
-def test_2_13_a_loopback_of_unprintable_characters_is_refused(procedure: tuple[int, bool]) -> None:
+def test_2_13_a_loopback_of_unprintable_characters_is_refused(procedure: Procedure) -> None:
     station = ComputerLinkStation(5, "liyan", *procedure)
     for byte in (0x00, 0x7F, 0x80, 0xFF):
         body = b"05FFTT001" + bytes([byte])
@@ -312,9 +312,7 @@ def test_2_12_the_global_flag_of_one_station_or_of_all_is_never_answered() -> No
     ("procedure", "d8120"),
     [((1, True), 0x6086), ((4, True), 0xE086), ((1, False), 0x4086), ((4, False), 0xC086)],
 )
-def test_d8120_and_d8121_are_taken_at_power_on_only(
-    procedure: tuple[int, bool], d8120: int
-) -> None:
+def test_d8120_and_d8121_are_taken_at_power_on_only(procedure: Procedure, d8120: int) -> None:
     assert ComputerLinkStation(5, "liyan", *procedure).memory.read("D8", 8120, 2) == [d8120, 5]
     station = ComputerLinkStation(5)
     station.memory.write("D8", 8120, [d8120, 7])
@@ -349,13 +347,13 @@ def test_the_model_code_is_what_pc_answers() -> None:
 
 
 @pytest.mark.parametrize("procedure", PROCEDURES)
-def test_on_demand_data_carries_pc_number_fe(procedure: tuple[int, bool]) -> None:
+def test_on_demand_data_carries_pc_number_fe(procedure: Procedure) -> None:
     block = ComputerLinkStation(5, "liyan", *procedure).on_demand("1234")
     assert LinkCodec(*procedure).feed(block) == [Text(5, "1234", "FE")]
 
 
 @pytest.mark.parametrize("procedure", PROCEDURES)
-async def test_the_driver_and_the_station_agree(procedure: tuple[int, bool]) -> None:
+async def test_the_driver_and_the_station_agree(procedure: Procedure) -> None:
     station = ComputerLinkStation(5, "liyan", *procedure, holes=[("D", 50)])
     driver = ComputerLink(
         station=5, frame_format=procedure[0], sum_check=procedure[1], monitor=True
@@ -417,7 +415,7 @@ pieces_of_line = st.lists(
 @settings(max_examples=150, deadline=None)
 @given(pieces_of_line, st.sampled_from(PROCEDURES), st.sampled_from(["liyan", "fx"]))
 def test_any_bytes_are_answered_or_not_and_the_next_request_is_heard(
-    pieces: list[bytes], procedure: tuple[int, bool], profile
+    pieces: list[bytes], procedure: Procedure, profile: ProfileName
 ) -> None:
     station = ComputerLinkStation(5, profile, *procedure)
     for piece in pieces:
