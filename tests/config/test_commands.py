@@ -15,11 +15,10 @@ from gateway.config import load
 from gateway.config.commands import NotControlled, check_command, speaker
 from gateway.engine.requests import CommandResult
 from gateway.errors import BadValue, ConfigError, LineDown
-from gateway.northbound import payload
 from gateway.northbound.audit import Audit
 from gateway.northbound.commands import Commands
-from gateway.northbound.keys import Family, Keys, asked
-from gateway.northbound.payload import Failure, Problem, WriteOutcome
+from gateway.northbound.keys import Family, Keys, parse_key
+from gateway.northbound.payload import Failure, Problem
 from gateway.northbound.writers import Sender
 from tests.e2e.processes import plc_gateway, started, write_config
 from tests.zenoh_peer import ZenohPeer, free_endpoint
@@ -112,7 +111,7 @@ def test_area_c_on_an_echoing_line_is_an_error(tmp_path: Path) -> None:
     ],
 )
 def test_keys_of_commands(key: str, family: Family) -> None:
-    assert asked(key).family is family
+    assert parse_key(key).family is family
 
 
 # Carried out, refused, told
@@ -143,12 +142,12 @@ class Below:
 def obey(below: Below, key: str, data: bytes | None = None) -> tuple[Any, list[Any]]:
     """The result, and what the log, the `writes` key and history were told."""
     published: list[bytes] = []
-    recorded: list[WriteOutcome] = []
+    recorded: list[str] = []
     with capture_logs() as logs:
-        audit = Audit(published.append, recorded.append)
+        audit = Audit(published.append, lambda time, document: recorded.append(document))
         controls = Commands(KEYS, below, lambda: None, audit)  # type: ignore[arg-type,return-value]
-        result = asyncio.run(controls.obey(key, data, Sender("client")))
-    assert [payload.write_outcome(outcome) for outcome in recorded] == published
+        result = asyncio.run(controls.execute(key, data, Sender("client")))
+    assert recorded == [document.decode() for document in published]
     return result, logs + [json.loads(line) for line in published]
 
 
@@ -185,7 +184,7 @@ def test_what_is_no_command_is_refused_and_told(
     assert isinstance(result, Failure)
     assert result.problem is problem
     assert below.told == []
-    assert (line["event"], line["log_level"]) == ("command not obeyed", "warning")
+    assert (line["event"], line["log_level"]) == ("command failed", "warning")
     assert (told["key"], told["outcome"]) == (key, problem.value)
 
 
@@ -202,7 +201,7 @@ def test_every_ending_has_its_word(error: Exception, problem: Problem) -> None:
     assert isinstance(result, Failure)
     assert result.problem is problem
     assert line["error"] == told["outcome"] == problem.value
-    assert ("perhaps" in line["event"]) == (problem is Problem.UNCLEAR)
+    assert (line["event"] == "command unclear") == (problem is Problem.UNCLEAR)
 
 
 async def test_the_gateway_hands_commands_to_the_line(tmp_path: Path) -> None:
@@ -211,7 +210,7 @@ async def test_the_gateway_hands_commands_to_the_line(tmp_path: Path) -> None:
         await gateway.control("oven", "model")
     tasks = [asyncio.create_task(line.run()) for line in gateway.lines]
     async with asyncio.timeout(10):
-        while not gateway.lines[0].is_open:
+        while not gateway.lines[0].engine.is_open:
             await asyncio.sleep(0)
         said = await gateway.control("oven", "model")
         with pytest.raises(NotControlled):

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from gateway.app import device_of
 from gateway.config import Config, ConfigErrors, load, schema
+from gateway.engine.device import Device
 from gateway.protocols.driver import Address, Cost, Span
 from gateway.protocols.frames import FrameDriver
 from gateway.tags import Publish, WriteRule
@@ -109,7 +109,7 @@ def test_all_fields_of_a_reply_are_asked_for_once(file: Callable[[str], Config])
     config = file(
         scale("hours: {address: hours, every: 1min}", "version: {address: version, every: 1s}")
     )
-    device = device_of(config.devices[0], config.lines[0])
+    device = Device(config.devices[0], config.lines[0].wire)
     (block,) = device.blocks
     assert block.every == 1.0
     assert {tag.name for tag in block.tags} == {"hours", "version"}
