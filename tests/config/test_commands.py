@@ -65,14 +65,14 @@ def written(folder: Path, endpoint: str = "tcp/127.0.0.1:7447", **devices: Any) 
         ("oven", "global", "saw does not permit commands"),
     ],
 )
-def test_what_the_file_does_not_allow(tmp_path: Path, device: str, command: str, why: str) -> None:
+def test_commands_without_permission(tmp_path: Path, device: str, command: str, why: str) -> None:
     config = load(written(tmp_path))
     check_command(config, "oven", "stop")
     with pytest.raises(BadValue, match=why):
         check_command(config, device, command)
 
 
-def test_all_stations_are_told_in_the_name_of_one_that_is_there(tmp_path: Path) -> None:
+def test_a_command_to_all_stations_is_sent_by_an_enabled_device(tmp_path: Path) -> None:
     config = load(written(tmp_path))
     assert speaker(config, "hall") == "oven"
     with pytest.raises(BadValue, match="no line attic"):
@@ -151,7 +151,7 @@ def obey(below: Below, key: str, data: bytes | None = None) -> tuple[Any, list[A
     return result, logs + [json.loads(line) for line in published]
 
 
-def test_a_command_is_handed_down_and_told_as_a_write_is() -> None:
+def test_a_command_is_passed_to_the_line_and_logged_like_a_write() -> None:
     below = Below(CommandResult("acknowledged", 1, 0.1))
     result, [line, told] = obey(below, "plant/oven/@stop")
     assert result == below.outcome
@@ -176,7 +176,7 @@ def test_a_command_is_handed_down_and_told_as_a_write_is() -> None:
         ("plant/oven/@loopback", b"A" * 2000, Problem.BAD_VALUE),
     ],
 )
-def test_what_is_no_command_is_refused_and_told(
+def test_an_invalid_command_is_refused_and_logged(
     key: str, data: bytes | None, problem: Problem
 ) -> None:
     below = Below(CommandResult("acknowledged", 1, 0.1))
@@ -196,7 +196,7 @@ def test_what_is_no_command_is_refused_and_told(
         (TimeoutError(), Problem.UNCLEAR),
     ],
 )
-def test_every_ending_has_its_word(error: Exception, problem: Problem) -> None:
+def test_every_result_has_its_code(error: Exception, problem: Problem) -> None:
     result, [line, told] = obey(Below(error), "plant/oven/@stop")
     assert isinstance(result, Failure)
     assert result.problem is problem
@@ -204,7 +204,7 @@ def test_every_ending_has_its_word(error: Exception, problem: Problem) -> None:
     assert (line["event"] == "command unclear") == (problem is Problem.UNCLEAR)
 
 
-async def test_the_gateway_hands_commands_to_the_line(tmp_path: Path) -> None:
+async def test_the_gateway_passes_commands_to_the_line(tmp_path: Path) -> None:
     gateway = Gateway(load(written(tmp_path)))
     with pytest.raises(LineDown):
         await gateway.control("oven", "model")

@@ -288,7 +288,7 @@ async def test_2_10_reads_the_registered_words(
     talk.done()
 
 
-async def test_2_10_a_plc_that_took_the_misprint_literally_is_asked_mw() -> None:
+async def test_2_10_a_plc_with_the_misprinted_command_gets_mw() -> None:
     driver = ComputerLink(station=8, monitor=True, monitor_word_command="MW")
     peer = Peer(8, 1, True)
     talk = Script(driver, sends(peer.enq("08FFMW0")), hears(peer.stx("1234")))
@@ -375,7 +375,7 @@ async def test_2_11_remote_run_while_running_is_refused_with_18() -> None:
 @pytest.mark.parametrize(
     ("frame_format", "sum_check", "number"), [(1, True, "049"), (1, False, "050"), (4, True, "051")]
 )
-async def test_2_12_the_global_flag_goes_to_all_stations_and_nobody_answers(
+async def test_2_12_the_global_flag_goes_to_all_stations_without_a_reply(
     frame_format: FrameFormat, sum_check: bool, number: str
 ) -> None:
     driver = ComputerLink(station=3, frame_format=frame_format, sum_check=sum_check)
@@ -411,7 +411,7 @@ async def test_2_13_loopback_of_ten_characters(
     talk.done()
 
 
-async def test_the_model_is_told_with_its_name() -> None:
+async def test_the_model_is_reported_with_its_name() -> None:
     driver, peer = ComputerLink(), Peer(0, 1, True)
     talk = Script(driver, sends(peer.enq("00FFPC0")), hears(peer.stx("9D")))
     assert await driver.control(talk, "model", "") == "9D (FX2N)"
@@ -430,7 +430,7 @@ BOUNDARIES = [
 
 
 @pytest.mark.parametrize(("number", "span", "wait"), BOUNDARIES, ids=str)
-async def test_the_last_devices_are_asked_for_as_in_the_vectors(
+async def test_the_last_devices_are_requested_as_in_the_vectors(
     number: str, span: Span, wait: float
 ) -> None:
     driver = ComputerLink(message_wait=wait)
@@ -513,7 +513,7 @@ async def test_a_write_is_done_by_its_own_stations_ack_alone() -> None:
         await driver.write(talk, Span("M", 10, 1), [1])
 
 
-def test_a_block_nobody_asked_for_can_be_told_for_the_log() -> None:
+def test_a_stray_block_is_described_for_the_log() -> None:
     driver = ComputerLink(station=5)
     assert driver.describe_stray(Text(5, "0007", "FE")) == "on-demand data of station 5: 0007"
     assert driver.describe_stray(Enquiry(5, "BR", "M001001")) == "echo of BR M001001"
@@ -525,7 +525,7 @@ def test_the_causes_of_silence_name_the_plcs_own_codes() -> None:
         assert code in NO_REPLY_CAUSES
 
 
-async def test_resync_takes_only_the_answer_to_its_own_salt() -> None:
+async def test_resync_takes_only_the_reply_with_its_own_probe_token() -> None:
     driver, peer = ComputerLink(station=5), Peer(5, 1, True)
     late = [peer.stx("05Z0006"), peer.stx("0501101"), peer.ack()]
     talk = Script(driver, sends(peer.enq("05FFTT005Z0007")), *map(hears, late))
@@ -539,9 +539,7 @@ async def test_resync_takes_only_the_answer_to_its_own_salt() -> None:
 
 
 @given(st.integers(0, 0xFFFF), st.sampled_from(["M", "D", "C32", "TS"]), st.integers(1, 16))
-async def test_no_answer_to_a_resync_can_be_taken_for_a_value(
-    salt: int, area: str, size: int
-) -> None:
+async def test_no_reply_to_a_resync_can_be_read_as_a_value(salt: int, area: str, size: int) -> None:
     driver, peer = ComputerLink(station=5), Peer(5, 1, True)
     first = driver.areas[area].first
     with pytest.raises(Garbled):
@@ -608,7 +606,7 @@ CONVERSATIONS: list[Converse] = [
     st.sampled_from(CONVERSATIONS),
     st.sampled_from(PROCEDURES),
 )
-async def test_whatever_comes_back_is_a_value_or_a_device_error(
+async def test_any_reply_is_a_value_or_a_device_error(
     pieces: list[bytes], converse: Converse, procedure: Procedure
 ) -> None:
     driver = ComputerLink(
@@ -654,7 +652,7 @@ def test_1_3_2_the_message_wait_is_one_digit_of_10_ms(step: int) -> None:
     assert driver.timing.turnaround == pytest.approx(max(0.02, step / 100))
 
 
-async def test_the_message_wait_goes_with_every_request() -> None:
+async def test_every_request_has_the_message_wait() -> None:
     driver, peer = ComputerLink(message_wait=0.15), Peer(0, 1, True)
     talk = Script(driver, sends(peer.enq("00FFWRFD000001")), hears(peer.stx("0001")))
     await driver.read(talk, Span("D", 0, 1))
@@ -700,7 +698,7 @@ def test_the_file_can_name_every_setting() -> None:
         TypeAdapter(ComputerLink).validate_python({"station": 32})
 
 
-def test_the_driver_can_do_what_the_contract_names() -> None:
+def test_the_driver_has_the_capabilities_of_the_contract() -> None:
     driver = ComputerLink()
     contract: Driver[Frame] = driver
     assert contract.protocol == "computer-link"
@@ -797,7 +795,7 @@ def test_devices_are_written_as_their_maker_writes_them(
         ("", "no device address"),
     ],
 )
-def test_an_address_the_plc_does_not_have_says_what_would_be_right(text: str, says: str) -> None:
+def test_an_address_the_plc_does_not_have_gets_a_correct_example(text: str, says: str) -> None:
     with pytest.raises(ConfigError, match=says):
         ComputerLink().address(text)
 

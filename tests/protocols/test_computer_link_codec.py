@@ -117,7 +117,7 @@ def test_a_reply_before_damage_is_handed_out_first() -> None:
         ((4, False), (4, True), "no sum check"),
     ],
 )
-def test_a_reply_of_another_setting_says_which(
+def test_a_reply_of_another_setting_names_the_setting(
     heard: Procedure, read_as: Procedure, says: str
 ) -> None:
     block = LinkCodec(*heard).encode(Text(5, "01101"))

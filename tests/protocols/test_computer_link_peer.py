@@ -71,7 +71,7 @@ def values(data: st.DataObject, driver: ComputerLink, span: Span) -> list[int]:
 
 @settings(max_examples=120, deadline=None)
 @given(st.data(), drivers, st.integers(1, 7))
-async def test_a_read_gives_the_devices_and_costs_what_was_said(
+async def test_a_read_returns_the_devices_at_exactly_its_cost(
     data: st.DataObject, driver: ComputerLink, pieces: int
 ) -> None:
     span = data.draw(spans(driver))
@@ -91,7 +91,7 @@ async def test_a_read_gives_the_devices_and_costs_what_was_said(
 
 @settings(max_examples=120, deadline=None)
 @given(st.data(), drivers)
-async def test_a_write_changes_its_devices_and_no_other_and_costs_what_was_said(
+async def test_a_write_changes_only_its_devices_at_exactly_its_cost(
     data: st.DataObject, driver: ComputerLink
 ) -> None:
     span = data.draw(spans(driver, 170))
@@ -187,7 +187,7 @@ def fits(driver: ComputerLink, area: str, start: int, *, write: bool = False) ->
         ),
     ],
 )
-def test_one_exchange_takes_what_the_profile_allows(
+def test_one_request_has_the_limits_of_the_profile(
     profile: ProfileName, read: dict[str, int], write: dict[str, int]
 ) -> None:
     driver = ComputerLink(profile=profile)
@@ -221,7 +221,7 @@ def test_20_scattered_points_go_in_one_bt_and_10_words_in_one_wt() -> None:
     ],
     ids=str,
 )
-def test_spans_that_cannot_go_together_are_told(spans_: list[Span]) -> None:
+def test_spans_that_do_not_fit_one_write_have_no_cost(spans_: list[Span]) -> None:
     assert ComputerLink().scattered_write_cost(spans_) is None
 
 
@@ -237,7 +237,7 @@ def test_spans_that_cannot_go_together_are_told(spans_: list[Span]) -> None:
     ],
     ids=str,
 )
-def test_spans_that_cannot_be_registered_together_are_told(spans_: list[Span]) -> None:
+def test_spans_that_do_not_fit_one_list_have_no_cost(spans_: list[Span]) -> None:
     assert ComputerLink(monitor=True).monitor_cost(spans_) is None
 
 
@@ -246,19 +246,19 @@ def test_points_beside_words_are_registered_in_sixteens() -> None:
     assert ComputerLink(monitor=True).monitor_cost(spans_) == Cost(8 + 2, 6 + 2 * 4 + 2)
 
 
-def test_nothing_is_registered_unless_the_file_says_monitor() -> None:
+def test_no_list_is_registered_without_the_setting_monitor() -> None:
     assert ComputerLink().monitor_cost([Span("D", 1, 1)]) is None
     assert ComputerLink(monitor=True).monitor_cost([Span("D", 1, 1)]) is not None
 
 
 @pytest.mark.parametrize("span", [Span("M", 0, 0), Span("M", 1530, 7), Span("M", -1, 2)], ids=str)
-def test_a_span_outside_the_device_cannot_be_asked_for(span: Span) -> None:
+def test_a_span_outside_the_device_has_no_cost(span: Span) -> None:
     assert ComputerLink().cost(span) is None
     assert ComputerLink().write_cost(span) is None
 
 
 @pytest.mark.parametrize("procedure", PROCEDURES)
-async def test_every_control_is_understood(procedure: Procedure) -> None:
+async def test_every_command_is_carried_out(procedure: Procedure) -> None:
     driver = ComputerLink(station=5, frame_format=procedure[0], sum_check=procedure[1])
     peer = peer_of(driver)
     wire = PeerTalk(driver, peer.hear)

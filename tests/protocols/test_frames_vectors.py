@@ -104,7 +104,7 @@ def test_the_vb_1com_frame_is_complete_by_its_count_before_any_gap(vector: Vecto
 
 
 @pytest.mark.parametrize("vector", DAMAGED, ids=repr)
-def test_damage_is_told_with_the_error_number_of_bfm_29(vector: Vector) -> None:
+def test_damage_is_reported_with_the_error_number_of_bfm_29(vector: Vector) -> None:
     number = vector.fields["expect"].removeprefix("error code ")
     with pytest.raises(Garbled, match=rf"error {number}\b"):
         FrameCodec(vb_1com(vector.fields)).feed(vector.frame)

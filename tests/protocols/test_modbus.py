@@ -210,7 +210,7 @@ def test_ex485lnk_reads_and_writes_32_registers_by_functions_03_and_16() -> None
         Span("nowhere", 0, 1),
     ],
 )
-async def test_a_span_outside_the_device_is_not_asked(span: Span) -> None:
+async def test_a_span_outside_the_device_is_not_requested(span: Span) -> None:
     driver = ModbusRtu(station=1)
     assert driver.cost(span) is None
     assert driver.write_cost(span) is None
@@ -241,7 +241,7 @@ def test_vigor_holes_belong_to_no_area() -> None:
         (1, pdu("modbus-rtu-001")),  # the question itself
     ],
 )
-async def test_only_station_function_and_byte_count_asked_for_are_taken(
+async def test_only_the_requested_station_function_and_byte_count_are_accepted(
     kind: type, station: int, body: bytes
 ) -> None:
     driver = kind(station=1)
@@ -255,7 +255,7 @@ async def test_only_station_function_and_byte_count_asked_for_are_taken(
 
 @pytest.mark.parametrize("kind", [ModbusRtu, ModbusAscii])
 @pytest.mark.parametrize("echo", [True, False])
-async def test_coils_that_look_like_the_echo_of_the_question_are_asked_apart(
+async def test_coils_equal_to_the_echo_of_the_request_are_read_in_two_parts(
     kind: type, echo: bool
 ) -> None:
     """24 coils from wire address 0300h: 01 03 00 00 18 is the question, and can be the answer."""
@@ -349,7 +349,7 @@ async def test_modbus_tcp_keeps_several_questions_apart() -> None:
         (0x2A, Refusal.OTHER),
     ],
 )
-async def test_exceptions_say_what_to_do_next(code: int, refusal: Refusal) -> None:
+async def test_exceptions_become_the_errors_of_their_remedy(code: int, refusal: Refusal) -> None:
     driver = ModbusRtu(station=1)
     talk = Hearing(driver, [framed(ModbusRtu, 1, bytes((0x83, code)))])
     with pytest.raises(Refused) as refused:
@@ -404,7 +404,7 @@ async def test_vigor_may_forget_the_address_in_its_answer_to_function_06() -> No
 
 
 @pytest.mark.parametrize("kind", [ModbusRtu, ModbusAscii])
-async def test_a_broadcast_is_told_and_nobody_is_waited_for(kind: type) -> None:
+async def test_a_broadcast_is_sent_without_waiting_for_a_reply(kind: type) -> None:
     driver = kind(station=0, addressing="ex485lnk")
     name = "modbus-rtu-005" if kind is ModbusRtu else "modbus-ascii-005"
     script, span = Script(driver, f"> {VECTORS[name].frame.hex()}"), Span("holding", 4, 2)
@@ -458,7 +458,7 @@ async def test_units_that_do_not_fit_are_not_sent(units: list[int]) -> None:
     st.integers(0, 10**6),
     st.data(),
 )
-async def test_a_resync_differs_from_the_doubt_and_from_the_last_resync(
+async def test_a_resync_differs_from_the_outstanding_read_and_from_the_last_resync(
     kind: type, dialect: Any, salt: int, data: st.DataObject
 ) -> None:
     driver = kind(station=1, addressing=dialect)
@@ -477,7 +477,7 @@ async def test_a_resync_differs_from_the_doubt_and_from_the_last_resync(
     assert len({cost.reply, *lengths}) == 3
 
 
-async def test_an_exception_to_a_resync_is_asked_again_in_another_size() -> None:
+async def test_after_an_exception_a_resync_reads_another_size() -> None:
     """And a second one says so: both may answer older questions."""
     driver, no = ModbusRtu(station=1), framed(ModbusRtu, 1, bytes((0x83, 2)))
     talk = Hearing(driver, [no], [no])

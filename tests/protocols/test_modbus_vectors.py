@@ -68,7 +68,7 @@ def test_the_codec_reads_and_writes_the_frame(vector: Vector) -> None:
 
 
 @pytest.mark.parametrize("vector", [v for v in ALL if not v.valid], ids=repr)
-def test_a_bad_frame_is_not_heard(vector: Vector) -> None:
+def test_a_bad_frame_is_ignored(vector: Vector) -> None:
     codecs = (
         [AsciiCodec()]
         if vector.protocol == "modbus-ascii"

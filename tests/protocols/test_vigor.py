@@ -196,7 +196,7 @@ async def test_b3_9_rs_example_reads_d0_of_station_1_with_check_code_00() -> Non
     assert list(await Vigor(station=1).read(script, Span("D", 0, 1))) == [0x3412]
 
 
-async def test_b3_9_rs_example_hears_that_d1_of_station_1_was_written() -> None:
+async def test_b3_9_rs_example_gets_the_acknowledgement_of_d1_of_station_1() -> None:
     request = encode(Request(1, "61", b"1C02020001"))
     script = Script(Vigor(station=1), f"> {request.hex()}", heard("vigor-013"))
     assert await Vigor(station=1).write(script, Span("D", 1, 1), [0x0100])
@@ -285,7 +285,7 @@ def test_addresses_are_written_as_in_the_manual(text: str, address: Address) -> 
         ("Y20.1", "Y20.1: Y20 is a bit already, write Y20"),
     ],
 )
-def test_a_wrong_address_is_told_what_would_be_right(text: str, right: str) -> None:
+def test_a_wrong_address_gets_a_correct_example(text: str, right: str) -> None:
     with pytest.raises(ConfigError) as raised:
         Vigor().address(text)
     assert str(raised.value) == right
@@ -440,14 +440,14 @@ def test_whatever_comes_back_a_write_is_done_or_a_device_error(pieces: list[byte
         (Span("C", 200, 1), [0]),
     ],
 )
-async def test_what_cannot_be_written_is_refused_before_anything_is_sent(
+async def test_an_impossible_write_is_refused_before_anything_is_sent(
     span: Span, units: list[int]
 ) -> None:
     with pytest.raises(BadValue):
         await Vigor().write(Script(Vigor()), span, units)
 
 
-async def test_what_cannot_be_read_is_refused_before_anything_is_sent() -> None:
+async def test_an_impossible_read_is_refused_before_anything_is_sent() -> None:
     with pytest.raises(ConfigError, match="not in one request"):
         await Vigor().read(Script(Vigor()), Span("D", 0, 65))
 
@@ -528,7 +528,7 @@ def random_image(data: st.DataObject) -> Image:
 
 @settings(max_examples=60)
 @given(spans(), st.data())
-def test_reading_any_span_gives_the_plcs_bytes_and_costs_what_was_said(
+def test_reading_any_span_returns_the_bytes_of_the_plc_at_exactly_its_cost(
     span: Span, data: st.DataObject
 ) -> None:
     cost = Vigor().cost(span)
@@ -637,7 +637,7 @@ class Questions:
 @pytest.mark.parametrize(
     "doubt", [None, Span("D", 0, 3), Span("M", 3, 20), Span("X", 0, 8), Span("R", 0, 1)]
 )
-async def test_a_resync_asks_what_neither_the_doubt_nor_the_resync_before_asked(
+async def test_a_resync_differs_from_the_outstanding_read_and_the_resync_before(
     doubt: Span | None,
 ) -> None:
     cost = Vigor().cost(doubt) if doubt else None
@@ -668,7 +668,7 @@ async def test_a_refused_resync_asks_nothing_that_the_next_one_asks() -> None:
         before = set(questions.counts)
 
 
-async def test_a_plc_that_refuses_every_resync_says_so() -> None:
+async def test_a_plc_that_refuses_every_resync_raises_refused() -> None:
     """Whoever asked decides what that is worth: the refusals may answer older questions."""
     questions = Questions(refuse=9)
     with pytest.raises(Refused):
@@ -731,7 +731,7 @@ def test_an_ack_in_the_noise_does_not_hide_the_reply(frame: bytes) -> None:
 
 
 @pytest.mark.parametrize("frame", GOOD, ids=lambda frame: frame.hex())
-def test_a_reply_begun_anew_is_heard(frame: bytes) -> None:
+def test_a_reply_that_begins_again_is_found(frame: bytes) -> None:
     for cut in range(1, len(frame)):
         assert hear([frame[:cut] + frame]) == hear([frame])
 

@@ -80,7 +80,7 @@ def test_a_text_is_there(tmp_path: Path) -> None:
     assert set(values["s"]) == {"SIM"}
 
 
-def test_what_can_be_written_stands_still_within_its_limits(tmp_path: Path) -> None:
+def test_a_writable_value_is_constant_within_its_limits(tmp_path: Path) -> None:
     tags = {
         "a": {"address": "D1", "write": {"min": 1, "max": 4}},
         "b": {"address": "D2", "write": True},
@@ -135,7 +135,7 @@ async def test_a_modbus_plc_has_the_drivers_word_order(order: Any) -> None:
     assert await driver.read(Wire(), Span("C32", 207, 1)) == [0x12345678]  # type: ignore[arg-type]
 
 
-def test_no_plc_speaks_no_protocol(tmp_path: Path) -> None:
+def test_an_unknown_protocol_cannot_be_simulated(tmp_path: Path) -> None:
     class Foreign:
         protocol = "foreign"
 

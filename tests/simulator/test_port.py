@@ -29,7 +29,7 @@ def near(seconds: float) -> Any:
     return pytest.approx(seconds)
 
 
-def test_a_request_is_heard_when_its_last_character_is_through_by_every_station() -> None:
+def test_every_station_receives_a_request_after_its_last_character() -> None:
     async def play() -> tuple[Says, Says]:
         one, other = Says(), Says()
         port = await open_simulator([one, other], WIRE, Heard())
@@ -211,7 +211,7 @@ def test_not_paced_takes_no_time_and_keeps_the_order() -> None:
     assert ear.pieces == [(0.0, bytes(300))] * 20
 
 
-def test_nothing_is_heard_after_close_and_writing_fails() -> None:
+def test_after_close_no_bytes_arrive_and_writing_fails() -> None:
     async def play() -> tuple[Heard, Says]:
         ear, station = Heard(), Says(REPLY)
         port = await open_simulator([station], WIRE, ear)
@@ -233,7 +233,7 @@ moments = st.lists(st.tuples(st.floats(0, 0.05), st.binary(min_size=1, max_size=
 
 @settings(max_examples=50)
 @given(moments, st.lists(st.tuples(st.binary(max_size=40), st.floats(0, 0.05)), max_size=3))
-def test_the_same_play_is_heard_the_same_and_no_character_is_lost(
+def test_the_same_run_gives_the_same_bytes_and_loses_no_character(
     writes: list[tuple[float, bytes]], answers: list[tuple[bytes, float]]
 ) -> None:
     async def play() -> tuple[list[tuple[float, bytes]], list[list[tuple[float, bytes]]]]:

@@ -36,7 +36,7 @@ async def test_stations_on_a_pty_answer_at_the_wires_speed() -> None:
     await served.close()
 
 
-async def test_a_pty_serves_one_program_after_another_and_its_end_is_heard() -> None:
+async def test_a_pty_serves_one_program_after_another_and_reports_its_end() -> None:
     served = await serve_on_pty([Says(REPLY)], WIRE, None)
     for _ in range(2):
         ear = Heard()
@@ -52,7 +52,7 @@ async def test_a_pty_serves_one_program_after_another_and_its_end_is_heard() -> 
     await port.close()
 
 
-async def test_a_pty_nobody_reads_does_not_stop_the_wire() -> None:
+async def test_a_pty_without_a_reader_does_not_stop_the_line() -> None:
     loop, troubles = asyncio.get_running_loop(), []
     loop.set_exception_handler(lambda _, context: troubles.append(context))
     station = Says(bytes(3000))
@@ -69,7 +69,9 @@ async def test_a_pty_nobody_reads_does_not_stop_the_wire() -> None:
     await served.close()
 
 
-async def test_a_link_to_the_pty_replaces_an_old_one_and_goes_with_it(tmp_path: Path) -> None:
+async def test_a_link_to_the_pty_replaces_an_old_one_and_is_removed_with_the_pty(
+    tmp_path: Path,
+) -> None:
     link = tmp_path / "ttyPLC"
     link.symlink_to("/dev/pts/of-a-run-that-crashed")
     served = await serve_on_pty([Says(REPLY)], WIRE, str(link))
@@ -83,7 +85,7 @@ async def test_a_link_to_the_pty_replaces_an_old_one_and_goes_with_it(tmp_path: 
     assert not link.is_symlink()
 
 
-async def test_a_link_that_is_somebody_elses_by_now_is_left_alone(tmp_path: Path) -> None:
+async def test_a_link_replaced_by_another_program_is_not_removed(tmp_path: Path) -> None:
     link = tmp_path / "ttyPLC"
     first = await serve_on_pty([], WIRE, str(link))
     second = await serve_on_pty([], WIRE, str(link))
@@ -100,7 +102,7 @@ async def test_a_file_in_the_links_place_is_kept(tmp_path: Path) -> None:
     assert link.read_text() == "precious"
 
 
-async def test_one_wire_behind_a_tcp_port_is_heard_by_everybody() -> None:
+async def test_every_connection_to_a_tcp_port_receives_the_one_line_behind_it() -> None:
     served = await serve_on_tcp([Says(REPLY)], WIRE, "127.0.0.1", 0)
     ears = Heard(), Heard()
     ports = [await reach(served.address, ear) for ear in ears]
@@ -143,7 +145,7 @@ async def test_network_stations_answer_each_connection_alone() -> None:
     await ports[1].close()
 
 
-async def test_a_tcp_port_in_use_is_said_plainly() -> None:
+async def test_a_tcp_port_in_use_has_a_clear_message() -> None:
     with listening() as taken:
         host, number = taken.getsockname()
         with pytest.raises(LineDown, match=f"{host}:{number}: this address is in use"):

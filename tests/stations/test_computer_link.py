@@ -45,7 +45,7 @@ def code(station: ComputerLinkStation, text: str) -> str:
 
 
 @pytest.mark.parametrize("vector", REQUESTS, ids=repr)
-def test_every_request_of_the_vectors_is_obeyed(vector: Vector) -> None:
+def test_every_request_of_the_vectors_is_carried_out(vector: Vector) -> None:
     station = station_of(vector)
     command = vector.fields["command"]
     if command in ("MB", "MN"):
@@ -192,7 +192,7 @@ def test_the_lowest_error_code_that_applies_is_sent(
     assert code(ComputerLinkStation(5, "liyan", *procedure), text) == expected
 
 
-def test_a_wrong_sum_goes_before_everything_else() -> None:
+def test_a_wrong_sum_is_reported_before_every_other_error() -> None:
     station = ComputerLinkStation(5)
     block = Peer(5, 1, True).enq("0500BR0M999901")
     assert station.hear(block[:-1] + b"x", 0.0) == [Peer(5, 1, True).nak("02")]
@@ -224,7 +224,7 @@ def test_a_refused_write_writes_nothing() -> None:
     assert station.memory.read("M", 1) == [0]
 
 
-def test_another_stations_requests_and_everybodys_answers_are_not_ours() -> None:
+def test_requests_to_other_stations_and_all_replies_are_ignored() -> None:
     station, peer = ComputerLinkStation(5), Peer(6, 1, True)
     for block in (peer.enq("06FFPC0"), peer.stx("0001"), peer.ack(), peer.nak("06")):
         assert station.hear(block, 0.0) == []
@@ -267,7 +267,7 @@ def test_2_13_a_loopback_of_unprintable_characters_is_refused(procedure: Procedu
 
 
 @pytest.mark.parametrize("number", ["091", "064", "066"])
-def test_eot_ack_and_nak_of_the_computer_begin_the_sequence_anew(number: str) -> None:
+def test_eot_ack_and_nak_of_the_computer_reset_the_sequence(number: str) -> None:
     station, block = ComputerLinkStation(5), Peer(5, 1, True).enq("05FFPC0")
     assert station.hear(block[:5] + VECTORS[f"fxlink-{number}"] + block[5:], 0.0) == []
     assert len(station.hear(block[:5] + VECTORS[f"fxlink-{number}"] + block, 0.0)) == 1
@@ -335,14 +335,14 @@ def test_the_registered_lists_are_lost_at_power_off() -> None:
         assert code(station, "05FFMB0") == "06"
 
 
-def test_a_mute_station_obeys_and_its_answer_is_lost() -> None:
+def test_a_mute_station_carries_out_a_request_and_its_reply_is_lost() -> None:
     station = ComputerLinkStation(5)
     station.mute = True
     assert code(station, "05FFBW0M0001011") == "silent"
     assert station.memory.read("M", 1) == [1]
 
 
-def test_the_model_code_is_what_pc_answers() -> None:
+def test_the_reply_to_pc_is_the_model_code() -> None:
     assert answer(ComputerLinkStation(5, model="F3"), "05FFPC0") == [Text(5, "F3")]
 
 
@@ -414,7 +414,7 @@ pieces_of_line = st.lists(
 
 @settings(max_examples=150, deadline=None)
 @given(pieces_of_line, st.sampled_from(PROCEDURES), st.sampled_from(["liyan", "fx"]))
-def test_any_bytes_are_answered_or_not_and_the_next_request_is_heard(
+def test_after_any_bytes_the_next_request_gets_its_reply(
     pieces: list[bytes], procedure: Procedure, profile: ProfileName
 ) -> None:
     station = ComputerLinkStation(5, profile, *procedure)

@@ -143,7 +143,7 @@ def test_exceptions_come_in_the_standards_order(dialect: Any, pdu: str, code: in
     assert ask(station, request) == bytes((request[0] | 0x80, code))
 
 
-def test_function_08_repeats_what_it_is_sent_where_it_is_served() -> None:
+def test_function_08_repeats_its_data_where_it_is_served() -> None:
     question = bytes.fromhex("080000A55A")
     assert ask(ModbusStation(), question) == question
     assert ask(ModbusStation(diagnostics=False), question) == b"\x88\x01"
@@ -190,7 +190,7 @@ def test_k120s_relays_are_words_and_bits_at_once() -> None:
     st.lists(st.integers(0, 0xFFFF), min_size=1, max_size=123),
     st.lists(st.booleans(), min_size=1, max_size=100),
 )
-def test_pymodbus_reads_back_what_it_wrote(
+def test_pymodbus_reads_back_its_own_writes(
     kind: type, start: int, words: list[int], bits: list[bool]
 ) -> None:
     framing: Any = FRAMINGS[kind]
