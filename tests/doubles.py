@@ -1,10 +1,10 @@
-"""The two doubles that serve all tests: a script of a conversation, a wire of bytes."""
+"""The two doubles of a `Talk`: a script of one transaction, and a wire of bytes."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, TypeVar
 
 from gateway.errors import Garbled, NoReply
-from gateway.protocols.driver import AnyDriver
+from gateway.protocols.driver import AnyDriver, Cost
 
 T = TypeVar("T")
 
@@ -53,3 +53,51 @@ class Script:
     def done(self) -> None:
         """The whole script was played."""
         assert not self._lines, f"not played: {self._lines}"
+
+
+class Wire:
+    """A `Talk` over bytes: `respond` gets each request and returns the pieces that come back.
+
+    `bounded`: no more bytes may come back than the driver announced.
+    """
+
+    may_echo = False
+
+    def __init__(
+        self,
+        driver: AnyDriver,
+        respond: Callable[[bytes], Iterable[bytes]],
+        *,
+        bounded: bool = False,
+    ) -> None:
+        self._codec: Any = driver.codec()
+        self._respond, self._bounded = respond, bounded
+        self.sent: list[bytes] = []
+        self.received: list[bytes] = []
+        self.replies: list[int] = []  # the reply lengths the driver announced
+
+    @property
+    def cost(self) -> Cost:
+        """The characters of all requests and of all bytes that came back."""
+        return Cost(len(b"".join(self.sent)), len(b"".join(self.received)))
+
+    async def tell(self, frame: Any) -> None:
+        self.sent.append(self._codec.encode(frame))
+        self._respond(self.sent[-1])
+
+    async def ask(self, frame: Any, reply: int, answers: Callable[[Any], T | None]) -> T:
+        self.sent.append(self._codec.encode(frame))
+        self.replies.append(reply)
+        pieces = list(self._respond(self.sent[-1]))
+        self.received += pieces
+        assert not self._bounded or len(b"".join(pieces)) <= reply
+        for piece in pieces:
+            for got in self._codec.feed(piece):
+                answer = answers(got)
+                if answer is not None:
+                    return answer
+        raise NoReply("no reply")
+
+
+def in_pieces(data: bytes, size: int) -> list[bytes]:
+    return [data[at : at + size] for at in range(0, len(data), size)]

@@ -3,7 +3,7 @@
 import re
 from collections.abc import Awaitable, Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -23,7 +23,7 @@ from gateway.protocols.driver import (
     ScatteredWriter,
     Span,
 )
-from tests.doubles import Script
+from tests.doubles import Script, Wire
 from tests.protocols.computer_link_peer import PROCEDURES, FrameFormat, Peer, Procedure
 from tests.vectors import vectors
 
@@ -542,31 +542,9 @@ async def test_resync_takes_only_the_reply_with_its_own_probe_token() -> None:
 async def test_no_reply_to_a_resync_can_be_read_as_a_value(salt: int, area: str, size: int) -> None:
     driver, peer = ComputerLink(station=5), Peer(5, 1, True)
     first = driver.areas[area].first
-    with pytest.raises(Garbled):
-        await driver.read(Answer(driver, peer.stx(f"05Z{salt:04X}")), Span(area, first, size))
-
-
-T = TypeVar("T")
-
-
-class Answer:
-    """A `Talk` that receives the same bytes after every request."""
-
-    may_echo = False
-
-    def __init__(self, driver: ComputerLink, *pieces: bytes) -> None:
-        self._codec, self._pieces = driver.codec(), pieces
-
-    async def tell(self, frame: Frame) -> None:
-        self._codec.encode(frame)
-
-    async def ask(self, frame: Frame, reply: int, answers: Callable[[Frame], T | None]) -> T:
-        self._codec.encode(frame)
-        for piece in self._pieces:
-            for got in self._codec.feed(piece):
-                if (answer := answers(got)) is not None:
-                    return answer
-        raise Garbled("nothing") if self._pieces else NoReply("nothing")
+    wire = Wire(driver, lambda _: [peer.stx(f"05Z{salt:04X}")])
+    with pytest.raises(NoReply):
+        await driver.read(wire, Span(area, first, size))
 
 
 BLOCKS = st.builds(
@@ -582,7 +560,7 @@ BLOCKS = st.builds(
     st.integers(4, 5),
     st.text("01239AFZ", max_size=12),
 )
-Converse = Callable[[ComputerLink, Answer], Awaitable[Any]]
+Converse = Callable[[ComputerLink, Wire], Awaitable[Any]]
 CONVERSATIONS: list[Converse] = [
     lambda driver, talk: driver.read(talk, Span("D", 100, 2)),
     lambda driver, talk: driver.read(talk, Span("M", 10, 2)),
@@ -613,7 +591,7 @@ async def test_any_reply_is_a_value_or_a_device_error(
         station=5, frame_format=procedure[0], sum_check=procedure[1], monitor=True
     )
     try:
-        said = await converse(driver, Answer(driver, *pieces))
+        said = await converse(driver, Wire(driver, lambda _: pieces))
     except DeviceError:
         return
     assert said is None or said is True or len(said) > 0

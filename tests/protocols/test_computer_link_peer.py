@@ -8,7 +8,8 @@ from gateway.errors import Refused
 from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.computer_link.devices import ProfileName
 from gateway.protocols.driver import Cost, Span, Unit
-from tests.protocols.computer_link_peer import PROCEDURES, Peer, PeerTalk, Procedure
+from tests.doubles import Wire, in_pieces
+from tests.protocols.computer_link_peer import PROCEDURES, Peer, Procedure
 
 LETTERS = {"M8": "M", "D8": "D", "T": "TN", "C": "CN", "C32": "CN"}
 
@@ -78,14 +79,14 @@ async def test_a_read_returns_the_devices_at_exactly_its_cost(
     peer = peer_of(driver)
     units = values(data, driver, span)
     peer.devices = dict(zip(names(peer, span), units, strict=True))
-    wire = PeerTalk(driver, peer.hear, pieces)
+    wire = Wire(driver, lambda data: in_pieces(peer.hear(data), pieces))
     cost = driver.cost(span)
     if cost is None:
         with pytest.raises(ValueError, match="does not fit"):
             await driver.read(wire, span)
         return
     assert list(await driver.read(wire, span)) == units
-    assert Cost(wire.sent, wire.received) == cost
+    assert wire.cost == cost
     assert peer.confirmed == driver.send_area_c
 
 
@@ -97,7 +98,7 @@ async def test_a_write_changes_only_its_devices_at_exactly_its_cost(
     span = data.draw(spans(driver, 170))
     peer = peer_of(driver)
     units = values(data, driver, span)
-    wire = PeerTalk(driver, peer.hear)
+    wire = Wire(driver, lambda data: [peer.hear(data)])
     cost = driver.write_cost(span)
     if cost is None:
         with pytest.raises(ValueError, match="does not fit"):
@@ -105,7 +106,7 @@ async def test_a_write_changes_only_its_devices_at_exactly_its_cost(
         return
     assert await driver.write(wire, span, units) is True
     assert peer.devices == dict(zip(names(peer, span), units, strict=True))
-    assert Cost(wire.sent, wire.received) == cost
+    assert wire.cost == cost
 
 
 @settings(max_examples=120, deadline=None)
@@ -115,7 +116,7 @@ async def test_a_scattered_write_changes_its_devices_and_no_other(
 ) -> None:
     parts = [(span, values(data, driver, span)) for span in data.draw(neighbours(driver))]
     peer = peer_of(driver)
-    wire = PeerTalk(driver, peer.hear)
+    wire = Wire(driver, lambda data: [peer.hear(data)])
     cost = driver.scattered_write_cost([span for span, _ in parts])
     if cost is None:
         return
@@ -126,7 +127,7 @@ async def test_a_scattered_write_changes_its_devices_and_no_other(
         assert not fresh.keys() & expected.keys()
         expected |= fresh
     assert peer.devices == expected
-    assert Cost(wire.sent, wire.received) == cost
+    assert wire.cost == cost
 
 
 @settings(max_examples=120, deadline=None)
@@ -142,16 +143,16 @@ async def test_registered_devices_are_read_in_their_order(
     cost = driver.monitor_cost(asked)
     if cost is None:
         return
-    wire = PeerTalk(driver, peer.hear)
+    wire = Wire(driver, lambda data: [peer.hear(data)])
     with pytest.raises(Refused):  # nothing is registered yet
         await driver.read_registered(wire, asked)
     await driver.register(wire, asked)
-    wire = PeerTalk(driver, peer.hear)
+    wire = Wire(driver, lambda data: [peer.hear(data)])
     read = await driver.read_registered(wire, asked)
     assert [list(units) for units in read] == [
         [peer.devices[name] for name in names(peer, span)] for span in asked
     ]
-    assert Cost(wire.sent, wire.received) == cost
+    assert wire.cost == cost
 
 
 @settings(max_examples=200, deadline=None)
@@ -261,18 +262,12 @@ def test_a_span_outside_the_device_has_no_cost(span: Span) -> None:
 async def test_every_command_is_carried_out(procedure: Procedure) -> None:
     driver = ComputerLink(station=5, frame_format=procedure[0], sum_check=procedure[1])
     peer = peer_of(driver)
-    wire = PeerTalk(driver, peer.hear)
+    wire = Wire(driver, lambda data: [peer.hear(data)])
     assert await driver.control(wire, "run", "") == "acknowledged"
     assert await driver.control(wire, "stop", "") == "acknowledged"
     assert await driver.control(wire, "model", "") == "9D (FX2N)"
     text = "".join(map(chr, range(32, 127)))
     assert await driver.control(wire, "loopback", text) == text
     await driver.resync(wire, None, 70000)
-    heard: list[bytes] = []
-
-    def silent(data: bytes) -> bytes:
-        heard.append(data)
-        return b""
-
-    await driver.control(PeerTalk(driver, silent), "global", "on")
-    assert heard == [peer.enq("FFFFGW01")]
+    await driver.control(wire, "global", "on")
+    assert wire.sent[-1:] == [peer.enq("FFFFGW01")]

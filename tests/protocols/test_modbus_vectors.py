@@ -15,7 +15,7 @@ from gateway.protocols.modbus import (
     RtuSlaveCodec,
 )
 from tests.doubles import Script
-from tests.protocols.modbus_peer import Hearing
+from tests.protocols.modbus_peer import hearing
 from tests.vectors import Vector, vectors
 
 ALL = vectors("modbus-rtu", "modbus-ascii")
@@ -137,7 +137,7 @@ async def test_the_driver_understands_the_answer(vector: Vector) -> None:
     answer = frame.pdu
     driver = driver_for(vector, frame.station)
     span, units = question_for(answer)
-    script = Hearing(driver, [vector.frame])
+    script = hearing(driver, [vector.frame])
     asked = driver.read(script, span) if units is None else driver.write(script, span, units)
     if answer[0] & 0x80:
         with pytest.raises(Refused) as refused:

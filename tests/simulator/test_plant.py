@@ -12,6 +12,7 @@ from gateway.protocols.modbus import ModbusTcp
 from gateway.simulator.plant import station_for
 from gateway.tags import Tag
 from gateway.values import Value
+from tests.doubles import Wire
 from tests.e2e.processes import ROOT, write_config
 
 MINUTES = [float(second) for second in range(0, 600, 7)]
@@ -122,17 +123,8 @@ async def test_a_modbus_plc_has_the_drivers_word_order(order: Any) -> None:
     station = station_for(driver, [])
     station.memory.write("C32", 207, [0x12345678])
 
-    class Wire:
-        """The station's answers, straight back."""
-
-        may_echo = False
-
-        async def ask(self, frame: Any, reply: int, answers: Any) -> Any:
-            [data] = station.hear(driver.codec().encode(frame), 0.0)
-            [heard] = driver.codec().feed(data)
-            return answers(heard)
-
-    assert await driver.read(Wire(), Span("C32", 207, 1)) == [0x12345678]  # type: ignore[arg-type]
+    wire = Wire(driver, lambda data: station.hear(data, 0.0))
+    assert await driver.read(wire, Span("C32", 207, 1)) == [0x12345678]
 
 
 def test_an_unknown_protocol_cannot_be_simulated(tmp_path: Path) -> None:

@@ -10,7 +10,8 @@ from gateway.protocols.computer_link.devices import ProfileName
 from gateway.protocols.driver import Span
 from gateway.stations.computer_link import ComputerLinkStation
 from gateway.stations.station import Station
-from tests.protocols.computer_link_peer import PROCEDURES, FrameFormat, Peer, PeerTalk, Procedure
+from tests.doubles import Wire
+from tests.protocols.computer_link_peer import PROCEDURES, FrameFormat, Peer, Procedure
 from tests.vectors import Vector, vectors
 
 LINK = vectors("fxlink")
@@ -364,7 +365,7 @@ async def test_the_driver_and_the_station_agree(procedure: Procedure) -> None:
         if station.memory.holds(name, first, last - first + 1)
         and not station.memory.holds(name, first, last - first + 2)
     }
-    wire = PeerTalk(driver, lambda data: b"".join(station.hear(data, 0.0)))
+    wire = Wire(driver, lambda data: station.hear(data, 0.0))
     for area in driver.areas.values():
         span = Span(area.name, area.last - 15, 16)
         units = [i % 2 for i in range(16)]

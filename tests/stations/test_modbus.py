@@ -15,7 +15,7 @@ from pymodbus.pdu.register_message import (
 from gateway.protocols.driver import Span
 from gateway.protocols.modbus import Frame, ModbusAscii, ModbusRtu, ModbusTcp
 from gateway.stations.modbus import ModbusStation
-from tests.protocols.modbus_peer import KINDS, Hearing, oracle_decodes, oracle_encodes
+from tests.protocols.modbus_peer import KINDS, hearing, oracle_decodes, oracle_encodes
 from tests.vectors import Vector, vectors
 
 FRAMINGS = {ModbusRtu: "rtu", ModbusAscii: "ascii", ModbusTcp: "tcp"}
@@ -227,12 +227,12 @@ async def test_driver_and_station_agree_on_where_everything_is(
     units = data.draw(st.lists(st.integers(0, largest), min_size=1, max_size=size))
     span = Span(area.name, start, len(units))
     if area.writable:
-        talk = Hearing(driver, lambda sent: station.hear(sent, 0.0))
+        talk = hearing(driver, lambda sent: station.hear(sent, 0.0))
         assert await driver.write(talk, span, units) is True
         assert station.memory.read(area.name, start, len(units)) == units
     else:
         station.memory.write(area.name, start, units)
-    talk = Hearing(driver, lambda sent: station.hear(sent, 0.0))
+    talk = hearing(driver, lambda sent: station.hear(sent, 0.0))
     assert list(await driver.read(talk, span)) == units
 
 
