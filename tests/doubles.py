@@ -1,24 +1,24 @@
-"""The two doubles of a `Talk`: a script of frames, a wire of bytes. Nothing waits."""
+"""The two doubles of a `Talk`: a script of one transaction, and a wire of bytes."""
 
 from collections.abc import Callable, Coroutine, Iterable
 from typing import Any, TypeVar
 
 from gateway.errors import Garbled, NoReply
-from gateway.protocols.driver import AnyDriver
+from gateway.protocols.driver import AnyDriver, Cost
 
 T = TypeVar("T")
 
 
 def octets(text: str) -> bytes:
-    """Returns the bytes of a frame in hex with spaces, as manuals and vectors print it."""
+    """Hex with spaces, as manuals and vectors print frames."""
     return bytes.fromhex(text)
 
 
 class Script:
     """A `Talk` that follows a script: ("> 02 30 …", "< 06 30 …"), bytes in hex.
 
-    A frame that the driver sends must equal the next `>` line. The driver then receives the `<`
-    lines after it, one piece each. A `>` line without `<` lines gives no reply.
+    What the driver sends must be the next `>` line; the `<` lines after it are then heard,
+    one piece each. Silence is a `>` with no `<` after it.
     """
 
     may_echo = False
@@ -30,62 +30,80 @@ class Script:
 
     async def tell(self, frame: Any) -> None:
         sent = self._codec.encode(frame)
-        assert self._lines, f"the script is at its end, but the driver sent {sent.hex(' ')}"
+        assert self._lines, f"nothing more was to be sent, but {sent.hex(' ')} was"
         line = self._lines.pop(0)
-        assert line.startswith(">"), f"the driver sent a frame instead of receiving {line}"
+        assert line.startswith(">"), f"the driver spoke when it should hear {line}"
         assert sent.hex(" ") == octets(line[1:]).hex(" ")
 
     async def ask(self, frame: Any, reply: int, answers: Callable[[Any], T | None]) -> T:
         await self.tell(frame)
         self.replies.append(reply)
-        received = b""
+        heard = b""
         while self._lines and self._lines[0].startswith("<"):
             data = octets(self._lines.pop(0)[1:])
-            received += data
+            heard += data
             for got in self._codec.feed(data):
                 answer = answers(got)
                 if answer is not None:
                     return answer
-        if received:
-            raise Garbled("no reply in the received bytes", received)
-        raise NoReply("no reply")
+        if heard:
+            raise Garbled("no answer among what was heard", heard)
+        raise NoReply("no answer")
 
     def done(self) -> None:
-        """Checks that the driver followed the script to its end."""
-        assert not self._lines, f"not reached: {self._lines}"
+        """The whole script was played."""
+        assert not self._lines, f"not played: {self._lines}"
 
 
 class Wire:
-    """A `Talk` over bytes: `respond` gets each request and returns the pieces of the reply."""
+    """A `Talk` over bytes: `respond` gets each request and returns the pieces that come back.
+
+    `bounded`: no more bytes may come back than the driver announced.
+    """
 
     may_echo = False
 
-    def __init__(self, driver: AnyDriver, respond: Callable[[bytes], Iterable[bytes]]) -> None:
+    def __init__(
+        self,
+        driver: AnyDriver,
+        respond: Callable[[bytes], Iterable[bytes]],
+        *,
+        bounded: bool = False,
+    ) -> None:
         self._driver = driver
-        self._respond = respond
+        self._respond, self._bounded = respond, bounded
         self.sent: list[bytes] = []
+        self.received: list[bytes] = []
         self.replies: list[int] = []  # the reply lengths the driver announced
 
+    @property
+    def cost(self) -> Cost:
+        """The characters of all requests and of all bytes that came back."""
+        return Cost(len(b"".join(self.sent)), len(b"".join(self.received)))
+
     async def tell(self, frame: Any) -> None:
-        self._send(self._driver.codec(), frame)
+        self.sent.append(self._driver.codec().encode(frame))
+        self._respond(self.sent[-1])
 
     async def ask(self, frame: Any, reply: int, answers: Callable[[Any], T | None]) -> T:
         codec = self._driver.codec()
+        self.sent.append(codec.encode(frame))
         self.replies.append(reply)
-        received = b""
-        for piece in self._send(codec, frame):
-            received += piece
+        pieces = list(self._respond(self.sent[-1]))
+        self.received += pieces
+        assert not self._bounded or len(b"".join(pieces)) <= reply
+        for piece in pieces:
             for got in codec.feed(piece):
                 answer = answers(got)
                 if answer is not None:
                     return answer
-        if received:
-            raise Garbled("no reply in the received bytes", received)
+        if pieces:
+            raise Garbled("no reply in the received bytes", b"".join(pieces))
         raise NoReply("no reply")
 
-    def _send(self, codec: Any, frame: Any) -> Iterable[bytes]:
-        self.sent.append(codec.encode(frame))
-        return self._respond(self.sent[-1])
+
+def in_pieces(data: bytes, size: int) -> list[bytes]:
+    return [data[at : at + size] for at in range(0, len(data), size)]
 
 
 def result_of(work: Coroutine[Any, Any, T]) -> T:

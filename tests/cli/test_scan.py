@@ -86,7 +86,7 @@ async def test_the_speed_and_format_at_which_they_answer_is_found() -> None:
     ("protocol", "first"),
     [("vigor", 0), ("computer-link", 0), ("modbus-rtu", 1), ("modbus-ascii", 1)],
 )
-def test_station_0_is_asked_where_it_is_a_single_plc(protocol: str, first: int) -> None:
+def test_station_0_is_asked_where_it_is_one_plc(protocol: str, first: int) -> None:
     assert planned("COM3", protocol).stations == list(range(first, 32))
 
 
@@ -97,13 +97,13 @@ async def test_a_vigor_at_cp1_is_found() -> None:
 
 
 @on_virtual_time
-async def test_a_station_that_is_named_twice_is_asked_and_shown_once() -> None:
+async def test_a_station_given_twice_is_asked_and_listed_once() -> None:
     report = await scan(sought(OldLine(VigorStation(1)), "vigor", "1-3,1"))
     assert show.found_stations(report, "COM3").count("station-1:") == 1
 
 
 @on_virtual_time
-async def test_nobody_there() -> None:
+async def test_a_line_without_stations() -> None:
     line = OldLine(VigorStation(40))
     report = await scan(sought(line, "vigor", "1-3"))
     assert not report.found
@@ -111,7 +111,7 @@ async def test_nobody_there() -> None:
 
 
 @on_virtual_time
-async def test_nonsense_is_no_answer_but_it_is_told() -> None:
+async def test_damaged_bytes_are_no_station_but_are_reported() -> None:
     line = OldLine(VigorStation(1), nonsense=b"\x02\xff\x7f\x15" * 4)
     report = await scan(sought(line, "vigor", "1-2"))
     assert stations(report) == [1]
@@ -131,7 +131,7 @@ async def test_how_a_computer_link_station_wants_it(frame_format: int, sum_check
 
 
 @on_virtual_time
-async def test_a_station_that_says_no_to_everything_is_there_all_the_same() -> None:
+async def test_a_station_that_refuses_every_request_is_found() -> None:
     line = OldLine(NaySayer(ComputerLinkStation(5, "liyan", 4, True)))
     [found] = (await scan(sought(line, "computer-link", "5"))).found
     assert "10" in found.refusal
@@ -160,7 +160,7 @@ class Unplugged(OldLine):
     [("vigor", 1.5), ("modbus-rtu", 3), ("modbus-ascii", 3), ("computer-link", 11.5)],
 )
 @on_virtual_time
-async def test_how_long_it_takes_where_nobody_is(protocol: str, minutes: float) -> None:
+async def test_the_duration_of_a_scan_without_stations(protocol: str, minutes: float) -> None:
     """As docs/operations.md says."""
     loop = asyncio.get_running_loop()
     began = loop.time()
@@ -181,7 +181,7 @@ async def test_modbus(framing: str) -> None:
 
 
 @on_virtual_time
-async def test_a_port_that_goes_ends_it() -> None:
+async def test_a_lost_port_ends_the_scan() -> None:
     line = Unplugged()
     with pytest.raises(LineDown, match="unplugged"):
         await scan(sought(line, "vigor"))
@@ -206,12 +206,12 @@ async def test_a_port_that_goes_ends_it() -> None:
         ({"timeout": "5"}, "no unit|no duration"),
     ],
 )
-def test_what_is_typed_wrong_is_said(given: dict[str, str], message: str) -> None:
+def test_a_wrong_option_is_reported(given: dict[str, str], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         planned(**{"port": "/dev/ttyS9", "protocol": "vigor", **given})
 
 
-def test_what_is_typed_is_tried_in_that_order() -> None:
+def test_given_settings_are_tried_in_their_order() -> None:
     plan = planned("COM3", "vigor", "3,7-9", "19200,4800", "8N1,7E1", "1s")
     assert plan.stations == [3, 7, 8, 9]
     assert plan.timeout == 1

@@ -708,7 +708,7 @@ TAGS = [
 
 
 @pytest.mark.parametrize("case", [*UNREADABLE, *SECTIONS, *LINES, *DEVICES, *TAGS], ids=repr)
-def test_a_mistake_is_told_with_its_line_its_path_and_what_would_be_right(
+def test_a_mistake_is_reported_with_line_path_and_a_correct_example(
     case: Bad, file: Callable[[str | bytes], Config]
 ) -> None:
     with pytest.raises(ConfigErrors) as caught:
@@ -819,7 +819,9 @@ def test_device_settings_are_laid_over_the_protocols(file: Callable[[str], Confi
     assert (device.blocks, device.control, device.enabled) == (True, True, False)
 
 
-def test_a_modbus_tcp_line_has_no_wire_unless_it_says_so(file: Callable[[str], Config]) -> None:
+def test_a_modbus_tcp_line_has_no_serial_line_unless_the_file_has_a_baudrate(
+    file: Callable[[str], Config],
+) -> None:
     rows = "port: tcp://[fe80::1]:502\ndevices: {m: {protocol: modbus-tcp, station: 1}}"
     (line,) = file(on_line(rows)).lines
     assert line.port == TcpAddress("fe80::1", 502)
@@ -1009,7 +1011,7 @@ def test_durations(text: str, seconds: float) -> None:
 @pytest.mark.parametrize(
     "value", [True, None, [], "", "s", "1", "1 s s", "-1s", "1S", "١s", "1e3s", float("inf")]
 )
-def test_what_is_no_duration(value: object) -> None:
+def test_a_wrong_duration_is_refused(value: object) -> None:
     with pytest.raises(ConfigError):
         parsers.duration(value)
 
@@ -1034,7 +1036,7 @@ def test_sizes() -> None:
         inner, max_size=5),
     max_leaves=20,
 ))  # fmt: skip
-def test_whatever_the_file_holds_it_is_loaded_or_its_mistakes_are_told(data: Any) -> None:
+def test_any_file_is_loaded_or_its_mistakes_are_reported(data: Any) -> None:
     with tempfile.TemporaryDirectory() as folder:
         plant = Path(folder) / "plant.yaml"
         plant.write_text(json.dumps(data))
@@ -1065,7 +1067,7 @@ def test_the_example_loads_and_runs_without_hardware() -> None:
     assert EXAMPLE.read_text().startswith("# yaml-language-server: $schema=./config.schema.json\n")
 
 
-def test_the_example_is_what_the_schema_describes(tmp_path: Path) -> None:
+def test_the_example_agrees_with_the_schema(tmp_path: Path) -> None:
     assert violations(plain(EXAMPLE), schema()) == []
     contract = tmp_path / "contract.yaml"
     contract.write_text(CONTRACT)
@@ -1098,7 +1100,7 @@ def test_every_default_in_the_schema_is_one_that_the_file_could_say() -> None:
         (TagDefaults, ("every", "scale", "publish", "payload")),
     ],
 )
-def test_a_default_in_the_schema_means_what_holds_when_nothing_is_said(
+def test_a_default_in_the_schema_equals_the_setting_left_out(
     section: type[Section], settings: tuple[str, ...]
 ) -> None:
     name_there = "Defaults" if section is TagDefaults else section.__name__
@@ -1122,7 +1124,9 @@ def test_a_default_in_the_schema_means_what_holds_when_nothing_is_said(
         ("lines: {}\nzeno: 1\n", ""),
     ],
 )
-def test_the_schema_finds_what_an_editor_can_find(case: str, where: str, tmp_path: Path) -> None:
+def test_the_schema_finds_the_mistakes_that_an_editor_can_find(
+    case: str, where: str, tmp_path: Path
+) -> None:
     plant = tmp_path / "plant.yaml"
     plant.write_text(case)
     assert where in violations(plain(plant), schema())
@@ -1173,7 +1177,7 @@ def _zenoh(setting: str) -> str:
         )),
     ],
 )  # fmt: skip
-def test_what_the_program_refuses_an_editor_shows(
+def test_an_editor_shows_the_settings_that_the_program_refuses(
     text: str, file: Callable[[str | bytes], Config], tmp_path: Path
 ) -> None:
     with pytest.raises(ConfigErrors):
@@ -1207,7 +1211,7 @@ def test_what_the_program_refuses_an_editor_shows(
         tags("температура: {address: D1}", "mühle/1.a-b_c: {address: D2}", "ไฟ: {address: M1}"),
     ],
 )  # fmt: skip
-def test_what_the_program_takes_an_editor_does_not_call_wrong(
+def test_an_editor_accepts_the_settings_that_the_program_accepts(
     text: str, file: Callable[[str | bytes], Config], tmp_path: Path
 ) -> None:
     assert file(text).lines
@@ -1272,7 +1276,7 @@ def test_without_security_settings_there_are_none(file: Callable[[str | bytes], 
     assert (config.standby, config.writers_file) == (None, None)
 
 
-def test_payload_is_json_unless_tag_device_line_or_file_says_raw(
+def test_payload_is_json_unless_tag_device_line_or_file_sets_raw(
     file: Callable[[str | bytes], Config],
 ) -> None:
     config = file(
@@ -1302,7 +1306,7 @@ def test_payload_is_json_unless_tag_device_line_or_file_says_raw(
         ("defaults: {payload: xml}", "1: defaults.payload: 'xml' is not known: use json or raw"),
     ],
 )
-def test_a_mistake_in_them_is_told_with_its_place(
+def test_a_mistake_in_these_settings_is_reported_with_its_place(
     file: Callable[[str | bytes], Config], rows: str, says: str
 ) -> None:
     with pytest.raises(ConfigErrors) as raised:

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from gateway.app import device_of
 from gateway.config import Config, ConfigErrors, load, schema
+from gateway.engine.device import Device
 from gateway.protocols.driver import Address, Cost, Span
 from gateway.protocols.frames import FrameDriver
 from gateway.tags import Publish, WriteRule
@@ -105,11 +105,11 @@ def test_a_device_of_frames_is_a_driver_like_any_other(file: Callable[[str], Con
         assert driver.address(driver.spell(tag.address)) == tag.address
 
 
-def test_all_fields_of_a_reply_are_asked_for_once(file: Callable[[str], Config]) -> None:
+def test_all_fields_of_a_reply_share_one_request(file: Callable[[str], Config]) -> None:
     config = file(
         scale("hours: {address: hours, every: 1min}", "version: {address: version, every: 1s}")
     )
-    device = device_of(config.devices[0], config.lines[0])
+    device = Device(config.devices[0], config.lines[0].wire)
     (block,) = device.blocks
     assert block.every == 1.0
     assert {tag.name for tag in block.tags} == {"hours", "version"}
@@ -246,7 +246,7 @@ MISTAKES = {
 
 
 @pytest.mark.parametrize("case", MISTAKES.values(), ids=list(MISTAKES))
-def test_a_mistake_is_told_with_its_line_its_path_and_what_would_be_right(
+def test_a_mistake_is_reported_with_line_path_and_a_correct_example(
     case: tuple[str, ...], file: Callable[[str], Config]
 ) -> None:
     text, *says = case
@@ -255,7 +255,9 @@ def test_a_mistake_is_told_with_its_line_its_path_and_what_would_be_right(
     assert list(caught.value.messages) == [f"plant.yaml:{message}" for message in says]
 
 
-def test_two_asked_devices_and_a_speaker_may_share_a_line(file: Callable[[str], Config]) -> None:
+def test_two_polled_devices_and_an_unsolicited_one_may_share_a_line(
+    file: Callable[[str], Config],
+) -> None:
     asked = "ask: {q: {send: Q, match: '(?P<b>.)', fields: {b: {type: text}}}}"
     config = file(
         on_line(
@@ -290,7 +292,7 @@ def test_the_examples_are_the_devices_of_the_page() -> None:
     assert seen == set(page) - {"scale-by-columns"}
 
 
-def test_what_the_file_must_not_say_an_editor_shows() -> None:
+def test_an_editor_shows_mistakes_in_frames() -> None:
     text = on_line(SCALE).replace("gap: 50ms", "gap: 50").replace("send:", "sned:")
     found = violations(yaml.safe_load(text), schema())
     device = "/lines/hall/devices/scale"

@@ -4,12 +4,13 @@ It hears one whole request and gives one whole answer. Devices are kept under th
 five-character names; nothing is forgiven.
 """
 
-from collections.abc import Callable
-from typing import Any, TypeVar
-
-from gateway.errors import Garbled, NoReply
+from typing import Literal, TypeVar
 
 T = TypeVar("T")
+
+FrameFormat = Literal[1, 4]
+Procedure = tuple[FrameFormat, bool]  # the second: sum check
+PROCEDURES: list[Procedure] = [(1, True), (1, False), (4, True), (4, False)]
 
 
 def summed(block: bytes) -> bytes:
@@ -196,33 +197,3 @@ class Peer:
                 self.devices[name] = value
         assert data == ""
         return self.ack()
-
-
-class PeerTalk:
-    """A `Talk` over bytes: what the driver says goes to `hear`, what comes back to its codec."""
-
-    may_echo = False
-
-    def __init__(self, driver: Any, hear: Callable[[bytes], bytes], pieces: int = 1000) -> None:
-        self._driver, self._hear, self._pieces = driver, hear, pieces
-        self.sent = self.received = 0
-
-    async def tell(self, frame: Any) -> None:
-        data = self._driver.codec().encode(frame)
-        self.sent += len(data)
-        self._hear(data)
-
-    async def ask(self, frame: Any, reply: int, answers: Callable[[Any], T | None]) -> T:
-        codec = self._driver.codec()
-        request = codec.encode(frame)
-        self.sent += len(request)
-        heard = self._hear(request)
-        self.received += len(heard)
-        for at in range(0, len(heard), self._pieces):
-            for got in codec.feed(heard[at : at + self._pieces]):
-                answer = answers(got)
-                if answer is not None:
-                    return answer
-        if heard:
-            raise Garbled("no answer among what was heard", heard)
-        raise NoReply("no answer")

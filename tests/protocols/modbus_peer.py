@@ -1,15 +1,13 @@
-"""A talk in which something certain is heard, whatever is asked; and pymodbus' view of frames."""
+"""A Modbus device with given replies; and pymodbus' view of frames."""
 
 from collections.abc import Callable, Sequence
-from typing import TypeVar
 
 from pymodbus.framer import FramerAscii, FramerBase, FramerRTU, FramerSocket
 from pymodbus.pdu import DecodePDU, ModbusPDU
 
-from gateway.errors import NoReply
-from gateway.protocols.modbus import Frame, ModbusAscii, ModbusRtu, ModbusTcp
+from gateway.protocols.modbus import ModbusAscii, ModbusRtu, ModbusTcp
+from tests.doubles import Wire
 
-T = TypeVar("T")
 KINDS = (ModbusRtu, ModbusAscii, ModbusTcp)
 Driver = ModbusRtu | ModbusAscii | ModbusTcp
 FRAMERS: dict[type, type[FramerBase]] = {
@@ -19,37 +17,18 @@ FRAMERS: dict[type, type[FramerBase]] = {
 }
 
 
-class Hearing:
-    """A `Talk`: to the n-th question, the n-th item of `heard` is what comes back, piece by piece.
+def hearing(driver: Driver, *heard: Sequence[bytes] | Callable[[bytes], Sequence[bytes]]) -> Wire:
+    """A wire on which the n-th item of `heard` comes back after the n-th request.
 
-    An item may also be what makes the pieces of the question's bytes.
+    An item may be a function of the bytes of the request.
     """
+    items = iter(heard)
 
-    may_echo = False
+    def respond(request: bytes) -> Sequence[bytes]:
+        pieces = next(items, [])
+        return pieces(request) if callable(pieces) else pieces
 
-    def __init__(
-        self, driver: Driver, *heard: Sequence[bytes] | Callable[[bytes], Sequence[bytes]]
-    ) -> None:
-        self._codec = driver.codec()
-        self._heard = list(heard)
-        self.sent: list[bytes] = []
-        self.replies: list[int] = []
-
-    async def tell(self, frame: Frame) -> None:
-        self.sent.append(self._codec.encode(frame))
-
-    async def ask(self, frame: Frame, reply: int, answers: Callable[[Frame], T | None]) -> T:
-        await self.tell(frame)
-        self.replies.append(reply)
-        pieces = self._heard.pop(0) if self._heard else []
-        if callable(pieces):
-            pieces = pieces(self.sent[-1])
-        for piece in pieces:
-            for got in self._codec.feed(piece):
-                answer = answers(got)
-                if answer is not None:
-                    return answer
-        raise NoReply("no answer")
+    return Wire(driver, respond)
 
 
 def oracle_decodes(kind: type, data: bytes, station: int, *, requests: bool) -> ModbusPDU:

@@ -1,7 +1,9 @@
 """The Computer Link driver, against the examples of the Liyan manual, chapter 2."""
 
 import re
+from collections.abc import Awaitable, Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -11,6 +13,7 @@ from pydantic import TypeAdapter, ValidationError
 from gateway.config import load
 from gateway.errors import BadValue, ConfigError, DeviceError, Garbled, NoReply, Refusal, Refused
 from gateway.protocols.computer_link import NO_REPLY_CAUSES, ComputerLink, Enquiry, Frame, Text
+from gateway.protocols.computer_link.devices import ProfileName
 from gateway.protocols.driver import (
     Address,
     Controllable,
@@ -20,8 +23,8 @@ from gateway.protocols.driver import (
     ScatteredWriter,
     Span,
 )
-from tests.doubles import Script
-from tests.protocols.computer_link_peer import Peer
+from tests.doubles import Script, Wire
+from tests.protocols.computer_link_peer import PROCEDURES, FrameFormat, Peer, Procedure
 from tests.vectors import vectors
 
 VECTORS = {vector.id: vector.frame for vector in vectors("fxlink")}
@@ -46,7 +49,7 @@ def vector(number: str) -> bytes:
     ("frame_format", "sum_check", "reply"), [(1, True, "057"), (1, False, "059"), (4, False, "076")]
 )
 async def test_2_1_reads_five_points_with_100_ms_wait(
-    frame_format: int, sum_check: bool, reply: str
+    frame_format: FrameFormat, sum_check: bool, reply: str
 ) -> None:
     driver = ComputerLink(
         station=5, frame_format=frame_format, sum_check=sum_check, message_wait=0.1
@@ -62,7 +65,7 @@ async def test_2_1_reads_five_points_with_100_ms_wait(
     ("frame_format", "sum_check", "number"), [(1, True, "001"), (1, False, "002"), (4, True, "003")]
 )
 async def test_2_1_the_five_points_m10_to_m14_cost_less_as_one_word_from_m8(
-    frame_format: int, sum_check: bool, number: str
+    frame_format: FrameFormat, sum_check: bool, number: str
 ) -> None:
     driver = ComputerLink(
         station=5, frame_format=frame_format, sum_check=sum_check, message_wait=0.1
@@ -81,7 +84,7 @@ async def test_2_1_the_five_points_m10_to_m14_cost_less_as_one_word_from_m8(
     ("frame_format", "sum_check", "number"), [(1, True, "005"), (1, False, "006"), (4, True, "007")]
 )
 async def test_2_2_example_1_reads_m40_to_m71_as_two_words(
-    frame_format: int, sum_check: bool, number: str
+    frame_format: FrameFormat, sum_check: bool, number: str
 ) -> None:
     driver = ComputerLink(
         station=5, frame_format=frame_format, sum_check=sum_check, message_wait=0.1
@@ -110,7 +113,7 @@ async def test_2_2_example_3_reads_d100_and_d101_of_station_15() -> None:
 
 @pytest.mark.parametrize(("frame_format", "reply"), [(1, "063"), (4, "080")])
 async def test_1_6_2_c200_is_one_device_with_its_high_word_first(
-    frame_format: int, reply: str
+    frame_format: FrameFormat, reply: str
 ) -> None:
     driver, peer = ComputerLink(frame_format=frame_format), Peer(0, frame_format, True)
     talk = Script(driver, sends(peer.enq("00FFWR0CN20001")), hears(vector(reply)))
@@ -131,7 +134,7 @@ async def test_2_3_a_writes_m903_to_m907() -> None:
     [(1, True, "009"), (1, False, "010"), (4, True, "011"), (4, False, "012")],
 )
 async def test_2_3_b_writes_m8030_and_m8031_of_station_8(
-    frame_format: int, sum_check: bool, number: str
+    frame_format: FrameFormat, sum_check: bool, number: str
 ) -> None:
     driver = ComputerLink(
         station=8, frame_format=frame_format, sum_check=sum_check, message_wait=0.01
@@ -161,7 +164,7 @@ async def test_2_4_example_2_writes_d0_and_d1() -> None:
     [(1, True, "013"), (1, False, "014"), (4, True, "015"), (4, False, "016")],
 )
 async def test_2_4_example_3_writes_d8130_and_d8131(
-    frame_format: int, sum_check: bool, number: str
+    frame_format: FrameFormat, sum_check: bool, number: str
 ) -> None:
     driver = ComputerLink(frame_format=frame_format, sum_check=sum_check)
     talk = Script(driver, sends(vector(number)), hears(Peer(0, frame_format, sum_check).ack()))
@@ -188,7 +191,7 @@ async def test_2_5_sets_m50_resets_s100_sets_y1_in_one_bt() -> None:
     ("frame_format", "sum_check", "number"), [(1, False, "018"), (4, True, "019")]
 )
 async def test_2_5_x_and_y_are_numbered_in_octal(
-    frame_format: int, sum_check: bool, number: str
+    frame_format: FrameFormat, sum_check: bool, number: str
 ) -> None:
     driver = ComputerLink(station=5, frame_format=frame_format, sum_check=sum_check)
     talk = Script(driver, sends(vector(number)), hears(Peer(5, frame_format, sum_check).ack()))
@@ -217,7 +220,7 @@ async def test_2_6_writes_d500_y100_to_y117_and_c100_in_one_wt() -> None:
     [(1, True, "021"), (1, False, "022"), (4, True, "023"), (4, False, "024")],
 )
 async def test_2_6_a_word_and_sixteen_states_go_in_one_wt(
-    frame_format: int, sum_check: bool, number: str
+    frame_format: FrameFormat, sum_check: bool, number: str
 ) -> None:
     driver = ComputerLink(station=5, frame_format=frame_format, sum_check=sum_check)
     talk = Script(driver, sends(vector(number)), hears(Peer(5, frame_format, sum_check).ack()))
@@ -234,7 +237,9 @@ WORDS = [Span("D", 500, 1), Span("Y", 0o100, 16), Span("C", 100, 1)]
     ("frame_format", "sum_check", "number"),
     [(1, True, "025"), (1, False, "026"), (4, False, "028")],
 )
-async def test_2_7_registers_three_points(frame_format: int, sum_check: bool, number: str) -> None:
+async def test_2_7_registers_three_points(
+    frame_format: FrameFormat, sum_check: bool, number: str
+) -> None:
     driver = ComputerLink(station=5, frame_format=frame_format, sum_check=sum_check, monitor=True)
     talk = Script(driver, sends(vector(number)), hears(Peer(5, frame_format, sum_check).ack()))
     await driver.register(talk, BITS)
@@ -245,7 +250,9 @@ async def test_2_7_registers_three_points(frame_format: int, sum_check: bool, nu
     ("frame_format", "sum_check", "number"),
     [(1, True, "029"), (1, False, "030"), (4, True, "031"), (4, False, "032")],
 )
-async def test_2_8_registers_three_words(frame_format: int, sum_check: bool, number: str) -> None:
+async def test_2_8_registers_three_words(
+    frame_format: FrameFormat, sum_check: bool, number: str
+) -> None:
     driver = ComputerLink(station=5, frame_format=frame_format, sum_check=sum_check, monitor=True)
     talk = Script(driver, sends(vector(number)), hears(Peer(5, frame_format, sum_check).ack()))
     await driver.register(talk, WORDS)
@@ -256,7 +263,7 @@ async def test_2_8_registers_three_words(frame_format: int, sum_check: bool, num
     ("frame_format", "request_", "reply"), [(1, "033", "061"), (4, "035", "078")]
 )
 async def test_2_9_reads_the_registered_points(
-    frame_format: int, request_: str, reply: str
+    frame_format: FrameFormat, request_: str, reply: str
 ) -> None:
     driver = ComputerLink(station=8, frame_format=frame_format, monitor=True)
     talk = Script(driver, sends(vector(request_)), hears(vector(reply)))
@@ -270,7 +277,7 @@ async def test_2_9_reads_the_registered_points(
     [(1, False, "038", "060"), (4, True, "039", "075"), (4, False, "040", "077")],
 )
 async def test_2_10_reads_the_registered_words(
-    frame_format: int, sum_check: bool, request_: str, reply: str
+    frame_format: FrameFormat, sum_check: bool, request_: str, reply: str
 ) -> None:
     driver = ComputerLink(station=8, frame_format=frame_format, sum_check=sum_check, monitor=True)
     spans = [Span("D", 500, 1), Span("C", 100, 1), Span("D", 7, 1)]
@@ -281,7 +288,7 @@ async def test_2_10_reads_the_registered_words(
     talk.done()
 
 
-async def test_2_10_a_plc_that_took_the_misprint_literally_is_asked_mw() -> None:
+async def test_2_10_a_plc_with_the_misprinted_command_gets_mw() -> None:
     driver = ComputerLink(station=8, monitor=True, monitor_word_command="MW")
     peer = Peer(8, 1, True)
     talk = Script(driver, sends(peer.enq("08FFMW0")), hears(peer.stx("1234")))
@@ -349,7 +356,7 @@ async def test_2_11_remote_run_of_station_5_and_stop_of_station_0(command: str, 
     ],
 )
 async def test_2_11_remote_run_and_stop_of_station_31(
-    frame_format: int, sum_check: bool, command: str, number: str
+    frame_format: FrameFormat, sum_check: bool, command: str, number: str
 ) -> None:
     driver = ComputerLink(station=31, frame_format=frame_format, sum_check=sum_check)
     talk = Script(driver, sends(vector(number)), hears(Peer(31, frame_format, sum_check).ack()))
@@ -368,8 +375,8 @@ async def test_2_11_remote_run_while_running_is_refused_with_18() -> None:
 @pytest.mark.parametrize(
     ("frame_format", "sum_check", "number"), [(1, True, "049"), (1, False, "050"), (4, True, "051")]
 )
-async def test_2_12_the_global_flag_goes_to_all_stations_and_nobody_answers(
-    frame_format: int, sum_check: bool, number: str
+async def test_2_12_the_global_flag_goes_to_all_stations_without_a_reply(
+    frame_format: FrameFormat, sum_check: bool, number: str
 ) -> None:
     driver = ComputerLink(station=3, frame_format=frame_format, sum_check=sum_check)
     talk = Script(driver, sends(vector(number)))
@@ -396,7 +403,7 @@ async def test_2_13_loopback_of_abcde() -> None:
     ("frame_format", "request_", "reply"), [(1, "053", "062"), (4, "055", "079")]
 )
 async def test_2_13_loopback_of_ten_characters(
-    frame_format: int, request_: str, reply: str
+    frame_format: FrameFormat, request_: str, reply: str
 ) -> None:
     driver = ComputerLink(station=1, frame_format=frame_format)
     talk = Script(driver, sends(vector(request_)), hears(vector(reply)))
@@ -404,7 +411,7 @@ async def test_2_13_loopback_of_ten_characters(
     talk.done()
 
 
-async def test_the_model_is_told_with_its_name() -> None:
+async def test_the_model_is_reported_with_its_name() -> None:
     driver, peer = ComputerLink(), Peer(0, 1, True)
     talk = Script(driver, sends(peer.enq("00FFPC0")), hears(peer.stx("9D")))
     assert await driver.control(talk, "model", "") == "9D (FX2N)"
@@ -423,7 +430,7 @@ BOUNDARIES = [
 
 
 @pytest.mark.parametrize(("number", "span", "wait"), BOUNDARIES, ids=str)
-async def test_the_last_devices_are_asked_for_as_in_the_vectors(
+async def test_the_last_devices_are_requested_as_in_the_vectors(
     number: str, span: Span, wait: float
 ) -> None:
     driver = ComputerLink(message_wait=wait)
@@ -455,7 +462,7 @@ def test_x100_to_x177_would_be_64_points_of_br_and_go_as_four_words() -> None:
 )
 @pytest.mark.parametrize("frame_format", [1, 4])
 async def test_a_nak_is_refused_with_its_code_and_meaning(
-    number: str, refusal: Refusal, frame_format: int
+    number: str, refusal: Refusal, frame_format: FrameFormat
 ) -> None:
     block = vector(number if frame_format == 1 else f"{int(number) + 17:03}")
     code = block[5:7].decode()
@@ -506,7 +513,7 @@ async def test_a_write_is_done_by_its_own_stations_ack_alone() -> None:
         await driver.write(talk, Span("M", 10, 1), [1])
 
 
-def test_a_block_nobody_asked_for_can_be_told_for_the_log() -> None:
+def test_a_stray_block_is_described_for_the_log() -> None:
     driver = ComputerLink(station=5)
     assert driver.describe_stray(Text(5, "0007", "FE")) == "on-demand data of station 5: 0007"
     assert driver.describe_stray(Enquiry(5, "BR", "M001001")) == "echo of BR M001001"
@@ -518,7 +525,7 @@ def test_the_causes_of_silence_name_the_plcs_own_codes() -> None:
         assert code in NO_REPLY_CAUSES
 
 
-async def test_resync_takes_only_the_answer_to_its_own_salt() -> None:
+async def test_resync_takes_only_the_reply_with_its_own_probe_token() -> None:
     driver, peer = ComputerLink(station=5), Peer(5, 1, True)
     late = [peer.stx("05Z0006"), peer.stx("0501101"), peer.ack()]
     talk = Script(driver, sends(peer.enq("05FFTT005Z0007")), *map(hears, late))
@@ -532,31 +539,12 @@ async def test_resync_takes_only_the_answer_to_its_own_salt() -> None:
 
 
 @given(st.integers(0, 0xFFFF), st.sampled_from(["M", "D", "C32", "TS"]), st.integers(1, 16))
-async def test_no_answer_to_a_resync_can_be_taken_for_a_value(
-    salt: int, area: str, size: int
-) -> None:
+async def test_no_reply_to_a_resync_can_be_read_as_a_value(salt: int, area: str, size: int) -> None:
     driver, peer = ComputerLink(station=5), Peer(5, 1, True)
     first = driver.areas[area].first
-    with pytest.raises(Garbled):
-        await driver.read(Answer(driver, peer.stx(f"05Z{salt:04X}")), Span(area, first, size))
-
-
-class Answer:
-    """A `Talk` that hears the same bytes whatever is asked."""
-
-    def __init__(self, driver: ComputerLink, *pieces: bytes) -> None:
-        self._codec, self._pieces = driver.codec(), pieces
-
-    async def tell(self, frame: Frame) -> None:
-        self._codec.encode(frame)
-
-    async def ask(self, frame, reply, answers):
-        self._codec.encode(frame)
-        for piece in self._pieces:
-            for got in self._codec.feed(piece):
-                if (answer := answers(got)) is not None:
-                    return answer
-        raise Garbled("nothing") if self._pieces else NoReply("nothing")
+    wire = Wire(driver, lambda _: [peer.stx(f"05Z{salt:04X}")])
+    with pytest.raises(NoReply):
+        await driver.read(wire, Span(area, first, size))
 
 
 BLOCKS = st.builds(
@@ -572,7 +560,8 @@ BLOCKS = st.builds(
     st.integers(4, 5),
     st.text("01239AFZ", max_size=12),
 )
-CONVERSATIONS = [
+Converse = Callable[[ComputerLink, Wire], Awaitable[Any]]
+CONVERSATIONS: list[Converse] = [
     lambda driver, talk: driver.read(talk, Span("D", 100, 2)),
     lambda driver, talk: driver.read(talk, Span("M", 10, 2)),
     lambda driver, talk: driver.read(talk, Span("M", 0, 30)),
@@ -593,16 +582,16 @@ CONVERSATIONS = [
 @given(
     st.lists(st.one_of(BLOCKS, st.binary(max_size=8)), max_size=4),
     st.sampled_from(CONVERSATIONS),
-    st.sampled_from([(1, True), (1, False), (4, True), (4, False)]),
+    st.sampled_from(PROCEDURES),
 )
-async def test_whatever_comes_back_is_a_value_or_a_device_error(
-    pieces, converse, procedure
+async def test_any_reply_is_a_value_or_a_device_error(
+    pieces: list[bytes], converse: Converse, procedure: Procedure
 ) -> None:
     driver = ComputerLink(
         station=5, frame_format=procedure[0], sum_check=procedure[1], monitor=True
     )
     try:
-        said = await converse(driver, Answer(driver, *pieces))
+        said = await converse(driver, Wire(driver, lambda _: pieces))
     except DeviceError:
         return
     assert said is None or said is True or len(said) > 0
@@ -629,7 +618,7 @@ async def test_whatever_comes_back_is_a_value_or_a_device_error(
     ],
     ids=str,
 )
-def test_a_setting_out_of_range_is_a_config_error(settings_, says: str) -> None:
+def test_a_setting_out_of_range_is_a_config_error(settings_: dict[str, Any], says: str) -> None:
     with pytest.raises(ConfigError, match=says):
         ComputerLink(**settings_)
 
@@ -641,7 +630,7 @@ def test_1_3_2_the_message_wait_is_one_digit_of_10_ms(step: int) -> None:
     assert driver.timing.turnaround == pytest.approx(max(0.02, step / 100))
 
 
-async def test_the_message_wait_goes_with_every_request() -> None:
+async def test_every_request_has_the_message_wait() -> None:
     driver, peer = ComputerLink(message_wait=0.15), Peer(0, 1, True)
     talk = Script(driver, sends(peer.enq("00FFWRFD000001")), hears(peer.stx("0001")))
     await driver.read(talk, Span("D", 0, 1))
@@ -687,7 +676,7 @@ def test_the_file_can_name_every_setting() -> None:
         TypeAdapter(ComputerLink).validate_python({"station": 32})
 
 
-def test_the_driver_can_do_what_the_contract_names() -> None:
+def test_the_driver_has_the_capabilities_of_the_contract() -> None:
     driver = ComputerLink()
     contract: Driver[Frame] = driver
     assert contract.protocol == "computer-link"
@@ -784,7 +773,7 @@ def test_devices_are_written_as_their_maker_writes_them(
         ("", "no device address"),
     ],
 )
-def test_an_address_the_plc_does_not_have_says_what_would_be_right(text: str, says: str) -> None:
+def test_an_address_the_plc_does_not_have_gets_a_correct_example(text: str, says: str) -> None:
     with pytest.raises(ConfigError, match=says):
         ComputerLink().address(text)
 
@@ -798,7 +787,9 @@ def test_an_address_the_plc_does_not_have_says_what_would_be_right(text: str, sa
         ("fx", ["X267", "M3071", "D7999"], ["X270", "M3072", "D8000.16", "D8256"]),
     ],
 )
-def test_1_5_each_profile_has_its_ranges(profile, has: list[str], has_not: list[str]) -> None:
+def test_1_5_each_profile_has_its_ranges(
+    profile: ProfileName, has: list[str], has_not: list[str]
+) -> None:
     driver = ComputerLink(profile=profile)
     for text in has:
         assert driver.spell(driver.address(text)) == text

@@ -6,6 +6,7 @@ from hypothesis import strategies as st
 
 from gateway.errors import Evidence, Garbled
 from gateway.protocols.computer_link import Ack, Enquiry, Frame, LinkCodec, Nak, Text
+from tests.protocols.computer_link_peer import PROCEDURES, Procedure
 from tests.vectors import Vector, vectors
 
 LINK = vectors("fxlink")
@@ -13,7 +14,6 @@ LINK = vectors("fxlink")
 VALID = [vector for vector in LINK if vector.valid and vector.fields.get("kind") != "EOT"]
 REPLIES = [vector for vector in VALID if vector.direction == "response"]
 REQUESTS = [vector for vector in VALID if "command" in vector.fields]
-PROCEDURES = [(1, True), (1, False), (4, True), (4, False)]
 
 
 def codec(vector: Vector) -> LinkCodec:
@@ -117,7 +117,9 @@ def test_a_reply_before_damage_is_handed_out_first() -> None:
         ((4, False), (4, True), "no sum check"),
     ],
 )
-def test_a_reply_of_another_setting_says_which(heard, read_as, says) -> None:
+def test_a_reply_of_another_setting_names_the_setting(
+    heard: Procedure, read_as: Procedure, says: str
+) -> None:
     block = LinkCodec(*heard).encode(Text(5, "01101"))
     with pytest.raises(Garbled, match=says) as caught:
         LinkCodec(*read_as).feed(block + block)
@@ -170,7 +172,9 @@ noise = st.lists(
 
 @settings(max_examples=60, deadline=None)
 @given(procedures, st.lists(st.tuples(noise, answers), max_size=4), st.lists(st.integers(1, 9)))
-def test_blocks_survive_noise_and_any_chopping(procedure, parts, cuts) -> None:
+def test_blocks_survive_noise_and_any_chopping(
+    procedure: Procedure, parts: list[tuple[bytes, Frame]], cuts: list[int]
+) -> None:
     writer, reader = LinkCodec(*procedure), LinkCodec(*procedure)
     stream = b"".join(junk + writer.encode(frame) for junk, frame in parts)
     heard: list[Frame] = []
@@ -181,9 +185,10 @@ def test_blocks_survive_noise_and_any_chopping(procedure, parts, cuts) -> None:
     assert heard == [frame for _, frame in parts]
 
 
-def outcome(procedure: tuple[int, bool], pieces: list[bytes]) -> tuple[list[Frame], str]:
+def outcome(procedure: Procedure, pieces: list[bytes]) -> tuple[list[Frame], str]:
     """What a codec makes of a stream: the blocks, and the damage it ends with."""
-    reader, frames = LinkCodec(*procedure), []
+    reader = LinkCodec(*procedure)
+    frames: list[Frame] = []
     reader.encode(Enquiry(5, "BR", "M001005", 10))
     try:
         for piece in [*pieces, b""]:
@@ -208,6 +213,8 @@ line_bytes = st.lists(
 @given(procedures, line_bytes)
 @example((4, True), b"\x0605FF\r\r\n")
 @example((1, True), b"\x0205FF\x03\r")
-def test_any_bytes_are_blocks_damage_or_nothing_however_they_are_cut(procedure, data) -> None:
+def test_any_bytes_are_blocks_damage_or_nothing_however_they_are_cut(
+    procedure: Procedure, data: bytes
+) -> None:
     whole = outcome(procedure, [data])
     assert outcome(procedure, [bytes([byte]) for byte in data]) == whole

@@ -6,10 +6,11 @@ from hypothesis import strategies as st
 
 from gateway.errors import Refused
 from gateway.protocols.computer_link import ComputerLink
+from gateway.protocols.computer_link.devices import ProfileName
 from gateway.protocols.driver import Cost, Span, Unit
-from tests.protocols.computer_link_peer import Peer, PeerTalk
+from tests.doubles import Wire, in_pieces
+from tests.protocols.computer_link_peer import PROCEDURES, Peer, Procedure
 
-PROCEDURES = [(1, True), (1, False), (4, True), (4, False)]
 LETTERS = {"M8": "M", "D8": "D", "T": "TN", "C": "CN", "C32": "CN"}
 
 drivers = st.builds(
@@ -64,40 +65,40 @@ def neighbours(draw: st.DrawFn, driver: ComputerLink) -> list[Span]:
     return found
 
 
-def values(draw: st.DrawFn, driver: ComputerLink, span: Span) -> list[int]:
+def values(data: st.DataObject, driver: ComputerLink, span: Span) -> list[int]:
     top = {Unit.BIT: 1, Unit.WORD: 0xFFFF, Unit.DWORD: 0xFFFFFFFF}[driver.areas[span.area].unit]
-    return draw(st.lists(st.integers(0, top), min_size=span.size, max_size=span.size))
+    return data.draw(st.lists(st.integers(0, top), min_size=span.size, max_size=span.size))
 
 
 @settings(max_examples=120, deadline=None)
 @given(st.data(), drivers, st.integers(1, 7))
-async def test_a_read_gives_the_devices_and_costs_what_was_said(
+async def test_a_read_returns_the_devices_at_exactly_its_cost(
     data: st.DataObject, driver: ComputerLink, pieces: int
 ) -> None:
     span = data.draw(spans(driver))
     peer = peer_of(driver)
-    units = values(data.draw, driver, span)
+    units = values(data, driver, span)
     peer.devices = dict(zip(names(peer, span), units, strict=True))
-    wire = PeerTalk(driver, peer.hear, pieces)
+    wire = Wire(driver, lambda data: in_pieces(peer.hear(data), pieces))
     cost = driver.cost(span)
     if cost is None:
         with pytest.raises(ValueError, match="does not fit"):
             await driver.read(wire, span)
         return
     assert list(await driver.read(wire, span)) == units
-    assert Cost(wire.sent, wire.received) == cost
+    assert wire.cost == cost
     assert peer.confirmed == driver.send_area_c
 
 
 @settings(max_examples=120, deadline=None)
 @given(st.data(), drivers)
-async def test_a_write_changes_its_devices_and_no_other_and_costs_what_was_said(
+async def test_a_write_changes_only_its_devices_at_exactly_its_cost(
     data: st.DataObject, driver: ComputerLink
 ) -> None:
     span = data.draw(spans(driver, 170))
     peer = peer_of(driver)
-    units = values(data.draw, driver, span)
-    wire = PeerTalk(driver, peer.hear)
+    units = values(data, driver, span)
+    wire = Wire(driver, lambda data: [peer.hear(data)])
     cost = driver.write_cost(span)
     if cost is None:
         with pytest.raises(ValueError, match="does not fit"):
@@ -105,7 +106,7 @@ async def test_a_write_changes_its_devices_and_no_other_and_costs_what_was_said(
         return
     assert await driver.write(wire, span, units) is True
     assert peer.devices == dict(zip(names(peer, span), units, strict=True))
-    assert Cost(wire.sent, wire.received) == cost
+    assert wire.cost == cost
 
 
 @settings(max_examples=120, deadline=None)
@@ -113,9 +114,9 @@ async def test_a_write_changes_its_devices_and_no_other_and_costs_what_was_said(
 async def test_a_scattered_write_changes_its_devices_and_no_other(
     data: st.DataObject, driver: ComputerLink
 ) -> None:
-    parts = [(span, values(data.draw, driver, span)) for span in data.draw(neighbours(driver))]
+    parts = [(span, values(data, driver, span)) for span in data.draw(neighbours(driver))]
     peer = peer_of(driver)
-    wire = PeerTalk(driver, peer.hear)
+    wire = Wire(driver, lambda data: [peer.hear(data)])
     cost = driver.scattered_write_cost([span for span, _ in parts])
     if cost is None:
         return
@@ -126,7 +127,7 @@ async def test_a_scattered_write_changes_its_devices_and_no_other(
         assert not fresh.keys() & expected.keys()
         expected |= fresh
     assert peer.devices == expected
-    assert Cost(wire.sent, wire.received) == cost
+    assert wire.cost == cost
 
 
 @settings(max_examples=120, deadline=None)
@@ -137,21 +138,21 @@ async def test_registered_devices_are_read_in_their_order(
     asked = data.draw(neighbours(driver))
     peer = peer_of(driver)
     for span in asked:
-        units = values(data.draw, driver, span)
+        units = values(data, driver, span)
         peer.devices |= dict(zip(names(peer, span), units, strict=True))
     cost = driver.monitor_cost(asked)
     if cost is None:
         return
-    wire = PeerTalk(driver, peer.hear)
+    wire = Wire(driver, lambda data: [peer.hear(data)])
     with pytest.raises(Refused):  # nothing is registered yet
         await driver.read_registered(wire, asked)
     await driver.register(wire, asked)
-    wire = PeerTalk(driver, peer.hear)
+    wire = Wire(driver, lambda data: [peer.hear(data)])
     read = await driver.read_registered(wire, asked)
     assert [list(units) for units in read] == [
         [peer.devices[name] for name in names(peer, span)] for span in asked
     ]
-    assert Cost(wire.sent, wire.received) == cost
+    assert wire.cost == cost
 
 
 @settings(max_examples=200, deadline=None)
@@ -187,8 +188,8 @@ def fits(driver: ComputerLink, area: str, start: int, *, write: bool = False) ->
         ),
     ],
 )
-def test_one_exchange_takes_what_the_profile_allows(
-    profile, read: dict[str, int], write: dict[str, int]
+def test_one_request_has_the_limits_of_the_profile(
+    profile: ProfileName, read: dict[str, int], write: dict[str, int]
 ) -> None:
     driver = ComputerLink(profile=profile)
     for area, size in read.items():
@@ -221,7 +222,7 @@ def test_20_scattered_points_go_in_one_bt_and_10_words_in_one_wt() -> None:
     ],
     ids=str,
 )
-def test_spans_that_cannot_go_together_are_told(spans_: list[Span]) -> None:
+def test_spans_that_do_not_fit_one_write_have_no_cost(spans_: list[Span]) -> None:
     assert ComputerLink().scattered_write_cost(spans_) is None
 
 
@@ -237,7 +238,7 @@ def test_spans_that_cannot_go_together_are_told(spans_: list[Span]) -> None:
     ],
     ids=str,
 )
-def test_spans_that_cannot_be_registered_together_are_told(spans_: list[Span]) -> None:
+def test_spans_that_do_not_fit_one_list_have_no_cost(spans_: list[Span]) -> None:
     assert ComputerLink(monitor=True).monitor_cost(spans_) is None
 
 
@@ -246,28 +247,27 @@ def test_points_beside_words_are_registered_in_sixteens() -> None:
     assert ComputerLink(monitor=True).monitor_cost(spans_) == Cost(8 + 2, 6 + 2 * 4 + 2)
 
 
-def test_nothing_is_registered_unless_the_file_says_monitor() -> None:
+def test_no_list_is_registered_without_the_setting_monitor() -> None:
     assert ComputerLink().monitor_cost([Span("D", 1, 1)]) is None
     assert ComputerLink(monitor=True).monitor_cost([Span("D", 1, 1)]) is not None
 
 
 @pytest.mark.parametrize("span", [Span("M", 0, 0), Span("M", 1530, 7), Span("M", -1, 2)], ids=str)
-def test_a_span_outside_the_device_cannot_be_asked_for(span: Span) -> None:
+def test_a_span_outside_the_device_has_no_cost(span: Span) -> None:
     assert ComputerLink().cost(span) is None
     assert ComputerLink().write_cost(span) is None
 
 
 @pytest.mark.parametrize("procedure", PROCEDURES)
-async def test_every_control_is_understood(procedure: tuple[int, bool]) -> None:
+async def test_every_command_is_carried_out(procedure: Procedure) -> None:
     driver = ComputerLink(station=5, frame_format=procedure[0], sum_check=procedure[1])
     peer = peer_of(driver)
-    wire = PeerTalk(driver, peer.hear)
+    wire = Wire(driver, lambda data: [peer.hear(data)])
     assert await driver.control(wire, "run", "") == "acknowledged"
     assert await driver.control(wire, "stop", "") == "acknowledged"
     assert await driver.control(wire, "model", "") == "9D (FX2N)"
     text = "".join(map(chr, range(32, 127)))
     assert await driver.control(wire, "loopback", text) == text
     await driver.resync(wire, None, 70000)
-    heard: list[bytes] = []
-    await driver.control(PeerTalk(driver, lambda data: heard.append(data) or b""), "global", "on")
-    assert heard == [peer.enq("FFFFGW01")]
+    await driver.control(wire, "global", "on")
+    assert wire.sent[-1:] == [peer.enq("FFFFGW01")]

@@ -59,7 +59,7 @@ def test_an_address_is_read_as_its_maker_writes_it(text: str, address: Address) 
         ("D7.16", "D7.16: the bits of a word are .0 to .15"),
     ],
 )
-def test_a_wrong_address_is_told_what_would_be_right(text: str, right: str) -> None:
+def test_a_wrong_address_gets_a_correct_example(text: str, right: str) -> None:
     with pytest.raises(ConfigError) as raised:
         parse_device(text, TABLE)
     assert str(raised.value) == right
@@ -82,7 +82,7 @@ def test_a_wrong_address_is_told_what_would_be_right(text: str, right: str) -> N
         "D" + "1" * 5000,
     ],
 )
-def test_what_has_not_the_form_of_an_address_is_shown_one(text: str) -> None:
+def test_a_text_that_is_no_address_gets_an_example(text: str) -> None:
     with pytest.raises(ConfigError, match="no device address: write it as D100, a bit of"):
         parse_device(text, TABLE)
 

@@ -45,7 +45,8 @@ sizes = st.lists(st.integers(1, 9), min_size=1, max_size=8)
 
 
 def pieces(data: bytes, cuts: list[int]) -> list[bytes]:
-    found, at = [], 0
+    found: list[bytes] = []
+    at = 0
     while at < len(data):
         size = cuts[len(found) % len(cuts)]
         found.append(data[at : at + size])
@@ -59,7 +60,7 @@ def frames(items: list[bytes | Garbled]) -> list[bytes]:
 
 @settings(max_examples=200)
 @given(framings(), st.binary(max_size=SMALL), noise, sizes)
-def test_what_is_encoded_is_heard_again_in_any_pieces(
+def test_an_encoded_frame_is_decoded_in_any_pieces(
     framing: Framing, data: bytes, after: bytes, cuts: list[int]
 ) -> None:
     data = data[: framing.length]
@@ -99,7 +100,7 @@ def test_any_bytes_in_any_pieces_give_the_same_frames_and_never_fail(
 
 @settings(max_examples=200)
 @given(framings(), noise, sizes)
-def test_one_turn_hears_frames_or_garbled_or_silence(
+def test_one_transaction_gives_frames_garbled_or_silence(
     framing: Framing, data: bytes, cuts: list[int]
 ) -> None:
     codec = FrameCodec(framing)
@@ -155,7 +156,7 @@ def test_a_gap_ends_all_noise(before: bytes) -> None:
         assert (heard or reader.expire()) == [b"0A0F"]
 
 
-def test_a_frame_that_was_begun_before_we_listened_is_not_taken_for_a_whole_one() -> None:
+def test_a_frame_that_began_before_the_port_opened_is_not_a_whole_one() -> None:
     framing = Framing(ending="CR LF")
     late = FrameReader(framing, quiet=False)
     assert late.feed(b"2.50\r\n12.50\r\n") == [b"12.50"]
@@ -201,7 +202,7 @@ def test_no_terminator_within_the_longest_frame_is_error_10() -> None:
         (b"\x02AB\x0386\r", "error 8, LF missing"),
     ],
 )
-def test_a_gap_inside_a_frame_says_what_is_missing(heard: bytes, message: str) -> None:
+def test_a_gap_inside_a_frame_names_the_missing_part(heard: bytes, message: str) -> None:
     codec = FrameCodec(
         Framing(header="<02>", terminator="<03>", sum_check=True, ending="CR LF", gap=0.05)
     )

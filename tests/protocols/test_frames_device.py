@@ -49,7 +49,7 @@ async def test_b_4_5_both_programs_write_d1_of_station_1(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", PROGRAMS)
-async def test_both_programs_read_what_a_vigor_station_holds(name: str) -> None:
+async def test_both_programs_read_the_values_of_a_vigor_station(name: str) -> None:
     one = device(name)
     station = VigorStation(1)
     station.memory.write("D", 0, [0xA325])
@@ -187,7 +187,7 @@ def inverter(text: str) -> str:
     return (b"\x02" + data + b"%02X" % (sum(data) % 256)).hex(" ")
 
 
-async def test_an_inverter_is_asked_by_ascii_command() -> None:
+async def test_an_inverter_is_read_by_ascii_command() -> None:
     one = device("inverter")
     talk = script(one, f"> {inverter('F?')}", f"< {inverter('F=049.98')}")
     assert await one.read(talk, "frequency") == {"frequency": 49.98}
@@ -206,7 +206,7 @@ async def test_a_reply_field_that_cannot_be_read_is_its_own_failure() -> None:
     assert "frequency: no decimal number" in str(values["frequency"])
 
 
-async def test_a_write_that_nobody_acknowledges_is_never_said_to_be_done() -> None:
+async def test_a_write_without_acknowledgement_is_not_reported_as_done() -> None:
     one = Frames(
         framing=Framing(terminator="<0D>"),
         write={"text": Write(send="PRINT {value}", value=Field(type="text"))},
@@ -255,7 +255,7 @@ def test_costs_are_exact_for_the_request_and_the_longest_for_the_reply() -> None
     assert one.cost("a") == (6, 13)
 
 
-def test_what_a_device_has_is_said_by_name() -> None:
+def test_an_unknown_field_gets_the_names_of_all_fields() -> None:
     one = device("inverter")
     assert one.listened == frozenset()
     assert one.asked == {"frequency": "frequency"}
@@ -390,7 +390,7 @@ def changed(name: str, *path: str, to: Any) -> dict[str, Any]:
         ({"protocol": "frames", "framing": {}}, (), "at least one of listen, ask and write"),
     ],
 )
-def test_a_mistake_is_told_with_its_place(
+def test_a_mistake_is_reported_with_its_place(
     settings: dict[str, Any], place: tuple[str, ...], message: str
 ) -> None:
     with pytest.raises(ValidationError) as caught:

@@ -76,7 +76,7 @@ def test_a_float_comes_back_as_it_was_put(value: float) -> None:
 def test_a_decimal_comes_back_as_it_was_put(whole: int, hundredths: int) -> None:
     value = float(f"{whole}.{hundredths:02d}")
     for point in (".", ","):
-        field = Field(type="decimal", format="08.2f", decimal_point=point)  # type: ignore[arg-type]
+        field = Field(type="decimal", format="08.2f", decimal_point=point)
         raw = field.put(value)
         assert len(raw) == 8
         assert field.take(raw) == value
@@ -95,7 +95,7 @@ def test_a_decimal_comes_back_as_it_was_put(whole: int, hundredths: int) -> None
         (Field(type="text", encoding="latin-1"), "Ä", b"\xc4"),
     ],
 )
-def test_values_are_written_as_the_format_says(field: Field, value: Value, raw: bytes) -> None:
+def test_values_are_written_in_their_format(field: Field, value: Value, raw: bytes) -> None:
     assert field.put(value) == raw
 
 
@@ -148,13 +148,13 @@ def test_decimals_as_devices_write_them(raw: bytes, value: float) -> None:
         *(b"--1", b"1.2.3", b"12kg", b"9" * 19, b"\xb2", b"+9999.9\x00", b"1\n"),
     ],
 )
-def test_what_is_no_number_is_never_read_as_one(raw: bytes) -> None:
+def test_a_text_that_is_no_number_is_garbled(raw: bytes) -> None:
     for field in (Field(type="decimal"), Field(type="integer")):
         with pytest.raises(Garbled):
             field.take(raw)
 
 
-def test_a_decimal_comma_must_be_said_and_a_thousands_point_is_no_number() -> None:
+def test_a_decimal_comma_needs_its_setting_and_a_thousands_point_is_no_number() -> None:
     comma = Field(type="decimal", decimal_point=",")
     assert comma.take(b"1,25") == 1.25
     for raw in (b"1.25", b"1.000,5"):

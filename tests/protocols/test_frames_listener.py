@@ -17,7 +17,7 @@ def weights(said: list[UnsolicitedEvent]) -> list[object]:
     return [item.values["weight"] for item in said if isinstance(item, UnsolicitedFrame)]
 
 
-def test_frames_are_heard_in_order_however_they_are_cut() -> None:
+def test_frames_are_decoded_in_order_in_any_pieces() -> None:
     listener = Listener(device("reader"), now=0.0)
     stream = b"".join(b"\x02CODE-%d\x03" % number for number in (1, 1, 2))
     said = [item for octet in stream for item in listener.received(bytes([octet]), now=5.0)]
@@ -28,14 +28,14 @@ def test_frames_are_heard_in_order_however_they_are_cut() -> None:
     ]
 
 
-def test_a_silent_device_costs_nothing() -> None:
+def test_a_silent_device_needs_no_time() -> None:
     listener = Listener(device("reader"), now=0.0)
     assert listener.due is None
     listener.received(b"\x02CODE-1\x03", now=1.0)
     assert listener.due is None
 
 
-def test_a_frame_under_way_when_the_port_opened_is_not_taken_for_a_whole_one() -> None:
+def test_a_frame_that_began_before_the_port_opened_is_discarded() -> None:
     listener = Listener(device("scale"), now=0.0)
     said = listener.received(b"5.5  g\r\n" + STABLE, now=0.01)
     assert weights(said) == [1234.5]
@@ -47,7 +47,7 @@ def test_the_first_frame_after_a_silence_is_taken() -> None:
     assert weights(listener.received(STABLE, now=0.3)) == [1234.5]
 
 
-def test_what_is_not_understood_is_told_and_never_passed_over() -> None:
+def test_an_unknown_frame_is_reported_as_garbled() -> None:
     listener = Listener(device("scale"), now=0.0)
     said = listener.received(STABLE + OVERLOAD + STABLE, now=1.0)
     assert weights(said) == [1234.5, 1234.5]
@@ -72,7 +72,7 @@ def test_a_frame_that_is_known_and_means_nothing_is_no_damage() -> None:
     ]
 
 
-def test_a_streaming_scale_that_falls_silent_is_stale_once() -> None:
+def test_a_streaming_scale_that_stops_becomes_stale_once() -> None:
     listener = Listener(device("scale"), now=0.0)
     listener.received(STABLE, now=1.0)
     assert listener.due == 3.0
@@ -84,13 +84,13 @@ def test_a_streaming_scale_that_falls_silent_is_stale_once() -> None:
     assert listener.due == 12.0
 
 
-def test_a_scale_that_was_never_heard_is_stale_too() -> None:
+def test_a_scale_that_never_sent_becomes_stale_too() -> None:
     listener = Listener(device("scale"), now=100.0)
     assert listener.due == 102.0
     assert listener.tick(now=102.0) == [Stale(frozenset({"weight", "state", "unit"}))]
 
 
-def test_a_value_heard_by_a_frame_that_is_never_stale_stays_known() -> None:
+def test_a_value_of_a_frame_without_stale_after_stays_known() -> None:
     weight = {"weight": Field(type="decimal")}
     one = Frames(
         framing=Framing(ending="CR LF"),
@@ -105,7 +105,7 @@ def test_a_value_heard_by_a_frame_that_is_never_stale_stays_known() -> None:
     assert listener.due is None
 
 
-def test_damage_upon_damage_is_told_once() -> None:
+def test_consecutive_damage_is_reported_once() -> None:
     said = Listener(device("scale"), now=0.0).received(OVERLOAD * 1000, now=1.0)
     assert [type(item) for item in said] == [Garbled]
 

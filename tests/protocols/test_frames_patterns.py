@@ -70,7 +70,7 @@ def test_a_shorter_frame_allows_more() -> None:
         (r"(a)\1", "never before a number"),
     ],
 )
-def test_what_cannot_be_checked_is_refused(text: str, message: str) -> None:
+def test_a_pattern_that_cannot_be_checked_is_refused(text: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         check_pattern(text, 512)
 

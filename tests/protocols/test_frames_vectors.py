@@ -1,7 +1,7 @@
 """No-protocol framing against the worked frames of the VB-1COM, RS, EX485LNK and K120S manuals."""
 
 import re
-from typing import Literal
+from typing import Any, Literal
 
 import pytest
 
@@ -23,8 +23,8 @@ def written(register: str) -> str:
     return "".join(f"<{octet:02X}>" for octet in bytes.fromhex(register).lstrip(b"\0"))
 
 
-def vb_1com(fields: dict[str, str], **more: int) -> Framing:
-    """What the buffer memory #0 and #4 to #11 of a vector say (B-4, nine formats)."""
+def vb_1com(fields: dict[str, str], **more: Any) -> Framing:
+    """The framing of buffer memory #0 and #4 to #11 of a vector (B-4, nine formats)."""
     bfm0 = int(fields["bfm0"], 16)
     ending, total = bfm0 >> 10 & 3, bool(bfm0 >> 13 & 1)
     if int(fields["terminator"], 16):
@@ -104,7 +104,7 @@ def test_the_vb_1com_frame_is_complete_by_its_count_before_any_gap(vector: Vecto
 
 
 @pytest.mark.parametrize("vector", DAMAGED, ids=repr)
-def test_damage_is_told_with_the_error_number_of_bfm_29(vector: Vector) -> None:
+def test_damage_is_reported_with_the_error_number_of_bfm_29(vector: Vector) -> None:
     number = vector.fields["expect"].removeprefix("error code ")
     with pytest.raises(Garbled, match=rf"error {number}\b"):
         FrameCodec(vb_1com(vector.fields)).feed(vector.frame)
@@ -184,7 +184,7 @@ def test_the_sum_of_a_longer_header_leaves_out_its_first_byte_or_all_of_it(rule:
 @pytest.mark.parametrize("vector", RS, ids=repr)
 def test_the_rs_instruction_sends_and_receives_its_words(vector: Vector) -> None:
     fields = vector.fields
-    buffer = 8 if fields["m9161"] else 16
+    buffer: Literal[16, 8] = 8 if fields["m9161"] else 16
     data = from_words([int(word, 16) for word in fields["words"]], fields["count"], buffer)
     framing = Framing(
         preset="vigor-rs",
@@ -206,7 +206,7 @@ def code(value: int | None) -> str:
 @pytest.mark.parametrize("vector", EX485LNK, ids=repr)
 def test_the_ex485lnk_user_mode_sends_and_receives_its_words(vector: Vector) -> None:
     fields = vector.fields
-    buffer = 8 if int(fields["bfm0"], 16) >> 14 & 1 else 16
+    buffer: Literal[16, 8] = 8 if int(fields["bfm0"], 16) >> 14 & 1 else 16
     data = from_words([int(word, 16) for word in fields["words"]], fields["byte_count"], buffer)
     framing = Framing(
         preset="ex485lnk-user",

@@ -15,7 +15,7 @@ from gateway.protocols.driver import Address, Cost, Driver, Span
 from gateway.protocols.modbus import Frame, ModbusAscii, ModbusRtu, ModbusTcp
 from gateway.stations.modbus import ModbusStation
 from tests.doubles import Script
-from tests.protocols.modbus_peer import KINDS, Hearing
+from tests.protocols.modbus_peer import KINDS, hearing
 from tests.vectors import vectors
 
 T = TypeVar("T")
@@ -210,7 +210,7 @@ def test_ex485lnk_reads_and_writes_32_registers_by_functions_03_and_16() -> None
         Span("nowhere", 0, 1),
     ],
 )
-async def test_a_span_outside_the_device_is_not_asked(span: Span) -> None:
+async def test_a_span_outside_the_device_is_not_requested(span: Span) -> None:
     driver = ModbusRtu(station=1)
     assert driver.cost(span) is None
     assert driver.write_cost(span) is None
@@ -241,21 +241,21 @@ def test_vigor_holes_belong_to_no_area() -> None:
         (1, pdu("modbus-rtu-001")),  # the question itself
     ],
 )
-async def test_only_station_function_and_byte_count_asked_for_are_taken(
+async def test_only_the_requested_station_function_and_byte_count_are_accepted(
     kind: type, station: int, body: bytes
 ) -> None:
     driver = kind(station=1)
     wrong = framed(kind, station, body)
     right = framed(kind, 1, pdu("modbus-rtu-002"))
     with pytest.raises(NoReply):
-        await driver.read(Hearing(driver, [wrong]), Span("holding", 0, 2))
-    talk = Hearing(kind(station=1), [wrong, right])
+        await driver.read(hearing(driver, [wrong]), Span("holding", 0, 2))
+    talk = hearing(kind(station=1), [wrong, right])
     assert list(await kind(station=1).read(talk, Span("holding", 0, 2))) == [0, 0]
 
 
 @pytest.mark.parametrize("kind", [ModbusRtu, ModbusAscii])
 @pytest.mark.parametrize("echo", [True, False])
-async def test_coils_that_look_like_the_echo_of_the_question_are_asked_apart(
+async def test_coils_equal_to_the_echo_of_the_request_are_read_in_two_parts(
     kind: type, echo: bool
 ) -> None:
     """24 coils from wire address 0300h: 01 03 00 00 18 is the question, and can be the answer."""
@@ -264,14 +264,14 @@ async def test_coils_that_look_like_the_echo_of_the_question_are_asked_apart(
     bits = [0] * 19 + [1, 1, 0, 0, 0]
     for shown in (bits, [1] * 24):
         station.memory.write("coil", 0x0300, shown)
-        talk = Hearing(driver, *[lambda sent: [sent] * echo + station.hear(sent, 0.0)] * 3)
+        talk = hearing(driver, *[lambda sent: [sent] * echo + station.hear(sent, 0.0)] * 3)
         assert list(await driver.read(talk, span)) == shown
     assert len(talk.sent) == (3 if echo else 1)
 
 
 async def test_modbus_tcp_takes_the_answer_of_its_own_number_alone() -> None:
     driver = ModbusTcp()
-    talk = Hearing(
+    talk = hearing(
         driver,
         [framed(ModbusTcp, 1, bytes((3, 2, 0, 1)), 1)],
         [framed(ModbusTcp, 1, bytes((3, 2, 0, 9)), number) for number in (1, 3, 0)],
@@ -349,9 +349,9 @@ async def test_modbus_tcp_keeps_several_questions_apart() -> None:
         (0x2A, Refusal.OTHER),
     ],
 )
-async def test_exceptions_say_what_to_do_next(code: int, refusal: Refusal) -> None:
+async def test_exceptions_become_the_errors_of_their_remedy(code: int, refusal: Refusal) -> None:
     driver = ModbusRtu(station=1)
-    talk = Hearing(driver, [framed(ModbusRtu, 1, bytes((0x83, code)))])
+    talk = hearing(driver, [framed(ModbusRtu, 1, bytes((0x83, code)))])
     with pytest.raises(Refused) as refused:
         await driver.read(talk, Span("holding", 0, 2))
     assert (refused.value.code, refused.value.refusal) == (f"{code:02X}", refusal)
@@ -359,7 +359,7 @@ async def test_exceptions_say_what_to_do_next(code: int, refusal: Refusal) -> No
 
 async def test_a_gateways_exception_0b_leaves_a_write_unclear() -> None:
     driver = ModbusTcp()
-    talk = Hearing(driver, [framed(ModbusTcp, 1, bytes((0x86, 0x0B)))])
+    talk = hearing(driver, [framed(ModbusTcp, 1, bytes((0x86, 0x0B)))])
     with pytest.raises(NoReply):
         await driver.write(talk, Span("holding", 0, 1), [5])
 
@@ -371,7 +371,7 @@ async def test_whatever_comes_back_is_units_or_a_device_error(
 ) -> None:
     driver, span = kind(station=1), Span("holding", 0, 2)
     bodies = [framed(kind, 1, piece[:20]) for piece in heard if piece]
-    talk = Hearing(driver, [piece for pair in zip(heard, bodies, strict=False) for piece in pair])
+    talk = hearing(driver, [piece for pair in zip(heard, bodies, strict=False) for piece in pair])
     with suppress(DeviceError):
         if writing:
             assert await driver.write(talk, span, [1, 2]) is True
@@ -387,24 +387,24 @@ async def test_a_write_is_acknowledged_by_its_own_address_and_value_only() -> No
     good = VECTORS["modbus-rtu-010"].frame
     others = [bytes((6, 0, 1, 0x12, 0x34)), bytes((6, 0, 0, 0x12, 0x35)), bytes((16, 0, 0, 0, 1))]
     wrong = [framed(ModbusRtu, 10, body) for body in others]
-    assert await driver.write(Hearing(driver, [*wrong, good]), span, [0x1234]) is True
+    assert await driver.write(hearing(driver, [*wrong, good]), span, [0x1234]) is True
     with pytest.raises(NoReply):
-        await driver.write(Hearing(driver, wrong), span, [0x1234])
+        await driver.write(hearing(driver, wrong), span, [0x1234])
 
 
 async def test_vigor_may_forget_the_address_in_its_answer_to_function_06() -> None:
     forgetful = framed(ModbusRtu, 1, bytes((6, 0, 0, 0x12, 0x34)))
     other_value = framed(ModbusRtu, 1, bytes((6, 0, 0, 0x12, 0x35)))
     vigor, plain = ModbusRtu(station=1, addressing="vigor"), ModbusRtu(station=1)
-    assert await vigor.write(Hearing(vigor, [forgetful]), Span("D", 7, 1), [0x1234]) is True
+    assert await vigor.write(hearing(vigor, [forgetful]), Span("D", 7, 1), [0x1234]) is True
     with pytest.raises(NoReply):
-        await vigor.write(Hearing(vigor, [other_value]), Span("D", 7, 1), [0x1234])
+        await vigor.write(hearing(vigor, [other_value]), Span("D", 7, 1), [0x1234])
     with pytest.raises(NoReply):
-        await plain.write(Hearing(plain, [forgetful]), Span("holding", 7, 1), [0x1234])
+        await plain.write(hearing(plain, [forgetful]), Span("holding", 7, 1), [0x1234])
 
 
 @pytest.mark.parametrize("kind", [ModbusRtu, ModbusAscii])
-async def test_a_broadcast_is_told_and_nobody_is_waited_for(kind: type) -> None:
+async def test_a_broadcast_is_sent_without_waiting_for_a_reply(kind: type) -> None:
     driver = kind(station=0, addressing="ex485lnk")
     name = "modbus-rtu-005" if kind is ModbusRtu else "modbus-ascii-005"
     script, span = Script(driver, f"> {VECTORS[name].frame.hex()}"), Span("holding", 4, 2)
@@ -423,7 +423,7 @@ def test_a_broadcast_device_is_written_to_only() -> None:
 
 async def test_modbus_tcp_unit_0_answers() -> None:
     driver = ModbusTcp(station=0)
-    talk = Hearing(driver, [framed(ModbusTcp, 0, bytes((3, 2, 0, 7)))])
+    talk = hearing(driver, [framed(ModbusTcp, 0, bytes((3, 2, 0, 7)))])
     assert list(await driver.read(talk, Span("holding", 0, 1))) == [7]
 
 
@@ -433,10 +433,10 @@ async def test_vigor_counters_from_c200_are_two_registers(order: Any) -> None:
     first, second = (0x5678, 0x1234) if order == "low_first" else (0x1234, 0x5678)
     answer = bytes((3, 4)) + first.to_bytes(2, "big") + second.to_bytes(2, "big")
     span = Span("C32", 200, 1)
-    talk = Hearing(driver, [framed(ModbusRtu, 1, answer)])
+    talk = hearing(driver, [framed(ModbusRtu, 1, answer)])
     assert list(await driver.read(talk, span)) == [0x12345678]
     assert talk.sent == [VECTORS["modbus-rtu-035"].frame]
-    writing = Hearing(driver, [framed(ModbusRtu, 1, bytes((16, 0x21, 0xC8, 0, 2)))])
+    writing = hearing(driver, [framed(ModbusRtu, 1, bytes((16, 0x21, 0xC8, 0, 2)))])
     assert await driver.write(writing, span, [0x12345678]) is True
     assert writing.sent[0][7:11] == answer[2:]
 
@@ -458,7 +458,7 @@ async def test_units_that_do_not_fit_are_not_sent(units: list[int]) -> None:
     st.integers(0, 10**6),
     st.data(),
 )
-async def test_a_resync_differs_from_the_doubt_and_from_the_last_resync(
+async def test_a_resync_differs_from_the_outstanding_read_and_from_the_last_resync(
     kind: type, dialect: Any, salt: int, data: st.DataObject
 ) -> None:
     driver = kind(station=1, addressing=dialect)
@@ -469,7 +469,7 @@ async def test_a_resync_differs_from_the_doubt_and_from_the_last_resync(
     cost = driver.cost(span)
     lengths = []
     for turn in (salt, salt + 2):
-        talk = Hearing(driver)
+        talk = hearing(driver)
         with pytest.raises(NoReply):
             await driver.resync(talk, span, turn)
         lengths += talk.replies
@@ -477,10 +477,10 @@ async def test_a_resync_differs_from_the_doubt_and_from_the_last_resync(
     assert len({cost.reply, *lengths}) == 3
 
 
-async def test_an_exception_to_a_resync_is_asked_again_in_another_size() -> None:
+async def test_after_an_exception_a_resync_reads_another_size() -> None:
     """And a second one says so: both may answer older questions."""
     driver, no = ModbusRtu(station=1), framed(ModbusRtu, 1, bytes((0x83, 2)))
-    talk = Hearing(driver, [no], [no])
+    talk = hearing(driver, [no], [no])
     with pytest.raises(Refused):
         await driver.resync(talk, Span("holding", 65535, 1), 0)
     assert len(talk.replies) == len(set(talk.replies)) == 2
@@ -488,7 +488,7 @@ async def test_an_exception_to_a_resync_is_asked_again_in_another_size() -> None
 
 async def test_a_numbered_exception_is_believed() -> None:
     driver = ModbusTcp()
-    talk = Hearing(driver, [framed(ModbusTcp, 1, bytes((0x83, 2)))])
+    talk = hearing(driver, [framed(ModbusTcp, 1, bytes((0x83, 2)))])
     await driver.resync(talk, None, 0)
     assert len(talk.sent) == 1
 
@@ -496,15 +496,15 @@ async def test_a_numbered_exception_is_believed() -> None:
 async def test_a_resync_by_diagnostics_takes_its_own_token_alone() -> None:
     driver = ModbusRtu(station=1, diagnostics=True)
     station = ModbusStation()
-    await driver.resync(Hearing(driver, lambda sent: station.hear(sent, 0.0)), None, 70000)
+    await driver.resync(hearing(driver, lambda sent: station.hear(sent, 0.0)), None, 70000)
     earlier = framed(ModbusRtu, 1, bytes((8, 0, 0, 0, 41)))
     with pytest.raises(NoReply):
-        await driver.resync(Hearing(driver, [earlier]), None, 42)
+        await driver.resync(hearing(driver, [earlier]), None, 42)
 
 
 async def test_a_resync_where_one_word_is_the_limit_asks_another_function() -> None:
     driver = ModbusRtu(station=1, max_read_words=1)
-    talk = Hearing(driver)
+    talk = hearing(driver)
     with pytest.raises(NoReply):
         await driver.resync(talk, Span("holding", 5, 1), 0)
     assert talk.sent[0][1] != 3

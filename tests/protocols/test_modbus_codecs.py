@@ -130,7 +130,7 @@ def test_rtu_an_echo_does_not_hide_the_answer(
     assert answer in feed_all(codec, chopped(stream, sizes))
 
 
-def test_rtu_an_echo_that_begins_like_the_answer_is_told_apart() -> None:
+def test_rtu_an_echo_that_begins_like_the_reply_is_recognised() -> None:
     # Register 0800h, four words: the echo reads 03 08, function and byte count of the answer.
     request, answer = read_words(1, 4, 0x0800), words_answer(1, [1, 2, 3, 4])
     exception = Frame(1, b"\x83\x02")
@@ -196,12 +196,12 @@ def test_rtu_an_endless_babble_is_forgotten() -> None:
     codec = asking(RtuCodec(), read_words(1, 1))
     for _ in range(50):
         assert codec.feed(bytes(range(2, 200))) == []
-        assert len(codec._heard) <= 520  # hunting through it would take ever longer
+        assert len(codec._heard) <= 520  # private: bounded memory has no other sign
     assert codec.feed(RtuCodec().encode(words_answer(1, [5]))) == [words_answer(1, [5])]
 
 
 @pytest.mark.parametrize("written", range(1, 20))
-def test_rtu_a_slave_hears_requests_between_others_answers(written: int) -> None:
+def test_rtu_a_slave_finds_requests_between_replies_of_others(written: int) -> None:
     """An answer to function 16 begins like a request, its CRC where the byte count would be."""
     request = read_words(1, 1)
     others = [
@@ -214,7 +214,7 @@ def test_rtu_a_slave_hears_requests_between_others_answers(written: int) -> None
     assert [frame for frame in frames if frame.station == 1] == [request]
 
 
-def test_rtu_an_unknown_function_is_heard_when_its_crc_closes_what_was_heard() -> None:
+def test_rtu_an_unknown_function_ends_with_its_crc() -> None:
     body = bytes((1, 0x2B, 0x0E, 1, 0))
     codec = RtuSlaveCodec(1)
     assert feed_all(codec, [body[:3], body[3:] + crc16(body)]) == [Frame(1, body[1:])]
@@ -234,7 +234,7 @@ def test_ascii_noise_before_and_after_does_not_hide_the_answer(
     assert answer in feed_all(codec, chopped(wire, sizes))
 
 
-def test_ascii_a_colon_begins_anew() -> None:
+def test_ascii_a_colon_begins_another_frame() -> None:
     good = vector("modbus-ascii-002")
     frame = Frame(1, bytes.fromhex(good.fields["pdu"]))
     assert AsciiCodec().feed(good.frame[:9] + good.frame) == [frame]
@@ -250,7 +250,7 @@ def test_ascii_a_damaged_answer_is_garbled(damage: bytes) -> None:
     assert garbled.value.evidence is Evidence.CHECKSUM
 
 
-def test_ascii_a_frame_before_the_damage_is_heard() -> None:
+def test_ascii_a_frame_before_the_damage_is_returned() -> None:
     codec = asking(AsciiCodec(), read_words(1, 1))
     wire = AsciiCodec().encode(words_answer(1, [1]))
     assert codec.feed(wire.replace(b":01", b":02")) == []  # not the answer: noise
@@ -281,7 +281,7 @@ def test_mbap_a_header_of_something_else_is_garbled(header: str) -> None:
         MbapCodec().feed(bytes.fromhex(header))
 
 
-def test_mbap_frames_before_the_damage_are_heard() -> None:
+def test_mbap_frames_before_the_damage_are_returned() -> None:
     codec, frame = MbapCodec(), Frame(1, b"\x83\x02", 9)
     assert codec.feed(codec.encode(frame) + b"HTTP/1.1") == [frame]
     with pytest.raises(Garbled):

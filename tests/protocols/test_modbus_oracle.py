@@ -1,5 +1,7 @@
 """The Modbus drivers against pymodbus: what we send it reads, what it answers we read."""
 
+from typing import Any
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -10,6 +12,7 @@ from pymodbus.pdu.bit_message import (
     WriteSingleCoilResponse,
 )
 from pymodbus.pdu.exceptionresponse import ExceptionResponse
+from pymodbus.pdu.pdu import ModbusPDU
 from pymodbus.pdu.register_message import (
     ReadHoldingRegistersResponse,
     ReadInputRegistersResponse,
@@ -19,7 +22,7 @@ from pymodbus.pdu.register_message import (
 
 from gateway.errors import Refused, Unclear
 from gateway.protocols.driver import Span
-from tests.protocols.modbus_peer import KINDS, Hearing, oracle_decodes, oracle_encodes
+from tests.protocols.modbus_peer import KINDS, hearing, oracle_decodes, oracle_encodes
 
 MODERATE = settings(max_examples=120, deadline=None)
 kinds = st.sampled_from(KINDS)
@@ -45,7 +48,7 @@ async def test_reads_are_the_oracles_reads(
     driver, span = kind(station=station), Span(area, start, len(units))
     spread = {"bits": [bool(u) for u in units]} if bits else {"registers": units}
     answer = READ_ANSWERS[area](dev_id=station, transaction_id=1, **spread)
-    talk = Hearing(driver, [oracle_encodes(kind, answer)])
+    talk = hearing(driver, [oracle_encodes(kind, answer)])
     assert list(await driver.read(talk, span)) == units
     asked = oracle_decodes(kind, talk.sent[0], station, requests=True)
     assert (asked.function_code, asked.address, asked.count) == (FUNCTIONS[area], start, len(units))
@@ -64,7 +67,8 @@ async def test_writes_are_the_oracles_writes(
     units = data.draw(st.lists(unit, min_size=1, max_size=room))
     driver = kind(station=station, write_single=single)
     span = Span("coil" if bits else "holding", start, len(units))
-    shared = {"dev_id": station, "transaction_id": 1, "address": start}
+    shared: dict[str, Any] = {"dev_id": station, "transaction_id": 1, "address": start}
+    answer: ModbusPDU
     if single and len(units) == 1:
         answer = (
             WriteSingleCoilResponse(bits=[bool(units[0])], **shared)
@@ -74,7 +78,7 @@ async def test_writes_are_the_oracles_writes(
     else:
         many = WriteMultipleCoilsResponse if bits else WriteMultipleRegistersResponse
         answer = many(count=len(units), **shared)
-    talk = Hearing(driver, [oracle_encodes(kind, answer)])
+    talk = hearing(driver, [oracle_encodes(kind, answer)])
     assert await driver.write(talk, span, units) is True
     asked = oracle_decodes(kind, talk.sent[0], station, requests=True)
     assert (asked.function_code, asked.address) == (answer.function_code, start)
@@ -90,7 +94,7 @@ async def test_the_oracles_exceptions_are_refusals(
 ) -> None:
     driver, span = kind(station=station), Span("holding", 7, 2)
     refused = ExceptionResponse(16 if writing else 3, code, device_id=station, transaction=1)
-    talk = Hearing(driver, [oracle_encodes(kind, refused)])
+    talk = hearing(driver, [oracle_encodes(kind, refused)])
     perhaps_done = writing and code in (4, 5)  # a failure in the middle, or done later
     with pytest.raises(Unclear if perhaps_done else Refused) as no:
         await (driver.write(talk, span, [1, 2]) if writing else driver.read(talk, span))

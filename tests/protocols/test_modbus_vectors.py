@@ -15,7 +15,7 @@ from gateway.protocols.modbus import (
     RtuSlaveCodec,
 )
 from tests.doubles import Script
-from tests.protocols.modbus_peer import Hearing
+from tests.protocols.modbus_peer import hearing
 from tests.vectors import Vector, vectors
 
 ALL = vectors("modbus-rtu", "modbus-ascii")
@@ -68,7 +68,7 @@ def test_the_codec_reads_and_writes_the_frame(vector: Vector) -> None:
 
 
 @pytest.mark.parametrize("vector", [v for v in ALL if not v.valid], ids=repr)
-def test_a_bad_frame_is_not_heard(vector: Vector) -> None:
+def test_a_bad_frame_is_ignored(vector: Vector) -> None:
     codecs = (
         [AsciiCodec()]
         if vector.protocol == "modbus-ascii"
@@ -137,7 +137,7 @@ async def test_the_driver_understands_the_answer(vector: Vector) -> None:
     answer = frame.pdu
     driver = driver_for(vector, frame.station)
     span, units = question_for(answer)
-    script = Hearing(driver, [vector.frame])
+    script = hearing(driver, [vector.frame])
     asked = driver.read(script, span) if units is None else driver.write(script, span, units)
     if answer[0] & 0x80:
         with pytest.raises(Refused) as refused:
@@ -148,5 +148,7 @@ async def test_the_driver_understands_the_answer(vector: Vector) -> None:
     else:
         bits = [byte >> i & 1 for byte in answer[2:] for i in range(8)]
         words = [int.from_bytes(answer[i : i + 2], "big") for i in range(2, len(answer), 2)]
-        assert list(await asked) == (bits if answer[0] <= 2 else words)
+        heard = await asked
+        assert not isinstance(heard, bool)
+        assert list(heard) == (bits if answer[0] <= 2 else words)
         assert script.replies == [len(vector.frame)]

@@ -21,7 +21,7 @@ from gateway.protocols.driver import Address, Cost, Driver, Span, Unit
 from gateway.protocols.vigor import Frame, Reply, Request, Vigor, VigorCodec
 from gateway.protocols.vigor.codec import encode
 from gateway.stations.vigor import VigorStation
-from tests.doubles import Script
+from tests.doubles import Script, Wire
 from tests.vectors import Vector, vectors
 
 T = TypeVar("T")
@@ -50,27 +50,8 @@ def play(coroutine: Coroutine[Any, Any, T]) -> T:
     raise AssertionError("the driver waited for something else than its talk")
 
 
-class Bus:
-    """A `Talk` over something that hears bytes and sends frames; counts the characters."""
-
-    def __init__(self, hear: Callable[[bytes], list[bytes]]) -> None:
-        self._hear = hear
-        self._codec = VigorCodec()
-        self.spent = Cost(0, 0)
-
-    async def tell(self, frame: Frame) -> None:
-        raise AssertionError("every Vigor frame is answered")
-
-    async def ask(self, frame: Frame, reply: int, answers: Callable[[Frame], T | None]) -> T:
-        request = self._codec.encode(frame)
-        back = b"".join(self._hear(request))
-        assert len(back) <= reply
-        self.spent = Cost(self.spent.request + len(request), self.spent.reply + len(back))
-        for got in self._codec.feed(back):
-            answer = answers(got)
-            if answer is not None:
-                return answer
-        raise NoReply("no answer")
+def bus(hear: Callable[[bytes], list[bytes]]) -> Wire:
+    return Wire(Vigor(), hear, bounded=True)
 
 
 # ---- every frame of the vectors ----------------------------------------------------------
@@ -194,7 +175,7 @@ async def test_b3_9_rs_example_reads_d0_of_station_1_with_check_code_00() -> Non
     assert list(await Vigor(station=1).read(script, Span("D", 0, 1))) == [0x3412]
 
 
-async def test_b3_9_rs_example_hears_that_d1_of_station_1_was_written() -> None:
+async def test_b3_9_rs_example_gets_the_acknowledgement_of_d1_of_station_1() -> None:
     request = encode(Request(1, "61", b"1C02020001"))
     script = Script(Vigor(station=1), f"> {request.hex()}", heard("vigor-013"))
     assert await Vigor(station=1).write(script, Span("D", 1, 1), [0x0100])
@@ -283,7 +264,7 @@ def test_addresses_are_written_as_in_the_manual(text: str, address: Address) -> 
         ("Y20.1", "Y20.1: Y20 is a bit already, write Y20"),
     ],
 )
-def test_a_wrong_address_is_told_what_would_be_right(text: str, right: str) -> None:
+def test_a_wrong_address_gets_a_correct_example(text: str, right: str) -> None:
     with pytest.raises(ConfigError) as raised:
         Vigor().address(text)
     assert str(raised.value) == right
@@ -438,14 +419,14 @@ def test_whatever_comes_back_a_write_is_done_or_a_device_error(pieces: list[byte
         (Span("C", 200, 1), [0]),
     ],
 )
-async def test_what_cannot_be_written_is_refused_before_anything_is_sent(
+async def test_an_impossible_write_is_refused_before_anything_is_sent(
     span: Span, units: list[int]
 ) -> None:
     with pytest.raises(BadValue):
         await Vigor().write(Script(Vigor()), span, units)
 
 
-async def test_what_cannot_be_read_is_refused_before_anything_is_sent() -> None:
+async def test_an_impossible_read_is_refused_before_anything_is_sent() -> None:
     with pytest.raises(ConfigError, match="not in one request"):
         await Vigor().read(Script(Vigor()), Span("D", 0, 65))
 
@@ -453,17 +434,17 @@ async def test_what_cannot_be_read_is_refused_before_anything_is_sent() -> None:
 async def test_a_contact_is_written_with_its_neighbours_as_they_were() -> None:
     station = VigorStation(0)
     station.memory.write("TS", 0, bits("10100110"))
-    bus = Bus(lambda data: station.hear(data, 0.0))
-    assert await Vigor().write(bus, Span("TS", 3, 1), [1])
+    wire = bus(lambda data: station.hear(data, 0.0))
+    assert await Vigor().write(wire, Span("TS", 3, 1), [1])
     assert station.memory.read("TS", 0, 8) == bits("10101110")
-    assert bus.spent == Vigor().write_cost(Span("TS", 3, 1)) == Cost(14 + 16, 12 + 10)
+    assert wire.cost == Vigor().write_cost(Span("TS", 3, 1)) == Cost(14 + 16, 12 + 10)
 
 
 async def test_neighbours_that_cannot_be_read_stop_the_write() -> None:
     station = VigorStation(0, holes={("M", 0)})
-    bus = Bus(lambda data: station.hear(data, 0.0))
+    wire = bus(lambda data: station.hear(data, 0.0))
     with pytest.raises(Refused):
-        await Vigor().write(bus, Span("M", 2, 3), [1, 1, 1])
+        await Vigor().write(wire, Span("M", 2, 3), [1, 1, 1])
     assert station.memory.read("M", 0, 8) == [0] * 8
 
 
@@ -526,7 +507,7 @@ def random_image(data: st.DataObject) -> Image:
 
 @settings(max_examples=60)
 @given(spans(), st.data())
-def test_reading_any_span_gives_the_plcs_bytes_and_costs_what_was_said(
+def test_reading_any_span_returns_the_bytes_of_the_plc_at_exactly_its_cost(
     span: Span, data: st.DataObject
 ) -> None:
     cost = Vigor().cost(span)
@@ -536,10 +517,10 @@ def test_reading_any_span_gives_the_plcs_bytes_and_costs_what_was_said(
         return
     image = random_image(data)
     at, width = where(span)
-    bus = Bus(image.hear)
+    wire = bus(image.hear)
     expected = [image.slice(at + i * width, width) for i in range(span.size)]
-    assert list(play(Vigor().read(bus, span))) == expected
-    assert bus.spent == cost
+    assert list(play(Vigor().read(wire, span))) == expected
+    assert wire.cost == cost
 
 
 @settings(max_examples=60)
@@ -556,10 +537,10 @@ def test_writing_any_span_changes_it_and_nothing_else(span: Span, data: st.DataO
     units = [pattern * (i + 1) >> i & (1 << width) - 1 for i in range(span.size)]
     for i, unit in enumerate(units):
         expected.put(at + i * width, width, unit)
-    bus = Bus(image.hear)
-    assert play(Vigor().write(bus, span, units)) is True
+    wire = bus(image.hear)
+    assert play(Vigor().write(wire, span, units)) is True
     assert image.bits == expected.bits
-    assert bus.spent == cost
+    assert wire.cost == cost
 
 
 @settings(max_examples=60)
@@ -571,10 +552,10 @@ def test_driver_and_station_agree_on_every_device(span: Span, data: st.DataObjec
     pattern = data.draw(st.integers(0, largest))
     units = [(pattern + 7 * i) & largest for i in range(span.size)]
     station = VigorStation(0)
-    bus = Bus(lambda heard: station.hear(heard, 0.0))
-    assert play(Vigor().write(bus, span, units))
+    wire = bus(lambda heard: station.hear(heard, 0.0))
+    assert play(Vigor().write(wire, span, units))
     assert station.memory.read(span.area, span.start, span.size) == units
-    assert list(play(Vigor().read(bus, span))) == units
+    assert list(play(Vigor().read(wire, span))) == units
 
 
 @pytest.mark.parametrize(
@@ -635,7 +616,7 @@ class Questions:
 @pytest.mark.parametrize(
     "doubt", [None, Span("D", 0, 3), Span("M", 3, 20), Span("X", 0, 8), Span("R", 0, 1)]
 )
-async def test_a_resync_asks_what_neither_the_doubt_nor_the_resync_before_asked(
+async def test_a_resync_differs_from_the_outstanding_read_and_the_resync_before(
     doubt: Span | None,
 ) -> None:
     cost = Vigor().cost(doubt) if doubt else None
@@ -643,7 +624,7 @@ async def test_a_resync_asks_what_neither_the_doubt_nor_the_resync_before_asked(
     before = 0
     for salt in range(0, 40, 2):
         questions = Questions()
-        await Vigor().resync(Bus(questions.hear), doubt, salt)
+        await Vigor().resync(bus(questions.hear), doubt, salt)
         (count,) = questions.counts
         assert count % 2 == 1
         assert count <= 15
@@ -653,7 +634,7 @@ async def test_a_resync_asks_what_neither_the_doubt_nor_the_resync_before_asked(
 
 async def test_a_late_refusal_is_not_taken_for_the_resyncs_answer() -> None:
     questions = Questions(refuse=1)
-    await Vigor().resync(Bus(questions.hear), None, 3)
+    await Vigor().resync(bus(questions.hear), None, 3)
     assert len(set(questions.counts)) == 2
 
 
@@ -661,22 +642,22 @@ async def test_a_refused_resync_asks_nothing_that_the_next_one_asks() -> None:
     before: set[int] = set()
     for salt in range(0, 40, 2):
         questions = Questions(refuse=1)
-        await Vigor().resync(Bus(questions.hear), Span("M", 3, 20), salt)
+        await Vigor().resync(bus(questions.hear), Span("M", 3, 20), salt)
         assert before.isdisjoint(questions.counts)
         before = set(questions.counts)
 
 
-async def test_a_plc_that_refuses_every_resync_says_so() -> None:
+async def test_a_plc_that_refuses_every_resync_raises_refused() -> None:
     """Whoever asked decides what that is worth: the refusals may answer older questions."""
     questions = Questions(refuse=9)
     with pytest.raises(Refused):
-        await Vigor().resync(Bus(questions.hear), None, 0)
+        await Vigor().resync(bus(questions.hear), None, 0)
     assert len(set(questions.counts)) == 2
 
 
 async def test_a_resync_without_an_answer_is_no_reply() -> None:
     with pytest.raises(NoReply):
-        await Vigor().resync(Bus(lambda _: []), None, 0)
+        await Vigor().resync(bus(lambda _: []), None, 0)
 
 
 # ---- the codec and noise -----------------------------------------------------------------
@@ -729,7 +710,7 @@ def test_an_ack_in_the_noise_does_not_hide_the_reply(frame: bytes) -> None:
 
 
 @pytest.mark.parametrize("frame", GOOD, ids=lambda frame: frame.hex())
-def test_a_reply_begun_anew_is_heard(frame: bytes) -> None:
+def test_a_reply_that_begins_again_is_found(frame: bytes) -> None:
     for cut in range(1, len(frame)):
         assert hear([frame[:cut] + frame]) == hear([frame])
 
@@ -777,7 +758,7 @@ def test_endless_noise_is_not_kept() -> None:
     codec = VigorCodec()
     for _ in range(50):
         assert codec.feed(b"\x06\xff" + b"0" * 1000) == []
-        assert len(codec._buffer) <= 266
+        assert len(codec._buffer) <= 266  # private: bounded memory has no other sign
     assert len(codec.feed(VECTORS["vigor-054"].frame)) == 1
 
 

@@ -6,16 +6,17 @@ from hypothesis import strategies as st
 
 from gateway.errors import Refused
 from gateway.protocols.computer_link import ComputerLink, Enquiry, Frame, LinkCodec, Nak, Text
+from gateway.protocols.computer_link.devices import ProfileName
 from gateway.protocols.driver import Span
 from gateway.stations.computer_link import ComputerLinkStation
 from gateway.stations.station import Station
-from tests.protocols.computer_link_peer import Peer, PeerTalk
+from tests.doubles import Wire
+from tests.protocols.computer_link_peer import PROCEDURES, FrameFormat, Peer, Procedure
 from tests.vectors import Vector, vectors
 
 LINK = vectors("fxlink")
 VECTORS = {vector.id: vector.frame for vector in LINK}
 REQUESTS = [vector for vector in LINK if vector.valid and "command" in vector.fields]
-PROCEDURES = [(1, True), (1, False), (4, True), (4, False)]
 
 
 def station_of(vector: Vector) -> ComputerLinkStation:
@@ -45,7 +46,7 @@ def code(station: ComputerLinkStation, text: str) -> str:
 
 
 @pytest.mark.parametrize("vector", REQUESTS, ids=repr)
-def test_every_request_of_the_vectors_is_obeyed(vector: Vector) -> None:
+def test_every_request_of_the_vectors_is_carried_out(vector: Vector) -> None:
     station = station_of(vector)
     command = vector.fields["command"]
     if command in ("MB", "MN"):
@@ -104,7 +105,7 @@ def test_2_1_m10_to_m14_are_answered_as_in_the_vector(
 
 
 @pytest.mark.parametrize(("number", "frame_format"), [("063", 1), ("080", 4)])
-def test_c200_is_answered_as_in_the_vector(number: str, frame_format: int) -> None:
+def test_c200_is_answered_as_in_the_vector(number: str, frame_format: FrameFormat) -> None:
     station = ComputerLinkStation(0, frame_format=frame_format)
     station.memory.write("C32", 200, [0x12345678])
     block = Peer(0, frame_format, True).enq("00FFWR0CN20001")
@@ -115,7 +116,7 @@ def test_c200_is_answered_as_in_the_vector(number: str, frame_format: int) -> No
     ("number", "frame_format", "sum_check"), [("058", 1, True), ("060", 1, False), ("075", 4, True)]
 )
 def test_2_10_registered_words_are_answered_as_in_the_vector(
-    number: str, frame_format: int, sum_check: bool
+    number: str, frame_format: FrameFormat, sum_check: bool
 ) -> None:
     station = ComputerLinkStation(8, "liyan", frame_format, sum_check)
     station.memory.write("D", 500, [0x1234])
@@ -185,14 +186,14 @@ def test_2_10_registered_words_are_answered_as_in_the_vector(
 )
 @pytest.mark.parametrize("procedure", PROCEDURES)
 def test_the_lowest_error_code_that_applies_is_sent(
-    text: str, expected: str | None, procedure: tuple[int, bool]
+    text: str, expected: str | None, procedure: Procedure
 ) -> None:
     if expected is None:  # a character too many: only format 4 can tell
         expected = "06" if procedure[0] == 4 else ("02" if procedure[1] else "")
     assert code(ComputerLinkStation(5, "liyan", *procedure), text) == expected
 
 
-def test_a_wrong_sum_goes_before_everything_else() -> None:
+def test_a_wrong_sum_is_reported_before_every_other_error() -> None:
     station = ComputerLinkStation(5)
     block = Peer(5, 1, True).enq("0500BR0M999901")
     assert station.hear(block[:-1] + b"x", 0.0) == [Peer(5, 1, True).nak("02")]
@@ -207,7 +208,7 @@ def test_fx_takes_256_points_as_00_and_has_no_monitor() -> None:
 
 
 @pytest.mark.parametrize("procedure", PROCEDURES)
-def test_a_hole_is_refused_with_06_and_only_where_it_is(procedure: tuple[int, bool]) -> None:
+def test_a_hole_is_refused_with_06_and_only_where_it_is(procedure: Procedure) -> None:
     station = ComputerLinkStation(5, "liyan", *procedure, holes=[("D", 12), ("M", 20)])
     assert code(station, "05FFWR0D001003") == "06"
     assert code(station, "05FFWR0D001002") == ""
@@ -224,7 +225,7 @@ def test_a_refused_write_writes_nothing() -> None:
     assert station.memory.read("M", 1) == [0]
 
 
-def test_another_stations_requests_and_everybodys_answers_are_not_ours() -> None:
+def test_requests_to_other_stations_and_all_replies_are_ignored() -> None:
     station, peer = ComputerLinkStation(5), Peer(6, 1, True)
     for block in (peer.enq("06FFPC0"), peer.stx("0001"), peer.ack(), peer.nak("06")):
         assert station.hear(block, 0.0) == []
@@ -257,7 +258,7 @@ def test_an_endless_message_is_dropped() -> None:
 
 
 @pytest.mark.parametrize("procedure", PROCEDURES)
-def test_2_13_a_loopback_of_unprintable_characters_is_refused(procedure: tuple[int, bool]) -> None:
+def test_2_13_a_loopback_of_unprintable_characters_is_refused(procedure: Procedure) -> None:
     station = ComputerLinkStation(5, "liyan", *procedure)
     for byte in (0x00, 0x7F, 0x80, 0xFF):
         body = b"05FFTT001" + bytes([byte])
@@ -267,7 +268,7 @@ def test_2_13_a_loopback_of_unprintable_characters_is_refused(procedure: tuple[i
 
 
 @pytest.mark.parametrize("number", ["091", "064", "066"])
-def test_eot_ack_and_nak_of_the_computer_begin_the_sequence_anew(number: str) -> None:
+def test_eot_ack_and_nak_of_the_computer_reset_the_sequence(number: str) -> None:
     station, block = ComputerLinkStation(5), Peer(5, 1, True).enq("05FFPC0")
     assert station.hear(block[:5] + VECTORS[f"fxlink-{number}"] + block[5:], 0.0) == []
     assert len(station.hear(block[:5] + VECTORS[f"fxlink-{number}"] + block, 0.0)) == 1
@@ -312,9 +313,7 @@ def test_2_12_the_global_flag_of_one_station_or_of_all_is_never_answered() -> No
     ("procedure", "d8120"),
     [((1, True), 0x6086), ((4, True), 0xE086), ((1, False), 0x4086), ((4, False), 0xC086)],
 )
-def test_d8120_and_d8121_are_taken_at_power_on_only(
-    procedure: tuple[int, bool], d8120: int
-) -> None:
+def test_d8120_and_d8121_are_taken_at_power_on_only(procedure: Procedure, d8120: int) -> None:
     assert ComputerLinkStation(5, "liyan", *procedure).memory.read("D8", 8120, 2) == [d8120, 5]
     station = ComputerLinkStation(5)
     station.memory.write("D8", 8120, [d8120, 7])
@@ -337,25 +336,25 @@ def test_the_registered_lists_are_lost_at_power_off() -> None:
         assert code(station, "05FFMB0") == "06"
 
 
-def test_a_mute_station_obeys_and_its_answer_is_lost() -> None:
+def test_a_mute_station_carries_out_a_request_and_its_reply_is_lost() -> None:
     station = ComputerLinkStation(5)
     station.mute = True
     assert code(station, "05FFBW0M0001011") == "silent"
     assert station.memory.read("M", 1) == [1]
 
 
-def test_the_model_code_is_what_pc_answers() -> None:
+def test_the_reply_to_pc_is_the_model_code() -> None:
     assert answer(ComputerLinkStation(5, model="F3"), "05FFPC0") == [Text(5, "F3")]
 
 
 @pytest.mark.parametrize("procedure", PROCEDURES)
-def test_on_demand_data_carries_pc_number_fe(procedure: tuple[int, bool]) -> None:
+def test_on_demand_data_carries_pc_number_fe(procedure: Procedure) -> None:
     block = ComputerLinkStation(5, "liyan", *procedure).on_demand("1234")
     assert LinkCodec(*procedure).feed(block) == [Text(5, "1234", "FE")]
 
 
 @pytest.mark.parametrize("procedure", PROCEDURES)
-async def test_the_driver_and_the_station_agree(procedure: tuple[int, bool]) -> None:
+async def test_the_driver_and_the_station_agree(procedure: Procedure) -> None:
     station = ComputerLinkStation(5, "liyan", *procedure, holes=[("D", 50)])
     driver = ComputerLink(
         station=5, frame_format=procedure[0], sum_check=procedure[1], monitor=True
@@ -366,7 +365,7 @@ async def test_the_driver_and_the_station_agree(procedure: tuple[int, bool]) -> 
         if station.memory.holds(name, first, last - first + 1)
         and not station.memory.holds(name, first, last - first + 2)
     }
-    wire = PeerTalk(driver, lambda data: b"".join(station.hear(data, 0.0)))
+    wire = Wire(driver, lambda data: station.hear(data, 0.0))
     for area in driver.areas.values():
         span = Span(area.name, area.last - 15, 16)
         units = [i % 2 for i in range(16)]
@@ -416,8 +415,8 @@ pieces_of_line = st.lists(
 
 @settings(max_examples=150, deadline=None)
 @given(pieces_of_line, st.sampled_from(PROCEDURES), st.sampled_from(["liyan", "fx"]))
-def test_any_bytes_are_answered_or_not_and_the_next_request_is_heard(
-    pieces: list[bytes], procedure: tuple[int, bool], profile
+def test_after_any_bytes_the_next_request_gets_its_reply(
+    pieces: list[bytes], procedure: Procedure, profile: ProfileName
 ) -> None:
     station = ComputerLinkStation(5, profile, *procedure)
     for piece in pieces:

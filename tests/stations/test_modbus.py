@@ -15,7 +15,7 @@ from pymodbus.pdu.register_message import (
 from gateway.protocols.driver import Span
 from gateway.protocols.modbus import Frame, ModbusAscii, ModbusRtu, ModbusTcp
 from gateway.stations.modbus import ModbusStation
-from tests.protocols.modbus_peer import KINDS, Hearing, oracle_decodes, oracle_encodes
+from tests.protocols.modbus_peer import KINDS, hearing, oracle_decodes, oracle_encodes
 from tests.vectors import Vector, vectors
 
 FRAMINGS = {ModbusRtu: "rtu", ModbusAscii: "ascii", ModbusTcp: "tcp"}
@@ -143,7 +143,7 @@ def test_exceptions_come_in_the_standards_order(dialect: Any, pdu: str, code: in
     assert ask(station, request) == bytes((request[0] | 0x80, code))
 
 
-def test_function_08_repeats_what_it_is_sent_where_it_is_served() -> None:
+def test_function_08_repeats_its_data_where_it_is_served() -> None:
     question = bytes.fromhex("080000A55A")
     assert ask(ModbusStation(), question) == question
     assert ask(ModbusStation(diagnostics=False), question) == b"\x88\x01"
@@ -190,7 +190,7 @@ def test_k120s_relays_are_words_and_bits_at_once() -> None:
     st.lists(st.integers(0, 0xFFFF), min_size=1, max_size=123),
     st.lists(st.booleans(), min_size=1, max_size=100),
 )
-def test_pymodbus_reads_back_what_it_wrote(
+def test_pymodbus_reads_back_its_own_writes(
     kind: type, start: int, words: list[int], bits: list[bool]
 ) -> None:
     framing: Any = FRAMINGS[kind]
@@ -227,12 +227,12 @@ async def test_driver_and_station_agree_on_where_everything_is(
     units = data.draw(st.lists(st.integers(0, largest), min_size=1, max_size=size))
     span = Span(area.name, start, len(units))
     if area.writable:
-        talk = Hearing(driver, lambda sent: station.hear(sent, 0.0))
+        talk = hearing(driver, lambda sent: station.hear(sent, 0.0))
         assert await driver.write(talk, span, units) is True
         assert station.memory.read(area.name, start, len(units)) == units
     else:
         station.memory.write(area.name, start, units)
-    talk = Hearing(driver, lambda sent: station.hear(sent, 0.0))
+    talk = hearing(driver, lambda sent: station.hear(sent, 0.0))
     assert list(await driver.read(talk, span)) == units
 
 

@@ -149,7 +149,7 @@ HOLES = [
 
 
 @pytest.mark.parametrize("hole", HOLES, ids=lambda hole: f"{hole[0]:04X}-{hole[1]:04X}")
-def test_b5_3_what_is_not_in_the_address_map_is_status_28(hole: tuple[int, int]) -> None:
+def test_b5_3_an_address_outside_the_map_is_status_28(hole: tuple[int, int]) -> None:
     station = VigorStation(0)
     first, last = hole
     for byte in (first, last):
@@ -190,13 +190,13 @@ def test_a_device_the_model_lacks_is_status_28() -> None:
 # ---- hearing -----------------------------------------------------------------------------
 
 
-def test_a_new_stx_begins_anew() -> None:
+def test_a_new_stx_begins_another_request() -> None:
     frame = VECTORS["vigor-001"].frame
     for cut in range(1, len(frame)):
         assert len(VigorStation(0).hear(frame[:cut] + frame, 0.0)) == 1
 
 
-def test_a_request_without_a_command_is_nobodys() -> None:
+def test_a_request_without_a_command_gets_no_reply() -> None:
     assert VigorStation(0).hear(b"\x0200\x0363", 0.0) == []
     assert VigorStation(0).hear(b"\x02005\x0398", 0.0) == []
 
@@ -209,7 +209,7 @@ def test_an_endless_request_is_dropped() -> None:
 
 
 @given(st.lists(st.sampled_from(OF_STATION_0), min_size=1, max_size=4), st.data())
-def test_requests_are_heard_however_they_are_cut(asked: list[Vector], data: st.DataObject) -> None:
+def test_requests_are_found_in_any_pieces(asked: list[Vector], data: st.DataObject) -> None:
     stream = b"".join(vector.frame for vector in asked)
     whole = VigorStation(0).hear(stream, 0.0)
     cuts = sorted(data.draw(st.sets(st.integers(0, len(stream)))))
@@ -230,13 +230,13 @@ def test_any_bytes_are_answered_or_ignored(data: bytes) -> None:
         assert reply[:3] == b"\x0600"
 
 
-def test_the_reply_speaks_upper_case_whatever_was_heard() -> None:
+def test_the_reply_is_upper_case_for_any_request() -> None:
     frame = encode(Request(0x0A, "51", b"1C0002"))
     heard = VigorStation(0x0A).hear(frame.replace(b"0A51", b"0a51"), 0.0)
     assert heard == status("10", number=0x0A)
 
 
-def test_a_mute_station_obeys_but_its_answer_is_lost() -> None:
+def test_a_mute_station_carries_out_a_request_but_its_reply_is_lost() -> None:
     station = VigorStation(0)
     station.mute = True
     assert station.hear(VECTORS["vigor-007"].frame, 0.0) == []
