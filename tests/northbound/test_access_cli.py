@@ -68,7 +68,7 @@ def closed_by_itself(folder: Path) -> Iterator[Path]:
         config_file="access.json5",
     )
     with started(path) as program:
-        program.says("device answers")
+        program.says("device online")
         yield path
 
 
@@ -101,7 +101,7 @@ def closed_by_a_router(folder: Path) -> Iterator[Path]:
         started(write_config(folder / "router.yaml", "", lines, zenoh=router)),
         started(path) as it,
     ):
-        it.says("device answers")
+        it.says("device online")
         it.says("Zenoh link up")
         yield path
 
