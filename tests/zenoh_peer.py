@@ -17,9 +17,9 @@ In a test:
 
 `subscribe(key, advanced=True)` is Zenoh's AdvancedSubscriber with history.
 
-The script speaks JSON lines: `{"n": 1, "do": "get", …}` in, `{"n": 1, "result": …}` or
-`{"n": 1, "error": "…"}` out, and `{"heard": <subscription>, …}` for every sample. Payloads travel
-as base64. It ends when its standard input does.
+The script exchanges JSON lines: `{"n": 1, "do": "get", …}` in, `{"n": 1, "result": …}` or
+`{"n": 1, "error": "…"}` out, and `{"received": <subscription>, …}` for every sample. Payloads are
+base64. It ends with its standard input.
 """
 
 import asyncio
@@ -52,7 +52,7 @@ def free_endpoint() -> str:
 # -- the test's side ---------------------------------------------------------------------------
 
 
-class Heard(NamedTuple):
+class Received(NamedTuple):
     """One sample; `time` is Zenoh's time stamp in ns, `kind` is PUT or DELETE."""
 
     key: str
@@ -85,24 +85,24 @@ class Subscription:
     """The samples of one subscription in the order of arrival; `samples` holds all of them."""
 
     def __init__(self) -> None:
-        self.samples: list[Heard] = []
+        self.samples: list[Received] = []
         self._arrived = asyncio.Event()
 
-    def feed(self, sample: Heard) -> None:
+    def feed(self, sample: Received) -> None:
         self.samples.append(sample)
         self._arrived.set()
 
-    def latest(self) -> dict[str, Heard]:
+    def latest(self) -> dict[str, Received]:
         """By key."""
         return {sample.key: sample for sample in self.samples}
 
-    async def next(self, wanted: Callable[[Heard], bool], timeout: float = TIMEOUT) -> Heard:
+    async def next(self, fits: Callable[[Received], bool], timeout: float = TIMEOUT) -> Received:
         """Returns the first sample that fits, of those since `forget`; waits for it."""
         seen = 0
         async with asyncio.timeout(timeout):
             while True:
                 for sample in self.samples[seen:]:
-                    if wanted(sample):
+                    if fits(sample):
                         return sample
                 seen = len(self.samples)
                 self._arrived.clear()
@@ -135,7 +135,7 @@ class ZenohPeer:
         self._listen = list(listen)
         self._process: asyncio.subprocess.Process | None = None
         self._reader: asyncio.Task[None] | None = None
-        self._asked: dict[int, asyncio.Future[Any]] = {}
+        self._pending: dict[int, asyncio.Future[Any]] = {}
         self._subscriptions: dict[int, Subscription] = {}
         self._count = 0
 
@@ -156,7 +156,7 @@ class ZenohPeer:
         )
         self._reader = asyncio.create_task(self._read())
         try:
-            await self._ask("hello")
+            await self._request("hello")
         except BaseException:
             await self.kill()  # `__aexit__` is not called after an exception here
             raise
@@ -199,7 +199,7 @@ class ZenohPeer:
     async def tokens(self, key: str) -> list[str]:
         """Returns the tokens. Zenoh 1.10.2 sometimes answers nothing just after a token was
         declared: see `until_alive`."""
-        result: list[str] = await self._ask("tokens", key=key)
+        result: list[str] = await self._request("tokens", key=key)
         return result
 
     async def until_alive(self, key: str, tokens: list[str], timeout: float = TIMEOUT) -> None:
@@ -214,54 +214,54 @@ class ZenohPeer:
         payload: bytes | None = None,
         timeout: float = TIMEOUT,
         attachment: bytes | None = None,
-        **how: str,
+        **options: str,
     ) -> list[Reply]:
-        """`how`: `target="ALL"`, `consolidation="NONE"`."""
+        """Sends one query. `options`: `target="ALL"`, `consolidation="NONE"`."""
         if attachment is not None:
-            how["attachment"] = base64.b64encode(attachment).decode()
-        [replies] = await self.many([(selector, payload)], timeout, **how)
+            options["attachment"] = base64.b64encode(attachment).decode()
+        [replies] = await self.many([(selector, payload)], timeout, **options)
         return replies
 
-    async def get_until(self, selector: str, wanted: Callable[[Any], bool]) -> Any:
-        """Waits until the one document is as wanted: a status may be a fifth of a second old."""
+    async def get_until(self, selector: str, fits: Callable[[Any], bool]) -> Any:
+        """Waits until the one document fits: a status may be a fifth of a second old."""
         async with asyncio.timeout(TIMEOUT):
             while True:
                 [reply] = await self.get(selector)
-                if wanted(reply.json):
+                if fits(reply.json):
                     return reply.json
 
     async def many(
         self,
         queries: Sequence[tuple[str, bytes | None]],
         timeout: float = TIMEOUT,
-        **how: str,
+        **options: str,
     ) -> list[list[Reply]]:
         """Sends all queries at once. Returns the replies of each, in the order of the queries."""
-        asked = [(selector, _text(payload)) for selector, payload in queries]
-        result = await self._ask("get", queries=asked, timeout=timeout, how=how)
+        encoded = [(selector, _text(payload)) for selector, payload in queries]
+        result = await self._request("get", queries=encoded, timeout=timeout, options=options)
         return [
             [Reply(ok, key, base64.b64decode(data), *rest) for ok, key, data, *rest in replies]
             for replies in result
         ]
 
     async def put(self, key: str, payload: bytes, attachment: bytes | None = None) -> None:
-        await self._ask("put", key=key, payload=_text(payload), attachment=_text(attachment))
+        await self._request("put", key=key, payload=_text(payload), attachment=_text(attachment))
 
     async def delete(self, key: str) -> None:
-        await self._ask("delete", key=key)
+        await self._request("delete", key=key)
 
     async def _subscribe(self, do: str, **arguments: Any) -> Subscription:
         subscription = Subscription()
         self._subscriptions[self._count + 1] = subscription
-        await self._ask(do, **arguments)
+        await self._request(do, **arguments)
         return subscription
 
-    async def _ask(self, do: str, **arguments: Any) -> Any:
+    async def _request(self, do: str, **arguments: Any) -> Any:
         assert self._process is not None
         assert self._process.stdin is not None
         self._count += 1
         n = self._count
-        self._asked[n] = answer = asyncio.get_running_loop().create_future()
+        self._pending[n] = answer = asyncio.get_running_loop().create_future()
         line = json.dumps({"n": n, "do": do, **arguments})
         self._process.stdin.write(line.encode() + b"\n")
         await self._process.stdin.drain()
@@ -273,18 +273,23 @@ class ZenohPeer:
         assert self._process.stdout is not None
         async for line in self._process.stdout:
             message = json.loads(line)
-            if "heard" in message:
-                key, kind, data, encoding, time, beside = message["sample"]
-                self._subscriptions[message["heard"]].feed(
-                    Heard(
-                        key, kind, base64.b64decode(data), encoding, time, base64.b64decode(beside)
+            if "received" in message:
+                key, kind, data, encoding, time, token = message["sample"]
+                self._subscriptions[message["received"]].feed(
+                    Received(
+                        key,
+                        kind,
+                        base64.b64decode(data),
+                        encoding,
+                        time,
+                        base64.b64decode(token),
                     )
                 )
             elif "error" in message:
-                self._asked.pop(message["n"]).set_exception(RuntimeError(message["error"]))
+                self._pending.pop(message["n"]).set_exception(RuntimeError(message["error"]))
             else:
-                self._asked.pop(message["n"]).set_result(message["result"])
-        for answer in self._asked.values():
+                self._pending.pop(message["n"]).set_result(message["result"])
+        for answer in self._pending.values():
             if not answer.done():
                 answer.set_exception(ConnectionError("the Zenoh peer has ended"))
 
@@ -298,15 +303,15 @@ def _text(payload: bytes | None) -> str | None:
 _stdout = threading.Lock()
 
 
-def _say(message: dict[str, Any]) -> None:
+def _send(message: dict[str, Any]) -> None:
     line = json.dumps(message) + "\n"
     with _stdout:
         sys.stdout.write(line)
         sys.stdout.flush()
 
 
-def _hear(n: int) -> Callable[[zenoh.Sample], None]:
-    return lambda sample: _say({"heard": n, "sample": _flat(sample)})
+def _forward(n: int) -> Callable[[zenoh.Sample], None]:
+    return lambda sample: _send({"received": n, "sample": _flat(sample)})
 
 
 def _flat(sample: zenoh.Sample) -> list[Any]:
@@ -329,7 +334,7 @@ def _reply(answer: zenoh.Reply) -> list[Any]:
     return [False, None, _text(bytes(answer.err.payload)), str(answer.err.encoding), None]
 
 
-def _octets(text: str | None) -> bytes | None:
+def _bytes_of(text: str | None) -> bytes | None:
     return None if text is None else base64.b64decode(text)
 
 
@@ -337,50 +342,50 @@ def _get(
     session: zenoh.Session,
     queries: list[tuple[str, str | None]],
     timeout: float,
-    how: dict[str, str],
+    extra: dict[str, str],
 ) -> list[list[Any]]:
     options: dict[str, Any] = {"timeout": timeout}
-    if "target" in how:
-        options["target"] = getattr(zenoh.QueryTarget, how["target"])
-    if "consolidation" in how:
-        options["consolidation"] = getattr(zenoh.ConsolidationMode, how["consolidation"])
-    if "attachment" in how:
-        options["attachment"] = _octets(how["attachment"])
+    if "target" in extra:
+        options["target"] = getattr(zenoh.QueryTarget, extra["target"])
+    if "consolidation" in extra:
+        options["consolidation"] = getattr(zenoh.ConsolidationMode, extra["consolidation"])
+    if "attachment" in extra:
+        options["attachment"] = _bytes_of(extra["attachment"])
     found: list[list[zenoh.Reply]] = [[] for _ in queries]
     ends = [threading.Event() for _ in queries]
     for (selector, payload), replies, end in zip(queries, found, ends, strict=True):
         handler = zenoh.handlers.Callback(replies.append, end.set, indirect=False)
-        session.get(selector, handler, payload=_octets(payload), **options)
+        session.get(selector, handler, payload=_bytes_of(payload), **options)
     for end in ends:
         end.wait()
     return [[_reply(answer) for answer in replies] for replies in found]
 
 
-def _obey(session: zenoh.Session, kept: list[object], ask: dict[str, Any]) -> Any:
-    match ask:
+def _execute(session: zenoh.Session, kept: list[object], request: dict[str, Any]) -> Any:
+    match request:
         case {"do": "hello"}:
             return str(session.zid())
         case {"do": "subscribe", "n": n, "key": key, "advanced": False}:
-            kept.append(session.declare_subscriber(key, _hear(n)))
+            kept.append(session.declare_subscriber(key, _forward(n)))
         case {"do": "subscribe", "n": n, "key": key}:
             history = ext.HistoryConfig(max_samples=1)
-            kept.append(ext.declare_advanced_subscriber(session, key, _hear(n), history=history))
+            kept.append(ext.declare_advanced_subscriber(session, key, _forward(n), history=history))
         case {"do": "liveliness", "n": n, "key": key}:
             live = session.liveliness()
-            kept.append(live.declare_subscriber(key, _hear(n), history=True))
+            kept.append(live.declare_subscriber(key, _forward(n), history=True))
         case {"do": "tokens", "key": key}:
             found = session.liveliness().get(key, timeout=2)
             return sorted(str(answer.ok.key_expr) for answer in found if answer.ok)
-        case {"do": "get", "queries": queries, "timeout": timeout, "how": how}:
-            return _get(session, queries, timeout, how)
+        case {"do": "get", "queries": queries, "timeout": timeout, "options": options}:
+            return _get(session, queries, timeout, options)
         case {"do": "put", "key": key, "payload": payload, "attachment": attachment}:
             block = zenoh.CongestionControl.BLOCK
-            data, beside = _octets(payload) or b"", _octets(attachment)
-            session.put(key, data, congestion_control=block, attachment=beside)
+            data, token = _bytes_of(payload) or b"", _bytes_of(attachment)
+            session.put(key, data, congestion_control=block, attachment=token)
         case {"do": "delete", "key": key}:
             session.delete(key)
         case _:
-            raise ValueError(f"no such command: {ask}")
+            raise ValueError(f"no such command: {request}")
     return None
 
 
@@ -412,11 +417,11 @@ def main() -> None:
     kept: list[object] = []
     with zenoh.open(_configured(json.loads(sys.argv[1]))) as session:
         for line in sys.stdin:
-            ask = json.loads(line)
+            request = json.loads(line)
             try:
-                _say({"n": ask["n"], "result": _obey(session, kept, ask)})
+                _send({"n": request["n"], "result": _execute(session, kept, request)})
             except (zenoh.ZError, ValueError) as error:
-                _say({"n": ask["n"], "error": str(error)})
+                _send({"n": request["n"], "error": str(error)})
 
 
 if __name__ == "__main__":

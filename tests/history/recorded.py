@@ -75,8 +75,8 @@ def result_of(process: "subprocess.Popen[str]") -> dict[str, Any]:
         assert process.stdout is not None
         output = process.stdout.read()
     assert process.returncode == 0, output
-    told: dict[str, Any] = json.loads(output.splitlines()[-1])
-    return told
+    result: dict[str, Any] = json.loads(output.splitlines()[-1])
+    return result
 
 
 def wait_for_state(historian: Historian, words: str) -> None:

@@ -202,16 +202,16 @@ async def test_outcomes_of_writes_and_commands_are_queried_by_time(tmp_path: Pat
         async def asked(selector: str) -> list[Any]:
             return [reply.json for reply in await client.get(f"{writes}?_time={selector}")]
 
-        told = await asked("[..]")
-        assert told == [json.loads(payload.write_outcome(outcome)) for outcome in done]
-        assert [line["outcome"] for line in told] == ["written", "obeyed", "unclear"]
-        assert await asked("[..];limit=1") == told[:1]
-        assert await asked("[2026-11-21T12:00:01Z..]") == told[2:]
+        lines = await asked("[..]")
+        assert lines == [json.loads(payload.write_outcome(outcome)) for outcome in done]
+        assert [line["outcome"] for line in lines] == ["written", "obeyed", "unclear"]
+        assert await asked("[..];limit=1") == lines[:1]
+        assert await asked("[2026-11-21T12:00:01Z..]") == lines[2:]
         assert [line["error"] for line in await asked("yesterday")] == ["bad-query"]
 
 
 class Poll:
-    """Records and publishes 1, 2, 3 ... every 5 ms, whatever the network does."""
+    """Records and publishes 1, 2, 3 ... every 5 ms, independently of the network."""
 
     def __init__(self, historian: Historian) -> None:
         self.plant = plant()

@@ -33,8 +33,8 @@ from tests.history_writer import tag, until
 
 
 def test_samples_of_all_types_survive_a_restart(tmp_path: Path) -> None:
-    told: list[Value] = [True, False, 1, -5, 2**64 - 1, 0.1, math.inf, "", "Füllstand", "A\0B"]
-    samples = [good(SPEED, value, NOON + n) for n, value in enumerate(told)]
+    recorded: list[Value] = [True, False, 1, -5, 2**64 - 1, 0.1, math.inf, "", "Füllstand", "A\0B"]
+    samples = [good(SPEED, value, NOON + n) for n, value in enumerate(recorded)]
     samples.append(bad(SPEED, Reason.NO_REPLY, NOON + 100))
     with history(tmp_path / "h.db") as historian:
         historian.record(samples)
@@ -84,11 +84,11 @@ def test_now_is_the_time_of_the_query_not_of_the_answer(tmp_path: Path) -> None:
         historian.record(numbered(100))
         for number in range(10):
             record_outcome(historian, write(number))
-        asked = NOON + 5 * SECOND
-        found = historian.samples(SPEED, "[now(-2s)..now()]", None, asked)
+        queried = NOON + 5 * SECOND
+        found = historian.samples(SPEED, "[now(-2s)..now()]", None, queried)
         assert [sample.value for sample in found] == [3, 4, 5]
-        told = historian.writes("[now(-2s)..now()]", None, asked)
-        assert [json.loads(line)["value"] for line in told] == [3, 4, 5]
+        outcomes = historian.writes("[now(-2s)..now()]", None, queried)
+        assert [json.loads(line)["value"] for line in outcomes] == [3, 4, 5]
 
 
 def test_two_samples_of_one_moment_are_both_kept_in_their_order(tmp_path: Path) -> None:
@@ -101,11 +101,11 @@ def test_two_samples_of_one_moment_are_both_kept_in_their_order(tmp_path: Path) 
 
 
 def test_a_clock_set_back_loses_nothing_and_the_answer_is_in_order(tmp_path: Path) -> None:
-    told = random.Random(1)
+    chance = random.Random(1)
     with history(tmp_path / "h.db", max_size=SMALL) as historian:
         times = [NOON + n * SECOND for n in range(6000)]
         times += [NOON - 500 * SECOND + n * SECOND for n in range(5000)]
-        times += [told.randrange(NOON, NOON + 3000 * SECOND) for _ in range(500)]
+        times += [chance.randrange(NOON, NOON + 3000 * SECOND) for _ in range(500)]
         for at in range(0, len(times), 100):
             historian.record(good(SPEED, at, time) for time in times[at : at + 100])
         until(historian, waiting=0)
@@ -118,28 +118,28 @@ def test_queries_see_each_sample_once_while_runs_move_to_disk(tmp_path: Path) ->
     with history(tmp_path / "h.db", max_size=3_000_000) as historian:
         ended = threading.Event()
 
-        def tell() -> None:
+        def record() -> None:
             for n in range(0, 30_000, 50):
                 historian.record(numbered(50, n))
                 if n % 5000 == 0:
                     until(historian, waiting=0)  # the disk keeps up
             ended.set()
 
-        thread = threading.Thread(target=tell)
+        thread = threading.Thread(target=record)
         thread.start()
-        asked = 0
+        queries = 0
         while not ended.is_set():
             found = values(historian)
             assert found == list(range(len(found)))
-            asked += 1
+            queries += 1
         thread.join()
-        assert asked > 5
+        assert queries > 5
         assert values(historian) == list(range(30_000))
         assert historian.document()["lost"] == 0
 
 
 def test_an_answer_of_very_many_samples_takes_little_memory(tmp_path: Path) -> None:
-    count = 200_000  # 50 MB of them; what is held is one run of 32,768 at a time
+    count = 200_000  # 50 MB; an answer holds one run of 32,768 at a time
     with history(tmp_path / "h.db") as historian:
         for first in range(0, count, 1000):
             historian.record(good(SPEED, n, NOON + n) for n in range(first, first + 1000))
@@ -191,13 +191,13 @@ def test_an_answer_begins_with_the_oldest_sample_that_is_left(
 ) -> None:
     at_once = Reader.samples
 
-    def late(reader: Reader, *asked: Any) -> list[Sample] | None:
+    def late(reader: Reader, *arguments: Any) -> list[Sample] | None:
         monkeypatch.undo()
         first = historian.document()["oldest"]
         for start in range(20_000, 60_000, 1000):
             if historian.document()["oldest"] == first:
                 flooded(historian, start, start + 1000)
-        return at_once(reader, *asked)
+        return at_once(reader, *arguments)
 
     with history(tmp_path / "h.db", max_size=SMALL) as historian:
         flooded(historian, 0, 20_000)

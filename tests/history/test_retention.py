@@ -113,7 +113,9 @@ def test_a_clock_that_is_wrong_for_a_moment_costs_little_history(tmp_path: Path)
 def test_samples_that_the_disk_cannot_take_are_dropped_oldest_first_and_counted(
     tmp_path: Path,
 ) -> None:
-    historian = Historian(tmp_path / "h.db", WEEK, 4_000_000)  # runs of 3906, and nobody writes
+    historian = Historian(
+        tmp_path / "h.db", WEEK, 4_000_000
+    )  # runs of 3906; the writer is not started yet
     historian.record(numbered(50_000))
     lost = (50_000 // 3906 + 1 - MOST_RUNS) * 3906
     assert historian.document()["lost"] == lost

@@ -35,15 +35,15 @@ def test_kill_9_costs_at_most_the_last_moment_and_never_the_file(tmp_path: Path)
     for _ in range(6):
         process = start_writer("run", path)
         assert process.stdout is not None
-        said = [process.stdout.readline()]
+        output = [process.stdout.readline()]
         time.sleep(at.uniform(0.05, 0.7))  # any moment
         process.kill()
         killed = time.monotonic_ns()
-        said += process.stdout.read().splitlines()
+        output += process.stdout.read().splitlines()
         process.wait()
         process.stdout.close()
         must = [
-            int(line.split()[0]) for line in said if killed - int(line.split()[1]) > 200_000_000
+            int(line.split()[0]) for line in output if killed - int(line.split()[1]) > 200_000_000
         ]
         shutil.copytree(tmp_path, tmp_path.with_name("copy"), dirs_exist_ok=True)
         assert is_intact(tmp_path.with_name("copy") / "h.db")
@@ -58,14 +58,14 @@ def test_kill_9_costs_at_most_the_last_moment_and_never_the_file(tmp_path: Path)
 
 
 def test_a_full_disk_is_reported_and_costs_no_sample(tmp_path: Path) -> None:
-    told = result_of(start_writer("full", tmp_path / "h.db"))
-    assert told["trouble"]["state"].startswith("the disk ")
-    assert told["after"]["lost"] == 0
-    assert told["longest"] < 0.05  # recording does not wait for the disk
+    result = result_of(start_writer("full", tmp_path / "h.db"))
+    assert result["trouble"]["state"].startswith("the disk ")
+    assert result["after"]["lost"] == 0
+    assert result["longest"] < 0.05  # recording does not wait for the disk
     assert is_intact(tmp_path / "h.db")
     with history(tmp_path / "h.db") as historian:
         for tag in TAGS:
-            assert values(historian, tag) == list(range(1, told["number"] + 1))
+            assert values(historian, tag) == list(range(1, result["number"] + 1))
 
 
 def test_a_read_only_file_is_reported_and_tried_again(tmp_path: Path) -> None:
@@ -82,9 +82,9 @@ def test_a_read_only_file_is_reported_and_tried_again(tmp_path: Path) -> None:
         for parent in (tmp_path, *tmp_path.parents[:3]):
             if parent.stat().st_mode & 0o011 != 0o011 and parent != Path("/"):
                 parent.chmod(0o755)
-    told = result_of(start_writer("readonly", path))
-    assert "read" in told["trouble"]["state"] or "opened" in told["trouble"]["state"]
-    assert told["after"]["lost"] == 0
+    result = result_of(start_writer("readonly", path))
+    assert "read" in result["trouble"]["state"] or "opened" in result["trouble"]["state"]
+    assert result["after"]["lost"] == 0
     with history(path) as historian:
         assert values(historian) == list(range(10))
         assert values(historian, TAGS[3]) == [1]
@@ -227,5 +227,5 @@ def test_a_bug_in_the_writer_is_reported(tmp_path: Path, monkeypatch: pytest.Mon
         historian.record(numbered(5, 5))
         assert values(historian) == list(range(10))
     monkeypatch.undo()
-    with history(path) as historian:  # nobody holds the file
+    with history(path) as historian:  # the lock is released
         assert values(historian) == []

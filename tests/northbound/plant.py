@@ -42,7 +42,7 @@ class PlainDevice:
 
 class PlainPlant:
     """Samples in a dict. A write is acknowledged, or ends as `endings` says for its value. A
-    command is answered if `known_commands` has it."""
+    command ends with `command_result`."""
 
     def __init__(self, *devices: PlainDevice) -> None:
         self._devices = devices
@@ -58,6 +58,7 @@ class PlainPlant:
         self.unread: set[str] = set()  # tags that the line does not read in time
         self.republished: list[Sample] = []
         self.known_commands: Mapping[str, frozenset[str]] = {}
+        self.command_result: CommandResult | Exception = CommandResult("acknowledged", 1, 0.1)
         self.commanded: list[tuple[str, str, str]] = []
 
     def devices(self) -> Iterable[PlainDevice]:
@@ -90,7 +91,9 @@ class PlainPlant:
 
     async def control(self, device: str, command: str, argument: str) -> CommandResult:
         self.commanded.append((device, command, argument))
-        return CommandResult("acknowledged", time.time_ns(), 0.1)
+        if isinstance(self.command_result, Exception):
+            raise self.command_result
+        return self.command_result
 
     def is_fresh(self, tag: Tag, max_age: float) -> bool:
         return time.time_ns() - self.samples[tag.key].time < max_age * 1e9

@@ -69,13 +69,13 @@ async def test_a_viewer_reads_an_operator_writes_and_strangers_do_neither(
         live = await viewer.liveliness("plant/@gateway/*")
         await live.next(lambda token: token.key == "plant/@gateway/demo")
         for reader in (viewer, operator):
-            heard = await reader.subscribe("plant/**")
+            received = await reader.subscribe("plant/**")
             for _ in range(100):  # Zenoh does not report when a subscription is known everywhere
                 northbound.publish([plant.now("mixer/speed", 12)])
-                if heard.samples:
+                if received.samples:
                     break
                 await asyncio.sleep(0.05)
-            assert heard.samples
+            assert received.samples
             for selector, count in (
                 ("plant/**", 4),
                 ("plant/**/@meta", 4),

@@ -27,8 +27,7 @@ TAGS = {"speed": {"address": "D100"}, "recipe": {"address": "D500", "write": Tru
 
 
 def typed(user: str | None, *arguments: object, password: str | None = None) -> Done:
-    """`plc-gateway ...`, typed by somebody who says who he is, or by nobody. `watch` ends with
-    whoever reads one line of it."""
+    """Runs `plc-gateway ...` as a user, or without one. `watch` ends after one line."""
     known = {}
     if user is not None:
         known = {USER_VARIABLE: user, PASSWORD_VARIABLE: password or PASSWORDS[user]}

@@ -17,25 +17,25 @@ NONE = "NONE"  # Zenoh's consolidation that streams
 async def test_a_raw_value_is_plain_text_with_its_quality_in_the_attachment() -> None:
     raw = PlainPlant(PlainDevice("mixer", (tag("mixer", "speed", payload=Form.RAW),)))
     async with gateway_and_client(raw) as (northbound, client):
-        heard = await client.subscribe("plant/**")
+        received = await client.subscribe("plant/**")
         northbound.publish([raw.now("mixer/speed", 12)])
-        arrived = await heard.next(lambda sample: sample.payload == b"12")
+        arrived = await received.next(lambda sample: sample.payload == b"12")
         assert (arrived.kind, arrived.encoding) == ("PUT", "text/plain")
-        beside = json.loads(arrived.attachment)
-        assert set(beside) == {"quality", "time"}
-        assert beside["quality"] == "good"
+        attachment = json.loads(arrived.attachment)
+        assert set(attachment) == {"quality", "time"}
+        assert attachment["quality"] == "good"
         [reply] = await client.get("plant/mixer/speed")
         assert (reply.payload, reply.encoding) == (b"12", "text/plain")
-        # What is not known is no text that could be taken for a value.
-        heard.forget()
+        # An unknown value has no text that a reader could mistake for a value.
+        received.forget()
         speed = raw.tag("mixer/speed")
         assert speed is not None
         raw.samples["mixer/speed"] = bad(speed, Reason.NO_REPLY, time.time_ns())
         northbound.publish([raw.samples["mixer/speed"]])
-        gone = await heard.next(lambda sample: True)
-        assert (gone.kind, gone.payload) == ("DELETE", b"")
-        beside = json.loads(gone.attachment)
-        assert (beside["quality"], beside["reason"]) == ("bad", "no-reply")
+        deleted = await received.next(lambda sample: True)
+        assert (deleted.kind, deleted.payload) == ("DELETE", b"")
+        attachment = json.loads(deleted.attachment)
+        assert (attachment["quality"], attachment["reason"]) == ("bad", "no-reply")
         [reply] = await client.get("plant/mixer/speed")
         assert (reply.ok, reply.payload) == (True, b"")
         [described] = await client.get("plant/mixer/speed/@meta")

@@ -98,7 +98,7 @@ def test_a_mistake_in_the_settings_is_one_sentence(settings: Any, message: str) 
 
 
 def no_plant() -> Any:
-    return None  # never asked: the settings are looked at first
+    return None  # never used: the settings are checked first
 
 
 async def test_a_port_in_use_is_one_sentence_and_ends_the_run() -> None:

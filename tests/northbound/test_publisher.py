@@ -24,31 +24,31 @@ from tests.northbound.plant import (
 async def test_a_published_value_arrives_as_the_contract_says() -> None:
     plant = mixer()
     async with gateway_and_client(plant) as (northbound, client):
-        heard = await client.subscribe("plant/**")
+        received = await client.subscribe("plant/**")
         sample = plant.now("mixer/speed", 12)
         northbound.publish([sample])
-        arrived = await heard.next(has_value("plant/mixer/speed", 12))
+        arrived = await received.next(has_value("plant/mixer/speed", 12))
         assert arrived.encoding == "application/json"
         assert set(arrived.json) == {"value", "quality", "time"}
         # A subscriber of values receives no key with @.
-        assert not any("@" in sample.key for sample in heard.samples)
+        assert not any("@" in sample.key for sample in received.samples)
 
 
 async def test_values_are_put_in_the_order_of_their_time_stamps() -> None:
     plant = mixer()
     async with gateway_and_client(plant) as (northbound, client):
-        heard = await client.subscribe("plant/**")
+        received = await client.subscribe("plant/**")
         for value in range(300):
             northbound.publish([plant.now("mixer/speed", value), plant.now("mixer/recipe", value)])
             if value % 7 == 0:
                 await asyncio.sleep(0)
-        await heard.next(has_value("plant/mixer/recipe", 299))
-        stamps = [sample.time for sample in heard.samples if sample.time is not None]
-        assert len(stamps) == len(heard.samples)
+        await received.next(has_value("plant/mixer/recipe", 299))
+        stamps = [sample.time for sample in received.samples if sample.time is not None]
+        assert len(stamps) == len(received.samples)
         assert stamps == sorted(stamps)
         counters = northbound.counters()
         # Only superseded values are missing. Beside the 600: the first publication.
-        assert counters["superseded"] + len(heard.samples) in range(600, 605)
+        assert counters["superseded"] + len(received.samples) in range(600, 605)
 
 
 class StuckSession:
@@ -113,17 +113,17 @@ async def test_events_beyond_the_limit_are_dropped_and_counted() -> None:
 async def test_events_all_arrive_in_order() -> None:
     plant = PlainPlant(PlainDevice("mixer", (tag("mixer", "speed", event=True),)))
     async with gateway_and_client(plant) as (northbound, client):
-        heard = await client.subscribe("plant/mixer/speed")
+        received = await client.subscribe("plant/mixer/speed")
         northbound.publish([plant.now("mixer/speed", value) for value in range(500)])
-        await heard.next(has_value("plant/mixer/speed", 499))
-        values = [sample.json["value"] for sample in heard.samples]
+        await received.next(has_value("plant/mixer/speed", 499))
+        values = [sample.json["value"] for sample in received.samples]
         assert [value for value in values if value is not None] == list(range(500))
 
 
 async def test_a_scan_of_a_device_with_blocks_is_one_put() -> None:
     plant = mixer(blocks=True)
     async with gateway_and_client(plant) as (northbound, client):
-        heard = await client.subscribe("plant/*/@block")
+        received = await client.subscribe("plant/*/@block")
         northbound.publish(
             [
                 plant.now("mixer/speed", 1),
@@ -131,7 +131,7 @@ async def test_a_scan_of_a_device_with_blocks_is_one_put() -> None:
                 plant.now("oven/temperature", 3),
             ]
         )
-        block = await heard.next(lambda sample: True)
+        block = await received.next(lambda sample: True)
         assert block.key == "plant/mixer/@block"
         assert {name: entry["value"] for name, entry in block.json.items()} == {
             "speed": 1,
@@ -144,13 +144,13 @@ async def test_a_scan_of_a_device_with_blocks_is_one_put() -> None:
 async def test_with_blocks_only_no_single_value_is_put() -> None:
     plant = mixer(blocks="only")
     async with gateway_and_client(plant) as (northbound, client):
-        heard = await client.subscribe("plant/**")
+        received = await client.subscribe("plant/**")
         block = await client.subscribe("plant/mixer/@block")
         northbound.publish([plant.now("mixer/speed", 1), plant.now("oven/temperature", 3)])
         scan = await block.next(lambda sample: sample.json["speed"]["value"] == 1)
         assert set(scan.json) >= {"speed"}
-        await heard.next(has_value("plant/oven/temperature", 3))
-        assert not [sample.key for sample in heard.samples if "mixer" in sample.key]
+        await received.next(has_value("plant/oven/temperature", 3))
+        assert not [sample.key for sample in received.samples if "mixer" in sample.key]
         # A query returns them, but not that of a subscriber, which would then wait for new ones.
         [reply] = await client.get("plant/mixer/speed")
         assert reply.json["value"] == 1
@@ -171,11 +171,11 @@ async def test_a_frozen_subscriber_does_not_block_the_event_loop() -> None:
                 northbound.publish([plant.now(key, value) for key in plant.samples])
                 await asyncio.sleep(0.02)
                 worst = max(worst, time.perf_counter() - before)
-        assert worst < 0.5  # one put to a frozen peer takes up to 50 ms, 2000 of them would show
+        assert worst < 0.5  # one put to a frozen peer takes up to 50 ms, 2000 of them 100 s
 
 
 class Stopped:
-    """A process held still by SIGSTOP."""
+    """A process that SIGSTOP pauses."""
 
     def __init__(self, pid: int) -> None:
         self._pid = pid

@@ -30,7 +30,7 @@ async def test_ten_thousand_current_values_by_one_wildcard_get() -> None:
             ("plant/*/t3", 20),
             ("plant/d1$*/t3", 11),
             ("plant/d7/t3", 1),
-            ("plant/nobody/t3", 0),
+            ("plant/unknown/t3", 0),
         ):
             replies = await client.get(selector, consolidation=NONE)
             assert len({reply.key for reply in replies}) == len(replies) == count, selector
@@ -45,15 +45,15 @@ async def test_a_late_advanced_subscriber_gets_every_last_value_and_then_new_one
     plant = mixer()
     async with gateway_and_client(plant) as (northbound, client):
         northbound.publish([plant.now("mixer/speed", 1), plant.now("oven/temperature", 200)])
-        heard = await client.subscribe("plant/**", advanced=True)
-        await heard.until(lambda of: len(of.latest()) == 4)
-        assert heard.latest()["plant/oven/temperature"].json["value"] == 200
-        assert heard.latest()["plant/mixer/recipe"].json["reason"] == "starting"
+        received = await client.subscribe("plant/**", advanced=True)
+        await received.until(lambda of: len(of.latest()) == 4)
+        assert received.latest()["plant/oven/temperature"].json["value"] == 200
+        assert received.latest()["plant/mixer/recipe"].json["reason"] == "starting"
         for value in range(2, 50):
             northbound.publish([plant.now("mixer/speed", value), plant.now("mixer/recipe", value)])
             await asyncio.sleep(0.001)
-        await heard.next(has_value("plant/mixer/speed", 49))
-        await heard.next(has_value("plant/mixer/recipe", 49))
+        await received.next(has_value("plant/mixer/speed", 49))
+        await received.next(has_value("plant/mixer/recipe", 49))
 
 
 async def test_every_tag_is_found_by_its_meta_key() -> None:
@@ -80,8 +80,8 @@ async def test_status_is_answered_and_published() -> None:
         assert keys == {f"{own}/status", f"{own}/lines/hall-1", f"{own}/zenoh"}
         [reply] = await client.get(f"{own}/lines/*")
         assert reply.json == {"load": 0.5}
-        heard = await client.subscribe("plant/@gateway/*/status")
-        assert (await heard.next(lambda _: True)).json == {"state": "running"}
+        received = await client.subscribe("plant/@gateway/*/status")
+        assert (await received.next(lambda _: True)).json == {"state": "running"}
 
 
 async def test_max_age_reads_the_device_unless_the_sample_is_younger() -> None:
@@ -102,7 +102,7 @@ async def test_max_age_reads_the_device_unless_the_sample_is_younger() -> None:
         ]
         [reply] = await client.get("plant/mixer/speed?max_age=soon")
         assert reply.json["error"] == "bad-query"
-        assert await client.get("plant/nobody/speed?max_age=soon") == []
+        assert await client.get("plant/unknown/speed?max_age=soon") == []
 
 
 async def test_a_tag_that_cannot_be_read_does_not_suppress_other_values() -> None:
@@ -127,7 +127,7 @@ async def test_a_tag_that_cannot_be_read_does_not_suppress_other_values() -> Non
 
 async def test_a_tag_that_becomes_too_old_while_another_is_read_is_read_too() -> None:
     class Slow(PlainPlant):
-        """Reading the speed takes so long that nothing else is young after it."""
+        """Reading the speed takes so long that all other samples are too old afterwards."""
 
         def is_fresh(self, tag: Tag, max_age: float) -> bool:
             return "mixer/speed" not in self.read and tag.name != "speed"
@@ -163,4 +163,4 @@ async def test_a_query_of_the_past_is_refused_without_history() -> None:
             [reply] = await client.get(selector)
             assert not reply.ok
             assert reply.json["error"] == "no-history"
-        assert await client.get("plant/nobody/speed?_time=[..]") == []
+        assert await client.get("plant/unknown/speed?_time=[..]") == []

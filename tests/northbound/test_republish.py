@@ -32,20 +32,20 @@ async def test_a_bad_value_is_repeated_with_its_heartbeat_and_keeps_its_time(eve
         speed, level = (plant.tag(f"mixer/{name}") for name in ("speed", "level"))
         assert speed is not None
         assert level is not None
-        heard = await client.subscribe("plant/mixer/*")
+        received = await client.subscribe("plant/mixer/*")
         down = [bad(of, Reason.NO_REPLY, time.time_ns()) for of in (speed, level)]
         plant.samples |= {sample.tag.key: sample for sample in down}
         northbound.publish(down)
-        await heard.next(lambda sample: sample.key.endswith("level"))
-        first = await heard.next(lambda sample: sample.key.endswith("speed"))
-        heard.forget()
+        await received.next(lambda sample: sample.key.endswith("level"))
+        first = await received.next(lambda sample: sample.key.endswith("speed"))
+        received.forget()
         for _ in range(2):
-            again = await heard.next(lambda _: True)
+            again = await received.next(lambda _: True)
             assert again.key == "plant/mixer/speed"  # the other has no heartbeat
             assert again.json == first.json
-            heard.forget()
+            received.forget()
         northbound.publish([plant.now("mixer/speed", 7)])
-        assert (await heard.next(lambda _: True)).json["value"] == 7
+        assert (await received.next(lambda _: True)).json["value"] == 7
 
 
 async def test_an_event_is_published_once_but_its_bad_quality_again() -> None:
@@ -62,9 +62,9 @@ async def test_an_event_is_published_once_but_its_bad_quality_again() -> None:
     await republisher.publish_all()
     assert published == [heavy]
     published.clear()
-    gone = plant.samples["reader/code"] = bad(code, Reason.LINE_DOWN, time.time_ns())
+    lost = plant.samples["reader/code"] = bad(code, Reason.LINE_DOWN, time.time_ns())
     await republisher.publish_all()
-    assert published == [gone, heavy]
+    assert published == [lost, heavy]
 
 
 async def test_the_plant_marks_republished_samples_before_they_go_out() -> None:
@@ -85,7 +85,7 @@ async def test_after_a_router_was_killed_and_returned_everything_is_published_ag
 ) -> None:
     plant = mixer()
     endpoint = free_endpoint()
-    # No router yet: the gateway starts all the same.
+    # The gateway starts without its router.
     northbound = Northbound(ZenohConfig(mode=mode, connect=(endpoint,)), "demo", plant)
     serves = asyncio.create_task(northbound.run())
     northbound.publish([plant.now("mixer/speed", 1)])
@@ -94,17 +94,17 @@ async def test_after_a_router_was_killed_and_returned_everything_is_published_ag
             ZenohPeer("router", listen=[endpoint]) as router,
             ZenohPeer("client", connect=[endpoint]) as client,
         ):
-            heard = await client.subscribe("plant/**")
-            await heard.next(has_value("plant/mixer/speed", 1))
+            received = await client.subscribe("plant/**")
+            await received.next(has_value("plant/mixer/speed", 1))
             live = await client.liveliness("plant/@gateway/*")
             await live.next(lambda token: token.kind == "PUT")
             await router.kill()
-            heard.forget()
+            received.forget()
             live.forget()
-            northbound.publish([plant.now("mixer/speed", 2)])  # nobody hears it
+            northbound.publish([plant.now("mixer/speed", 2)])  # no link: it reaches no subscriber
             async with ZenohPeer("router", listen=[endpoint]):
-                await heard.next(has_value("plant/mixer/speed", 2), timeout=15)
-                await heard.until(lambda of: len(of.latest()) == 4)
+                await received.next(has_value("plant/mixer/speed", 2), timeout=15)
+                await received.until(lambda of: len(of.latest()) == 4)
                 await live.next(lambda token: token.kind == "PUT")
     finally:
         serves.cancel()

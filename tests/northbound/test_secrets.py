@@ -115,8 +115,8 @@ async def test_the_gateway_prints_and_serves_no_secret(tmp_path: Path) -> None:
         tmp_path / "zenoh.json5",
         '{transport: {auth: {usrpwd: {user: "gateway", password: "in-the-zenoh-file"}}}}',
     )
-    everybody = users(tmp_path)
-    everybody.write_text(everybody.read_text() + "gateway2:in-the-users-file\n")
+    users_file = users(tmp_path)
+    users_file.write_text(users_file.read_text() + "gateway2:in-the-users-file\n")
     hash_of = writers_line("alice", TOKEN)
     config = {
         "gateway": {"name": "demo"},
@@ -125,7 +125,7 @@ async def test_the_gateway_prints_and_serves_no_secret(tmp_path: Path) -> None:
             "config_file": str(zenoh_file),
             "user": "gateway2",
             "password_file": str(secret(tmp_path / "password", "in-the-password-file")),
-            "users_file": str(everybody),
+            "users_file": str(users_file),
         },
         "writers": {"file": str(secret(tmp_path / "writers", hash_of))},
         "lines": {"hall": {"port": "simulator", "devices": {"mixer": {
@@ -139,30 +139,30 @@ async def test_the_gateway_prints_and_serves_no_secret(tmp_path: Path) -> None:
     with Program(*command) as program:
         await asyncio.to_thread(program.says, "Zenoh session ready")
         async with as_user("operator", endpoint) as client:
-            heard = await client.subscribe("plant/@gateway/**")
-            for token in (None, b"wrong-token-of-somebody", TOKEN.encode()):
+            received = await client.subscribe("plant/@gateway/**")
+            for token in (None, b"wrong-token-of-a-client", TOKEN.encode()):
                 served += [r.payload for r in await client.get(RECIPE, b"7", attachment=token)]
             for selector in ("plant/**", "plant/**/@meta", "plant/@gateway/**"):
                 served += [r.payload for r in await client.get(selector, consolidation="NONE")]
-            await heard.next(lambda sample: sample.json.get("by") == "alice")
-            served += [sample.payload for sample in heard.samples]
+            await received.next(lambda sample: sample.json.get("by") == "alice")
+            served += [sample.payload for sample in received.samples]
         with RefusedConnection(endpoint):
             pass
         assert await asyncio.to_thread(program.end) == 0
-    shown = "\n".join(program.lines) + "\n".join(data.decode() for data in served)
-    assert "written" in shown
+    output = "\n".join(program.lines) + "\n".join(data.decode() for data in served)
+    assert "written" in output
     assert len(served) > 8
     for word in (
         *PASSWORDS.values(),
         "in-the-zenoh-file",
         "in-the-users-file",
         "in-the-password-file",
-        "wrong-token-of-somebody",
+        "wrong-token-of-a-client",
         TOKEN,
         SALT,
         hash_of.rpartition(":")[2].strip(),
     ):
-        assert word not in shown, word
+        assert word not in output, word
 
 
 class RefusedConnection:
@@ -217,8 +217,8 @@ def test_an_unprotected_endpoint_gives_a_warning(
     config = configure(ZenohConfig())
     for path, value in {"listen/endpoints": [listen], **setup}.items():
         config.insert_json5(path, json.dumps(value))
-    told = secrets.exposures(config)
-    assert len(told) == len(says)
-    for sentence, words in zip(told, says, strict=True):
+    warnings = secrets.exposures(config)
+    assert len(warnings) == len(says)
+    for sentence, words in zip(warnings, says, strict=True):
         assert words in sentence
         assert listen in sentence

@@ -54,7 +54,7 @@ async def test_every_refused_write_has_its_error_word() -> None:
         3: LineDown("the port is gone"),
         4: Busy("too many writes are waiting"),
         5: BadValue("not in this mode"),
-        6: GatewayError("nobody foresaw this"),
+        6: GatewayError("an unexpected error"),
         8: TimeoutError(),
     }
     recipe = "plant/mixer/recipe/@set"
@@ -91,7 +91,7 @@ async def test_every_refused_write_has_its_error_word() -> None:
             assert reply.json["reason"]
         for reply in await client.get("plant/**/@set", b"7"):
             assert reply.json["error"] == "unknown-tag"
-        assert await client.get("plant/nobody/recipe/@set", b"7") == []
+        assert await client.get("plant/unknown/recipe/@set", b"7") == []
     assert plant.written == []
 
 
@@ -140,7 +140,7 @@ async def test_a_put_writes_too_and_its_outcome_is_published() -> None:
         await client.delete("plant/mixer/recipe/@set")  # a write of nothing
         assert (await audit.next(lambda _: True)).json["outcome"] == "bad-value"
         audit.forget()
-        await client.put("plant/nobody/recipe/@set", b"7")
+        await client.put("plant/unknown/recipe/@set", b"7")
         for key, sent, word in (
             ("plant/mixer/recipe/@set", b"", "bad-value"),
             ("plant/**/@set", b"7", "unknown-tag"),
