@@ -230,6 +230,11 @@ class Engine:
         if not isinstance(after, Poll | Probe):
             self._in_flight.continuation = self._requests.settled(settle, now)
 
+    @property
+    def is_idle(self) -> bool:
+        """No job is in flight: bytes that arrive now belong to no transaction."""
+        return self._in_flight.job is None
+
     # What comes from outside
 
     def submit(self, request: Request, now: float) -> list[Effect]:

@@ -83,17 +83,17 @@ class Bus:
         self.sent_at, self.heard, self.request = start, b"", b""
         protocol = protocol_of(self.protocol, data)
         number = station_in(protocol, data)
-        self.note("sent", self.line.name, data)
+        self.note("sent", self.config.name, data)
         self.story.counts["frames"] += 1
         self.story.counts[f"frames {protocol}"] += 1
         if start - self._to_all_until < AFTER_ALL:
-            self.broke(f"{self.line.name}: spoke {start - self._to_all_until:.3f} s after all")
+            self.broke(f"{self.config.name}: spoke {start - self._to_all_until:.3f} s after all")
         named = [d for d in self.line.engine.devices if self.number_of(d) == number]
         if number == ALL.get(protocol):
             self._to_all_until = end
-            named = named or [d for d in self.line.engine.devices if d.control]
+            named = named or [d for d in self.line.engine.devices if d.settings.control]
         if not named:
-            self.broke(f"{self.line.name}: spoke to station {number}, which is not served")
+            self.broke(f"{self.config.name}: spoke to station {number}, which is not served")
             return
         self.asked = named[0]
         self.writes[number] += is_write(protocol, data)
@@ -107,7 +107,7 @@ class Bus:
         begin, until = self.speaking
         heard = begin + 0.001 < start < min(until - 0.001, begin + 1.0)
         if heard and self.hurt["<"] < begin - 0.1:
-            self.broke(f"{self.line.name}: spoke into a frame that was coming in")
+            self.broke(f"{self.config.name}: spoke into a frame that was coming in")
 
     def number_of(self, device: Device) -> int:
         """What `station_in` says of what is sent to it."""
@@ -129,14 +129,14 @@ class Bus:
             return
         if device.state in (State.OFFLINE, State.STARTING):
             return  # nobody waits for late answers to a probe: that is the rule
-        self.broke(f"{self.line.name}: spoke while {device.name} did")
+        self.broke(f"{self.config.name}: spoke while {device.name} did")
 
     def damaged(self, way: str) -> None:
         self.hurt_at = self.hurt[way] = self.now()
         self.story.counts["damaged"] += 1
 
     def passed(self, way: str, data: bytes) -> None:
-        self.note(way, self.line.name, data)
+        self.note(way, self.config.name, data)
         if way == "<":
             self.heard += data
             if isinstance(self.wire, SimNet) and len(data) >= 7:

@@ -27,13 +27,13 @@ class Judge:
     story: Story
     began: float
     read_at: dict[Tag, float] = field(default_factory=dict)  # when it was good last
-    alive: dict[str, bool] = field(default_factory=dict)
+    online: dict[str, bool] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._plain = self.gateway.samples
         self.gateway.samples = self.told  # type: ignore[method-assign]  # the lines call it
         self.known = {tag for device in self.gateway.config.devices for tag in device.tags}
-        self.health.online = {device.name for device in self.gateway.spoken_to}
+        self.enabled = {device.name for device in self.gateway.enabled_devices}
 
     def broke(self, what: str) -> None:
         if len(self.story.broken) < MOST_TROUBLES:
@@ -61,10 +61,10 @@ class Judge:
                 self.story.counts["bad samples"] += 1
                 self.story.counts["overdue"] += sample.reason is Reason.OVERDUE
 
-    def shown_alive(self, device: str, alive: bool) -> None:
-        self.alive[device] = alive
-        if device not in self.health.online:
-            self.broke(f"{device} is not served, but shown")
+    def set_online(self, device: str, online: bool) -> None:
+        self.online[device] = online
+        if device not in self.enabled:
+            self.broke(f"{device} is disabled, but reported as online or offline")
 
     def _judge(self, sample: Sample) -> None:
         tag, bus = sample.tag, self.buses[sample.tag.device]
@@ -131,6 +131,6 @@ class Judge:
 
     def readable(self, tag: Tag) -> bool:
         """Whether it can ever be good: asked for, or said."""
-        _, device = self.gateway._places[tag.device]
+        device = next(d for d in self.gateway.enabled_devices if d.name == tag.device)
         asked = device.driver.areas[tag.span.area].readable
         return asked or (isinstance(device.driver, FrameDriver) and tag.span.area == LISTENED)

@@ -10,7 +10,8 @@ from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.driver import AnyDriver
 from gateway.stations.computer_link import ComputerLinkStation
 from gateway.tags import Tag
-from tests.sim.plant import WIRE, Bench, Plant, Unruly, made_device, make_tag
+from tests.sim.bench import WIRE, Bench, Unruly
+from tests.sim.plant import Plant, made_device, make_tag
 
 
 def link_device(

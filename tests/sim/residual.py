@@ -22,9 +22,8 @@ from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from gateway.line.reading import read_block
-
 from gateway.errors import DeviceError, NoReply
+from gateway.line.perform import read_with_care
 from gateway.planning.wire_timing import WireTiming
 from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.driver import Address, AnyDriver, Span
@@ -104,11 +103,12 @@ class Bench:
         self.right = WORDS[:size]
         addresses = [Address(area, start + n) for n in range(size)]
         tags = [make_tag(case.driver.spell(address), case.driver) for address in addresses]
-        self.device = made_device(
-            "plc", case.driver, WireTiming(19200, 10), case.driver.timing, tuple(tags), 0.0
-        )
-        [self.block] = self.device.blocks
-        assert self.block.span == case.span
+        wire, timing = WireTiming(19200, 10), case.driver.timing
+        self.devices = [
+            made_device("plc", case.driver, wire, timing, tags, 0.0, verify_reads=times)
+            for times in (1, 2)
+        ]
+        assert self.devices[0].blocks[0].span == case.span
 
     def ask(self, data: bytes) -> bytes:
         self.now += 10.0  # whatever it heard before is forgotten
@@ -117,10 +117,10 @@ class Bench:
     def read(self, times: int = 1) -> list[int] | None:
         """The words, as the gateway takes them after so many readings (`verify_reads`); None
         where anything was noticed."""
-        self.device.verify_reads = times
+        device = self.devices[times - 1]
         talk = Direct(self.case, self.ask, self.hurt)
         try:
-            return list(finish(read_block(talk, self.device, self.block)))
+            return list(finish(read_with_care(talk, device, device.blocks[0])))
         except DeviceError:
             self.station.hear(b"\x00" * 300, self.now + 10.0)
             return None

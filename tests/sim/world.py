@@ -55,10 +55,10 @@ class World:
         with tempfile.TemporaryDirectory() as folder:
             config = load(drawn.write(Path(folder)))
         self.gateway = gateway = Gateway(config, self._wall, self._opener)
-        gateway.publish, gateway.show_alive = self._published, self._shown_alive
+        gateway.subscribe(self)
         for line, settings in zip(gateway.lines, config.lines, strict=True):
-            self._lines[line.name].line = line
-            self._lines[line.name].config = settings
+            self._lines[line.engine.name].line = line
+            self._lines[line.engine.name].config = settings
         self.devices = {d.name: d for line in gateway.lines for d in line.engine.devices}
         self._buses = {d.name: self._lines[s.name] for s in config.lines for d in s.devices}
         self.judge = Judge(gateway, self._buses, self.stations, story, self._began)
@@ -79,14 +79,14 @@ class World:
     def note(self, *what: object) -> None:
         self._trace.update(repr((self._loop.time(), *what)).encode())
 
-    def _published(self, samples: Sequence[Sample]) -> None:
+    def publish(self, samples: Sequence[Sample]) -> None:
         for sample in samples:
             self.note("sample", sample.tag.key, sample.value, sample.quality.value, sample.time)
         self.judge.published(samples)
 
-    def _shown_alive(self, device: str, alive: bool) -> None:
-        self.note("alive", device, alive)
-        self.judge.shown_alive(device, alive)
+    def set_online(self, device: str, online: bool) -> None:
+        self.note("online", device, online)
+        self.judge.set_online(device, online)
 
     def _broke(self, what: str) -> None:
         self.judge.broke(what)  # built last of all
@@ -174,7 +174,7 @@ class World:
                     tasks.append(asyncio.create_task(person.write_now_and_then()))
                 elif who == "reader":
                     tasks.append(asyncio.create_task(person.ask_now_and_then()))
-                elif device.control and device.driver.protocol == "computer-link":
+                elif device.settings.control and device.driver.protocol == "computer-link":
                     tasks.append(asyncio.create_task(person.command_now_and_then()))
             if isinstance(device.driver, FrameDriver) and device.driver.sends_unsolicited:
                 tasks.append(asyncio.create_task(self._speak(device.name, bus)))
@@ -213,11 +213,13 @@ class World:
 
     def _begun(self, bus: Bus, until: float) -> None:
         """The first of an unasked frame has arrived: was anybody speaking then?"""
-        if bus.line._turn is None and bus.line.engine.is_open:
+        if bus.line.engine.is_open and bus.line.engine.is_idle:
             bus.speaking = self._loop.time(), until
 
     async def live(self) -> None:
-        lines = [asyncio.create_task(line.run(), name=line.name) for line in self.gateway.lines]
+        lines = [
+            asyncio.create_task(line.run(), name=line.engine.name) for line in self.gateway.lines
+        ]
         others = [*self._tasks(), asyncio.create_task(self.expect.look_around())]
         suffering = asyncio.create_task(self.faults.suffer())
         done, _ = await asyncio.wait(
@@ -235,7 +237,7 @@ class World:
         for bus in self._lines.values():
             if bus.wire.opened != bus.wire.closed:
                 self.judge.broke(
-                    f"{bus.line.name}: opened {bus.wire.opened} times, closed {bus.wire.closed}"
+                    f"{bus.config.name}: opened {bus.wire.opened} times, closed {bus.wire.closed}"
                 )
         self.story.trace = self._trace.hexdigest()
 
