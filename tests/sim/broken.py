@@ -39,7 +39,7 @@ MUTANTS = (
     Mutant(
         "bytes from before the request count as its reply",
         "line/transaction.py",
-        "            self._codec = self._device.driver.codec()\n",
+        "            self._codec = self._device.settings.driver.codec()\n",
         "            pass\n",
         "tests/line/test_transaction.py",
     ),
@@ -284,9 +284,9 @@ MUTANTS = (
     ),
     Mutant(
         "writes to a device cost it its polls",
-        "engine/in_flight.py",
-        "            self.charged = job.device if type(job) is Probe else None\n",
-        "            self.charged = job.device\n",
+        "engine/engine.py",
+        "            in_flight.charged = job.device if isinstance(job, Probe) else None\n",
+        "            in_flight.charged = job.device\n",
         "tests/engine/test_staleness.py",
     ),
     Mutant(
