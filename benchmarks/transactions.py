@@ -1,10 +1,10 @@
 """CPU per read of 64 words: `python -m benchmarks.transactions`.
 
-Our whole line (schedule, turn, driver, decoding, mirror) beside pymodbus's asyncio client and a
-libmodbus loop in C, against the same slave (libmodbus, in another process) in one run. Its
-registers stay as they are; for the rows `changing` all of them change between two reads. Vigor has
-no foreign slave, so a simulated station in another process answers. Figures are processor
-time of this process, or of the C loop, per exchange; ratios within the run are what counts.
+Compares our whole line (engine, transaction, driver, decoding, mirror) with pymodbus's asyncio
+client and a libmodbus loop in C, against the same slave (libmodbus, in another process) in one run.
+Its registers keep their values; for the rows `changing` all of them change between two reads. No
+foreign Vigor slave exists, so a simulated station in another process replies. Figures are
+processor time of this process, or of the C loop, per exchange. Compare ratios within one run.
 """
 
 import argparse
@@ -20,6 +20,7 @@ import tempfile
 import time
 from collections.abc import Awaitable, Callable, Coroutine, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -28,7 +29,8 @@ import structlog
 from pymodbus.client import AsyncModbusSerialClient, AsyncModbusTcpClient
 
 from benchmarks.words import words
-from gateway.engine.device import Device
+from gateway.engine.device import Device, DeviceSettings
+from gateway.engine.engine import Engine
 from gateway.line.line import Line
 from gateway.planning.wire_timing import NETWORK_BAUD, WireTiming
 from gateway.protocols.driver import AnyDriver
@@ -62,7 +64,7 @@ asyncio.run(main())
 
 
 class Counting:
-    """Upstairs with a mirror, as the gateway has one; stops the run after so many exchanges."""
+    """Updates a mirror as the gateway does; sets `done` after so many exchanges."""
 
     def __init__(self, tags: Sequence[Tag], exchanges: int) -> None:
         self._mirror = Mirror(tags, 0)
@@ -93,20 +95,21 @@ async def ours(
     where: Callable[[Receiver], Awaitable[Port]],
     count: int,
 ) -> float:
-    """Seconds of processor time per exchange. No silence is kept: it would only add sleep."""
+    """Seconds of processor time per exchange, without silences: they would only add sleep."""
     timing = replace(driver.timing, silence=0.0, silence_chars=0.0)
     wire = WireTiming(NETWORK_BAUD, 10)
     chosen = tags(area, each)
-    device = Device("plc", driver, wire, timing, chosen, 0.5, turnaround=1.0)
+    settings = DeviceSettings(name="plc", driver=driver, timing=timing, turnaround=1.0, tags=chosen)
+    device = Device(settings, wire)
     assert len(device.blocks) == 1, device.blocks
-    upstairs = Counting(chosen, count)
-    line = Line("bench", [device], wire, where, upstairs, time.time_ns)
+    sink = Counting(chosen, count)
+    line = Line(Engine("bench", [device], wire), where, sink)
     begun = time.process_time()
     task = asyncio.create_task(line.run())
-    await upstairs.done.wait()
+    await sink.done.wait()
     task.cancel()
     await asyncio.gather(task, return_exceptions=True)
-    return (upstairs.cpu - begun) / count
+    return (sink.cpu - begun) / count
 
 
 async def pymodbus(
@@ -124,18 +127,18 @@ async def pymodbus(
 
 
 def libmodbus(master: Path, mode: str, where: str, count: int) -> float:
-    """The C loop tells microseconds per read itself: wall clock and processor time."""
-    command = [master, mode, where, "1", str(count)]
+    """The C loop prints microseconds per read: wall clock and processor time."""
+    command = [str(master), mode, where, "1", str(count)]
     told = subprocess.run(command, check=True, capture_output=True, text=True).stdout
     return float(told.split()[1]) / 1e6
 
 
 @contextlib.contextmanager
 def process(*command: str | Path) -> Iterator[str]:
-    """A peer in another process; what it printed first."""
+    """A peer in another process; yields the first line that it prints."""
     child = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    assert child.stdout is not None
     try:
-        assert child.stdout is not None
         yield child.stdout.readline().strip()
     finally:
         child.terminate()
@@ -184,18 +187,18 @@ def run_fast(coroutine: Coroutine[Any, Any, float]) -> float:
 
 
 def tcp_opener(port: int) -> Callable[[Receiver], Awaitable[Port]]:
-    return lambda ear: open_port(TcpAddress("127.0.0.1", port), SerialSettings(), ear)
+    return lambda receiver: open_port(TcpAddress("127.0.0.1", port), SerialSettings(), receiver)
 
 
 def serial_opener(path: str) -> Callable[[Receiver], Awaitable[Port]]:
-    return lambda ear: open_port(SerialPath(path), SerialSettings(115200, "8N1"), ear)
+    return lambda receiver: open_port(SerialPath(path), SerialSettings(115200, "8N1"), receiver)
 
 
 Runs = dict[str, Callable[[int], float]]
 
 
 def repeated(runs: Runs, count: int, rounds: int) -> dict[str, float]:
-    """The least of a few rounds, each of all contestants in turn: other programs only add."""
+    """The least of a few rounds, as other programs only add time. Each round runs all in turn."""
     found: dict[str, list[float]] = {name: [] for name in runs}
     for _ in range(rounds):
         for name, run in runs.items():
@@ -211,9 +214,9 @@ def beside(
     in_c: Callable[[int], float] | None = None,
     changing: Callable[[Receiver], Awaitable[Port]] | None = None,
 ) -> Runs:
-    """Ours, and who else can ask that slave; once more on uvloop where it is installed.
+    """Ours and the other masters of that slave; once more on uvloop where it is installed.
 
-    `changing` opens a port to a slave of which no register is as it was at the last reading.
+    `changing` opens a port to a slave whose registers all change between two reads.
     """
     loops = {"": run}
     if find_spec("uvloop") is not None:
@@ -233,10 +236,18 @@ def beside(
             if changing is not None:
                 runs[f"ours, {tags} changing tags{suffix}"] = read(step, changing)
         if client is not None:
-            runs["pymodbus client" + suffix] = lambda n, on=on: on(pymodbus(client, n))
+            runs["pymodbus client" + suffix] = partial(_of_pymodbus, on, client)
     if in_c is not None:
         runs["libmodbus in C"] = in_c
     return runs
+
+
+def _of_pymodbus(
+    on: Callable[[Coroutine[Any, Any, float]], float],
+    client: Callable[[], AsyncModbusTcpClient | AsyncModbusSerialClient],
+    count: int,
+) -> float:
+    return on(pymodbus(client, count))
 
 
 def modbus_tcp(folder: Path, count: int, rounds: int) -> dict[str, float] | None:
@@ -286,8 +297,10 @@ def vigor(count: int, rounds: int, way: str) -> dict[str, float]:
 
 
 def on_one_core() -> None:
-    """Us and those we ask: what it costs to wake another core, on a virtual machine often more
-    than the read itself, falls on whoever is measured just then."""
+    """Runs this process and its peers on one core.
+
+    To wake another core often costs more than the read itself on a virtual machine.
+    """
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
 

@@ -6,11 +6,10 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import Any
 
-from gateway.protocols.computer_link.refusals import model_name
-
 from gateway.engine.device import Device
 from gateway.errors import BadValue, Busy, GatewayError, LineDown, Offline, Refused
 from gateway.protocols.computer_link import ComputerLink
+from gateway.protocols.computer_link.replies import model_name
 from gateway.protocols.frames.driver import LISTENED
 from gateway.tags import Quality, Tag, WriteResult
 from gateway.values import Kind, Value
