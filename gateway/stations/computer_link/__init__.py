@@ -1,5 +1,13 @@
 """A simulated Liyan EX or Mitsubishi FX PLC on the Computer Link."""
 
-from gateway.stations.computer_link.station import ComputerLinkStation, computer_link_station
+from gateway.protocols.computer_link import ComputerLink
+from gateway.stations.computer_link.station import ComputerLinkStation
 
 __all__ = ["ComputerLinkStation", "computer_link_station"]
+
+
+def computer_link_station(driver: ComputerLink) -> ComputerLinkStation:
+    """Returns the station that the driver can talk to."""
+    return ComputerLinkStation(
+        driver.station, driver.profile, driver.frame_format, driver.sum_check
+    )

@@ -6,7 +6,6 @@ It finds its devices independent of the driver: tables of the Liyan manual 1-5 a
 from collections.abc import Callable, Iterable
 
 from gateway.protocols.checksums import byte_sum
-from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.computer_link.codec import (
     Ack,
     Frame,
@@ -290,13 +289,6 @@ class ComputerLinkStation:
 
     def _encode(self, frame: Frame) -> bytes:
         return LinkCodec(self.frame_format, self.sum_check).encode(frame)
-
-
-def computer_link_station(driver: ComputerLink) -> ComputerLinkStation:
-    """Returns the station that the driver can talk to."""
-    return ComputerLinkStation(
-        driver.station, driver.profile, driver.frame_format, driver.sum_check
-    )
 
 
 def _hex(text: str) -> int:
