@@ -35,6 +35,7 @@ import structlog
 import zenoh
 
 from gateway.config import ZenohConfig, ZenohMode
+from gateway.engine.requests import CommandResult
 from gateway.northbound import Northbound
 from gateway.northbound.session import configure
 from gateway.protocols.driver import Address, Span, Unit
@@ -78,8 +79,17 @@ class Plant:
         tag.encode(value)
         return WriteResult(value, time.time_ns(), took=0.0)
 
-    def told(self, samples: Sequence[Sample]) -> None:
+    def mark_published(self, samples: Sequence[Sample]) -> None:
         self.mirror.mark_published(samples)
+
+    def commands(self) -> Mapping[str, frozenset[str]]:
+        return {}
+
+    def speaker(self, line: str) -> str:
+        raise NotImplementedError
+
+    async def control(self, device: str, command: str, argument: str) -> CommandResult:
+        raise NotImplementedError
 
     def is_fresh(self, tag: Tag, max_age: float) -> bool:
         return False

@@ -94,47 +94,47 @@ class Historian:
         Raises `BadValue` for a bad range or limit, and `Busy`, also in the middle, when the file
         cannot be read now or the next samples were dropped: the answer is then incomplete.
         """
-        wanted = self._range(time_range, limit, now)
-        return islice(self._samples(tag, wanted, limit), limit)
+        period = self._range(time_range, limit, now)
+        return islice(self._samples(tag, period, limit), limit)
 
     def writes(
         self, time_range: str, limit: int | None = None, now: int | None = None
     ) -> Iterator[str]:
         """Yields outcomes of writes as on the `writes` key (JSON), in the order of time. Raises
         like `samples`."""
-        wanted = self._range(time_range, limit, now)
-        return islice(self._writes(wanted), limit)
+        period = self._range(time_range, limit, now)
+        return islice(self._writes(period), limit)
 
     def _range(self, text: str, limit: int | None, now: int | None) -> TimeRange:
         if limit is not None and not 1 <= limit <= HIGHEST_LIMIT:
             raise BadValue("limit is not between 1 and 1000000000")
-        wanted = time_range(text, self._wall() if now is None else now)
+        period = time_range(text, self._wall() if now is None else now)
         if not self._writer.readable:
             raise Busy(f"history cannot be read: {self._writer.trouble}")
-        return wanted
+        return period
 
-    def _writes(self, wanted: TimeRange) -> Iterator[str]:
-        pending = self._outcomes.pending(wanted)
-        stored = self._reader.writes(pending.file, pending.last, wanted)
+    def _writes(self, period: TimeRange) -> Iterator[str]:
+        pending = self._outcomes.pending(period)
+        stored = self._reader.writes(pending.file, pending.last, period)
         try:
             for outcome in merge(stored, pending.outcomes, key=lambda outcome: outcome.time):
                 yield outcome.text
         except (sqlite3.Error, OSError) as error:
             raise Busy(f"history cannot be read: {error}") from error
 
-    def _samples(self, tag: Tag, wanted: TimeRange, limit: int | None) -> Iterator[Sample]:
+    def _samples(self, tag: Tag, period: TimeRange, limit: int | None) -> Iterator[Sample]:
         file, sorted_runs, newest = self._recent.find(tag.key)
-        runs = [run for run in sorted_runs if run.first <= wanted.last and run.last >= wanted.first]
+        runs = [run for run in sorted_runs if run.first <= period.last and run.last >= period.first]
         begun = False
 
         def read(run: SortedRun) -> list[Sample]:
-            samples = self._reader.samples(file, tag, run, wanted, limit)
+            samples = self._reader.samples(file, tag, run, period, limit)
             if samples is None and begun:
-                raise Busy("history has dropped meanwhile what was to come next: ask again")
+                raise Busy("the next samples were dropped meanwhile: ask again")
             return samples or []  # dropped before the first sample: as if queried a moment later
 
         parts = [Part(run.first, partial(read, run)) for run in runs]
-        parts += [_part_of(run, wanted) for run in newest]
+        parts += [_part_of(run, period) for run in newest]
         try:
             for sample in in_order(parts):
                 begun = True
@@ -143,7 +143,7 @@ class Historian:
             raise Busy(f"history cannot be read: {error}") from error
 
 
-def _part_of(run: list[Sample], wanted: TimeRange) -> Part:
-    found = [sample for sample in run if wanted.first <= sample.time <= wanted.last]
+def _part_of(run: list[Sample], period: TimeRange) -> Part:
+    found = [sample for sample in run if period.first <= sample.time <= period.last]
     found.sort(key=lambda sample: sample.time)
-    return Part(found[0].time if found else wanted.first, lambda: found)
+    return Part(found[0].time if found else period.first, lambda: found)

@@ -28,8 +28,8 @@ _TAKEN = (errno.EAGAIN, errno.EWOULDBLOCK, errno.EACCES)  # the last on Windows
 def locked(path: Path) -> int:
     """Takes the lock for a file that may not exist yet. Release it with `os.close`.
 
-    The lock is on a separate file, `<path>.lock`, which is not deleted: a lock on the database
-    itself would end SQLite's own locks when it is closed. The system releases the lock when the
+    The lock is on a separate file, `<path>.lock`, which is not deleted: closing a second
+    descriptor of the database would end SQLite's own locks. The system releases the lock when the
     process ends, however it ends. Raises `OSError`, of type `BlockingIOError` if another process
     has the lock.
     """

@@ -46,10 +46,10 @@ class Outcomes:
                 self.lost += 1
             self._waiting.append(Outcome(time, text))
 
-    def pending(self, wanted: TimeRange) -> Pending:
+    def pending(self, period: TimeRange) -> Pending:
         with self._lock:
             file, last, found = self._file, self._last, [*self._storing, *self._waiting]
-        first, latest = wanted
+        first, latest = period
         in_range = [outcome for outcome in found if first <= outcome.time <= latest]
         return Pending(file, last, sorted(in_range, key=lambda outcome: outcome.time))
 

@@ -66,7 +66,7 @@ class Reader:
         self._generation = 0  # connections of an older one are not used again
 
     def samples(
-        self, file: Identity | None, tag: Tag, run: SortedRun, wanted: TimeRange, limit: int | None
+        self, file: Identity | None, tag: Tag, run: SortedRun, period: TimeRange, limit: int | None
     ) -> list[Sample] | None:
         """Returns the first `limit` samples of a tag in one run. None if the run was dropped."""
         with self._connection(file) as database:
@@ -74,7 +74,7 @@ class Reader:
                 "SELECT time, value, kind, bad FROM sample"
                 " WHERE run = ? AND tag = (SELECT id FROM tag WHERE key = ?)"
                 " AND time BETWEEN ? AND ? ORDER BY time, n LIMIT ?",
-                (run.number, tag.key, *wanted, -1 if limit is None else limit),
+                (run.number, tag.key, *period, -1 if limit is None else limit),
             ).fetchall()
             # A dropped run leaves its number to another one, with another time.
             is_same = database.execute(
@@ -82,22 +82,22 @@ class Reader:
             ).fetchall()
         return [from_row(tag, row) for row in rows] if is_same else None
 
-    def writes(self, file: Identity | None, last: int, wanted: TimeRange) -> Iterator[Outcome]:
+    def writes(self, file: Identity | None, last: int, period: TimeRange) -> Iterator[Outcome]:
         """Yields outcomes of writes in the order of time, up to number `last`."""
-        after = (wanted.first, -1)
+        after = (period.first, -1)
         begun = False
         while True:
             with self._connection(file) as database:
                 rows = database.execute(
                     "SELECT time, id, outcome FROM written WHERE (time, id) > (?, ?)"
                     " AND time <= ? AND id <= ? ORDER BY time, id LIMIT 1000",
-                    (*after, wanted.last, last),
+                    (*after, period.last, last),
                 ).fetchall()
                 is_there = database.execute(
                     "SELECT 1 FROM written WHERE id = ?", after[1:]
                 ).fetchall()
             if begun and not is_there:  # perhaps later ones were dropped too
-                raise Busy("history has dropped meanwhile what was to come next: ask again")
+                raise Busy("the next outcomes were dropped meanwhile: ask again")
             begun = True
             if not rows:
                 return

@@ -52,7 +52,7 @@ class AnswerPool:
     # -- event loop --
 
     def admit(self, query: zenoh.Query) -> bool:
-        """Takes the query in; False if there is no room and the query is refused."""
+        """Admits the query; False if there is no room and the query is refused."""
         self.counters.queries += 1
         if self._closing or not self._open.acquire(blocking=False):
             self.refuse(query)
@@ -60,7 +60,7 @@ class AnswerPool:
         return True
 
     def admit_wide(self, query: zenoh.Query) -> bool:
-        """Takes the room of an admitted wide query, until `release_wide`; False if the query is
+        """Reserves room for an admitted wide query until `release_wide`; False if the query is
         refused."""
         if self._open_wide.acquire(blocking=False):
             return True

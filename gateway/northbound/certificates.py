@@ -1,4 +1,4 @@
-"""Certificates and keys, looked at before Zenoh is: it finds out late, and says less."""
+"""Certificates and keys, checked before Zenoh opens: it reports errors late and briefly."""
 
 import ssl
 from collections.abc import Iterator, Sequence
@@ -11,20 +11,21 @@ from gateway.errors import ConfigError
 
 
 def check_files(tls: TlsConfig) -> None:
-    """Raises `ConfigError` for what is no certificate, or no key, or not the one's key."""
+    """Raises `ConfigError` for a file that is no certificate or no key, and for a key of another
+    certificate."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     for name, file in (("ca", tls.ca), ("certificate", tls.certificate)):
         if file is not None:
-            with _told(f"zenoh.tls.{name} {file}", "holds no certificate in PEM form"):
+            with _as_config_error(f"zenoh.tls.{name} {file}", "holds no certificate in PEM form"):
                 context.load_verify_locations(file)
     if tls.certificate is not None and tls.key is not None:
         wrong = f"is no PEM key without a password, or not that of {tls.certificate}"
-        with _told(f"zenoh.tls.key {tls.key}", wrong):
+        with _as_config_error(f"zenoh.tls.key {tls.key}", wrong):
             context.load_cert_chain(tls.certificate, tls.key, password="")
 
 
-def check_shown(config: zenoh.Config, listen: Sequence[str]) -> None:
-    """Raises `ConfigError` where an endpoint is to show a certificate and has none."""
+def check_listen(config: zenoh.Config, listen: Sequence[str]) -> None:
+    """Raises `ConfigError` for an endpoint that needs a certificate and has none."""
     link = "transport/link/tls/listen_certificate"
     if any(config.get_json(name) != "null" for name in (link, f"{link}_base64")):
         return
@@ -37,7 +38,7 @@ def check_shown(config: zenoh.Config, listen: Sequence[str]) -> None:
 
 
 @contextmanager
-def _told(called: str, wrong: str) -> Iterator[None]:
+def _as_config_error(called: str, wrong: str) -> Iterator[None]:
     try:
         yield
     except ssl.SSLError:

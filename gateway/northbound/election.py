@@ -15,7 +15,7 @@ from typing import NamedTuple
 # Longer than Zenoh takes to link up again after a connection was cut once (0.5 s), and short
 # enough that another gateway is active within 3 s of a crash.
 CLAIM_TIME = 1.5
-# After the network itself was lost or restored, other tokens may take this long to arrive.
+# After the network itself was lost or restored, other tokens may arrive this much later.
 SETTLE_TIME = 10.0
 # A token found by a query counts for this long; it may have been undeclared since.
 QUERY_VALIDITY = 0.8
@@ -48,7 +48,7 @@ class RoleToken(NamedTuple):
 
 
 class _Links:
-    """The links of a gateway, as far as they tell whether it can see the others."""
+    """The links of a gateway. Without them it sees no other gateway."""
 
     def __init__(self, now: float, *, needed: bool) -> None:
         self.changed = now  # the network itself was lost or restored
@@ -120,7 +120,7 @@ class Election:
             self._found[token] = now
 
     def link_changed(self, session: str, up: bool, router: bool, now: float) -> None:
-        """A link has come up or gone down. `router`: other gateways are seen through it."""
+        """A link is up or down. `router`: other gateways are seen through it."""
         self._links.update(session, up, router, now)
 
     def decide(self, now: float) -> State:

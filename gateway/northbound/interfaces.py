@@ -67,7 +67,7 @@ class Plant(Protocol):
 
 
 class History(Protocol):
-    """Recorded samples, found by Zenoh's time ranges; `now`: ns since 1970, when the query came."""
+    """Recorded samples, found by Zenoh's time ranges. `now`: ns since 1970, when the query came."""
 
     def samples(self, tag: Tag, time_range: str, limit: int | None, now: int) -> Iterator[Sample]:
         """The first `limit` samples in the order of time; called from an answering thread.

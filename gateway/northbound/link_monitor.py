@@ -20,7 +20,7 @@ class LinkMonitor:
     def __init__(self) -> None:
         self.returned = asyncio.Event()
         self._up: dict[str, str] = {}  # kind of each linked session, by its id
-        self._lost: dict[str, None] = {}  # ids of sessions that are gone, oldest first
+        self._lost: dict[str, None] = {}  # ids of unlinked sessions, oldest first
         self._log_limit = RateLimit(100, 1.0)  # any client can link as often as it likes
 
     def __len__(self) -> int:

@@ -24,7 +24,7 @@ from gateway.northbound.session import (
     CLOSE_WITHIN,
     configure,
     off_loop,
-    opened,
+    open_session,
 )
 from gateway.northbound.standby import Standby, StandbySettings
 from gateway.northbound.status_publisher import StatusPublisher
@@ -41,12 +41,12 @@ _FLUSH_TIMEOUT = 0.5  # seconds for waiting puts when the gateway ends
 class Northbound:
     """One Zenoh session and its declarations. Every method belongs to the event loop.
 
-    Four events tell the service about its life:
+    Four events report its progress to the service:
 
     * `exclusive`: no other process runs this gateway; files and lines may be opened.
     * `active`: this gateway may open its lines. Set from the beginning without `standby`.
     * `opened`: everything is declared, and all current values are queued.
-    * `replaced`: another gateway of the standby group took over; close the lines, then end this.
+    * `replaced`: another gateway of the standby group is active; close the lines, then end this.
 
     Raises `ConfigError` for a bad prefix, name, endpoint, Zenoh file or writers file, and for a
     secret that every user of this machine could read.
@@ -137,7 +137,7 @@ class Northbound:
         """
         for exposure in secrets.exposures(self._config):
             log.warning("Zenoh session exposed", why=exposure)
-        session = await opened(self._config, retry=self._is_client)
+        session = await open_session(self._config, retry=self._is_client)
         self.exclusive.set()
         try:
             await self._serve(session)

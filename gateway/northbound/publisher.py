@@ -1,7 +1,7 @@
 """The one thread that puts on Zenoh, fed by a map that holds only the last value of each tag.
 
 A put can block for as long as the network is congested, so the event loop never does one. The
-queue is bounded by the number of tags: a newer value replaces one that has not gone out yet.
+queue is bounded by the number of tags: a newer value replaces one that is still waiting.
 Every entry gets its time stamp when it is queued and leaves in that order, because Zenoh's
 AdvancedSubscriber discards a sample with an older stamp than the last one of the same session.
 

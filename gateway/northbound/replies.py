@@ -55,7 +55,7 @@ class Replies:
             if self._ended:
                 return
             if parsed.family is Family.LAST and tag.device in self._only_blocks:
-                continue  # a subscriber asks so before it waits for this key; none will come
+                continue  # a subscriber would wait for this key, which is never put
             if parsed.family is Family.META:
                 self._reply(query, self._keys.meta(tag.key), payload.meta(tag), self._stamp())
             else:

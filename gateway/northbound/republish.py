@@ -16,7 +16,7 @@ from gateway.tags import Quality, Sample, Tag
 
 # After a link returned, its declarations arrive first; only then does a put reach a subscriber.
 _SETTLE_TIME = 0.3
-# The other clients of a restarted router may reconnect later than this gateway: publish once more.
+# Other clients of a restarted router may reconnect later than this gateway: publish again.
 _LATE_CLIENTS = 5.0
 _BATCH_SIZE = 500  # samples in one turn of the loop
 _HEARTBEAT_CHECK = 1.0  # seconds: a heartbeat may be this late

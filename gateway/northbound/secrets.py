@@ -1,6 +1,6 @@
-"""What must stay secret, and who could reach this session: looked at before it is opened.
+"""Checks of secret files and of open endpoints, made before the session opens.
 
-No message here ever shows the content of a file.
+No message here shows the content of a file.
 """
 
 import ipaddress
@@ -22,19 +22,19 @@ _ENCRYPTED_PROTOCOLS = ("tls", "quic", *_LOCAL_PROTOCOLS)
 
 
 def closed_to_others(path: Path, called: str) -> None:
-    """Raises `ConfigError` if everybody on this machine could read or change the file."""
+    """Raises `ConfigError` if every user of this machine can read or change the file."""
     try:
         mode = path.stat().st_mode
     except OSError as error:
         raise ConfigError(f"{called} {path}: {error.strerror}") from None
     if os.name == "posix" and mode & (stat.S_IROTH | stat.S_IWOTH):
         raise ConfigError(
-            f"{called} {path} is open to everybody on this machine: run chmod o-rwx {path}"
+            f"{called} {path} is open to every user of this machine: run chmod o-rwx {path}"
         )
 
 
 def readable_secret(path: Path, called: str) -> str:
-    """The text of a file that is closed to others. Raises `ConfigError`."""
+    """Returns the text of a file that is closed to others. Raises `ConfigError`."""
     closed_to_others(path, called)
     try:
         return path.read_text(encoding="utf-8")
@@ -45,7 +45,8 @@ def readable_secret(path: Path, called: str) -> str:
 
 
 def password(file: Path | None) -> str | None:
-    """From the file (its first line), or else from the environment. Raises `ConfigError`."""
+    """Returns the file's first line, or without a file the environment's password. Raises
+    `ConfigError`."""
     if file is None:
         return os.environ.get(PASSWORD_VARIABLE) or None
     found = readable_secret(file, "zenoh.password_file").partition("\n")[0].strip()
@@ -55,7 +56,8 @@ def password(file: Path | None) -> str | None:
 
 
 def check_users(path: Path) -> None:
-    """Raises `ConfigError` for a file that Zenoh would not take, or take to mean everybody."""
+    """Raises `ConfigError` for a file that Zenoh would refuse, or without any user: Zenoh would
+    then accept every connection."""
     named = False
     for number, line in enumerate(readable_secret(path, "zenoh.users_file").splitlines(), 1):
         name, _, password = line.partition(":")
@@ -66,16 +68,18 @@ def check_users(path: Path) -> None:
                 )
             named = True
     if not named:
-        raise ConfigError(f"zenoh.users_file {path} names nobody, and would let everybody in")
+        raise ConfigError(
+            f"zenoh.users_file {path} names no user, so the gateway would accept every connection"
+        )
 
 
 def holds_secret(zenoh_file: str) -> bool:
-    """Whether the text of a Zenoh file has a password or a private key in itself."""
+    """True if the text of a Zenoh file contains a password or a private key."""
     return _SECRET.search(zenoh_file) is not None
 
 
-def where(error: zenoh.ZError, zenoh_file: str) -> str:
-    """What is wrong with a Zenoh file, without quoting from one that holds a secret."""
+def describe_error(error: zenoh.ZError, zenoh_file: str) -> str:
+    """Returns the error in a Zenoh file, without a quotation if the file may hold a secret."""
     text = str(error)
     if not _MAY_HOLD_SECRET.search(zenoh_file):
         return text
@@ -87,13 +91,13 @@ def where(error: zenoh.ZError, zenoh_file: str) -> str:
 
 
 def exposures(config: zenoh.Config) -> list[str]:
-    """What somebody should know who lets other machines reach this session: sentences."""
+    """Returns warnings about endpoints that other machines can reach, as sentences."""
     endpoints = [str(endpoint) for endpoint in _endpoints(config)]
     reachable = [endpoint for endpoint in endpoints if not _is_local(endpoint)]
     if not reachable:
         return []
-    told, places = [], ", ".join(reachable)
-    asks_who = (
+    warnings, places = [], ", ".join(reachable)
+    authenticates = (
         _setting(config, "transport/auth/usrpwd/dictionary_file") is not None
         or _setting(config, "transport/link/tls/enable_mtls") is True
         or _setting(config, "transport/auth/pubkey/known_keys_file") is not None
@@ -101,15 +105,17 @@ def exposures(config: zenoh.Config) -> list[str]:
     rules = _setting(config, "access_control/enabled") is True and (
         _setting(config, "access_control/default_permission") == "deny"
     )
-    if not asks_who and not rules:
-        told.append(
-            f"other machines can reach {places}, and nothing protects it: whoever does may read "
-            "every value and write every tag that can be written; see docs/security.md"
+    if not authenticates and not rules:
+        warnings.append(
+            f"other machines can reach {places}, and nothing protects it: any client may read "
+            "every value and write every writable tag; see docs/security.md"
         )
-    open_wire = [one for one in reachable if one.partition("/")[0] not in _ENCRYPTED_PROTOCOLS]
-    if asks_who and open_wire:
-        told.append(f"passwords and values travel in the clear on {', '.join(open_wire)}: use tls/")
-    return told
+    unencrypted = [one for one in reachable if one.partition("/")[0] not in _ENCRYPTED_PROTOCOLS]
+    if authenticates and unencrypted:
+        warnings.append(
+            f"passwords and values travel in the clear on {', '.join(unencrypted)}: use tls/"
+        )
+    return warnings
 
 
 def _endpoints(config: zenoh.Config) -> list[object]:

@@ -1,4 +1,4 @@
-"""The one Zenoh session: configured, opened and closed without ever holding the event loop."""
+"""The Zenoh session: configured, and opened and closed without blocking the event loop."""
 
 import asyncio
 import errno
@@ -23,8 +23,8 @@ CLOSE_WITHIN = 2.0  # seconds
 _SHORTEST_RETRY, _LONGEST_RETRY = 0.5, 5.0  # seconds between two attempts of a client
 
 
-# What a gateway needs other than Zenoh's own defaults. A value that the user's file sets wins.
-_GATEWAY: dict[str, object] = {
+# The gateway's defaults, where Zenoh's do not fit. A value in the user's Zenoh file has priority.
+_DEFAULTS: dict[str, object] = {
     "listen/endpoints": [],  # Zenoh's default is every interface
     "connect/retry": {"period_init_ms": 500, "period_max_ms": 4000, "period_increase_factor": 2},
     "open/return_conditions/connect_scouted": False,  # open returns in 1 ms, not in 500
@@ -32,27 +32,27 @@ _GATEWAY: dict[str, object] = {
     "scouting/gossip/autoconnect": [],  # no links around the router and its access control
     "timestamping/enabled": True,
     "transport/shared_memory/enabled": False,
-    "transport/link/tx/lease": 3000,  # ms until a frozen gateway is taken for gone
-    # µs. The default of 1 ms loses a share of every burst without a word.
+    "transport/link/tx/lease": 3000,  # ms until the tokens of a frozen gateway end
+    # µs. The default of 1 ms silently loses a part of every burst.
     "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 50_000,
     # µs that a frozen client may hold an answering thread before its link is closed.
     "transport/link/tx/queue/congestion_control/block/wait_before_close": 1_000_000,
 }
-# A router carries the messages of others; any other gateway is sent writes, which are short.
+# A router forwards the messages of others; any other gateway receives only writes, which are short.
 _LONGEST_MESSAGE = {"transport/link/rx/max_message_size": 256 * 1024}
 
 
 def configure(settings: ZenohConfig) -> zenoh.Config:
-    """The session's configuration. Raises `ConfigError` for a bad file or endpoint."""
+    """Returns the session's configuration. Raises `ConfigError` for a bad file or endpoint."""
     config = zenoh.Config() if settings.config_file is None else _from_file(settings.config_file)
     untouched = zenoh.Config()
-    wanted = _GATEWAY if settings.mode is ZenohMode.ROUTER else _GATEWAY | _LONGEST_MESSAGE
-    for path, setting in wanted.items():
+    defaults = _DEFAULTS if settings.mode is ZenohMode.ROUTER else _DEFAULTS | _LONGEST_MESSAGE
+    for path, setting in defaults.items():
         if config.get_json(path) == untouched.get_json(path):
             config.insert_json5(path, json.dumps(setting))
     config.insert_json5("mode", json.dumps(settings.mode.value))
     if settings.mode is ZenohMode.CLIENT:
-        # It would wait for ever in a thread that nobody can stop: `opened` tries again instead.
+        # Without it, open waits for ever in its thread; `open_session` retries instead.
         config.insert_json5("connect/timeout_ms", "1000")
     for path, value in (_tls(settings.tls) | _users(settings)).items():
         config.insert_json5(path, json.dumps(value))
@@ -61,14 +61,14 @@ def configure(settings: ZenohConfig) -> zenoh.Config:
             _check(side, endpoint)
         if endpoints:
             config.insert_json5(f"{side}/endpoints", json.dumps(endpoints))
-    certificates.check_shown(config, settings.listen)
+    certificates.check_listen(config, settings.listen)
     if settings.mode is ZenohMode.CLIENT and json.loads(config.get_json("connect/endpoints")) == []:
-        raise ConfigError("zenoh mode client: say in `connect` which router it is a client of")
+        raise ConfigError("zenoh mode client: name its router in `connect`")
     return config
 
 
 def as_client(config: zenoh.Config) -> zenoh.Config:
-    """The same as a client that listens to nobody, for another session beside the first."""
+    """Returns the same configuration for a second session: a client without endpoints."""
     copy = zenoh.Config.from_json5(str(config))
     copy.insert_json5("mode", '"client"')
     copy.insert_json5("listen/endpoints", "[]")
@@ -87,14 +87,14 @@ def _from_file(path: Path) -> zenoh.Config:
     except UnicodeDecodeError:
         raise ConfigError(f"{called} {path} is no UTF-8 text") from None
     except zenoh.ZError as error:
-        raise ConfigError(f"{called} {path}: {secrets.where(error, text)}") from None
+        raise ConfigError(f"{called} {path}: {secrets.describe_error(error, text)}") from None
     if secrets.holds_secret(text):
         secrets.closed_to_others(path, f"{called} holds a secret, and")
     return config
 
 
 def _tls(tls: TlsConfig | None) -> dict[str, object]:
-    """Zenoh's settings; our one certificate is shown to those who connect and where we do."""
+    """Returns Zenoh's settings; incoming and outgoing links use the same certificate."""
     if tls is None:
         return {}
     if tls.key is not None:
@@ -136,8 +136,8 @@ def _check(side: str, endpoint: str) -> None:
         raise ConfigError(f"zenoh {side} {error}") from None
 
 
-async def opened(config: zenoh.Config, *, retry: bool) -> zenoh.Session:
-    """The open session. With `retry` (a client) it tries until there is a router.
+async def open_session(config: zenoh.Config, *, retry: bool) -> zenoh.Session:
+    """Opens a session. With `retry` (a client) it tries until a router answers.
 
     Raises `GatewayError` when it cannot be opened, a port in use for instance.
     """
@@ -148,21 +148,21 @@ async def opened(config: zenoh.Config, *, retry: bool) -> zenoh.Session:
             return await asyncio.shield(opening)
         except asyncio.CancelledError:
             with suppress(zenoh.ZError):
-                await off_loop((await opening).close)  # it was opened for nobody
+                await off_loop((await opening).close)  # no caller is left to close it
             raise
         except zenoh.ZError as error:
             if not retry:
                 raise GatewayError(
-                    f"Zenoh cannot be opened: {_plain(error)}{_hint(error)}"
+                    f"Zenoh cannot be opened: {_without_place(error)}{_hint(error)}"
                 ) from None
-            tell = log.warning if pause == _SHORTEST_RETRY else log.debug  # once is enough
-            tell("no Zenoh router yet: it is tried again", error=_plain(error))
+            report = log.warning if pause == _SHORTEST_RETRY else log.debug  # a warning once
+            report("Zenoh router unreachable", error=_without_place(error))
         await asyncio.sleep(pause)
         pause = min(pause * 2, _LONGEST_RETRY)
 
 
-def _plain(error: zenoh.ZError) -> str:
-    """Zenoh's sentence without the place in its source."""
+def _without_place(error: zenoh.ZError) -> str:
+    """Returns Zenoh's message without the place in its source."""
     return str(error).partition(" at /")[0]
 
 
@@ -172,29 +172,29 @@ def _hint(error: zenoh.ZError) -> str:
 
 
 async def off_loop(function: Callable[..., T], *arguments: object) -> T:
-    """Runs a call that blocks on a thread of its own, which holds up neither loop nor exit."""
+    """Runs a blocking call on its own daemon thread, which delays neither the loop nor the exit."""
     loop = asyncio.get_running_loop()
-    done: asyncio.Future[T] = loop.create_future()
+    outcome: asyncio.Future[T] = loop.create_future()
 
     def settle(result: T | None, error: Exception | None) -> None:
-        if done.cancelled():
+        if outcome.cancelled():
             return
         if error is not None:
-            done.set_exception(error)
+            outcome.set_exception(error)
         else:
-            done.set_result(result)  # type: ignore[arg-type]  # T itself may be None
+            outcome.set_result(result)  # type: ignore[arg-type]  # T itself may be None
 
     def run() -> None:
         result: T | None = None
-        error: Exception | None = GatewayError(f"{function.__name__} ended in an unforeseen way")
+        error: Exception | None = GatewayError(f"{function.__name__} failed unexpectedly")
         try:
             result = function(*arguments)
             error = None
-        except (zenoh.ZError, OSError) as foreseen:
-            error = foreseen
+        except (zenoh.ZError, OSError) as expected:
+            error = expected
         finally:
-            with suppress(RuntimeError):  # the loop was closed meanwhile
+            with suppress(RuntimeError):  # the loop is closed
                 loop.call_soon_threadsafe(settle, result, error)
 
     threading.Thread(target=run, name=f"zenoh {function.__name__}", daemon=True).start()
-    return await done
+    return await outcome
