@@ -1,11 +1,11 @@
-"""A process with a history of its own, for tests that kill it or take its disk away.
+"""A process with its own history, for tests that kill it or make its disk fail.
 
-`run PATH`     records a scan of ten samples every 2 ms, until it is killed; before each it prints
-               the scan's number and the monotonic clock in ns
-`full PATH`    records until the file may not grow any more, then is allowed to, and ends
-`readonly PATH` finds a file that it may only read, until its mode is changed
+`run PATH`      records a scan of ten samples every 2 ms until it is killed; before each it prints
+                the scan's number and the monotonic clock in ns
+`full PATH`     records until the file reaches a size limit, then lifts the limit and ends
+`readonly PATH` starts with a read-only file, then makes it writable and ends
 
-The last two print a JSON line at the end: what the status said, and what was recorded.
+The last two print a JSON line at the end: the status and the number of scans.
 """
 
 import json
@@ -49,7 +49,7 @@ def scan(number: int) -> list[Sample]:
 
 
 def until(historian: Historian, **wanted: object) -> dict[str, Any]:
-    """Waits at most 10 s until the status says so."""
+    """Waits at most 10 s until the status has these values."""
     for _ in range(1000):
         document = dict(historian.document())
         if all(document[name] == value for name, value in wanted.items()):
@@ -106,7 +106,7 @@ def readonly(historian: Historian, path: Path) -> None:
 def main() -> None:
     do, path = sys.argv[1], Path(sys.argv[2])
     structlog.configure(logger_factory=structlog.PrintLoggerFactory(sys.stderr))
-    if do == "readonly" and os.getuid() == 0:  # whom no mode keeps from writing
+    if do == "readonly" and os.getuid() == 0:  # root may write in spite of any mode
         os.setuid(NOBODY)
     historian = Historian(path, WEEK, 100_000_000)
     historian.start()

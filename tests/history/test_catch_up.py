@@ -1,4 +1,4 @@
-"""History over Zenoh: asked by `_time`, and caught up by a consumer whose router was away."""
+"""History over Zenoh: queries with `_time`, and a consumer that catches up after an outage."""
 
 import asyncio
 import json
@@ -19,8 +19,9 @@ from gateway.northbound.interfaces import History
 from gateway.northbound.payload import Failure, Problem, WriteOutcome
 from gateway.tags import Reason, Sample, Tag, WriteResult, bad, good
 from tests.e2e.processes import Program
+from tests.history.recorded import record_outcome
 from tests.history_writer import WEEK, until
-from tests.northbound.test_northbound import PlainDevice, PlainPlant, tag
+from tests.northbound.plant import PlainDevice, PlainPlant, tag
 from tests.test_docs import bare, table
 from tests.zenoh_peer import ZenohPeer, free_endpoint
 
@@ -105,27 +106,30 @@ async def test_history_is_answered_by_zenohs_time_ranges(tmp_path: Path) -> None
             assert reply.json["error"] == "bad-query", wrong
 
 
-class Slow:
-    """A history that tells nothing before it may, and keeps what it was asked for."""
+class SlowHistory:
+    """A history that answers only when `go` is set, and notes each range with its `now`."""
 
     def __init__(self) -> None:
-        self.asked: dict[str, list[int]] = {}  # range -> every `now`
+        self.asked: dict[str, list[int]] = {}  # every `now` by range
         self.go = threading.Event()
 
     def samples(self, tag: Tag, time_range: str, limit: int | None, now: int) -> Iterator[Sample]:
-        return self._told(time_range, now, [good(tag, 1, PAST)])
+        return self._answer(time_range, now, [good(tag, 1, PAST)])
 
     def writes(self, time_range: str, limit: int | None, now: int) -> Iterator[str]:
-        return self._told(time_range, now, ["{}"])
+        return self._answer(time_range, now, ["{}"])
 
-    def _told(self, time_range: str, now: int, told: list[T]) -> Iterator[T]:
+    def record_write(self, time: int, outcome: str) -> None:
+        raise NotImplementedError
+
+    def _answer(self, time_range: str, now: int, found: list[T]) -> Iterator[T]:
         self.asked.setdefault(time_range, []).append(now)
         assert self.go.wait(20)
-        return iter(told)
+        return iter(found)
 
 
-async def test_now_is_when_a_question_is_taken_for_all_its_tags() -> None:
-    endpoint, slow = free_endpoint(), Slow()
+async def test_now_is_the_time_at_which_the_query_arrived_for_all_its_tags() -> None:
+    endpoint, slow = free_endpoint(), SlowHistory()
     async with (
         serving(plant(), slow, endpoint, listen=True) as northbound,
         ZenohPeer("client", connect=[endpoint]) as client,
@@ -145,7 +149,7 @@ async def test_now_is_when_a_question_is_taken_for_all_its_tags() -> None:
         assert set(nows) == {nows[0]}
 
 
-async def test_the_questions_that_the_page_shows_are_answered(tmp_path: Path) -> None:
+async def test_the_queries_that_the_page_shows_are_answered(tmp_path: Path) -> None:
     endpoint, now, ever = free_endpoint(), time.time_ns(), 2**63
     minute, noon = 60 * SECOND, PAST - 86400 * SECOND  # 2026-11-20T12:00:00Z
     shown = noon + 123_456_000
@@ -174,7 +178,7 @@ async def test_the_questions_that_the_page_shows_are_answered(tmp_path: Path) ->
     }
 
 
-async def test_what_became_of_writes_and_commands_is_asked_back_by_time(tmp_path: Path) -> None:
+async def test_outcomes_of_writes_and_commands_are_queried_by_time(tmp_path: Path) -> None:
     endpoint = free_endpoint()
     writes = "plant/@gateway/demo/writes"
     done = [
@@ -190,7 +194,7 @@ async def test_what_became_of_writes_and_commands_is_asked_back_by_time(tmp_path
         ZenohPeer("client", connect=[endpoint]) as client,
     ):
         for outcome in done:
-            historian.record_write(outcome)
+            record_outcome(historian, outcome)
         async with asyncio.timeout(10):
             while historian.document()["writes_stored"] != len(done):
                 await asyncio.sleep(0.01)
@@ -198,32 +202,32 @@ async def test_what_became_of_writes_and_commands_is_asked_back_by_time(tmp_path
         async def asked(selector: str) -> list[Any]:
             return [reply.json for reply in await client.get(f"{writes}?_time={selector}")]
 
-        told = await asked("[..]")
-        assert told == [json.loads(payload.write_outcome(outcome)) for outcome in done]
-        assert [line["outcome"] for line in told] == ["written", "obeyed", "unclear"]
-        assert await asked("[..];limit=1") == told[:1]
-        assert await asked("[2026-11-21T12:00:01Z..]") == told[2:]
+        lines = await asked("[..]")
+        assert lines == [json.loads(payload.write_outcome(outcome)) for outcome in done]
+        assert [line["outcome"] for line in lines] == ["written", "obeyed", "unclear"]
+        assert await asked("[..];limit=1") == lines[:1]
+        assert await asked("[2026-11-21T12:00:01Z..]") == lines[2:]
         assert [line["error"] for line in await asked("yesterday")] == ["bad-query"]
 
 
 class Poll:
-    """A plant that goes on whatever the network does: 1, 2, 3 ... every 5 ms, all recorded."""
+    """Records and publishes 1, 2, 3 ... every 5 ms, independently of the network."""
 
     def __init__(self, historian: Historian) -> None:
         self.plant = plant()
-        self.told = 0
+        self.count = 0
         self.northbound: Northbound | None = None
         self._historian = historian
 
     async def run(self) -> None:
         while True:
-            self.told += 1
-            sample = self.plant.now("mixer/speed", self.told)
+            self.count += 1
+            sample = self.plant.now("mixer/speed", self.count)
             self._historian.record([sample])
             if (northbound := self.northbound) is not None:
                 before = northbound.counters()["published"]
                 northbound.publish([sample])
-                # No faster than they go out: on a busy machine a newer one would take its place.
+                # Waits for the put: on a busy machine a newer sample would supersede it.
                 while (
                     self.northbound is northbound and northbound.counters()["published"] <= before
                 ):
@@ -265,7 +269,7 @@ class Consumer:
 
 @asynccontextmanager
 async def consuming(endpoint: str, since: str) -> AsyncIterator[Consumer]:
-    """In the end it is killed."""
+    """Kills the consumer at the end."""
     process = await asyncio.create_subprocess_exec(
         sys.executable,
         str(EXAMPLE),
@@ -302,7 +306,7 @@ def nothing_lost_and_nothing_twice(lines: list[str]) -> None:
     assert not any("late" in words for words in speeds)
 
 
-async def test_ctrl_c_ends_the_consumer_without_a_word(tmp_path: Path) -> None:
+async def test_ctrl_c_ends_the_consumer_without_output(tmp_path: Path) -> None:
     endpoint = free_endpoint()
     command = (sys.executable, EXAMPLE, "--connect", endpoint)
     with Program(*command) as waiting:
@@ -326,17 +330,17 @@ async def test_a_consumer_loses_nothing_when_its_router_is_killed(tmp_path: Path
         async with poll.on_air(endpoint):
             for _ in range(3):
                 async with ZenohPeer(ZenohMode.ROUTER, listen=[endpoint]) as router:
-                    await consumer.knows(poll.told + 50)
+                    await consumer.knows(poll.count + 50)
                     await router.kill()
-                missed = poll.told + 50
-                while poll.told < missed:
+                missed = poll.count + 50
+                while poll.count < missed:
                     await asyncio.sleep(0.01)
             async with ZenohPeer(ZenohMode.ROUTER, listen=[endpoint]):
-                await consumer.knows(poll.told + 50)
+                await consumer.knows(poll.count + 50)
         nothing_lost_and_nothing_twice(consumer.lines)
 
 
-async def test_a_consumer_loses_nothing_when_the_gateway_is_away(tmp_path: Path) -> None:
+async def test_a_consumer_loses_nothing_while_the_gateway_is_down(tmp_path: Path) -> None:
     endpoint = free_endpoint()
     async with (
         ZenohPeer(ZenohMode.ROUTER, listen=[endpoint]),
@@ -344,11 +348,11 @@ async def test_a_consumer_loses_nothing_when_the_gateway_is_away(tmp_path: Path)
     ):
         for _ in range(2):
             async with poll.on_air(endpoint):
-                await consumer.knows(poll.told + 50)
+                await consumer.knows(poll.count + 50)
         nothing_lost_and_nothing_twice(consumer.lines)
 
 
-async def test_a_consumer_that_is_killed_goes_on_from_the_last_it_knew(tmp_path: Path) -> None:
+async def test_a_killed_consumer_continues_from_its_last_sample(tmp_path: Path) -> None:
     endpoint = free_endpoint()
     known: list[str] = []
     async with (
@@ -359,8 +363,8 @@ async def test_a_consumer_that_is_killed_goes_on_from_the_last_it_knew(tmp_path:
         for _ in range(4):
             since = known[-1].split()[0] if known else MIDNIGHT
             async with consuming(endpoint, since) as consumer:
-                await consumer.knows(poll.told + 50)
-            # Killed while it listened; what was asked for again is what it knew already.
+                await consumer.knows(poll.count + 50)
+            # The second query of a consumer returns its last sample again.
             whole = [line for line in consumer.lines if line.split()[0] > since or not known]
             known += [line for line in whole if "plant/mixer/speed" in line]
         assert poll.northbound is not None

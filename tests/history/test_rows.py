@@ -1,0 +1,38 @@
+"""Values and reasons in the columns of the file."""
+
+import sqlite3
+from contextlib import closing
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gateway.history.rows import from_row, to_row
+from gateway.history.timerange import EARLIEST, LATEST
+from gateway.tags import Quality, Reason, Sample, good
+from gateway.values import Value
+from tests.history.recorded import NOON, SPEED
+
+any_value = st.one_of(
+    st.booleans(),
+    st.integers(-(2**70), 2**70),
+    st.sampled_from([2**63 - 1, 2**63, 2**64 - 1, -(2**63)]),
+    st.floats(),
+    st.text(st.characters(exclude_categories=())),
+)
+
+
+@given(any_value, st.integers(EARLIEST, LATEST))
+def test_a_value_comes_back_from_sqlite_unchanged(value: Value, time: int) -> None:
+    with closing(sqlite3.connect(":memory:")) as database:
+        row = database.execute("SELECT ?, ?, ?, ?", to_row(good(SPEED, value, time))).fetchone()
+    sample = from_row(SPEED, row)
+    assert type(sample.value) is type(value)
+    assert repr(sample.value) == repr(value)
+    assert sample._replace(value=None) == Sample(SPEED, None, Quality.GOOD, time)
+
+
+@pytest.mark.parametrize("reason", [*Reason, None])
+def test_bad_samples_keep_their_reason(reason: Reason | None) -> None:
+    sample = Sample(SPEED, None, Quality.BAD, NOON, reason)
+    assert from_row(SPEED, to_row(sample)) == sample
