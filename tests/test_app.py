@@ -288,7 +288,7 @@ def test_what_moved_within_its_deadband_and_is_published_again_is_news_to_all(
         gateway.samples([good(level, value, time.time_ns())])
     assert [sample.value for sample in told] == [100]
     for _ in range(2):
-        gateway.told([gateway.sample(level)])
+        gateway.mark_published([gateway.sample(level)])
     assert [sample.value for sample in told] == [100, 104]
     gateway.samples([good(level, 96, time.time_ns())])
     assert [sample.value for sample in told] == [100, 104, 96]

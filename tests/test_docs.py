@@ -94,7 +94,7 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     path.write_text(text, encoding="utf-8")
     with started(path) as program:
         for _ in range(3):
-            program.says("device answers")
+            program.says("device online")
         until(lambda: plc_gateway("read", path).code == 0, "every value is good")
         yield path
 

@@ -1,25 +1,25 @@
-"""A Zenoh router, peer or client in another process, driven from a test.
+"""A Zenoh router, peer or client in another process, controlled by a test.
 
 In a test:
 
     async with ZenohPeer(Mode.ROUTER, listen=[endpoint]) as router: ...
     async with ZenohPeer("client", connect=[endpoint]) as client:
-        heard = await client.subscribe("plant/**")             # a Subscription: its samples
-        await heard.next(lambda s: s.key == "plant/mixer/speed" and s.json["value"] == 12)
+        values = await client.subscribe("plant/**")            # a Subscription: its samples
+        await values.next(lambda s: s.key == "plant/mixer/speed" and s.json["value"] == 12)
         replies = await client.get("plant/mixer/*")            # list of Reply
         [reply] = await client.get("plant/mixer/recipe/@set", b"7")
         replies = await client.many([("plant/mixer/recipe/@set", b"7")] * 1000)   # all at once
         await client.put("plant/mixer/recipe/@set", b"7")
         await client.delete("plant/mixer/recipe/@set")
-        alive = await client.liveliness("plant/**")            # a Subscription: PUT and DELETE
+        tokens = await client.liveliness("plant/**")           # a Subscription: PUT and DELETE
         await client.until_alive("plant/*", ["plant/mixer"])   # these and no others
-        await client.kill()                                    # SIGKILL; .pid is there for the rest
+        await client.kill()                                    # SIGKILL; other signals by `.pid`
 
 `subscribe(key, advanced=True)` is Zenoh's AdvancedSubscriber with history.
 
-The script speaks JSON lines: `{"n": 1, "do": "get", …}` in, `{"n": 1, "result": …}` or
-`{"n": 1, "error": "…"}` out, and `{"heard": <subscription>, …}` for every sample. Payloads travel
-as base64. It ends when its standard input does.
+The script exchanges JSON lines: `{"n": 1, "do": "get", …}` in, `{"n": 1, "result": …}` or
+`{"n": 1, "error": "…"}` out, and `{"received": <subscription>, …}` for every sample. Payloads are
+base64. It ends with its standard input.
 """
 
 import asyncio
@@ -37,13 +37,13 @@ import zenoh
 from zenoh import ext
 
 TIMEOUT = 10.0  # seconds a test waits for anything
-# A question that every gateway answers. Zenoh declares without waiting, but what was declared
-# before goes the same way first.
+# A query that every gateway answers. Zenoh does not wait for a declaration to arrive, but earlier
+# declarations go the same way before the query.
 BARRIER = "*/@gateway/*/status"
 
 
 def free_endpoint() -> str:
-    """A loopback endpoint nobody listens on now."""
+    """Returns a loopback endpoint with a free port."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
@@ -52,7 +52,7 @@ def free_endpoint() -> str:
 # -- the test's side ---------------------------------------------------------------------------
 
 
-class Heard(NamedTuple):
+class Received(NamedTuple):
     """One sample; `time` is Zenoh's time stamp in ns, `kind` is PUT or DELETE."""
 
     key: str
@@ -85,31 +85,31 @@ class Subscription:
     """The samples of one subscription in the order of arrival; `samples` holds all of them."""
 
     def __init__(self) -> None:
-        self.samples: list[Heard] = []
+        self.samples: list[Received] = []
         self._arrived = asyncio.Event()
 
-    def feed(self, sample: Heard) -> None:
+    def feed(self, sample: Received) -> None:
         self.samples.append(sample)
         self._arrived.set()
 
-    def latest(self) -> dict[str, Heard]:
+    def latest(self) -> dict[str, Received]:
         """By key."""
         return {sample.key: sample for sample in self.samples}
 
-    async def next(self, wanted: Callable[[Heard], bool], timeout: float = TIMEOUT) -> Heard:
-        """The first sample that fits among those not yet passed over by `forget`."""
+    async def next(self, fits: Callable[[Received], bool], timeout: float = TIMEOUT) -> Received:
+        """Returns the first sample that fits, of those since `forget`; waits for it."""
         seen = 0
         async with asyncio.timeout(timeout):
             while True:
                 for sample in self.samples[seen:]:
-                    if wanted(sample):
+                    if fits(sample):
                         return sample
                 seen = len(self.samples)
                 self._arrived.clear()
                 await self._arrived.wait()
 
     async def until(self, done: Callable[["Subscription"], bool], timeout: float = TIMEOUT) -> None:
-        """Waits until `done(self)`, looked at after every arrival."""
+        """Waits until `done(self)`, checked after every arrival."""
         async with asyncio.timeout(timeout):
             while not done(self):
                 self._arrived.clear()
@@ -129,33 +129,36 @@ class ZenohPeer:
         connect: Sequence[str] = (),
         config: dict[str, Any] | None = None,
     ) -> None:
-        self._setup = {
-            "mode": str(mode),
-            "listen": list(listen),
-            "connect": list(connect),
-            "config": config or {},
-        }
+        self.config = config or {}
         self.connect = list(connect)
+        self._mode = str(mode)
+        self._listen = list(listen)
         self._process: asyncio.subprocess.Process | None = None
         self._reader: asyncio.Task[None] | None = None
-        self._asked: dict[int, asyncio.Future[Any]] = {}
+        self._pending: dict[int, asyncio.Future[Any]] = {}
         self._subscriptions: dict[int, Subscription] = {}
         self._count = 0
 
     async def __aenter__(self) -> Self:
+        setup = {
+            "mode": self._mode,
+            "listen": self._listen,
+            "connect": self.connect,
+            "config": self.config,
+        }
         self._process = await asyncio.create_subprocess_exec(
             sys.executable,
             str(Path(__file__)),
-            json.dumps(self._setup),
+            json.dumps(setup),
             stdin=asyncio.subprocess.PIPE,
             stdout=asyncio.subprocess.PIPE,
             limit=64 * 1024 * 1024,
         )
         self._reader = asyncio.create_task(self._read())
         try:
-            await self._ask("hello")
+            await self._request("hello")
         except BaseException:
-            await self.kill()  # nobody would: there is no `__aexit__` after this
+            await self.kill()  # `__aexit__` is not called after an exception here
             raise
         return self
 
@@ -179,27 +182,28 @@ class ZenohPeer:
 
     async def kill(self) -> None:
         assert self._process is not None
-        with suppress(ProcessLookupError):  # it has ended by itself
+        with suppress(ProcessLookupError):  # it has ended already
             self._process.kill()
         await self._process.wait()
 
     async def subscribe(self, key: str, *, advanced: bool = False) -> Subscription:
-        """Returns when every gateway that can be reached knows of it."""
+        """Returns when every reachable gateway knows the subscription."""
         subscription = await self._subscribe("subscribe", key=key, advanced=advanced)
         await self.get(BARRIER)
         return subscription
 
     async def liveliness(self, key: str) -> Subscription:
-        """Tokens that come (PUT) and go (DELETE), those already there included."""
+        """Observes tokens: declared (PUT, also before) and undeclared (DELETE)."""
         return await self._subscribe("liveliness", key=key)
 
     async def tokens(self, key: str) -> list[str]:
-        """Zenoh 1.10.2 answers nothing now and then just after a token came: see `until_alive`."""
-        result: list[str] = await self._ask("tokens", key=key)
+        """Returns the tokens. Zenoh 1.10.2 sometimes answers nothing just after a token was
+        declared: see `until_alive`."""
+        result: list[str] = await self._request("tokens", key=key)
         return result
 
     async def until_alive(self, key: str, tokens: list[str], timeout: float = TIMEOUT) -> None:
-        """Waits until these tokens, and no others, are alive under `key`."""
+        """Waits until exactly these tokens are declared under `key`."""
         async with asyncio.timeout(timeout):
             while await self.tokens(key) != tokens:
                 pass
@@ -210,54 +214,54 @@ class ZenohPeer:
         payload: bytes | None = None,
         timeout: float = TIMEOUT,
         attachment: bytes | None = None,
-        **how: str,
+        **options: str,
     ) -> list[Reply]:
-        """`how`: `target="ALL"`, `consolidation="NONE"`."""
+        """Sends one query. `options`: `target="ALL"`, `consolidation="NONE"`."""
         if attachment is not None:
-            how["attachment"] = base64.b64encode(attachment).decode()
-        [replies] = await self.many([(selector, payload)], timeout, **how)
+            options["attachment"] = base64.b64encode(attachment).decode()
+        [replies] = await self.many([(selector, payload)], timeout, **options)
         return replies
 
-    async def get_until(self, selector: str, wanted: Callable[[Any], bool]) -> Any:
-        """The one document there, once it is as wanted: a status may be a fifth of a second old."""
+    async def get_until(self, selector: str, fits: Callable[[Any], bool]) -> Any:
+        """Waits until the one document fits: a status may be a fifth of a second old."""
         async with asyncio.timeout(TIMEOUT):
             while True:
                 [reply] = await self.get(selector)
-                if wanted(reply.json):
+                if fits(reply.json):
                     return reply.json
 
     async def many(
         self,
         queries: Sequence[tuple[str, bytes | None]],
         timeout: float = TIMEOUT,
-        **how: str,
+        **options: str,
     ) -> list[list[Reply]]:
-        """All at once; the replies of each in the order of the queries."""
-        asked = [(selector, _text(payload)) for selector, payload in queries]
-        result = await self._ask("get", queries=asked, timeout=timeout, how=how)
+        """Sends all queries at once. Returns the replies of each, in the order of the queries."""
+        encoded = [(selector, _text(payload)) for selector, payload in queries]
+        result = await self._request("get", queries=encoded, timeout=timeout, options=options)
         return [
             [Reply(ok, key, base64.b64decode(data), *rest) for ok, key, data, *rest in replies]
             for replies in result
         ]
 
     async def put(self, key: str, payload: bytes, attachment: bytes | None = None) -> None:
-        await self._ask("put", key=key, payload=_text(payload), attachment=_text(attachment))
+        await self._request("put", key=key, payload=_text(payload), attachment=_text(attachment))
 
     async def delete(self, key: str) -> None:
-        await self._ask("delete", key=key)
+        await self._request("delete", key=key)
 
     async def _subscribe(self, do: str, **arguments: Any) -> Subscription:
         subscription = Subscription()
         self._subscriptions[self._count + 1] = subscription
-        await self._ask(do, **arguments)
+        await self._request(do, **arguments)
         return subscription
 
-    async def _ask(self, do: str, **arguments: Any) -> Any:
+    async def _request(self, do: str, **arguments: Any) -> Any:
         assert self._process is not None
         assert self._process.stdin is not None
         self._count += 1
         n = self._count
-        self._asked[n] = answer = asyncio.get_running_loop().create_future()
+        self._pending[n] = answer = asyncio.get_running_loop().create_future()
         line = json.dumps({"n": n, "do": do, **arguments})
         self._process.stdin.write(line.encode() + b"\n")
         await self._process.stdin.drain()
@@ -269,18 +273,23 @@ class ZenohPeer:
         assert self._process.stdout is not None
         async for line in self._process.stdout:
             message = json.loads(line)
-            if "heard" in message:
-                key, kind, data, encoding, time, beside = message["sample"]
-                self._subscriptions[message["heard"]].feed(
-                    Heard(
-                        key, kind, base64.b64decode(data), encoding, time, base64.b64decode(beside)
+            if "received" in message:
+                key, kind, data, encoding, time, token = message["sample"]
+                self._subscriptions[message["received"]].feed(
+                    Received(
+                        key,
+                        kind,
+                        base64.b64decode(data),
+                        encoding,
+                        time,
+                        base64.b64decode(token),
                     )
                 )
             elif "error" in message:
-                self._asked.pop(message["n"]).set_exception(RuntimeError(message["error"]))
+                self._pending.pop(message["n"]).set_exception(RuntimeError(message["error"]))
             else:
-                self._asked.pop(message["n"]).set_result(message["result"])
-        for answer in self._asked.values():
+                self._pending.pop(message["n"]).set_result(message["result"])
+        for answer in self._pending.values():
             if not answer.done():
                 answer.set_exception(ConnectionError("the Zenoh peer has ended"))
 
@@ -294,15 +303,15 @@ def _text(payload: bytes | None) -> str | None:
 _stdout = threading.Lock()
 
 
-def _say(message: dict[str, Any]) -> None:
+def _send(message: dict[str, Any]) -> None:
     line = json.dumps(message) + "\n"
     with _stdout:
         sys.stdout.write(line)
         sys.stdout.flush()
 
 
-def _hear(n: int) -> Callable[[zenoh.Sample], None]:
-    return lambda sample: _say({"heard": n, "sample": _flat(sample)})
+def _forward(n: int) -> Callable[[zenoh.Sample], None]:
+    return lambda sample: _send({"received": n, "sample": _flat(sample)})
 
 
 def _flat(sample: zenoh.Sample) -> list[Any]:
@@ -325,7 +334,7 @@ def _reply(answer: zenoh.Reply) -> list[Any]:
     return [False, None, _text(bytes(answer.err.payload)), str(answer.err.encoding), None]
 
 
-def _octets(text: str | None) -> bytes | None:
+def _bytes_of(text: str | None) -> bytes | None:
     return None if text is None else base64.b64decode(text)
 
 
@@ -333,50 +342,50 @@ def _get(
     session: zenoh.Session,
     queries: list[tuple[str, str | None]],
     timeout: float,
-    how: dict[str, str],
+    extra: dict[str, str],
 ) -> list[list[Any]]:
     options: dict[str, Any] = {"timeout": timeout}
-    if "target" in how:
-        options["target"] = getattr(zenoh.QueryTarget, how["target"])
-    if "consolidation" in how:
-        options["consolidation"] = getattr(zenoh.ConsolidationMode, how["consolidation"])
-    if "attachment" in how:
-        options["attachment"] = _octets(how["attachment"])
+    if "target" in extra:
+        options["target"] = getattr(zenoh.QueryTarget, extra["target"])
+    if "consolidation" in extra:
+        options["consolidation"] = getattr(zenoh.ConsolidationMode, extra["consolidation"])
+    if "attachment" in extra:
+        options["attachment"] = _bytes_of(extra["attachment"])
     found: list[list[zenoh.Reply]] = [[] for _ in queries]
     ends = [threading.Event() for _ in queries]
     for (selector, payload), replies, end in zip(queries, found, ends, strict=True):
         handler = zenoh.handlers.Callback(replies.append, end.set, indirect=False)
-        session.get(selector, handler, payload=_octets(payload), **options)
+        session.get(selector, handler, payload=_bytes_of(payload), **options)
     for end in ends:
         end.wait()
     return [[_reply(answer) for answer in replies] for replies in found]
 
 
-def _obey(session: zenoh.Session, kept: list[object], ask: dict[str, Any]) -> Any:
-    match ask:
+def _execute(session: zenoh.Session, kept: list[object], request: dict[str, Any]) -> Any:
+    match request:
         case {"do": "hello"}:
             return str(session.zid())
         case {"do": "subscribe", "n": n, "key": key, "advanced": False}:
-            kept.append(session.declare_subscriber(key, _hear(n)))
+            kept.append(session.declare_subscriber(key, _forward(n)))
         case {"do": "subscribe", "n": n, "key": key}:
             history = ext.HistoryConfig(max_samples=1)
-            kept.append(ext.declare_advanced_subscriber(session, key, _hear(n), history=history))
+            kept.append(ext.declare_advanced_subscriber(session, key, _forward(n), history=history))
         case {"do": "liveliness", "n": n, "key": key}:
             live = session.liveliness()
-            kept.append(live.declare_subscriber(key, _hear(n), history=True))
+            kept.append(live.declare_subscriber(key, _forward(n), history=True))
         case {"do": "tokens", "key": key}:
             found = session.liveliness().get(key, timeout=2)
             return sorted(str(answer.ok.key_expr) for answer in found if answer.ok)
-        case {"do": "get", "queries": queries, "timeout": timeout, "how": how}:
-            return _get(session, queries, timeout, how)
+        case {"do": "get", "queries": queries, "timeout": timeout, "options": options}:
+            return _get(session, queries, timeout, options)
         case {"do": "put", "key": key, "payload": payload, "attachment": attachment}:
             block = zenoh.CongestionControl.BLOCK
-            data, beside = _octets(payload) or b"", _octets(attachment)
-            session.put(key, data, congestion_control=block, attachment=beside)
+            data, token = _bytes_of(payload) or b"", _bytes_of(attachment)
+            session.put(key, data, congestion_control=block, attachment=token)
         case {"do": "delete", "key": key}:
             session.delete(key)
         case _:
-            raise ValueError(f"no such command: {ask}")
+            raise ValueError(f"no such command: {request}")
     return None
 
 
@@ -408,11 +417,11 @@ def main() -> None:
     kept: list[object] = []
     with zenoh.open(_configured(json.loads(sys.argv[1]))) as session:
         for line in sys.stdin:
-            ask = json.loads(line)
+            request = json.loads(line)
             try:
-                _say({"n": ask["n"], "result": _obey(session, kept, ask)})
+                _send({"n": request["n"], "result": _execute(session, kept, request)})
             except (zenoh.ZError, ValueError) as error:
-                _say({"n": ask["n"], "error": str(error)})
+                _send({"n": request["n"], "error": str(error)})
 
 
 if __name__ == "__main__":

@@ -56,7 +56,7 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     lines = {"hall": vigor_line("simulator", TAGS)}
     path = write_config(folder / "config.yaml", free_endpoint(), lines)
     with started(path) as program:
-        program.says("device answers")
+        program.says("device online")
         while plc_gateway("read", path).code:
             pass  # until the first values arrive
         yield path

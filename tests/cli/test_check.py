@@ -59,7 +59,7 @@ def test_check_prints_brackets_unchanged(command: Command, tmp_path: Path) -> No
 
 
 MISTAKES: dict[str, tuple[dict[str, Any], str]] = {
-    "client of nobody": ({"mode": "client", "listen": []}, "say in `connect` which router"),
+    "client of nobody": ({"mode": "client", "listen": []}, "name its router in `connect`"),
     "no port": (
         {"listen": ["tcp/foo"]},
         "1: zenoh.listen[0]: 'tcp/foo': write it as tcp/host:port",
@@ -72,7 +72,7 @@ MISTAKES: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "no JSON5": ({"config_file": "text"}, "zenoh config_file"),
     "misspelt": ({"config_file": "misspelt"}, "unknown field `acces_control`"),
-    "open to all": ({"users_file": "open"}, "open is open to everybody on this machine"),
+    "open to all": ({"users_file": "open"}, "open is open to every user of this machine"),
     "no users": ({"users_file": "text"}, "text, line 1: write it as name:password"),
     "writers": ({}, "writers.file"),
 }

@@ -68,7 +68,7 @@ def test_watch_shows_bad_values_while_the_gateway_is_down(tmp_path: Path) -> Non
     lines = {"hall": vigor_line("simulator", {"speed": {"address": "D10"}})}
     path = write_config(tmp_path / "config.yaml", free_endpoint(), lines)
     with started(path) as first:
-        first.says("device answers")
+        first.says("device online")
         with gateway("watch", path, "--json") as watch:
             watch.says('"quality": "good"')
             first.end(signal.SIGKILL)
@@ -83,7 +83,7 @@ def test_watch_shows_changes_of_a_device_that_publishes_only_blocks(tmp_path: Pa
     lines = {"hall": vigor_line("simulator", {"speed": {"address": "D10"}}, blocks="only")}
     path = write_config(tmp_path / "config.yaml", free_endpoint(), lines)
     with started(path) as program:
-        program.says("device answers")
+        program.says("device online")
         with gateway("watch", path, "--json") as watch:
             wait_for_another_value(watch, json.loads(watch.says('"quality": "good"'))["value"])
 

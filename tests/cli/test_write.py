@@ -82,7 +82,7 @@ def test_a_gateway_that_hangs_does_not_get_the_write(
     lines = {"hall": vigor_line("simulator", TAGS)}
     path = write_config(tmp_path / "config.yaml", free_endpoint(), lines)
     with started(path) as program:
-        program.says("device answers")
+        program.says("device online")
         assert plc_gateway("write", path, "mixer/trim", "1").code == 0
         with connected(load(path), print) as client:
             os.kill(program.pid, signal.SIGSTOP)

@@ -1,26 +1,18 @@
 """Commands to PLCs over Zenoh and by hand: obeyed where the file allows it, else refused unsent."""
 
 import asyncio
-import json
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import pytest
-from structlog.testing import capture_logs
 
 from gateway.app import Gateway
 from gateway.config import load
 from gateway.config.commands import NotControlled, check_command, speaker
-from gateway.engine.requests import CommandResult
 from gateway.errors import BadValue, ConfigError, LineDown
-from gateway.northbound import payload
-from gateway.northbound.audit import Audit
-from gateway.northbound.commands import Commands
-from gateway.northbound.keys import Family, Keys, asked
-from gateway.northbound.payload import Failure, Problem, WriteOutcome
-from gateway.northbound.writers import Sender
+from gateway.northbound.keys import Keys
 from tests.e2e.processes import plc_gateway, started, write_config
 from tests.zenoh_peer import ZenohPeer, free_endpoint
 
@@ -93,125 +85,13 @@ def test_area_c_on_an_echoing_line_is_an_error(tmp_path: Path) -> None:
     load(path)
 
 
-# Keys
-
-
-@pytest.mark.parametrize(
-    ("key", "family"),
-    [
-        (KEYS.command("oven", "run"), Family.COMMAND),
-        (KEYS.command("oven", "stop"), Family.COMMAND),
-        (KEYS.command("oven", "loopback"), Family.COMMAND),
-        (KEYS.command("oven", "model"), Family.COMMAND),
-        (KEYS.to_all("hall"), Family.COMMAND),
-        ("plant/@gateway/demo/lines/hall", Family.STATUS),
-        ("plant/@gateway/demo/lines/global", Family.STATUS),
-        ("plant/@gateway/demo/**", Family.STATUS),
-        ("plant/@gateway", Family.STATUS),
-        ("plant/oven/run", Family.VALUE),
-    ],
-)
-def test_keys_of_commands(key: str, family: Family) -> None:
-    assert asked(key).family is family
-
-
-# Carried out, refused, told
-
-
-class Below:
-    """A plant that obeys, or fails as it is told."""
-
-    def __init__(self, outcome: CommandResult | Exception) -> None:
-        self.outcome = outcome
-        self.told: list[tuple[str, str, str]] = []
-
-    def commands(self) -> dict[str, frozenset[str]]:
-        return {"oven": frozenset({"run", "stop"})}
-
-    def speaker(self, line: str) -> str:
-        if line != "hall":
-            raise BadValue(f"there is no line {line}")
-        return "oven"
-
-    async def control(self, device: str, command: str, argument: str) -> CommandResult:
-        self.told.append((device, command, argument))
-        if isinstance(self.outcome, Exception):
-            raise self.outcome
-        return self.outcome
-
-
-def obey(below: Below, key: str, data: bytes | None = None) -> tuple[Any, list[Any]]:
-    """The result, and what the log, the `writes` key and history were told."""
-    published: list[bytes] = []
-    recorded: list[WriteOutcome] = []
-    with capture_logs() as logs:
-        audit = Audit(published.append, recorded.append)
-        controls = Commands(KEYS, below, lambda: None, audit)  # type: ignore[arg-type,return-value]
-        result = asyncio.run(controls.obey(key, data, Sender("client")))
-    assert [payload.write_outcome(outcome) for outcome in recorded] == published
-    return result, logs + [json.loads(line) for line in published]
-
-
-def test_a_command_is_handed_down_and_told_as_a_write_is() -> None:
-    below = Below(CommandResult("acknowledged", 1, 0.1))
-    result, [line, told] = obey(below, "plant/oven/@stop")
-    assert result == below.outcome
-    assert (told["key"], told["value"], told["by"]) == ("plant/oven/@stop", None, "client")
-    assert (told["outcome"], told["answer"]) == ("obeyed", "acknowledged")
-    assert {"time", "took"} <= told.keys()
-    assert below.told == [("oven", "stop", "")]
-    assert line["event"] == "command executed"
-    assert (line["key"], line["by"], line["log_level"]) == ("plant/oven/@stop", "client", "info")
-    _, [_, told] = obey(below, "plant/@gateway/demo/lines/hall/global", b"on")
-    assert told["value"] == "on"
-    assert below.told[-1] == ("oven", "global", "on")
-
-
-@pytest.mark.parametrize(
-    ("key", "data", "problem"),
-    [
-        ("plant/*/@stop", None, Problem.BAD_VALUE),
-        ("plant/@gateway/demo/lines/*/global", b"on", Problem.BAD_VALUE),
-        ("plant/@gateway/demo/lines/attic/global", b"on", Problem.BAD_VALUE),
-        ("plant/oven/@loopback", b"\xff", Problem.BAD_VALUE),
-        ("plant/oven/@loopback", b"A" * 2000, Problem.BAD_VALUE),
-    ],
-)
-def test_what_is_no_command_is_refused_and_told(
-    key: str, data: bytes | None, problem: Problem
-) -> None:
-    below = Below(CommandResult("acknowledged", 1, 0.1))
-    result, [line, told] = obey(below, key, data)
-    assert isinstance(result, Failure)
-    assert result.problem is problem
-    assert below.told == []
-    assert (line["event"], line["log_level"]) == ("command not obeyed", "warning")
-    assert (told["key"], told["outcome"]) == (key, problem.value)
-
-
-@pytest.mark.parametrize(
-    ("error", "problem"),
-    [
-        (NotControlled("no"), Problem.NOT_WRITABLE),
-        (LineDown("unplugged"), Problem.LINE_DOWN),
-        (TimeoutError(), Problem.UNCLEAR),
-    ],
-)
-def test_every_ending_has_its_word(error: Exception, problem: Problem) -> None:
-    result, [line, told] = obey(Below(error), "plant/oven/@stop")
-    assert isinstance(result, Failure)
-    assert result.problem is problem
-    assert line["error"] == told["outcome"] == problem.value
-    assert ("perhaps" in line["event"]) == (problem is Problem.UNCLEAR)
-
-
 async def test_the_gateway_hands_commands_to_the_line(tmp_path: Path) -> None:
     gateway = Gateway(load(written(tmp_path)))
     with pytest.raises(LineDown):
         await gateway.control("oven", "model")
     tasks = [asyncio.create_task(line.run()) for line in gateway.lines]
     async with asyncio.timeout(10):
-        while not gateway.lines[0].is_open:
+        while not gateway.lines[0].engine.is_open:
             await asyncio.sleep(0)
         said = await gateway.control("oven", "model")
         with pytest.raises(NotControlled):

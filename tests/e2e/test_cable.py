@@ -19,7 +19,7 @@ from tests.e2e.processes import (
     vigor_line,
     write_config,
 )
-from tests.zenoh_peer import Heard, ZenohPeer, free_endpoint
+from tests.zenoh_peer import Received, ZenohPeer, free_endpoint
 
 TAGS = {
     "speed": {"address": "D10"},
@@ -123,5 +123,5 @@ async def test_the_line_recovers_by_itself(
         assert link.plc.tell("get 1 D 500") == "9"
 
 
-def _all(latest: dict[str, Heard], quality: str) -> bool:
+def _all(latest: dict[str, Received], quality: str) -> bool:
     return latest.keys() == KEYS and all(s.json["quality"] == quality for s in latest.values())

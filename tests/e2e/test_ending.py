@@ -136,8 +136,8 @@ def test_a_client_without_its_router_ends_in_time(tmp_path: Path) -> None:
     zenoh = {"mode": "client", "listen": [], "connect": [free_endpoint()]}
     path = write_config(tmp_path / "config.yaml", "", lines, zenoh=zenoh)
     with gateway("run", path) as program:
-        program.says("device answers")
-        program.says("no Zenoh router yet")
+        program.says("device online")
+        program.says("Zenoh router unreachable")
         told = time.monotonic()
         assert program.end() == 0
         assert time.monotonic() - told < WITHIN
@@ -152,7 +152,7 @@ async def test_a_second_gateway_at_the_same_port_reports_it_and_waits(
     tags = {"speed": {"address": "D10"}}
     other = write_config(tmp_path / "other.yaml", endpoint, {"hall": vigor_line(tty, tags)})
     with started(plant.config) as first:
-        first.says("device answers")
+        first.says("device online")
         with gateway("run", other) as second:
             why = second.says("line down")
             assert f"{tty}: in use by another program" in why

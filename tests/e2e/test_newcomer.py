@@ -17,7 +17,7 @@ def test_the_example_runs_and_its_proposed_commands_work(tmp_path: Path) -> None
     with started(path) as program:
         program.says("Ctrl-C ends it.")
         for _ in range(3):
-            program.says("device answers")
+            program.says("device online")
         first = next(i for i, line in enumerate(program.lines) if "In a second terminal:" in line)
         said = program.lines[first + 1 :]
         steps = [shlex.split(line) for line in said if line.startswith("  ") and str(path) in line]

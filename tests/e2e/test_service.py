@@ -101,9 +101,9 @@ def test_a_client_keeps_history_while_it_waits_for_its_router(tmp_path: Path) ->
         history={"path": "history.db"},
     )
     with gateway("run", path) as program:
-        program.says("no Zenoh router yet")
+        program.says("Zenoh router unreachable")
         program.says("history ready")
-        program.says("device answers")
+        program.says("device online")
         assert program.end() == 0
 
 

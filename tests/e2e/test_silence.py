@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import pytest
 
 from tests.e2e.processes import Program, started, station, write_config
-from tests.zenoh_peer import Heard, ZenohPeer, free_endpoint
+from tests.zenoh_peer import Received, ZenohPeer, free_endpoint
 
 EVERY = 1.0
 SLACK = 0.15  # s: two processes share a machine with everything else
@@ -130,9 +130,9 @@ async def test_the_gateways_token_ends_with_the_gateway(plant: Plant) -> None:
         assert gone.key == "plant/@gateway/demo"
 
 
-def _good(sample: Heard) -> bool:
+def _good(sample: Received) -> bool:
     return bool(sample.json["quality"] == "good")
 
 
-def _time(sample: Heard) -> float:
+def _time(sample: Received) -> float:
     return datetime.fromisoformat(sample.json["time"]).timestamp()

@@ -16,7 +16,7 @@ from tests.zenoh_peer import ZenohPeer, free_endpoint
 # The command itself; only the longest wait is shorter, so that the suite is.
 RUN = """
 import gateway.northbound.election as election
-election.HOLD = 2.0
+election.SETTLE_TIME = 2.0
 from gateway.cli.main import main
 main()
 """
@@ -135,7 +135,7 @@ async def test_watch_continues_with_the_active_gateway_of_the_group(
         programs.enter_context(station("tcp", str(port)))
         async with ZenohPeer("router", listen=[router_at]):
             a = programs.enter_context(gateway(tmp_path, "a", router_at, port))
-            await says(a, "device answers")
+            await says(a, "device online")
             b = programs.enter_context(gateway(tmp_path, "b", router_at, port))
             file = tmp_path / f"{watched}.yaml"
             watch = programs.enter_context(

@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 from tests.e2e.processes import Program, plc_gateway, started, until
-from tests.northbound.test_security import GATEWAY_RULES, certificates, secret
+from tests.northbound.access import GATEWAY_RULES, certificates, secret
 from tests.test_docs import ENDPOINT, EXAMPLE, Block, _blocks, shape
 from tests.zenoh_peer import free_endpoint
 
@@ -38,7 +38,7 @@ def set_up(folder: Path, zenoh: dict[str, object], client: str) -> Iterator[Stor
     (folder / "scada.json5").write_text(client, encoding="utf-8")
     with started(path) as program:
         for _ in range(3):
-            program.says("device answers")
+            program.says("device online")
         yield Story(folder, path)
 
 

@@ -246,13 +246,14 @@ async def test_an_event_is_not_published_again_when_the_network_comes_back() -> 
     repeated: list[Sample] = []
 
     class Everything:
-        def all(self) -> list[Tag]:
+        @property
+        def tags(self) -> list[Tag]:
             return tags
 
         def sample(self, tag: Tag) -> Sample:
             return good(tag, 1, 0)
 
-        def told(self, samples: Sequence[Sample]) -> None:
+        def mark_published(self, samples: Sequence[Sample]) -> None:
             pass
 
     everything: Any = Everything()

@@ -11,7 +11,7 @@ import pytest
 
 from tests.conftest import forbidden, needs
 from tests.e2e.processes import Program, vigor_line, write_config
-from tests.zenoh_peer import Heard, Subscription, ZenohPeer, free_endpoint
+from tests.zenoh_peer import Received, Subscription, ZenohPeer, free_endpoint
 
 WITHIN = 2.0  # seconds from SIGTERM to the end
 SIZE = 8  # MB of the small disk
@@ -126,5 +126,5 @@ async def _is_remembered(client: ZenohPeer, heard: Subscription) -> None:
     assert set(live) <= set(kept)
 
 
-def _good(sample: Heard) -> bool:
+def _good(sample: Received) -> bool:
     return bool(sample.json["quality"] == "good")

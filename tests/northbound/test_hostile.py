@@ -1,7 +1,7 @@
-"""Whatever a stranger sends on whichever key: bounded memory, and the event loop undisturbed.
+"""A flood of messages on all keys: bounded memory, and an undisturbed event loop.
 
 `python -m benchmarks.northbound --flood 600` does the same for longer, with 50,000 tags, and prints
-how many questions a second came.
+the rate of the queries.
 """
 
 import asyncio
@@ -15,10 +15,10 @@ from pathlib import Path
 
 from benchmarks.northbound import Lag, memory
 from gateway.config import ZenohConfig
-from tests.northbound.test_northbound import PlainDevice, PlainPlant, serving, tag
+from tests.northbound.plant import PlainDevice, PlainPlant, serving, tag
 from tests.zenoh_peer import ZenohPeer, free_endpoint
 
-# One with everything on every key, and two with questions alone: 10,000 a second and more.
+# One client with everything on every key, two with queries alone: 10,000 a second and more.
 KINDS = ("flood", "ask", "ask")
 SECONDS = "3"
 ROOT = Path(__file__).parents[2]
@@ -47,33 +47,33 @@ async def test_a_flood_of_everything_costs_little_memory_and_no_poll() -> None:
         lag = Lag()
         probe = asyncio.create_task(lag.run())
         with ExitStack() as stack:
-            strangers = [stack.enter_context(other(kind, endpoint)) for kind in KINDS]
+            clients = [stack.enter_context(other(kind, endpoint)) for kind in KINDS]
             idler = stack.enter_context(other("idle"))
-            while any(one.poll() is None for one in strangers):
+            while any(one.poll() is None for one in clients):
                 northbound.publish([served.now("d0/t0", int(time.time()) % 30_000)])
                 most = max(most, memory())
                 await asyncio.sleep(0.05)
-            *told, idle = [p.stdout.read() for p in (*strangers, idler) if p.stdout is not None]
+            *results, idle = [p.stdout.read() for p in (*clients, idler) if p.stdout is not None]
         probe.cancel()
         counters = northbound.counters()
-        # It did hear a good part of it, and refused what there was no room for.
-        assert int(told[0]) > 0
+        # It received many of them, and refused those beyond its limits.
+        assert int(results[0]) > 0
         assert counters["queries"] > 0
-        # Each question ended, with an answer, with an error, or (no room for that) without a word.
+        # Each query ended: with an answer, with an error, or without a reply.
         ended: Counter[str] = Counter()
-        for told_by_one in map(json.loads, told[1:]):
-            assert sum(told_by_one["ended"].values()) == told_by_one["asked"]
-            ended += Counter(told_by_one["ended"])
+        for result in map(json.loads, results[1:]):
+            assert sum(result["ended"].values()) == result["asked"]
+            ended += Counter(result["ended"])
         assert ended["answered"] > 0
         assert ended["an error"] > 0
         assert ended["silent"] <= counters["unanswered"]
         assert most - before < 150.0, f"{before:.0f} MB grew to {most:.0f} MB"
-        # A line's task would have been late by as much. So was the loop of a process that has
-        # nothing to do, where the machine is busy with others.
+        # A line's task would have been as late. On a busy machine the loop of an idle process is
+        # late too.
         late, idlers = sorted(lag.late), json.loads(idle)
         assert late[len(late) // 2] < 0.02 + 5 * idlers[len(idlers) // 2]
         assert late[-1] < 1.0 + 5 * idlers[-1]
         assert served.written == []
-        # And it answers as before.
+        # Afterwards it answers as before.
         [reply] = await client.get("plant/d1/t1")
         assert reply.ok

@@ -1,11 +1,11 @@
-"""Where everything lies on Zenoh."""
+"""The keys of the contract, and the keys that arrive."""
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gateway.errors import BadValue, ConfigError
-from gateway.northbound.keys import Asked, Family, Keys, asked, max_age
+from gateway.northbound.keys import Family, Keys, ParsedKey, max_age, parse_key
 
 KEYS = Keys("site/plant", "hall-1")
 CHUNK = st.from_regex(r"[\w.\-]{1,12}", fullmatch=True)
@@ -24,7 +24,7 @@ def test_the_keys_of_the_contract() -> None:
 
 
 @pytest.mark.parametrize(
-    ("key", "family", "of"),
+    ("key", "family", "target"),
     [
         ("plant/mixer/speed", Family.VALUE, "plant/mixer/speed"),
         ("plant/**", Family.VALUE, "plant/**"),
@@ -37,14 +37,14 @@ def test_the_keys_of_the_contract() -> None:
         ("plant/mixer/speed/@adv/**", Family.LAST, "plant/mixer/speed"),
     ],
 )
-def test_a_key_that_arrives_says_what_is_asked(key: str, family: Family, of: str) -> None:
-    assert asked(key) == Asked(family, of)
+def test_a_received_key_has_a_family_and_a_target(key: str, family: Family, target: str) -> None:
+    assert parse_key(key) == ParsedKey(family, target)
 
 
 @pytest.mark.parametrize("key", ["plant/*/speed", "plant/**", "plant/mix$*/speed/@set"])
-def test_a_wildcard_of_any_kind_is_seen(key: str) -> None:
-    assert asked(key).is_wild
-    assert not asked("plant/mixer/speed").is_wild
+def test_a_wildcard_of_any_kind_is_recognised(key: str) -> None:
+    assert parse_key(key).has_wildcard
+    assert not parse_key("plant/mixer/speed").has_wildcard
 
 
 @given(TAG)
@@ -56,14 +56,14 @@ def test_every_tag_comes_back_from_each_of_its_keys(tag: str) -> None:
         (KEYS.set(tag), Family.SET),
         (KEYS.meta(tag), Family.META),
     ):
-        assert asked(key).family is family
-        assert KEYS.tag(asked(key).of) == tag
+        assert parse_key(key).family is family
+        assert KEYS.tag(parse_key(key).target) == tag
 
 
 @given(st.text(alphabet="ab/@*$set_metablockgwy", max_size=40))
 @settings(max_examples=200)
-def test_any_key_at_all_asks_for_something(key: str) -> None:
-    assert len(asked(key).of) <= len(key)
+def test_any_key_is_parsed(key: str) -> None:
+    assert len(parse_key(key).target) <= len(key)
 
 
 def test_a_key_outside_the_prefix_is_no_tag() -> None:

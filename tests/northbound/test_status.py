@@ -1,4 +1,4 @@
-"""What the status documents say of lines and devices."""
+"""The status documents of lines and devices."""
 
 import asyncio
 import json
@@ -11,7 +11,7 @@ from gateway.engine.device import Device
 from gateway.errors import NoReply
 from gateway.line.line import Line
 from gateway.northbound import payload
-from gateway.northbound.status import device_document
+from gateway.northbound.status import device_document, standing
 from tests.e2e.processes import vigor_line, write_config
 
 TAGS = {"speed": {"address": "D10"}, "door": {"address": "M12"}}
@@ -24,22 +24,22 @@ def made(folder: Path, **device: Any) -> Gateway:
 
 def only(gateway: Gateway) -> tuple[Line, Device]:
     [line] = gateway.lines
-    [device] = line.devices
+    [device] = line.engine.devices
     return line, device
 
 
 async def served(gateway: Gateway, until: str) -> None:
-    """Runs the one line until the device stands so."""
+    """Runs the one line until the document of the device shows this standing."""
     line, device = only(gateway)
     task = asyncio.create_task(line.run())
     async with asyncio.timeout(10):
-        while device.standing.value != until:
+        while standing(device) != until:
             await asyncio.sleep(0)
     task.cancel()
     await asyncio.gather(task, return_exceptions=True)
 
 
-async def test_before_anything_was_said(tmp_path: Path) -> None:
+async def test_before_the_first_transaction(tmp_path: Path) -> None:
     documents = made(tmp_path).status()
     assert set(documents) == {"status", "lines/hall", "devices/mixer"}
     status = documents["status"]
@@ -52,7 +52,7 @@ async def test_before_anything_was_said(tmp_path: Path) -> None:
     assert (line["open"], line["opened"], line["baudrate"]) == (False, 0, 19200)
 
 
-async def test_what_was_said_is_counted(tmp_path: Path) -> None:
+async def test_transactions_are_counted(tmp_path: Path) -> None:
     gateway = made(tmp_path)
     await served(gateway, "up")
     document = gateway.status()["devices/mixer"]
@@ -62,9 +62,11 @@ async def test_what_was_said_is_counted(tmp_path: Path) -> None:
     assert document["failures"] == {}
 
 
-async def test_a_device_in_trouble_says_what_to_look_for(tmp_path: Path) -> None:
+async def test_a_failing_device_has_a_diagnosis(tmp_path: Path) -> None:
     _, device = only(made(tmp_path))
-    device.failed(NoReply("no reply"), None, 0.0)
+    error = NoReply("no reply")
+    device.record.count_failure(error)
+    device.health.unclear(error, None, 0.0)
     document = device_document(device, [])
     assert document["failures"] == {"silence": 1}
     assert "check power, wiring" in str(document["diagnosis"])
@@ -83,7 +85,7 @@ async def test_every_document_is_json(tmp_path: Path) -> None:
         assert json.loads(payload.document(document)).keys() == document.keys()
 
 
-async def test_a_line_tells_what_was_promised(tmp_path: Path) -> None:
+async def test_a_line_shows_its_forecast(tmp_path: Path) -> None:
     gateway = made(tmp_path)
     line, device = only(gateway)
     expected = gateway.status()["lines/hall"]["expected"]
@@ -91,4 +93,4 @@ async def test_a_line_tells_what_was_promised(tmp_path: Path) -> None:
     assert isinstance(expected, dict)
     assert expected["load"] == round(load, 4)
     assert expected["requests_per_second"] == 10  # two blocks, five times a second
-    assert line.wire.baudrate == 19200
+    assert line.engine.wire.baudrate == 19200

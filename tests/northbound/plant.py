@@ -1,0 +1,176 @@
+"""A plant of plain data, and a gateway that serves it on Zenoh."""
+
+import asyncio
+import time
+from collections.abc import AsyncIterator, Callable, Iterable, Mapping, Sequence
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from gateway.config import ZenohConfig
+from gateway.engine.requests import CommandResult
+from gateway.errors import (
+    BadValue,
+    Busy,
+)
+from gateway.northbound import Northbound
+from gateway.protocols.driver import Address, Span, Unit
+from gateway.tags import Reason, Sample, Tag, WriteResult, WriteRule, bad, good
+from gateway.values import Layout, Value, parse_type
+from tests.zenoh_peer import ZenohPeer, free_endpoint
+
+
+def tag(device: str, name: str, **settings: Any) -> Tag:
+    return Tag(
+        device=device,
+        name=name,
+        text="D100",
+        address=Address("D", 100),
+        span=Span("D", 100, 1),
+        unit_kind=Unit.WORD,
+        layout=Layout(parse_type("int16")),
+        **settings,
+    )
+
+
+@dataclass(frozen=True)
+class PlainDevice:
+    name: str
+    tags: tuple[Tag, ...]
+    blocks: bool | Literal["only"] = False
+
+
+class PlainPlant:
+    """Samples in a dict. A write is acknowledged, or ends as `endings` says for its value. A
+    command ends with `command_result`."""
+
+    def __init__(self, *devices: PlainDevice) -> None:
+        self._devices = devices
+        self._tags = {tag.key: tag for device in devices for tag in device.tags}
+        self.samples = {
+            key: bad(tag, Reason.STARTING, time.time_ns()) for key, tag in self._tags.items()
+        }
+        self.endings: dict[Value, Exception] = {}
+        self.gate = asyncio.Event()  # writes wait for it
+        self.gate.set()
+        self.written: list[tuple[str, Value]] = []
+        self.read: list[str] = []
+        self.unread: set[str] = set()  # tags that the line does not read in time
+        self.republished: list[Sample] = []
+        self.known_commands: Mapping[str, frozenset[str]] = {}
+        self.command_result: CommandResult | Exception = CommandResult("acknowledged", 1, 0.1)
+        self.commanded: list[tuple[str, str, str]] = []
+
+    def devices(self) -> Iterable[PlainDevice]:
+        return self._devices
+
+    def tag(self, key: str) -> Tag | None:
+        return self._tags.get(key)
+
+    def sample(self, tag: Tag) -> Sample:
+        return self.samples[tag.key]
+
+    async def write(self, tag: Tag, value: Value) -> WriteResult:
+        tag.encode(value)
+        await self.gate.wait()
+        if value in self.endings:
+            raise self.endings[value]
+        self.written.append((tag.key, value))
+        return WriteResult(value, time.time_ns(), verified=True, took=0.031)
+
+    def mark_published(self, samples: Sequence[Sample]) -> None:
+        self.republished += samples
+
+    def commands(self) -> Mapping[str, frozenset[str]]:
+        return self.known_commands
+
+    def speaker(self, line: str) -> str:
+        if line != "hall":
+            raise BadValue(f"there is no line {line}")
+        return "oven"
+
+    async def control(self, device: str, command: str, argument: str) -> CommandResult:
+        self.commanded.append((device, command, argument))
+        if isinstance(self.command_result, Exception):
+            raise self.command_result
+        return self.command_result
+
+    def is_fresh(self, tag: Tag, max_age: float) -> bool:
+        return time.time_ns() - self.samples[tag.key].time < max_age * 1e9
+
+    async def fresh(self, tag: Tag, max_age: float) -> Sample:
+        if not self.is_fresh(tag, max_age):
+            self.read.append(tag.key)
+            if tag.key in self.unread:
+                raise Busy(f"{tag.key} could not be read")
+            self.samples[tag.key] = good(tag, 4711, time.time_ns())
+        return self.samples[tag.key]
+
+    def status(self) -> Mapping[str, Mapping[str, object]]:
+        return {"status": {"state": "running"}, "lines/hall-1": {"load": 0.5}}
+
+    def now(self, key: str, value: Value) -> Sample:
+        """A new sample, already current."""
+        self.samples[key] = good(self._tags[key], value, time.time_ns())
+        return self.samples[key]
+
+
+def mixer(*, blocks: bool | Literal["only"] = False) -> PlainPlant:
+    return PlainPlant(
+        PlainDevice(
+            "mixer",
+            (
+                tag("mixer", "speed", unit="rpm"),
+                tag("mixer", "alarms/door", description="Guard door open"),
+                tag("mixer", "recipe", write=WriteRule(min=1, max=4000)),
+            ),
+            blocks,
+        ),
+        PlainDevice("oven", (tag("oven", "temperature"),)),
+    )
+
+
+@asynccontextmanager
+async def serving(plant: PlainPlant, settings: ZenohConfig) -> AsyncIterator[Northbound]:
+    async with running(Northbound(settings, "demo", plant, status_every=0.5)) as northbound:
+        yield northbound
+
+
+@asynccontextmanager
+async def running(northbound: Northbound) -> AsyncIterator[Northbound]:
+    """Runs it until everything is declared, or until it fails; stops it at the end."""
+    serves = asyncio.create_task(northbound.run())
+    opens = asyncio.create_task(northbound.opened.wait())
+    await asyncio.wait([serves, opens], return_when=asyncio.FIRST_COMPLETED, timeout=5)
+    try:
+        if serves.done():
+            serves.result()
+        yield northbound
+    finally:
+        opens.cancel()
+        serves.cancel()
+        await asyncio.wait([serves], timeout=5)
+        assert serves.done()
+
+
+@asynccontextmanager
+async def gateway_and_client(
+    plant: PlainPlant,
+) -> AsyncIterator[tuple[Northbound, ZenohPeer]]:
+    """A gateway that listens, and a client in another process."""
+    endpoint = free_endpoint()
+    async with (
+        serving(plant, ZenohConfig(listen=(endpoint,))) as northbound,
+        ZenohPeer("client", connect=[endpoint]) as client,
+    ):
+        yield northbound, client
+
+
+def has_value(key: str, value: Value | None) -> Any:
+    return lambda sample: sample.key == key and sample.json["value"] == value
+
+
+async def until(condition: Callable[[], bool]) -> None:
+    async with asyncio.timeout(5):
+        while not condition():
+            await asyncio.sleep(0.005)

@@ -1,0 +1,47 @@
+"""The audit under a flood of refused writes."""
+
+import json
+
+import structlog
+
+from gateway.northbound.audit import BURST, Audit
+from gateway.northbound.payload import Failure, Problem, WriteOutcome
+from gateway.northbound.rate_limit import RateLimit
+from gateway.tags import WriteResult
+
+
+def outcome(result: WriteResult | Failure, number: int = 0) -> WriteOutcome:
+    return WriteOutcome("plant/mixer/recipe", number, result, number, 0.0, None)
+
+
+def test_a_flood_of_refusals_is_counted_while_sent_writes_are_all_reported() -> None:
+    published: list[bytes] = []
+    recorded: list[tuple[int, str]] = []
+    audit = Audit(published.append, lambda time, text: recorded.append((time, text)))
+    with structlog.testing.capture_logs() as lines:
+        for number in range(10_000):
+            audit(outcome(Failure(Problem.UNKNOWN_TAG, "no"), number))
+        for ending in (
+            WriteResult(1, 0, took=0.1),
+            Failure(Problem.UNCLEAR, "?"),
+            Failure(Problem.REFUSED, "no", "28"),
+        ):
+            audit(outcome(ending))
+        audit.report_suppressed()
+        audit.report_suppressed()
+    assert len(published) == len(recorded) == BURST + 3
+    assert [text.encode() for _, text in recorded] == published
+    assert [time for time, _ in recorded] == [*range(BURST), 0, 0, 0]
+    words = [json.loads(data)["outcome"] for data in published[BURST:]]
+    assert words == ["written", "unclear", "refused"]
+    assert audit.suppressed == 10_000 - BURST
+    assert len(lines) == BURST + 3 + 1
+    assert lines[-1]["count"] == 10_000 - BURST
+
+
+def test_a_rate_limit_allows_a_burst_and_then_one_per_interval() -> None:
+    limit = RateLimit(burst=3, every=2.0)
+    passed = [now for now in range(20) if limit.allows(float(now) / 2)]
+    assert passed == [0, 1, 2, 4, 8, 12, 16]
+    assert limit.newly_suppressed() == limit.suppressed == 20 - len(passed)
+    assert limit.newly_suppressed() == 0

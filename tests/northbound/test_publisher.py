@@ -1,0 +1,187 @@
+"""Publishing: every value in order, the newest never lost, blocks and events."""
+
+import asyncio
+import itertools
+import json
+import os
+import signal
+import threading
+import time
+from typing import Any
+
+from gateway.northbound.keys import Keys
+from gateway.northbound.publisher import EVENTS_LIMIT, Publisher
+from tests.northbound.plant import (
+    PlainDevice,
+    PlainPlant,
+    gateway_and_client,
+    has_value,
+    mixer,
+    tag,
+)
+
+
+async def test_a_published_value_arrives_as_the_contract_says() -> None:
+    plant = mixer()
+    async with gateway_and_client(plant) as (northbound, client):
+        received = await client.subscribe("plant/**")
+        sample = plant.now("mixer/speed", 12)
+        northbound.publish([sample])
+        arrived = await received.next(has_value("plant/mixer/speed", 12))
+        assert arrived.encoding == "application/json"
+        assert set(arrived.json) == {"value", "quality", "time"}
+        # A subscriber of values receives no key with @.
+        assert not any("@" in sample.key for sample in received.samples)
+
+
+async def test_values_are_put_in_the_order_of_their_time_stamps() -> None:
+    plant = mixer()
+    async with gateway_and_client(plant) as (northbound, client):
+        received = await client.subscribe("plant/**")
+        for value in range(300):
+            northbound.publish([plant.now("mixer/speed", value), plant.now("mixer/recipe", value)])
+            if value % 7 == 0:
+                await asyncio.sleep(0)
+        await received.next(has_value("plant/mixer/recipe", 299))
+        stamps = [sample.time for sample in received.samples if sample.time is not None]
+        assert len(stamps) == len(received.samples)
+        assert stamps == sorted(stamps)
+        counters = northbound.counters()
+        # Only superseded values are missing. Beside the 600: the first publication.
+        assert counters["superseded"] + len(received.samples) in range(600, 605)
+
+
+class StuckSession:
+    """The part of a session that the publisher uses; every put blocks until `go` is set."""
+
+    def __init__(self) -> None:
+        self.go = threading.Event()
+        self.hangs = threading.Event()
+        self.puts: list[tuple[int, str, Any]] = []
+        self._clock = itertools.count()
+
+    def new_timestamp(self) -> int:
+        return next(self._clock)
+
+    def put(self, key: str, data: bytes, *, timestamp: int, **_how: object) -> None:
+        self.hangs.set()
+        assert self.go.wait(5)
+        self.puts.append((timestamp, key, json.loads(data)["value"]))
+
+
+async def test_while_a_put_blocks_the_newest_value_of_each_tag_is_kept_in_order() -> None:
+    plant = mixer()
+    session: Any = StuckSession()
+    publisher = Publisher(Keys("plant", "demo"))
+    publisher.start(session)
+    publisher.values([plant.now("mixer/speed", 0)])
+    await asyncio.to_thread(session.hangs.wait, 5)
+    publisher.values([plant.now("mixer/speed", 1), plant.now("mixer/recipe", 10)])
+    publisher.events([plant.now("oven/temperature", value) for value in (100, 101)])
+    for value in range(2, 20_000):
+        publisher.values([plant.now("mixer/speed", value)])
+    session.go.set()
+    await asyncio.to_thread(publisher.stop, 5)
+    speed, recipe, oven = "plant/mixer/speed", "plant/mixer/recipe", "plant/oven/temperature"
+    assert [(key, value) for _, key, value in session.puts] == [
+        (speed, 0),
+        (recipe, 10),
+        (oven, 100),
+        (oven, 101),
+        (speed, 19_999),
+    ]
+    assert session.puts == sorted(session.puts)  # by their stamps
+    assert publisher.counters.superseded == 19_998
+    assert publisher.counters.published == 5
+
+
+async def test_events_beyond_the_limit_are_dropped_and_counted() -> None:
+    plant = mixer()
+    session: Any = StuckSession()
+    publisher = Publisher(Keys("plant", "demo"))
+    publisher.events([plant.now("mixer/speed", 0)])  # no session yet
+    publisher.start(session)
+    publisher.values([plant.now("mixer/recipe", 0)])
+    await asyncio.to_thread(session.hangs.wait, 5)
+    publisher.events(plant.now("mixer/speed", value) for value in range(EVENTS_LIMIT + 5))
+    session.go.set()
+    await asyncio.to_thread(publisher.stop, 5)
+    assert publisher.counters.dropped == 6
+    assert [value for *_, value in session.puts] == [0, *range(EVENTS_LIMIT)]
+
+
+async def test_events_all_arrive_in_order() -> None:
+    plant = PlainPlant(PlainDevice("mixer", (tag("mixer", "speed", event=True),)))
+    async with gateway_and_client(plant) as (northbound, client):
+        received = await client.subscribe("plant/mixer/speed")
+        northbound.publish([plant.now("mixer/speed", value) for value in range(500)])
+        await received.next(has_value("plant/mixer/speed", 499))
+        values = [sample.json["value"] for sample in received.samples]
+        assert [value for value in values if value is not None] == list(range(500))
+
+
+async def test_a_scan_of_a_device_with_blocks_is_one_put() -> None:
+    plant = mixer(blocks=True)
+    async with gateway_and_client(plant) as (northbound, client):
+        received = await client.subscribe("plant/*/@block")
+        northbound.publish(
+            [
+                plant.now("mixer/speed", 1),
+                plant.now("mixer/recipe", 2),
+                plant.now("oven/temperature", 3),
+            ]
+        )
+        block = await received.next(lambda sample: True)
+        assert block.key == "plant/mixer/@block"
+        assert {name: entry["value"] for name, entry in block.json.items()} == {
+            "speed": 1,
+            "recipe": 2,
+        }
+        [reply] = await client.get("plant/*/@block")
+        assert set(reply.json) == {"speed", "recipe", "alarms/door"}
+
+
+async def test_with_blocks_only_no_single_value_is_put() -> None:
+    plant = mixer(blocks="only")
+    async with gateway_and_client(plant) as (northbound, client):
+        received = await client.subscribe("plant/**")
+        block = await client.subscribe("plant/mixer/@block")
+        northbound.publish([plant.now("mixer/speed", 1), plant.now("oven/temperature", 3)])
+        scan = await block.next(lambda sample: sample.json["speed"]["value"] == 1)
+        assert set(scan.json) >= {"speed"}
+        await received.next(has_value("plant/oven/temperature", 3))
+        assert not [sample.key for sample in received.samples if "mixer" in sample.key]
+        # A query returns them, but not that of a subscriber, which would then wait for new ones.
+        [reply] = await client.get("plant/mixer/speed")
+        assert reply.json["value"] == 1
+        late = await client.subscribe("plant/**", advanced=True)
+        await late.next(has_value("plant/oven/temperature", 3))
+        assert not [sample.key for sample in late.samples if "mixer" in sample.key]
+
+
+async def test_a_frozen_subscriber_does_not_block_the_event_loop() -> None:
+    plant = PlainPlant(PlainDevice("big", tuple(tag("big", f"t{n}") for n in range(2000))))
+    async with gateway_and_client(plant) as (northbound, client):
+        await client.subscribe("plant/**")
+        worst = 0.0
+        stopped = Stopped(client.pid)
+        with stopped:
+            for value in range(30):
+                before = time.perf_counter()
+                northbound.publish([plant.now(key, value) for key in plant.samples])
+                await asyncio.sleep(0.02)
+                worst = max(worst, time.perf_counter() - before)
+        assert worst < 0.5  # one put to a frozen peer takes up to 50 ms, 2000 of them 100 s
+
+
+class Stopped:
+    """A process that SIGSTOP pauses."""
+
+    def __init__(self, pid: int) -> None:
+        self._pid = pid
+
+    def __enter__(self) -> None:
+        os.kill(self._pid, signal.SIGSTOP)
+
+    def __exit__(self, *_error: object) -> None:
+        os.kill(self._pid, signal.SIGCONT)

@@ -1,0 +1,111 @@
+"""Publishing again: heartbeats of bad values, and all values after a link has returned."""
+
+import asyncio
+import time
+from collections.abc import Sequence
+
+import pytest
+
+from gateway.config import ZenohConfig, ZenohMode
+from gateway.northbound import Northbound
+from gateway.northbound.keys import Keys
+from gateway.northbound.link_monitor import LinkMonitor
+from gateway.northbound.republish import Republisher
+from gateway.northbound.tag_index import TagIndex
+from gateway.tags import Reason, Sample, bad
+from tests.northbound.plant import (
+    PlainDevice,
+    PlainPlant,
+    gateway_and_client,
+    has_value,
+    mixer,
+    tag,
+)
+from tests.zenoh_peer import ZenohPeer, free_endpoint
+
+
+@pytest.mark.parametrize("event", [False, True])
+async def test_a_bad_value_is_repeated_with_its_heartbeat_and_keeps_its_time(event: bool) -> None:
+    repeated = tag("mixer", "speed", heartbeat=0.5, event=event)
+    plant = PlainPlant(PlainDevice("mixer", (repeated, tag("mixer", "level"))))
+    async with gateway_and_client(plant) as (northbound, client):
+        speed, level = (plant.tag(f"mixer/{name}") for name in ("speed", "level"))
+        assert speed is not None
+        assert level is not None
+        received = await client.subscribe("plant/mixer/*")
+        down = [bad(of, Reason.NO_REPLY, time.time_ns()) for of in (speed, level)]
+        plant.samples |= {sample.tag.key: sample for sample in down}
+        northbound.publish(down)
+        await received.next(lambda sample: sample.key.endswith("level"))
+        first = await received.next(lambda sample: sample.key.endswith("speed"))
+        received.forget()
+        for _ in range(2):
+            again = await received.next(lambda _: True)
+            assert again.key == "plant/mixer/speed"  # the other has no heartbeat
+            assert again.json == first.json
+            received.forget()
+        northbound.publish([plant.now("mixer/speed", 7)])
+        assert (await received.next(lambda _: True)).json["value"] == 7
+
+
+async def test_an_event_is_published_once_but_its_bad_quality_again() -> None:
+    code, weight = tag("reader", "code", event=True), tag("reader", "weight")
+    plant = PlainPlant(PlainDevice("reader", (code, weight)))
+    index = TagIndex(Keys("plant", "demo"), plant.devices())
+    published: list[Sample] = []
+    republisher = Republisher(published.extend, plant, index, LinkMonitor())
+    await republisher.publish_all()  # as at a start
+    assert published == [bad(of, Reason.STARTING, plant.sample(of).time) for of in (code, weight)]
+    published.clear()
+    plant.now("reader/code", 4711)
+    heavy = plant.now("reader/weight", 12)
+    await republisher.publish_all()
+    assert published == [heavy]
+    published.clear()
+    lost = plant.samples["reader/code"] = bad(code, Reason.LINE_DOWN, time.time_ns())
+    await republisher.publish_all()
+    assert published == [lost, heavy]
+
+
+async def test_the_plant_marks_republished_samples_before_they_go_out() -> None:
+    plant, published = mixer(), list[Sample]()
+
+    def publish(samples: Sequence[Sample]) -> None:
+        published.extend(samples)
+        assert plant.republished == published
+
+    index = TagIndex(Keys("plant", "demo"), plant.devices())
+    await Republisher(publish, plant, index, LinkMonitor()).publish_all()
+    assert len(published) == 4
+
+
+@pytest.mark.parametrize("mode", [ZenohMode.PEER, ZenohMode.CLIENT])
+async def test_after_a_router_was_killed_and_returned_everything_is_published_again(
+    mode: ZenohMode,
+) -> None:
+    plant = mixer()
+    endpoint = free_endpoint()
+    # The gateway starts without its router.
+    northbound = Northbound(ZenohConfig(mode=mode, connect=(endpoint,)), "demo", plant)
+    serves = asyncio.create_task(northbound.run())
+    northbound.publish([plant.now("mixer/speed", 1)])
+    try:
+        async with (
+            ZenohPeer("router", listen=[endpoint]) as router,
+            ZenohPeer("client", connect=[endpoint]) as client,
+        ):
+            received = await client.subscribe("plant/**")
+            await received.next(has_value("plant/mixer/speed", 1))
+            live = await client.liveliness("plant/@gateway/*")
+            await live.next(lambda token: token.kind == "PUT")
+            await router.kill()
+            received.forget()
+            live.forget()
+            northbound.publish([plant.now("mixer/speed", 2)])  # no link: it reaches no subscriber
+            async with ZenohPeer("router", listen=[endpoint]):
+                await received.next(has_value("plant/mixer/speed", 2), timeout=15)
+                await received.until(lambda of: len(of.latest()) == 4)
+                await live.next(lambda token: token.kind == "PUT")
+    finally:
+        serves.cancel()
+        await asyncio.wait([serves], timeout=5)

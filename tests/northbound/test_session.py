@@ -1,0 +1,54 @@
+"""The configuration of the session."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from gateway.config import ZenohConfig
+from gateway.errors import (
+    ConfigError,
+)
+from gateway.northbound.session import configure
+
+
+def test_the_settings_override_the_zenoh_file(tmp_path: Path) -> None:
+    file = tmp_path / "zenoh.json5"
+    file.write_text(
+        """{
+          mode: "client",  // comments are allowed
+          connect: {endpoints: ["tcp/10.0.0.1:7447"]},
+          listen: {endpoints: ["tcp/127.0.0.1:7000"]},
+          transport: {link: {tx: {lease: 5000}}},
+        }"""
+    )
+    config = configure(ZenohConfig(listen=("tcp/127.0.0.1:7447",), config_file=file))
+    seen = {
+        path: json.loads(config.get_json(path))
+        for path in (
+            "mode",
+            "connect/endpoints",
+            "listen/endpoints",
+            "transport/link/tx/lease",
+            "scouting/multicast/enabled",
+        )
+    }
+    assert seen == {
+        "mode": "peer",
+        "connect/endpoints": ["tcp/10.0.0.1:7447"],
+        "listen/endpoints": ["tcp/127.0.0.1:7447"],
+        "transport/link/tx/lease": 5000,
+        "scouting/multicast/enabled": False,
+    }
+
+
+def test_without_listen_the_session_opens_no_endpoint() -> None:
+    assert json.loads(configure(ZenohConfig()).get_json("listen/endpoints")) == []
+
+
+@pytest.mark.parametrize("text", ["{mode: ", "{nonsense: 1}", '{mode: "pear"}'])
+def test_a_file_that_is_no_zenoh_configuration_is_refused(tmp_path: Path, text: str) -> None:
+    file = tmp_path / "zenoh.json5"
+    file.write_text(text)
+    with pytest.raises(ConfigError, match=r"config_file .*zenoh\.json5"):
+        configure(ZenohConfig(config_file=file))
