@@ -713,7 +713,7 @@ async def test_noise_makes_no_wrong_value_and_no_exception(noise: float, silent:
         line.bench.noise = 0.0
         await asyncio.sleep(70)
         assert all(line.good(dev) for dev in devices)
-        # Words: two bits that cancel in one reply; theory and measurement are in docs/proof.md.
+        # Words: two bits that cancel in one reply; theory and measurement: docs/residual-errors.md.
         blind = {1e-4: 0, 1e-3: 6, 1e-2: 40}[noise]
     assert len(witness.wrong) <= blind
     assert witness.right > 1000
