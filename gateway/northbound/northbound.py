@@ -24,7 +24,7 @@ from gateway.northbound.session import (
     CLOSE_WITHIN,
     configure,
     off_loop,
-    opened,
+    open_session,
 )
 from gateway.northbound.standby import Standby, StandbySettings
 from gateway.northbound.status_publisher import StatusPublisher
@@ -137,7 +137,7 @@ class Northbound:
         """
         for exposure in secrets.exposures(self._config):
             log.warning("Zenoh session exposed", why=exposure)
-        session = await opened(self._config, retry=self._is_client)
+        session = await open_session(self._config, retry=self._is_client)
         self.exclusive.set()
         try:
             await self._serve(session)

@@ -52,7 +52,7 @@ def configure(settings: ZenohConfig) -> zenoh.Config:
             config.insert_json5(path, json.dumps(setting))
     config.insert_json5("mode", json.dumps(settings.mode.value))
     if settings.mode is ZenohMode.CLIENT:
-        # Without it, open waits for ever in a thread that cannot be stopped; `opened` retries.
+        # Without it, open waits for ever in its thread; `open_session` retries instead.
         config.insert_json5("connect/timeout_ms", "1000")
     for path, value in (_tls(settings.tls) | _users(settings)).items():
         config.insert_json5(path, json.dumps(value))
@@ -136,7 +136,7 @@ def _check(side: str, endpoint: str) -> None:
         raise ConfigError(f"zenoh {side} {error}") from None
 
 
-async def opened(config: zenoh.Config, *, retry: bool) -> zenoh.Session:
+async def open_session(config: zenoh.Config, *, retry: bool) -> zenoh.Session:
     """Opens a session. With `retry` (a client) it tries until a router answers.
 
     Raises `GatewayError` when it cannot be opened, a port in use for instance.

@@ -16,7 +16,7 @@ import zenoh
 from gateway.northbound.election import Election, Role, RoleToken, State
 from gateway.northbound.inbox import Inbox
 from gateway.northbound.keys import Keys
-from gateway.northbound.session import as_client, off_loop, opened
+from gateway.northbound.session import as_client, off_loop, open_session
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 
@@ -89,7 +89,7 @@ class Standby:
 
     async def _open(self, session: zenoh.Session, election: Election) -> None:
         """Opens the session of the tokens, if it is another one, and observes the group."""
-        found = session if self._config is None else await opened(self._config, retry=True)
+        found = session if self._config is None else await open_session(self._config, retry=True)
 
         def token_changed(sample: zenoh.Sample) -> None:
             if token := _parse_token(str(sample.key_expr)):
