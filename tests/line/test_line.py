@@ -10,8 +10,9 @@ from structlog.testing import capture_logs
 
 from gateway.engine.device import Device
 from gateway.engine.health import State
+from gateway.engine.requests import WRITE_EXPIRY
 from gateway.errors import Busy, Evidence, GatewayError, LineDown, Offline, Refused, Unclear
-from gateway.line.line import PATIENCE, REOPEN_LONGEST
+from gateway.line.line import REOPEN_LONGEST
 from gateway.planning.wire_timing import WireTiming
 from gateway.protocols.vigor import Vigor
 from gateway.tags import Quality, Reason, Tag, WriteResult, WriteRule
@@ -247,7 +248,7 @@ async def test_healthy_stations_keep_95_percent_of_their_reads(
         fresh = [clocks(20, station=n, every=every) for n in range(1, healthy + mute + 1)]
         line = plant(fresh if dead else [d for d in fresh if d.name in [a.name for a in alive]])
         wind_up(line)
-        for dev, station in zip(line.engine.devices, line.stations, strict=True):
+        for dev, station in zip(line.devices, line.stations, strict=True):
             station.mute = dev.name not in [a.name for a in alive]
         async with running(line):
             await asyncio.sleep(2)
@@ -255,7 +256,7 @@ async def test_healthy_stations_keep_95_percent_of_their_reads(
             await asyncio.sleep(2 * mute)
             settled = now()
             await asyncio.sleep(span)
-        ok = [d for d in line.engine.devices if d.name in [a.name for a in alive]]
+        ok = [d for d in line.devices if d.name in [a.name for a in alive]]
         probed = sum(
             len(data) * WIRE.character + 0.5
             for at, data in line.bench.sent
@@ -302,7 +303,7 @@ async def test_writes_to_a_silent_station_do_not_take_the_line() -> None:
             await asyncio.sleep(0.1)
         probes = [at for at, data in line.bench.sent if at >= start and data[1:3] == b"02"]
         assert len(probes) * 0.5 <= 0.06 * 60
-        await asyncio.sleep(PATIENCE)
+        await asyncio.sleep(WRITE_EXPIRY)
         assert all(isinstance(o.once, Offline) for o in outcomes)
         assert line.writes_sent() == []
         assert len(line.reads(devices[0], start)) >= 57
@@ -395,7 +396,7 @@ async def test_an_expired_write_is_never_sent() -> None:
         asked = now()
         await asyncio.sleep(30)
     sent = line.writes_sent(asked)
-    assert max(at for at, _ in sent) < asked + PATIENCE + 0.1
+    assert max(at for at, _ in sent) < asked + WRITE_EXPIRY + 0.1
     unclear = [o for o in outcomes if isinstance(o.once, Unclear)]
     late = [o for o in outcomes if isinstance(o.once, Busy)]
     assert len(unclear) == len(sent)
@@ -456,7 +457,7 @@ async def test_a_bit_of_a_word_is_changed_where_it_is() -> None:
         await asyncio.sleep(0.5)
         for bit, value in ((3, True), (0, False), (15, False), (14, True), (3, True)):
             before = memory.read("D", 7)[0]
-            outcome = line.submit(line.engine.devices[0], tags[bit], value)
+            outcome = line.submit(line.devices[0], tags[bit], value)
             await asyncio.sleep(0.5)
             expected = before | 1 << bit if value else before & ~(1 << bit)
             assert memory.read("D", 7)[0] == expected
@@ -470,7 +471,7 @@ async def test_a_written_value_is_seen_at_once() -> None:
     line = plant([device([slow])])
     async with running(line):
         await asyncio.sleep(1)
-        outcome = line.submit(line.engine.devices[0], slow, 4711)
+        outcome = line.submit(line.devices[0], slow, 4711)
         await asyncio.sleep(0.2)
         assert outcome.once.value == 4711
         assert line.now[slow].value == 4711
@@ -483,7 +484,7 @@ async def test_a_refused_write_says_the_makers_code() -> None:
     async with running(line):
         await asyncio.sleep(1)
         line.stations[0].inner.holes.add(("D", 0))
-        outcome = line.submit(line.engine.devices[0], tag, 1)
+        outcome = line.submit(line.devices[0], tag, 1)
         await asyncio.sleep(0.5)
         assert isinstance(outcome.once, Refused)
         assert outcome.once.code == "28"
@@ -638,11 +639,11 @@ async def test_a_bug_in_a_driver_takes_its_line_down_and_no_more(
     monkeypatch.setattr(Vigor, "read", buggy)
     async with running(broken), running(sound):
         await asyncio.sleep(0.3)
-        assert "ZeroDivisionError" in broken.line.engine.record.trouble
+        assert "ZeroDivisionError" in broken.line.line.engine.record.trouble
         assert broken.reason(broken.devices[0].tags[0]) is Reason.LINE_DOWN
         await asyncio.sleep(10)
         assert broken.good(broken.devices[0])
-        assert sound.line.engine.record.opened == 1
+        assert sound.line.line.engine.record.opened == 1
 
 
 @on_virtual_time
@@ -656,10 +657,10 @@ async def test_a_bug_in_the_middle_of_a_write_answers_it(monkeypatch: pytest.Mon
     monkeypatch.setattr(Vigor, "write", buggy)
     async with running(line):
         await asyncio.sleep(1)
-        outcome = line.submit(line.engine.devices[0], tag, 1)
+        outcome = line.submit(line.devices[0], tag, 1)
         await asyncio.sleep(5)
         assert isinstance(outcome.once, Unclear)
-        assert line.good(line.engine.devices[0])
+        assert line.good(line.devices[0])
 
 
 # Refused addresses

@@ -78,12 +78,12 @@ async def test_three_protocol_variants_on_one_wire_are_all_healthy() -> None:
     line = mixed()
     async with running(line):
         await asyncio.sleep(30)
-        for dev in line.engine.devices:
+        for dev in line.devices:
             assert line.good(dev), dev.name
             assert dev.record.failures == {}
             assert dev.record.unasked == 0
             assert len(line.reads(dev)) > 80
-        for dev in line.engine.devices:
+        for dev in line.devices:
             outcome = line.submit(dev, dev.tags[0], 4711)
             await asyncio.sleep(1)
             assert isinstance(outcome.once, WriteResult)
@@ -100,12 +100,12 @@ async def test_one_that_dies_disturbs_neither_of_the_others(dead: int) -> None:
         await asyncio.sleep(5)
         line.stations[dead].mute = True
         await asyncio.sleep(60)
-        for i, dev in enumerate(line.engine.devices):
+        for i, dev in enumerate(line.devices):
             assert (dev.state is State.OFFLINE) == (i == dead)
             assert line.good(dev) == (i != dead)
         line.stations[dead].mute = False
         await asyncio.sleep(90)
-        assert all(line.good(dev) for dev in line.engine.devices)
+        assert all(line.good(dev) for dev in line.devices)
     assert wrong(line) == []
 
 
@@ -121,7 +121,7 @@ async def test_late_and_lost_answers_on_a_mixed_wire_never_make_a_wrong_value() 
         await asyncio.sleep(2000)
     assert checks.wrong == []
     assert checks.right > 10_000
-    for dev, station in zip(line.engine.devices[1:], line.stations[1:], strict=True):
+    for dev, station in zip(line.devices[1:], line.stations[1:], strict=True):
         assert dev.record.late > 20
         assert commands(station).count("TT") > 20
         said = {data[9:] for _, data in station.heard if data[5:7] == b"TT"}
@@ -224,7 +224,7 @@ async def test_on_demand_blocks_between_exchanges_are_counted_and_never_taken_fo
         await asyncio.sleep(2)
         for _ in range(50):
             await asyncio.sleep(0.17)
-            while line.line._turn is not None:
+            while not line.line.engine.is_idle:
                 await asyncio.sleep(0.002)
             block = on_demand(line)
             for start in range(0, len(block), 4):
@@ -243,7 +243,7 @@ def test_on_demand_blocks_are_told_in_the_log_but_do_not_fill_it() -> None:
             await asyncio.sleep(2)
             for _ in range(100):
                 await asyncio.sleep(0.25)
-                while line.line._turn is not None:
+                while not line.line.engine.is_idle:
                     await asyncio.sleep(0.002)
                 line.bench.received(on_demand(line))
 

@@ -70,7 +70,10 @@ def clock_word(now: float, n: int) -> int:
 
 @dataclass
 class Plant:
-    """One line, its devices and stations; an `Upstairs` that keeps everything."""
+    """One line, its devices and stations; a `SampleSink` that keeps everything.
+
+    `sink` receives samples and state changes instead, if given.
+    """
 
     devices: list[Device]
     stations: list[Unruly]
@@ -170,11 +173,13 @@ def device(
     name: str = "",
     guard: float = 0.5,
     wire: WireTiming = WIRE,
+    verify_reads: int = 1,
     **timing: Any,
 ) -> Device:
     driver = Vigor(station=station)
     times: Timing = replace(driver.timing, **timing)
-    return made_device(name or f"plc{station}", driver, wire, times, tuple(tags), guard)
+    name = name or f"plc{station}"
+    return made_device(name, driver, wire, times, tags, guard, verify_reads=verify_reads)
 
 
 def made_device(
