@@ -21,7 +21,7 @@ def one(rule: WriteRule, text: str = "D0") -> tuple[Plant, Device, Tag]:
 def deafen(line: Plant, command: bytes, times: int = 1, *, obeys: bool = False) -> None:
     """The station does not answer the next `times` requests of this command."""
     station = line.stations[0].inner
-    answer = station._answer
+    answer = station._answer  # private: the station's rule is changed between two frames
 
     def sometimes(request: bytes, now: float) -> object:
         nonlocal times
