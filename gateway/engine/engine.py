@@ -107,17 +107,21 @@ class Engine:
         They share the transaction of `poll`; each is concluded by itself.
         """
         others = self.schedule.alongside(poll, poll.device.window - 1, now)
-        self._in_flight.open_polls += len(others)
+        if others:
+            self._in_flight.open_polls += len(others)
+            self._in_flight.shared = Traffic()
         return others
 
     def conclude(
         self, job: Transacted, result: Result, traffic: Traffic, now: float, time: int
     ) -> list[Effect]:
         """Applies the result of a job."""
+        device, in_flight = job.device, self._in_flight
+        if in_flight.shared is not None:
+            traffic = in_flight.traffic_of_all(in_flight.shared, traffic)
         characters = (traffic.sent + traffic.heard) * self.wire.character
         self.record.busy += characters
         self.record.turnarounds += traffic.turnaround
-        device, in_flight = job.device, self._in_flight
         device.record.count_exchanges(traffic.exchanges, characters, traffic.turnaround)
         if isinstance(job, Poll):
             in_flight.open_polls -= 1
@@ -133,8 +137,7 @@ class Engine:
             self._conclude_other(job, result, traffic, now, time)
         if in_flight.continuation is None:
             in_flight.job = None
-            if in_flight.failed:
-                in_flight.failed.clear()
+            in_flight.failed.clear()
             if in_flight.charged is not None and len(self.devices) > 1:
                 in_flight.charged.used(now, in_flight.begun)
         if self._unsolicited.speakers:

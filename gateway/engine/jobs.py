@@ -154,6 +154,18 @@ class InFlight:
     open_polls: int = 0
     failed: list[tuple[Poll, DeviceError]] = field(default_factory=list)
     continuation: Transacted | None = None
+    shared: "Traffic | None" = None  # of polls that share one transaction
+
+    def traffic_of_all(self, shared: "Traffic", traffic: "Traffic") -> "Traffic":
+        """The traffic of all polls of a transaction once the last has ended, else none."""
+        shared.sent += traffic.sent
+        shared.heard += traffic.heard
+        shared.exchanges += traffic.exchanges
+        shared.turnaround += traffic.turnaround
+        if self.open_polls > 1:
+            return Traffic()
+        self.shared = None
+        return shared
 
     def resume(self, now: float) -> Transacted:
         """Hands out the continuation. What confirms or repeats a write has its own time."""

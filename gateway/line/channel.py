@@ -61,13 +61,19 @@ class Echo:
     in the file the replies show whether the adapter echoes.
     """
 
-    __slots__ = ("_early", "_line", "_pending", "found", "strip")
+    __slots__ = ("_early", "_line", "_logged", "_pending", "_setting", "found", "strip")
 
     def __init__(self, line: str, setting: bool | None) -> None:
         """`setting`: of the file; None: not said."""
         self._line = line
+        self._setting = setting
+        self._logged = False  # once for each line, not at every opening
         self.strip = bool(setting)
-        self.found = setting  # None: no reply has shown it yet
+        self.opened()
+
+    def opened(self) -> None:
+        """The port was opened, perhaps with another adapter."""
+        self.found = self._setting  # None: no reply has shown it yet
         self._pending = b""  # what must still come back
         self._early = b""  # what came instead, so far
 
@@ -116,7 +122,9 @@ class Echo:
                 self.found = False
         elif len(heard) - place - len(request) >= SHORTEST_REPLY and not self.found:
             self.found = True
-            log.warning("adapter echoes", line=self._line, advice="set echo: true")
+            if not self._logged:
+                self._logged = True
+                log.warning("adapter echoes", line=self._line, advice="set echo: true")
 
 
 class Channel:
@@ -133,11 +141,11 @@ class Channel:
         "wire_log",
     )
 
-    def __init__(self, port: Port, wire: WireTiming, wire_log: WireLog, echo: bool | None) -> None:
-        """`echo`: the port hears what it sends; None: not known yet."""
+    def __init__(self, port: Port, wire: WireTiming, wire_log: WireLog, echo: Echo) -> None:
         self.wire = wire
         self.wire_log = wire_log
-        self.echo = Echo(wire_log.line, echo)
+        self.echo = echo
+        echo.opened()
         self.now = asyncio.get_running_loop().time
         self.quiet_since = 0.0  # when the wire was busy last
         self.alarm = Alarm()  # for the time-outs of its transactions

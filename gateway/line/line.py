@@ -19,7 +19,7 @@ from gateway.engine.engine import Engine
 from gateway.engine.jobs import Idle, Poll, Settle, Traffic
 from gateway.engine.requests import Command, Outcome, Request, Write
 from gateway.errors import GatewayError, LineDown
-from gateway.line.channel import NEVER, Alarm, Channel
+from gateway.line.channel import NEVER, Alarm, Channel, Echo
 from gateway.line.perform import perform
 from gateway.line.transaction import Transaction
 from gateway.line.wire_log import WireLog
@@ -55,7 +55,7 @@ class Line:
         self.engine = engine
         self._open_port = open_port
         self._sink = sink
-        self._echo = echo
+        self._echo = Echo(engine.name, echo)
         self._wall = wall
         self._random = random.Random(seed)  # noqa: S311  (jitter, not a secret)
         self._channel: Channel | None = None

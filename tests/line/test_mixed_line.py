@@ -30,6 +30,7 @@ from tests.sim.plant import (
     running,
 )
 from tests.sim.virtual import on_virtual_time, run_virtual
+from tests.sim.witness import Witness
 
 ONE_FORMAT = WireTiming(19200, 10)  # 7E1, of all of them
 NUMBERS = (0, 300, 600)
@@ -78,12 +79,12 @@ async def test_three_protocol_variants_on_one_wire_are_all_healthy() -> None:
     line = mixed()
     async with running(line):
         await asyncio.sleep(30)
-        for dev in line.engine.devices:
+        for dev in line.devices:
             assert line.good(dev), dev.name
             assert dev.record.failures == {}
             assert dev.record.unasked == 0
             assert len(line.reads(dev)) > 80
-        for dev in line.engine.devices:
+        for dev in line.devices:
             outcome = line.submit(dev, dev.tags[0], 4711)
             await asyncio.sleep(1)
             assert isinstance(outcome.once, WriteResult)
@@ -100,12 +101,12 @@ async def test_one_that_dies_disturbs_neither_of_the_others(dead: int) -> None:
         await asyncio.sleep(5)
         line.stations[dead].mute = True
         await asyncio.sleep(60)
-        for i, dev in enumerate(line.engine.devices):
+        for i, dev in enumerate(line.devices):
             assert (dev.state is State.OFFLINE) == (i == dead)
             assert line.good(dev) == (i != dead)
         line.stations[dead].mute = False
         await asyncio.sleep(90)
-        assert all(line.good(dev) for dev in line.engine.devices)
+        assert all(line.good(dev) for dev in line.devices)
     assert wrong(line) == []
 
 
@@ -116,39 +117,16 @@ async def test_late_and_lost_answers_on_a_mixed_wire_never_make_a_wrong_value() 
     for station in line.stations:
         station.late = lambda c: 0.3 + c.uniform(0.05, 0.5) if c.random() < 0.1 else 0.0
         station.lose, station.cut = 0.03, 0.03
-    checks = Check(line)
+    checks = Witness(line)
     async with running(line):
         await asyncio.sleep(2000)
     assert checks.wrong == []
     assert checks.right > 10_000
-    for dev, station in zip(line.engine.devices[1:], line.stations[1:], strict=True):
+    for dev, station in zip(line.devices[1:], line.stations[1:], strict=True):
         assert dev.record.late > 20
         assert commands(station).count("TT") > 20
         said = {data[9:] for _, data in station.heard if data[5:7] == b"TT"}
         assert len(said) == commands(station).count("TT")  # no two alike
-
-
-class Check:
-    """Every good value is compared with the clock as it was during its exchange."""
-
-    def __init__(self, line: Plant) -> None:
-        self.line, self.right, self.wrong = line, 0, list[Any]()
-        line.line._sink = self
-
-    def online(self, device: Device, online: bool) -> None: ...
-
-    def samples(self, samples: Any) -> None:
-        began = self.line.bench.sent[-1][0] if self.line.bench.sent else 0.0
-        for sample in samples:
-            if sample.quality is Quality.GOOD:
-                age = (clock_word(now(), sample.tag.address.number) - sample.value) % 65536
-                if age <= (now() - began) * 1000 + 1:
-                    self.right += 1
-                else:
-                    self.wrong.append((now(), sample.tag.key, age))
-
-
-# NAK 06 in the middle of a block
 
 
 @on_virtual_time
@@ -206,7 +184,7 @@ async def test_on_demand_blocks_before_replies_are_counted_and_never_taken_for_o
         return replies
 
     station.inner.hear = chatty  # type: ignore[method-assign]
-    checks = Check(line)
+    checks = Witness(line)
     async with running(line):
         await asyncio.sleep(60)
     assert said > 25
@@ -219,12 +197,12 @@ async def test_on_demand_blocks_before_replies_are_counted_and_never_taken_for_o
 @on_virtual_time
 async def test_on_demand_blocks_between_exchanges_are_counted_and_never_taken_for_a_reply() -> None:
     line, dev = talkative()
-    checks, said = Check(line), 0
+    checks, said = Witness(line), 0
     async with running(line):
         await asyncio.sleep(2)
         for _ in range(50):
             await asyncio.sleep(0.17)
-            while line.line._turn is not None:
+            while not line.line.engine.is_idle:
                 await asyncio.sleep(0.002)
             block = on_demand(line)
             for start in range(0, len(block), 4):
@@ -243,13 +221,13 @@ def test_on_demand_blocks_are_told_in_the_log_but_do_not_fill_it() -> None:
             await asyncio.sleep(2)
             for _ in range(100):
                 await asyncio.sleep(0.25)
-                while line.line._turn is not None:
+                while not line.line.engine.is_idle:
                     await asyncio.sleep(0.002)
                 line.bench.received(on_demand(line))
 
     with capture_logs() as logs:
         run_virtual(whole())
-    told = [entry for entry in logs if entry["event"] == "nobody asked for this"]
+    told = [entry for entry in logs if entry["event"] == "stray frame"]
     assert len(told) == 100
     assert {entry["what"] for entry in told} == {"on-demand data of station 5: 1E61"}
     at_info = [entry for entry in told if entry["log_level"] == "info"]

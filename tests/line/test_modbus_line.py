@@ -27,9 +27,9 @@ from gateway.protocols.modbus import (
 from gateway.stations.modbus import ModbusStation
 from gateway.tags import Quality, Reason, Tag, WriteResult, WriteRule
 from gateway.transport import Receiver
-from tests.line.test_line import Witness
 from tests.sim.plant import WIRE, Bench, Plant, Unruly, clock_word, made_device, make_tag, running
 from tests.sim.virtual import on_virtual_time
+from tests.sim.witness import Witness
 from tests.vectors import vectors
 
 NETWORK = WireTiming(NETWORK_BAUD, 10)
@@ -74,6 +74,7 @@ def plant(
     wire: WireTiming = WIRE,
     seed: int = 0,
     bench: Bench | None = None,
+    echo_in_file: bool = True,
     **station: Any,
 ) -> Plant:
     """Each device with its station, whose holding registers tell the time in milliseconds."""
@@ -85,7 +86,13 @@ def plant(
             if tag.address.area == "holding" and tag.write is None:
                 n = tag.address.number
                 inner.memory.animate("holding", n, lambda at, n=n: clock_word(at, n))
-    return Plant(list(devices), stations, bench or Bench(seed=seed), wire)
+    return Plant(
+        list(devices),
+        stations,
+        bench or Bench(seed=seed),
+        wire,
+        echo_in_file=echo_in_file,
+    )
 
 
 def good_reads(plant: Plant, since: float = 0.0) -> int:
@@ -366,18 +373,12 @@ def writable(driver: Driver) -> tuple[Tag, Tag]:
     )
 
 
-def unsaid(line: Plant) -> Plant:
-    """The adapter echoes, and the file does not say so."""
-    line.line._echo = None
-    return line
-
-
 @pytest.mark.parametrize("driver", [ModbusRtu(station=1), ModbusAscii(station=1)])
 @on_virtual_time
 async def test_an_echo_the_file_does_not_speak_of_is_no_acknowledgement(driver: Driver) -> None:
     tags = writable(driver)
     dev = slave(driver, tags)
-    line = unsaid(plant([dev], bench=Bench(echo=True)))
+    line = plant([dev], bench=Bench(echo=True), echo_in_file=False)
     async with running(line):
         await asyncio.sleep(5)
         for tag, value in zip(tags, (1234, True), strict=True):
@@ -398,7 +399,7 @@ async def test_an_echo_the_file_does_not_speak_of_is_no_acknowledgement(driver: 
 @on_virtual_time
 async def test_an_echo_the_file_does_not_speak_of_is_told_once() -> None:
     driver = ModbusRtu(station=1)
-    line = unsaid(plant([slave(driver, writable(driver))], bench=Bench(echo=True)))
+    line = plant([slave(driver, writable(driver))], bench=Bench(echo=True), echo_in_file=False)
     with capture_logs() as logs:
         async with running(line):
             await asyncio.sleep(60)
@@ -408,7 +409,7 @@ async def test_an_echo_the_file_does_not_speak_of_is_told_once() -> None:
             await asyncio.sleep(60)
     told = [entry for entry in logs if "adapter echoes" in entry["event"]]
     assert [(entry["event"], entry["log_level"]) for entry in told] == [
-        ("the adapter echoes: set echo: true", "warning")
+        ("adapter echoes", "warning")
     ]
 
 
@@ -434,7 +435,7 @@ async def test_a_dead_slave_is_not_brought_to_life_by_the_echo_of_a_loopback() -
     """Function 08 is answered with the request, too."""
     driver = ModbusRtu(station=1, diagnostics=True)
     dev = slave(driver, writable(driver))
-    line = unsaid(plant([dev], bench=Bench(echo=True)))
+    line = plant([dev], bench=Bench(echo=True), echo_in_file=False)
     line.stations[0].mute = True
     async with running(line):
         await asyncio.sleep(60)

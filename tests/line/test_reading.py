@@ -10,8 +10,7 @@ from tests.sim.virtual import on_virtual_time
 
 @on_virtual_time
 async def test_two_readings_that_agree_are_believed_and_both_were_sent() -> None:
-    mixer = device(words(100, 2))
-    mixer.verify_reads = 2
+    mixer = device(words(100, 2), verify_reads=2)
     hall = plant([mixer])
     async with running(hall):
         await asyncio.sleep(10)
@@ -24,8 +23,7 @@ async def test_two_readings_that_agree_are_believed_and_both_were_sent() -> None
 
 @on_virtual_time
 async def test_a_value_that_is_another_each_time_is_never_believed() -> None:
-    mixer = device(words(100, 1))
-    mixer.verify_reads = 2
+    mixer = device(words(100, 1), verify_reads=2)
     hall = plant([mixer])
     hall.stations[0].memory.animate("D", 100, lambda now: int(now * 1000) & 0xFFFF)
     async with running(hall):
@@ -38,8 +36,7 @@ async def test_a_value_that_is_another_each_time_is_never_believed() -> None:
 
 @on_virtual_time
 async def test_a_device_is_not_taken_for_silent_because_one_of_its_values_moves() -> None:
-    mixer = device([*words(100, 1), *words(900, 1)])
-    mixer.verify_reads = 2
+    mixer = device([*words(100, 1), *words(900, 1)], verify_reads=2)
     hall = plant([mixer])
     hall.stations[0].memory.animate("D", 100, lambda now: int(now * 1000) & 0xFFFF)
     async with running(hall):

@@ -80,11 +80,18 @@ def now() -> float:
     return asyncio.get_running_loop().time()
 
 
-def behind(server: DeviceServer, driver: AnyDriver, *tags: Tag) -> tuple[Plant, Device, Any]:
+def behind(
+    server: DeviceServer,
+    driver: AnyDriver,
+    *tags: Tag,
+    echo_in_file: bool = True,
+    **timing: Any,
+) -> tuple[Plant, Device, Any]:
     """The line, its device, and the memory of its PLC."""
-    dev = made_device("plc", driver, WIRE, driver.timing, tags, GUARD)
+    dev = made_device("plc", driver, WIRE, replace(driver.timing, **timing), tags, GUARD)
     station = station_for(driver, [])
-    return Plant([dev], [station], server, WIRE), dev, station.memory  # type: ignore[list-item]
+    line = Plant([dev], [station], server, WIRE, echo_in_file=echo_in_file)  # type: ignore[list-item]
+    return line, dev, station.memory
 
 
 def told_wrong(line: Plant) -> list[object]:
@@ -107,8 +114,7 @@ async def test_after_a_stall_no_old_answer_is_taken_for_a_new_one(
     numbers = (100, 1000, 1001, 2000, 2001, 2002, 3000, 3001, 3002, 3003)
     tags = [make_tag(f"{area}{n}", driver, device="plc", type="uint16") for n in numbers]
     server = DeviceServer()
-    line, dev, memory = behind(server, driver, *tags)
-    dev.timing = replace(dev.timing, retries=retries)
+    line, dev, memory = behind(server, driver, *tags, retries=retries)
     for number in range(4000):
         memory.write(area.strip(":"), number, [number])
     async with running(line):
@@ -189,16 +195,17 @@ async def test_late_refusals_of_what_a_slave_does_not_have_acknowledge_nothing(
     line = Plant([dev], [Few(dict.fromkeys(numbers, 0), inner)], server, WIRE)  # type: ignore[list-item]
     false: list[object] = []
 
-    def judged(tag: Tag, value: int, outcome: Any) -> None:
+    def judged(tag: Tag, value: int, written: asyncio.Future[WriteResult]) -> None:
         there = inner.memory.read("holding", tag.address.number)[0]
-        if isinstance(outcome, WriteResult) and there != value:
+        if written.exception() is None and there != value:
             false.append((tag.text, value, there))
 
     async with running(line):
         for count in range(1500):
             tag, value = tags[count % 5], 1000 + count
             held[tag.address.number].add(value)
-            line.line.submit(dev, tag, [value], partial(judged, tag, value))
+            written = line.line.write(dev, tag, [value])
+            written.add_done_callback(partial(judged, tag, value))
             await asyncio.sleep(0.7)
     assert false == []
     good = [s for _, s in line.told if s.quality is Quality.GOOD]
@@ -258,8 +265,7 @@ async def test_the_echo_of_our_own_area_c_acknowledges_no_write(delay: float) ->
     driver = ComputerLink(station=5, send_area_c=True)
     tag = make_tag("D100", driver, device="plc", every=0.1, write=WriteRule())
     server = DeviceServer(echo=True, latency=delay)
-    line, dev, _ = behind(server, driver, tag)
-    line.line._echo = None  # the file says nothing of it
+    line, dev, _ = behind(server, driver, tag, echo_in_file=False)
     async with running(line):
         await asyncio.sleep(3)
         server.deaf_to = lambda request: request[5:7] == b"WW"
@@ -317,8 +323,7 @@ async def test_a_port_that_goes_while_the_line_settles_is_noticed_at_once(
     driver = ModbusRtu(station=1)
     tag = make_tag("holding:100", driver, device="plc", every=0.2)
     server = DeviceServer()
-    line, dev, _ = behind(server, driver, tag)
-    dev.timing = replace(driver.timing, reply_timeout=reply_timeout, retries=10)
+    line, dev, _ = behind(server, driver, tag, reply_timeout=reply_timeout, retries=10)
     async with running(line):
         await asyncio.sleep(5)
         server.flows.clear()
@@ -356,8 +361,7 @@ async def test_writes_refused_together_are_answered_when_their_time_is_over() ->
     driver = ComputerLink(station=1)
     tags = [make_tag(f"D{n}", driver, device="plc", write=WriteRule()) for n in (100, 200, 300)]
     server = DeviceServer()
-    line, dev, _ = behind(server, driver, *tags)
-    dev.timing = replace(driver.timing, reply_timeout=15.0)
+    line, dev, _ = behind(server, driver, *tags, reply_timeout=15.0)
     refuse = b"\x1501FF06"
     answer = line.stations[0].hear
 

@@ -1,21 +1,23 @@
-"""One conversation: time-outs, late answers, echoes, noise and lost ports, byte by byte."""
+"""One transaction: time-outs, late replies, echoes, noise and lost ports, byte by byte."""
 
 import asyncio
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import pytest
-from gateway.line.clock import Clock
 
 from gateway.errors import Evidence, Garbled, LineDown, NoReply, Refused
-from gateway.line.transaction import Turn
-from gateway.line.wire_log import Recorder
+from gateway.line.channel import Channel, Echo
+from gateway.line.transaction import Transaction
+from gateway.line.wire_log import WireLog
 from gateway.planning.wire_timing import WireTiming
-from gateway.protocols.driver import Span
+from gateway.protocols.driver import AnyDriver, Span
 from gateway.protocols.modbus import ModbusRtu
 from gateway.protocols.vigor import Vigor
 from gateway.stations.modbus import ModbusStation
 from gateway.stations.vigor import VigorStation
+from tests.sim.plant import made_device
 from tests.sim.virtual import on_virtual_time
 
 WIRE = WireTiming(9600, 10)
@@ -34,7 +36,7 @@ class Far:
         self.sent: list[tuple[float, bytes]] = []
         self.after: Callable[[int], float | None] = lambda number: 0.1  # None: not at all
         self.spoil: Callable[[bytes], bytes] = lambda data: data
-        self.turn: Turn | None = None
+        self.talk: Transaction | None = None
 
     def write(self, data: bytes) -> None:
         self.sent.append((now(), data))
@@ -47,23 +49,37 @@ class Far:
         asyncio.get_running_loop().call_later(delay, self._deliver, data)
 
     def _deliver(self, data: bytes) -> None:
-        assert self.turn is not None
-        self.turn.received(data)
+        assert self.talk is not None
+        self.talk.received(data)
 
     async def close(self) -> None: ...
 
 
-def turn(port: Far, driver: Any = None, **settings: Any) -> Turn:
+def opened(
+    port: Far,
+    driver: AnyDriver | None = None,
+    *,
+    quiet_since: float = 0.0,
+    baudrate: int = 9600,
+    echo: bool = False,
+    needs_resync: bool = False,
+    unmatched: list[Any] | None = None,
+) -> Transaction:
+    """A transaction on the port. `unmatched` collects the frames that are no reply."""
     driver = driver or Vigor(station=1)
-    clock = settings.pop("clock", Clock())
-    echo = settings.pop("echo", False)
-    port.turn = Turn(
-        port, driver.codec, WIRE, 0.005, 0.3, clock, Recorder("test"), driver.station, echo
-    )
-    return port.turn
+    wire = WireTiming(baudrate, 10)
+    timing = replace(driver.timing, reply_timeout=0.3, silence=0.005, silence_chars=0.0)
+    device = made_device("plc", driver, wire, timing, ())
+    if not needs_resync:
+        device.health.answered()
+    channel = Channel(port, wire, WireLog("test"), Echo("test", echo))
+    channel.quiet_since = quiet_since
+    frames = [] if unmatched is None else unmatched
+    port.talk = Transaction(channel, device, lambda _, frame: frames.append(frame))
+    return port.talk
 
 
-def read(talk: Turn, span: Span = SPAN) -> Any:
+def read(talk: Transaction, span: Span = SPAN) -> Any:
     return Vigor(station=1).read(talk, span)
 
 
@@ -71,15 +87,15 @@ def read(talk: Turn, span: Span = SPAN) -> Any:
 async def test_an_answer_in_pieces_is_an_answer() -> None:
     port = Far()
     port.station.memory.write("D", 0, [7, 8])
-    talk = turn(port)
+    talk = opened(port)
     port.after = lambda _: None
     asking = asyncio.create_task(read(talk))
     await asyncio.sleep(0.01)
     for i, octet in enumerate(b"".join(port.station.hear(port.sent[0][1], 0.0))):
         port.say(bytes([octet]), 0.002 * i)
     assert await asking == (7, 8)
-    assert talk.exchanges == 1
-    assert talk.heard == 10 + 8
+    assert talk.traffic.exchanges == 1
+    assert talk.traffic.heard == 10 + 8
 
 
 @on_virtual_time
@@ -88,25 +104,26 @@ async def test_a_time_out_is_the_characters_own_time_and_the_stations() -> None:
     port.after = lambda _: None
     start = now()
     with pytest.raises(NoReply):
-        await read(turn(port))
+        await read(opened(port))
     request, reply = Vigor(station=1).cost(SPAN)  # type: ignore[misc]
     assert now() - start == pytest.approx((request + reply) * WIRE.character + 0.3)
 
 
 @on_virtual_time
 async def test_the_silence_before_a_request_is_kept_by_the_clock() -> None:
-    port, clock = Far(), Clock(quiet_since=now() + 0.02)
-    await read(turn(port, clock=clock))
+    port = Far()
+    await read(opened(port, quiet_since=now() + 0.02))
     assert port.sent[0][0] == pytest.approx(now() - 0.1)
     assert port.sent[0][0] >= 1000.0 + 0.025
 
 
-@pytest.mark.parametrize("spin", [0.0, 0.001])
+@pytest.mark.parametrize("baudrate", [9600, 115200])  # above 19200 it looks at the clock
 @on_virtual_time
-async def test_watching_the_clock_ends_the_silence_neither_early_nor_much_late(spin: float) -> None:
-    port, clock = Far(), Clock(quiet_since=now(), spin=spin)
-    start = now()
-    await read(turn(port, clock=clock))
+async def test_watching_the_clock_ends_the_silence_neither_early_nor_much_late(
+    baudrate: int,
+) -> None:
+    port, start = Far(), now()
+    await read(opened(port, quiet_since=start, baudrate=baudrate))
     assert 0.005 - 1e-9 <= port.sent[0][0] - start <= 0.0051
 
 
@@ -115,12 +132,12 @@ async def test_bytes_heard_before_the_request_answer_nothing() -> None:
     """Half a late reply before the question and half of it after: still a late reply."""
     before = Far()
     before.station.memory.write("D", 0, [666, 666])
-    await read(turn(before))
+    await read(opened(before))
     late = b"".join(before.station.hear(before.sent[0][1], 0.0))
     port = Far()
     port.station.memory.write("D", 0, [1, 1])
     port.after = lambda _: None
-    talk = turn(port, clock=Clock(quiet_since=now()))
+    talk = opened(port, quiet_since=now())
     asking = asyncio.create_task(read(talk))
     await asyncio.sleep(0)
     assert not port.sent
@@ -136,7 +153,7 @@ async def test_bytes_heard_before_the_request_answer_nothing() -> None:
 async def test_settling_ends_when_the_late_answer_has_passed() -> None:
     port = Far()
     port.after = lambda _: 0.5
-    talk = turn(port)
+    talk = opened(port)
     with pytest.raises(NoReply):
         await read(talk)
     start = now()
@@ -150,7 +167,7 @@ async def test_settling_ends_when_the_late_answer_has_passed() -> None:
 async def test_settling_ends_with_the_guard_when_nothing_comes() -> None:
     port = Far()
     port.after = lambda _: None
-    talk = turn(port)
+    talk = opened(port)
     with pytest.raises(NoReply):
         await read(talk)
     start = now()
@@ -158,44 +175,44 @@ async def test_settling_ends_with_the_guard_when_nothing_comes() -> None:
     assert now() - start == pytest.approx(0.4)
 
 
-@pytest.mark.parametrize("in_doubt", [False, True])
+@pytest.mark.parametrize("needs_resync", [False, True])
 @on_virtual_time
 async def test_a_late_refusal_is_a_late_answer_unless_it_may_answer_something_older(
-    in_doubt: bool,
+    needs_resync: bool,
 ) -> None:
     port = Far(VigorStation(1, holes=[("D", 0)]))
     port.after = lambda _: 0.5
-    talk = turn(port)
-    talk.in_doubt = in_doubt
+    talk = opened(port, needs_resync=needs_resync)
     with pytest.raises(NoReply):
         await read(talk)
     late = await talk.settle(10.0, 0.02)
-    assert (late is None) is in_doubt
+    assert (late is None) is needs_resync
 
 
 @on_virtual_time
 async def test_another_frame_does_not_end_the_guard() -> None:
     port = Far()
     port.after = lambda _: None
-    talk = turn(port)
+    frames: list[Any] = []
+    talk = opened(port, unmatched=frames)
     with pytest.raises(NoReply):
         await read(talk)
     other = Far()
-    await read(turn(other), Span("D", 0, 5))
+    await read(opened(other), Span("D", 0, 5))
     frame = b"".join(other.station.hear(other.sent[0][1], 0.0))
     port.say(frame, 0.1)
-    port.turn = talk
+    port.talk = talk
     start = now()
     assert await talk.settle(0.4, 0.02) is None
     assert now() - start == pytest.approx(0.4)
-    assert talk.passed == 1
+    assert len(frames) == 1
 
 
 @on_virtual_time
 async def test_settling_can_be_cancelled() -> None:
     port = Far()
     port.after = lambda _: None
-    talk = turn(port)
+    talk = opened(port)
     with pytest.raises(NoReply):
         await read(talk)
     settling = asyncio.create_task(talk.settle(10.0, 0.02))
@@ -209,7 +226,7 @@ async def test_settling_can_be_cancelled() -> None:
 async def test_after_nonsense_it_waits_for_quiet() -> None:
     port = Far()
     port.spoil = lambda data: data[:-1] + b"?"
-    talk = turn(port)
+    talk = opened(port)
     with pytest.raises(Garbled) as caught:
         await read(talk)
     assert caught.value.evidence is Evidence.CHECKSUM
@@ -233,13 +250,13 @@ async def test_after_nonsense_it_waits_for_quiet() -> None:
 async def test_what_was_heard_instead_says_what_is_wrong(heard: str, evidence: Evidence) -> None:
     port = Far()
     port.after = lambda _: None
-    talk = turn(port)
+    talk = opened(port)
     asking = asyncio.create_task(read(talk))
     await asyncio.sleep(0.01)
     other = Far(VigorStation(2 if heard == "station" else 1))
     driver = Vigor(station=other.station.station)
     span = Span("D", 0, 3) if heard == "shape" else SPAN
-    await driver.read(turn(other, driver), span)
+    await driver.read(opened(other, driver), span)
     frame = b"".join(other.station.hear(other.sent[0][1], 0.0))
     talk.received(
         {"station": frame, "shape": frame, "noise": b"\xffU\x00", "echo": port.sent[0][1]}[heard]
@@ -253,7 +270,7 @@ async def test_what_was_heard_instead_says_what_is_wrong(heard: str, evidence: E
 async def test_a_lost_port_ends_the_question_and_all_that_would_follow() -> None:
     port = Far()
     port.after = lambda _: None
-    talk = turn(port)
+    talk = opened(port)
     asking = asyncio.create_task(read(talk))
     await asyncio.sleep(0.1)
     talk.lost(LineDown("gone"))
@@ -270,7 +287,7 @@ async def test_a_lost_port_ends_the_settling(garbled: bool) -> None:
     port = Far()
     port.after = lambda _: 0.1 if garbled else None
     port.spoil = lambda data: data[:-1] + b"?"
-    talk = turn(port)
+    talk = opened(port)
     with pytest.raises(Garbled if garbled else NoReply):
         await read(talk)
     settling = asyncio.create_task(talk.settle(10.0, 0.02))
@@ -284,7 +301,7 @@ async def test_a_lost_port_ends_the_settling(garbled: bool) -> None:
 @on_virtual_time
 async def test_noise_between_two_questions_of_a_turn_does_no_harm() -> None:
     port = Far()
-    talk = turn(port)
+    talk = opened(port)
     await read(talk)
     broken = b"".join(port.station.hear(port.sent[0][1], 0.0))[:-1] + b"?"
     talk.received(broken)
@@ -296,7 +313,7 @@ async def test_a_refusal_is_raised_at_once() -> None:
     port = Far(VigorStation(1, holes=[("D", 0)]))
     start = now()
     with pytest.raises(Refused):
-        await read(turn(port))
+        await read(opened(port))
     assert now() - start == pytest.approx(0.1)
 
 
@@ -318,7 +335,7 @@ async def test_an_echo_is_dropped_whatever_comes_before_it(added: bytes) -> None
     port = Echoing()
     port.added = added
     port.station.memory.write("D", 0, [3, 4])
-    assert await read(turn(port, echo=True)) == (3, 4)
+    assert await read(opened(port, echo=True)) == (3, 4)
 
 
 @pytest.mark.parametrize("added", [b"", b"\x00"])
@@ -329,7 +346,7 @@ async def test_an_echo_is_never_taken_for_an_acknowledgement(added: bytes) -> No
     port = Echoing(ModbusStation(station=1, framing="rtu"))
     port.added = added
     port.after = lambda _: None  # the station is dead
-    talk = turn(port, driver, echo=True)
+    talk = opened(port, driver, echo=True)
     with pytest.raises((NoReply, Garbled)):
         await driver.write(talk, Span("holding", 5, 1), [42])
 
@@ -341,7 +358,7 @@ async def test_where_the_echo_is_missing_nothing_is_believed() -> None:
     port.adapter = False
     port.spoil = lambda data: b"\x01" + data
     with pytest.raises(Garbled, match="did not come back"):
-        await driver.read(turn(port, driver, echo=True), Span("holding", 5, 2))
+        await driver.read(opened(port, driver, echo=True), Span("holding", 5, 2))
 
 
 @on_virtual_time
@@ -349,6 +366,6 @@ async def test_the_turnaround_is_the_stations_own_time() -> None:
     port = Far()
     request, reply = Vigor(station=1).cost(SPAN)  # type: ignore[misc]
     port.after = lambda _: (request + reply) * WIRE.character + 0.04
-    talk = turn(port)
+    talk = opened(port)
     await read(talk)
-    assert talk.turnaround == pytest.approx(0.04)
+    assert talk.traffic.turnaround == pytest.approx(0.04)

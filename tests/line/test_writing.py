@@ -21,7 +21,7 @@ def one(rule: WriteRule, text: str = "D0") -> tuple[Plant, Device, Tag]:
 def deafen(line: Plant, command: bytes, times: int = 1, *, obeys: bool = False) -> None:
     """The station does not answer the next `times` requests of this command."""
     station = line.stations[0].inner
-    answer = station._answer
+    answer = station._answer  # private: the station's rule is changed between two frames
 
     def sometimes(request: bytes, now: float) -> object:
         nonlocal times
@@ -36,7 +36,7 @@ def deafen(line: Plant, command: bytes, times: int = 1, *, obeys: bool = False) 
 
 
 async def write(line: Plant, value: int = 5) -> Outcome:
-    dev = line.engine.devices[0]
+    dev = line.devices[0]
     outcome = line.submit(dev, dev.tags[0], value)
     await asyncio.sleep(4)
     return outcome
@@ -159,7 +159,7 @@ async def test_a_refused_reading_back_does_not_make_the_write_refused() -> None:
     assert station.memory.read("D", 0) == [5]
     assert isinstance(outcome, Unclear)
     assert "acknowledged" in str(outcome)
-    assert dev.failures == 0
+    assert dev.health.consecutive_failures == 0
 
 
 @on_virtual_time
@@ -171,7 +171,7 @@ async def test_a_device_that_holds_something_else_is_said_so() -> None:
         outcome = (await write(line)).once
         assert isinstance(outcome, Differs)
         assert "now holds 0" in str(outcome)
-        assert dev.failures == 0
+        assert dev.health.consecutive_failures == 0
     assert len(line.writes_sent()) == 1
 
 
@@ -207,7 +207,7 @@ async def test_reading_the_word_of_a_bit_failing_sends_nothing() -> None:
     async with running(line):
         await asyncio.sleep(1)
         deafen(line, b"51", times=1)
-        outcome = line.submit(line.engine.devices[0], line.engine.devices[0].tags[0], True)
+        outcome = line.submit(line.devices[0], line.devices[0].tags[0], True)
         await asyncio.sleep(3)
         assert isinstance(outcome.once, Unclear)
     assert line.writes_sent() == []
@@ -218,7 +218,7 @@ async def test_a_bit_area_is_written_bit_by_bit() -> None:
     line, _, tag = one(WriteRule(verify=True), "M12")
     async with running(line):
         await asyncio.sleep(1)
-        outcome = line.submit(line.engine.devices[0], tag, True)
+        outcome = line.submit(line.devices[0], tag, True)
         await asyncio.sleep(1)
         assert isinstance(outcome.once, WriteResult)
         assert outcome.once.verified

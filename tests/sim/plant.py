@@ -4,7 +4,7 @@ What the line tells, sends and hears is kept with its time, so that a test can a
 """
 
 import asyncio
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -70,7 +70,10 @@ def clock_word(now: float, n: int) -> int:
 
 @dataclass
 class Plant:
-    """One line, its devices and stations; an `Upstairs` that keeps everything."""
+    """One line, its devices and stations; a `SampleSink` that keeps everything.
+
+    `listeners` receive the samples first.
+    """
 
     devices: list[Device]
     stations: list[Unruly]
@@ -79,6 +82,8 @@ class Plant:
     told: list[tuple[float, Sample]] = field(default_factory=list)
     lives: list[tuple[float, str, bool]] = field(default_factory=list)
     now: dict[Tag, Sample] = field(default_factory=dict)
+    echo_in_file: bool = True  # False: an adapter echoes, and the file does not mention it
+    listeners: list[Callable[[Sequence[Sample]], None]] = field(default_factory=list)
     line: Line = field(init=False)
 
     def __post_init__(self) -> None:
@@ -86,12 +91,14 @@ class Plant:
             Engine("line", self.devices, self.wire, self.bench.seed),
             lambda receiver: self.bench.open(self.stations, self.wire, receiver),
             self,
-            echo=self.bench.echo or None,
+            echo=(self.bench.echo and self.echo_in_file) or None,
             wall=lambda: int(_now() * SECOND),
             seed=self.bench.seed,
         )
 
     def samples(self, samples: Sequence[Sample]) -> None:
+        for listener in self.listeners:
+            listener(samples)
         for sample in samples:
             self.told.append((_now(), sample))
             self.now[sample.tag] = sample
@@ -170,11 +177,13 @@ def device(
     name: str = "",
     guard: float = 0.5,
     wire: WireTiming = WIRE,
+    verify_reads: int = 1,
     **timing: Any,
 ) -> Device:
     driver = Vigor(station=station)
     times: Timing = replace(driver.timing, **timing)
-    return made_device(name or f"plc{station}", driver, wire, times, tuple(tags), guard)
+    name = name or f"plc{station}"
+    return made_device(name, driver, wire, times, tags, guard, verify_reads=verify_reads)
 
 
 def made_device(

@@ -1,9 +1,8 @@
-"""A sample sink that checks every good value against the clock of the stations' memory."""
+"""Checks every good value against the clock of the stations' memory."""
 
 import asyncio
 from collections.abc import Sequence
 
-from gateway.engine.device import Device
 from gateway.tags import Quality, Sample
 from tests.sim.plant import Plant, clock_word
 
@@ -11,17 +10,14 @@ from tests.sim.plant import Plant, clock_word
 class Witness:
     """Checks every good value against the station's memory during the transaction that read it.
 
-    Passes all samples on to the plant. The memory must hold clock words (`clockwork`).
+    The memory must hold clock words (`clockwork`).
     """
 
     def __init__(self, plant: Plant) -> None:
         self.plant = plant
         self.right = 0
         self.wrong: list[tuple[float, str, int]] = []  # when, tag, milliseconds too old
-        plant.line._sink = self  # private: a plant is made with its line and is its only sink
-
-    def online(self, device: Device, online: bool) -> None:
-        self.plant.online(device, online)
+        plant.listeners.append(self.samples)
 
     def samples(self, samples: Sequence[Sample]) -> None:
         now = asyncio.get_running_loop().time()
@@ -36,4 +32,3 @@ class Witness:
                 self.right += 1
             else:
                 self.wrong.append((now, sample.tag.key, age))
-        self.plant.samples(samples)

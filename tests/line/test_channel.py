@@ -3,8 +3,7 @@
 import asyncio
 from collections.abc import Callable
 
-from gateway.line.clock import NEVER, Alarm
-
+from gateway.line.channel import NEVER, Alarm
 from tests.sim.virtual import on_virtual_time
 
 
