@@ -54,9 +54,7 @@ def busy_plant() -> tuple[Plant, BusyStation]:
 
 
 @on_virtual_time
-async def test_a_device_busy_twice_is_polled_again_at_growing_pauses_and_keeps_its_values() -> (
-    None
-):
+async def test_a_device_busy_twice_is_polled_again_at_growing_pauses_and_keeps_its_values() -> None:
     line, station = busy_plant()
     (dev,) = line.line.engine.devices
     async with running(line):
