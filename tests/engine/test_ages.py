@@ -39,7 +39,7 @@ def random_devices(chance: random.Random) -> list[Device]:
 
 
 def ages(devices: list[Device], seconds: float, written: Device | None = None) -> dict[Poll, float]:
-    """The worst age of each poll, on a wire that takes the planned times. `written`: all the time."""
+    """The worst age of each poll, in planned wire times. `written`: all the time."""
     schedule, now, worst = Schedule(devices, 0.0), 0.0, dict[Poll, float]()
     while now < seconds:
         if written is not None and not schedule.requests.waiting:
