@@ -158,6 +158,8 @@ class Engine:
                 self._in_flight.failed.append((poll, result))
             case LineDown():
                 device.health.left_outstanding(poll.block.span)
+            case _:
+                raise result
 
     def _conclude_other(
         self, job: Transacted, result: Result, traffic: Traffic, now: float, time: int
@@ -188,6 +190,8 @@ class Engine:
                     self._results.answered(device, now, time)
             case Unclear():
                 self._unclear(probe, result, traffic, now, time)
+            case BadValue():
+                raise result
 
     def _conclude_request(
         self, job: RequestJob, result: Result, traffic: Traffic, now: float, time: int

@@ -56,7 +56,7 @@ class Results:
         """A block was read well."""
         device, block = poll.device, poll.block
         health, last = device.health, poll.last
-        if health.needs_resync or not health.online:
+        if health.needs_resync or health.state is not State.ONLINE:
             self.answered(device, now, time)
         record = poll.record
         if last.at is not None:
