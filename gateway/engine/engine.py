@@ -84,6 +84,8 @@ class Engine:
         in_flight = self._in_flight
         if in_flight.continuation is not None:
             return in_flight.resume(now)
+        if in_flight.job is not None:
+            raise AssertionError(f"{in_flight.job!r} is not concluded")
         job: Job | None = None
         if self._unsolicited.speakers:
             job = self._unsolicited.next(now)
