@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from tests.sim.plant import Unruly
+from tests.sim.bench import Unruly
 
 Instead = Callable[[bytes], list[bytes] | None]
 

@@ -79,7 +79,7 @@ def weighing_machine() -> Device:
 
 
 class Rig:
-    """One engine with an open line, and what it has told so far."""
+    """One engine with an open line, and its effects so far."""
 
     def __init__(self, *devices: Device) -> None:
         self.devices = devices or (link_device(),)

@@ -201,6 +201,16 @@ def after_failed_write(text: str) -> Setup:
     return setup
 
 
+def after_late_reply(then: Setup) -> Setup:
+    """The last failure takes the device offline, but its late reply ends the need of a resync."""
+
+    def setup(rig: Rig) -> Transacted:
+        rig.fail(rig.transacted(), late=0.1)
+        return then(rig)
+
+    return setup
+
+
 def repeat(rig: Rig) -> Transacted:
     rig.conclude(after_failed_write("D3")(rig), Sent())
     return rig.transacted()
@@ -248,6 +258,10 @@ SITUATIONS: dict[str, tuple[State, Setup]] = {
     "offline Settle/Probe": (S.OFFLINE, settle(first)),
     "offline Settle/Ambiguous": (S.OFFLINE, ambiguous(first)),
     "offline ProbeAgain": (S.OFFLINE, probe_again(first)),
+    "offline Write": (S.FAILING, after_late_reply(write("D0"))),
+    "offline WriteVerified": (S.FAILING, after_late_reply(write("D2"))),
+    "offline WriteTogether": (S.FAILING, after_late_reply(write_together)),
+    "offline Command": (S.FAILING, after_late_reply(command)),
     "offline Confirm": (S.FAILING, after_failed_write("D3")),
     "offline ConfirmVerify": (S.FAILING, after_failed_write("D2")),
     "offline ConfirmBoth": (S.FAILING, after_failed_write("D4")),
@@ -427,6 +441,32 @@ offline  ProbeAgain            ambiguous     online    online                   
 offline  ProbeAgain            any-refusal   online    online                               Poll
 offline  ProbeAgain            any-unclear   offline   -                                    Settle
 offline  ProbeAgain            lost          offline   -                                    -
+offline  Write                 sent          online    online+written                       Poll
+offline  Write                 to-all        offline   pause+sent                           Probe
+offline  Write                 any-refusal   online    online+Refused                       Poll
+offline  Write                 any-unclear   offline   -                                    Settle
+offline  Write                 lost          offline   Unclear                              -
+offline  Write                 not-sent      offline   -                                    Settle
+offline  WriteVerified         held          online    online+verified                      Poll
+offline  WriteVerified         differs       online    online+Differs                       Poll
+offline  WriteVerified         refused-back  online    online+Differs                       Poll
+offline  WriteVerified         to-all        offline   pause+sent                           Probe
+offline  WriteVerified         any-refusal   online    online+Refused                       Poll
+offline  WriteVerified         any-unclear   offline   -                                    Settle
+offline  WriteVerified         lost          offline   Unclear                              -
+offline  WriteVerified         not-sent      offline   -                                    Settle
+offline  WriteTogether         sent          online    online+written+written               Poll
+offline  WriteTogether         any-refusal   online    online                               Poll
+offline  WriteTogether         any-unclear   offline   -                                    Settle
+offline  WriteTogether         lost          offline   Unclear+Unclear                      -
+offline  WriteTogether         not-sent      offline   -                                    Settle
+offline  Command               obeyed        online    online+obeyed                        Poll
+offline  Command               obeyed-by-all offline   pause+obeyed                         Idle
+offline  Command               bad-value     offline   BadValue                             Idle
+offline  Command               any-refusal   online    online+Refused                       Poll
+offline  Command               any-unclear   offline   -                                    Settle
+offline  Command               lost          offline   Unclear                              -
+offline  Command               not-sent      offline   -                                    Settle
 offline  Confirm               sent          offline   -                                    Repeat
 offline  Confirm               any-refusal   online    online+NoReply                       Poll
 offline  Confirm               any-unclear   offline   -                                    Settle

@@ -129,7 +129,7 @@ class Machine(RuleBasedStateMachine):
         self.devices = devices()
         self.engine = Engine("line", self.devices, WIRE)
         self.states = {device: device.state for device in self.devices}
-        self.online = dict.fromkeys(self.devices, False)  # as the effects tell
+        self.online = dict.fromkeys(self.devices, False)  # by the effects
         self.submitted = list[Request]()
         self.ended = set[Request]()
         self.in_flight: list[Transacted] = []
@@ -164,7 +164,9 @@ class Machine(RuleBasedStateMachine):
                             [of] = [one for one in self.devices if sample.tag in one.tags]
                             assert self.engine.is_open
                             assert of.health.online
-                            assert self.online[of], "online is told before the first sample"
+                            assert self.online[of], (
+                                "the device comes online before its first sample"
+                            )
 
     def take(self) -> Job:
         """The next job, and the promises on it."""

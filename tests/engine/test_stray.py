@@ -15,7 +15,7 @@ LIST = (Span("D", 0, 1),)
 ON_DEMAND = ComputerLinkStation(1).on_demand("1E61")
 
 
-class Heard:
+class StrayLine:
     """The stray frames of one line."""
 
     def __init__(self, *devices: Device) -> None:
@@ -30,88 +30,88 @@ class Heard:
 
 def test_a_stray_frame_of_the_station_is_counted_and_explained() -> None:
     dev = link_device()
-    heard = Heard(dev)
-    heard.stray.received(ON_DEMAND, 0.0)
+    line = StrayLine(dev)
+    line.stray.received(ON_DEMAND, 0.0)
     fields: dict[str, object] = {
         "line": "line",
         "device": "plc1",
         "what": "on-demand data of station 1: 1E61",
         "count": 1,
     }
-    assert heard.log() == [LogEvent("info", "stray frame", fields)]
+    assert line.log() == [LogEvent("info", "stray frame", fields)]
     assert dev.record.unasked == 1
 
 
 def test_a_stray_frame_of_another_station_is_neither_counted_nor_logged() -> None:
     dev, other = link_device(station=1), link_device(station=2)
-    heard = Heard(dev, other)
-    heard.stray.received(ON_DEMAND, 0.0)
-    assert [event.fields["device"] for event in heard.log()] == ["plc1"]
+    line = StrayLine(dev, other)
+    line.stray.received(ON_DEMAND, 0.0)
+    assert [event.fields["device"] for event in line.log()] == ["plc1"]
     assert (dev.record.unasked, other.record.unasked) == (1, 0)
 
 
 def test_any_stray_byte_forgets_every_monitor_list() -> None:
     devices = link_device(station=1), link_device(station=2), device(words(0, 1), station=3)
-    Heard(*devices).stray.received(b"\x00", 0.0)
+    StrayLine(*devices).stray.received(b"\x00", 0.0)
     assert [one.registered for one in devices] == [(), (), ()]
 
 
 def test_a_frame_may_arrive_in_pieces_with_short_pauses() -> None:
-    heard = Heard(link_device())
+    line = StrayLine(link_device())
     for n, byte in enumerate(ON_DEMAND):
-        heard.stray.received(bytes([byte]), n * PAUSE / 2)
-    assert len(heard.log()) == 1
+        line.stray.received(bytes([byte]), n * PAUSE / 2)
+    assert len(line.log()) == 1
 
 
 def test_after_a_pause_a_new_frame_begins() -> None:
-    heard = Heard(link_device())
-    heard.stray.received(ON_DEMAND[:5], 0.0)
-    heard.stray.received(ON_DEMAND, 1.1 * PAUSE)
-    assert len(heard.log()) == 1
-    heard.stray.received(ON_DEMAND[:5], 20.0)
-    heard.stray.received(ON_DEMAND[5:], 20.0 + 1.1 * PAUSE)
-    assert heard.log() == []
+    line = StrayLine(link_device())
+    line.stray.received(ON_DEMAND[:5], 0.0)
+    line.stray.received(ON_DEMAND, 1.1 * PAUSE)
+    assert len(line.log()) == 1
+    line.stray.received(ON_DEMAND[:5], 20.0)
+    line.stray.received(ON_DEMAND[5:], 20.0 + 1.1 * PAUSE)
+    assert line.log() == []
 
 
 @pytest.mark.parametrize("damage", [b"\x0201FE12\x0300", b"\x0201FF1E61\x0300"])
 def test_a_damaged_frame_is_skipped_and_the_next_is_read(damage: bytes) -> None:
-    heard = Heard(link_device())
-    heard.stray.received(damage, 0.0)
-    assert heard.log() == []
-    heard.stray.received(ON_DEMAND, 1.0)
-    assert len(heard.log()) == 1
+    line = StrayLine(link_device())
+    line.stray.received(damage, 0.0)
+    assert line.log() == []
+    line.stray.received(ON_DEMAND, 1.0)
+    assert len(line.log()) == 1
 
 
 def test_frames_are_logged_as_information_only_now_and_then() -> None:
-    heard = Heard(link_device())
+    line = StrayLine(link_device())
     levels = list[str]()
     for now in (0.0, 0.5 * LOG_EVERY, LOG_EVERY - 0.01, LOG_EVERY, 1.5 * LOG_EVERY):
-        heard.stray.received(ON_DEMAND, now)
-        levels += [event.level for event in heard.log()]
+        line.stray.received(ON_DEMAND, now)
+        levels += [event.level for event in line.log()]
     assert levels == ["info", "debug", "debug", "info", "debug"]
 
 
 def test_each_device_has_its_own_log_interval() -> None:
     dev, other = link_device(station=1), link_device(station=2)
-    heard = Heard(dev, other)
-    heard.stray.frames(dev, [Text(1, "7", "FE")], 0.0)
-    heard.stray.frames(other, [Text(2, "7", "FE")], 0.1)
-    assert [event.level for event in heard.log()] == ["info", "info"]
+    line = StrayLine(dev, other)
+    line.stray.frames(dev, [Text(1, "7", "FE")], 0.0)
+    line.stray.frames(other, [Text(2, "7", "FE")], 0.1)
+    assert [event.level for event in line.log()] == ["info", "info"]
 
 
 def test_a_frame_within_a_transaction_forgets_the_list_of_its_device_alone() -> None:
     dev, other = link_device(station=1), link_device(station=2)
-    heard = Heard(dev, other)
-    heard.stray.frames(dev, [Ack(1)], 0.0)
+    line = StrayLine(dev, other)
+    line.stray.frames(dev, [Ack(1)], 0.0)
     assert (dev.registered, other.registered) == ((), LIST)
-    assert heard.log() == []  # the driver has no explanation
+    assert line.log() == []  # the driver has no explanation
     assert dev.record.unasked == 0  # the caller counts
 
 
 def test_a_protocol_without_stray_frames_explains_nothing() -> None:
     dev = device(words(0, 1))
-    heard = Heard(dev)
-    heard.stray.received(ON_DEMAND, 0.0)
-    heard.stray.frames(dev, [object()], 0.0)
-    assert heard.log() == []
+    line = StrayLine(dev)
+    line.stray.received(ON_DEMAND, 0.0)
+    line.stray.frames(dev, [object()], 0.0)
+    assert line.log() == []
     assert dev.record.unasked == 0

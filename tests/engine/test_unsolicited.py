@@ -53,7 +53,7 @@ class Bench:
     pause: float = 0.01  # seconds until it replies
     echo: bool = False
     sent: list[tuple[float, bytes]] = field(default_factory=list)
-    told: list[tuple[float, Sample]] = field(default_factory=list)
+    delivered: list[tuple[float, Sample]] = field(default_factory=list)
     onlines: list[bool] = field(default_factory=list)
     receiver: Receiver | None = None
 
@@ -83,7 +83,7 @@ class Bench:
     # The sample sink
 
     def samples(self, samples: Sequence[Sample]) -> None:
-        self.told += [(now(), sample) for sample in samples]
+        self.delivered += [(now(), sample) for sample in samples]
 
     def online(self, device: Device, online: bool) -> None:
         self.onlines.append(online)
@@ -96,7 +96,7 @@ class Bench:
 
     def values(self, name: str) -> list[Value | Reason | None]:
         """All samples of a tag: the values, or the reasons of bad ones."""
-        return [s.reason or s.value for _, s in self.told if s.tag.name == name]
+        return [s.reason or s.value for _, s in self.delivered if s.tag.name == name]
 
     def last(self, name: str) -> Value | Reason | None:
         return self.values(name)[-1]
@@ -164,7 +164,7 @@ async def test_a_scale_that_stops_sending_turns_stale_and_offline_until_its_next
         bench.say(STABLE * 2)
         spoke = now()
         await asyncio.sleep(10)
-        stale = [(at, s.reason) for at, s in bench.told if s.quality is Quality.BAD]
+        stale = [(at, s.reason) for at, s in bench.delivered if s.quality is Quality.BAD]
         assert [reason for _, reason in stale] == [Reason.NO_REPLY] * 2  # its two tags, once
         assert stale[0][0] - spoke == pytest.approx(2.0, abs=0.01)
         assert bench.onlines == [True, False]
@@ -691,7 +691,7 @@ async def test_listening_begins_again_when_the_port_was_lost_and_reopened() -> N
     )
 )
 def test_no_received_bytes_end_the_line(name: str, pieces: list[tuple[bytes, float]]) -> None:
-    async def heard() -> None:
+    async def receive() -> None:
         async with running(example(name)) as bench:
             for data, pause in pieces:
                 bench.say(data)
@@ -700,6 +700,6 @@ def test_no_received_bytes_end_the_line(name: str, pieces: list[tuple[bytes, flo
 
     loop = VirtualLoop()
     try:
-        loop.run_until_complete(heard())
+        loop.run_until_complete(receive())
     finally:
         loop.close()
