@@ -84,6 +84,8 @@ class Engine:
         in_flight = self._in_flight
         if in_flight.continuation is not None:
             return in_flight.resume(now)
+        if in_flight.job is not None:
+            raise AssertionError(f"{in_flight.job!r} is not concluded")
         job: Job | None = None
         if self._unsolicited.speakers:
             job = self._unsolicited.next(now)
@@ -161,6 +163,8 @@ class Engine:
                 self._in_flight.failed.append((poll, result))
             case LineDown():
                 device.health.left_outstanding(poll.block.span)
+            case _:
+                raise result
 
     def _conclude_other(
         self, job: Transacted, result: Result, traffic: Traffic, now: float, time: int
@@ -191,6 +195,8 @@ class Engine:
                     self._results.answered(device, now, time)
             case Unclear():
                 self._unclear(probe, result, traffic, now, time)
+            case BadValue():
+                raise result
 
     def _conclude_request(
         self, job: RequestJob, result: Result, traffic: Traffic, now: float, time: int

@@ -115,17 +115,21 @@ class RequestResults:
             self._refused(job.device, result, now, time)
             self._schedule.requests.each_alone(job.writes)
             return
+        if not isinstance(result, Sent):
+            raise TypeError(f"{result!r} is no result of a write")
         self._results.answered(job.device, now, time)
         for write in job.writes:
             self._end(write, write.result(now, time), now)
 
     def _confirmed(self, job: Confirm, result: Result, now: float, time: int) -> Repeat | None:
         """`result`: the units read back, None where the tag does not say `verify`."""
+        if not isinstance(result, Sent | Refused):
+            raise TypeError(f"{result!r} is no result of a write")
         write, rule = job.write, job.write.tag.write
         outcome: Outcome = job.error
         if isinstance(result, Refused):
             self._refused(job.device, result, now, time)
-        elif isinstance(result, Sent) and result.held is not None and write.holds(result.held):
+        elif result.held is not None and write.holds(result.held):
             self._results.answered(job.device, now, time)
             outcome = write.result(now, time, verified=True)
         elif rule is not None and rule.repeat and now < write.expires:

@@ -167,14 +167,14 @@ class UnsolicitedFrames:
             speaker.device.record.count_failure(value)
             if name not in speaker.unreadable:
                 speaker.unreadable.add(name)
-                self._log(speaker.device, value)
+                self._log("field garbled", speaker.device, value)
 
     def _garbled(self, speaker: _Speaker, damage: Garbled, time: int) -> None:
         device = speaker.device
         if device.broadcast:
             device.health.not_understood(damage)
         if speaker.understood:  # damage after damage is logged once
-            self._log(device, damage)
+            self._log("frame garbled", device, damage)
         speaker.understood = False
         device.record.count_failure(damage)
         self._bad(speaker, speaker.tags, Reason.GARBLED, str(damage), time)
@@ -202,6 +202,6 @@ class UnsolicitedFrames:
         if tags := speaker.tags_of(fields):
             self._effects.bad(tags, reason, time, detail)
 
-    def _log(self, device: Device, damage: Garbled) -> None:
+    def _log(self, event: str, device: Device, damage: Garbled) -> None:
         heard = damage.data.hex(" ")
-        self._effects.info("frame garbled", device=device.name, why=str(damage), bytes=heard)
+        self._effects.info(event, device=device.name, why=str(damage), bytes=heard)

@@ -1,4 +1,4 @@
-"""The ages that `check` promises, held against the schedule on lines drawn at random."""
+"""The ages that `check` promises, compared with the schedule on random lines."""
 
 import random
 
@@ -26,7 +26,7 @@ def answering(station: int, *intervals: float) -> Device:
     return found
 
 
-def drawn(chance: random.Random) -> list[Device]:
+def random_devices(chance: random.Random) -> list[Device]:
     def intervals() -> list[float]:
         groups = chance.choice((1, 1, 2, 3))
         return [
@@ -39,19 +39,18 @@ def drawn(chance: random.Random) -> list[Device]:
 
 
 def ages(devices: list[Device], seconds: float, written: Device | None = None) -> dict[Poll, float]:
-    """The worst of each poll, on a wire that takes what is reckoned. `written`: all the time."""
+    """The worst age of each poll, in planned wire times. `written`: all the time."""
     schedule, now, worst = Schedule(devices, 0.0), 0.0, dict[Poll, float]()
     while now < seconds:
-        if written is not None and not schedule.requests:
-            write = Write(written, written.tags[0], [1], now, now + 99, lambda _: None)
-            schedule.requests.submit(write)
+        if written is not None and not schedule.requests.waiting:
+            schedule.requests.submit(Write(written, written.tags[0], [1], now))
         match schedule.next(now):
-            case Poll(device=of, last_good=before) as poll:
-                begun = now
+            case Poll(device=of) as poll:
+                begun, before = now, poll.last.at
                 now += of.seconds(poll.block.cost)
                 if before is not None and before > seconds / 10:  # all have found their places
                     worst[poll] = max(worst.get(poll, 0.0), now - before)
-                poll.read(now)
+                poll.last.at = now
                 schedule.polled(poll, now)
                 of.used(now, begun)
             case Write():
@@ -63,7 +62,7 @@ def ages(devices: list[Device], seconds: float, written: Device | None = None) -
 
 
 def over(found: dict[Poll, float]) -> float:
-    """How much the worst was above what was promised; 1.0: nothing."""
+    """The worst age as a share of the promised one."""
     blocks = asked([*dict.fromkeys(poll.device for poll in found)])
     promised = dict(zip([(b.device, b.block) for b in blocks], worst_ages(blocks), strict=True))
     return max(age / promised[poll.device, poll.block] for poll, age in found.items())
@@ -71,12 +70,12 @@ def over(found: dict[Poll, float]) -> float:
 
 @pytest.mark.parametrize("seed", range(12))
 def test_no_value_gets_older_than_promised(seed: int) -> None:
-    devices = drawn(random.Random(seed))
+    devices = random_devices(random.Random(seed))
     overloaded = load_of(asked(devices)) > 1
     assert over(ages(devices, 120.0)) <= (1.25 if overloaded else 1.0)
 
 
-def test_a_big_device_among_small_ones_waits_longer_and_that_is_promised() -> None:
+def test_the_longer_wait_of_a_big_device_among_small_ones_is_promised() -> None:
     """All have the same share of the wire, and it needs ten times what the others need."""
     small = [answering(n, *[0.5] * 10) for n in range(1, 10)]
     big = answering(10, *[0.5] * 100)
@@ -89,7 +88,7 @@ def test_a_big_device_among_small_ones_waits_longer_and_that_is_promised() -> No
     assert max(by_device[small[0]]) < 3.0
 
 
-def test_who_is_written_to_all_the_time_is_read_like_the_others() -> None:
+def test_a_device_that_is_written_all_the_time_is_polled_like_the_others() -> None:
     devices = [answering(n, *[0.5] * 20) for n in (1, 2, 3)]
     found = ages(devices, 300.0, written=devices[0])
     worst = [max(age for poll, age in found.items() if poll.device is one) for one in devices]

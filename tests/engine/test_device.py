@@ -1,4 +1,4 @@
-"""A device's standing, its doubts, its record and what it says is the matter."""
+"""One device: its health and diagnosis, its plan, its record and its use of the wire."""
 
 import pytest
 
@@ -8,7 +8,8 @@ from gateway.errors import Evidence, Garbled, NoReply, Unclear
 from gateway.protocols.driver import Span
 from gateway.protocols.modbus import ModbusRtu
 from gateway.tags import Reason
-from tests.sim.plant import WIRE, device, made_device, make_tag, words
+from tests.sim.bench import WIRE
+from tests.sim.plant import device, made_device, make_tag, words
 
 
 @pytest.fixture
@@ -16,7 +17,7 @@ def dev() -> Device:
     return device(words(0, 10))
 
 
-def test_a_device_starts_in_doubt_for_answers_to_an_earlier_gateway_may_still_come(
+def test_a_device_starts_with_a_resync_for_replies_to_an_earlier_gateway_may_still_arrive(
     dev: Device,
 ) -> None:
     assert dev.state is State.STARTING
@@ -24,10 +25,15 @@ def test_a_device_starts_in_doubt_for_answers_to_an_earlier_gateway_may_still_co
     assert not dev.health.online
 
 
-def test_an_answer_ends_all_doubt(dev: Device) -> None:
-    dev.failed(NoReply("silence"), Span("D", 0, 10), 0.0)
+def test_a_reply_completes_the_resync(dev: Device) -> None:
+    dev.health.unclear(NoReply("silence"), Span("D", 0, 10), 0.0)
     dev.health.answered()
-    assert (dev.state, dev.failures, dev.health.needs_resync, dev.health.outstanding) == (
+    assert (
+        dev.state,
+        dev.health.consecutive_failures,
+        dev.health.needs_resync,
+        dev.health.outstanding,
+    ) == (
         State.ONLINE,
         0,
         False,
@@ -36,91 +42,98 @@ def test_an_answer_ends_all_doubt(dev: Device) -> None:
     assert dev.diagnosis() == ""
 
 
-def test_a_failure_of_a_device_that_answered_makes_it_failing(dev: Device) -> None:
+def test_a_failure_of_an_online_device_makes_it_failing(dev: Device) -> None:
     dev.health.answered()
-    dev.failed(NoReply("silence"), Span("D", 0, 10), 0.0)
+    dev.health.unclear(NoReply("silence"), Span("D", 0, 10), 0.0)
     assert dev.state is State.FAILING
     assert dev.health.online
     assert dev.health.needs_resync
 
 
-@pytest.mark.parametrize("standing", [State.STARTING, State.OFFLINE])
-def test_a_failure_of_one_that_did_not_leaves_it_so(dev: Device, standing: State) -> None:
-    dev.state = standing
-    dev.failed(NoReply("silence"), None, 0.0)
-    assert dev.state is standing
+@pytest.mark.parametrize("state", [State.STARTING, State.OFFLINE])
+def test_a_failure_of_a_device_that_is_not_online_leaves_its_state(
+    dev: Device, state: State
+) -> None:
+    if state is State.OFFLINE:
+        dev.health.gave_up(0.0, 1.0)
+    dev.health.unclear(NoReply("silence"), None, 0.0)
+    assert dev.state is state
 
 
-def test_a_probe_that_fails_does_not_forget_what_may_still_be_answered(dev: Device) -> None:
-    dev.failed(NoReply("silence"), Span("D", 0, 10), 0.0)
-    dev.failed(NoReply("silence"), None, 0.0)
+def test_a_failed_probe_keeps_the_older_outstanding_request(dev: Device) -> None:
+    dev.health.unclear(NoReply("silence"), Span("D", 0, 10), 0.0)
+    dev.health.unclear(NoReply("silence"), None, 0.0)
     assert dev.health.outstanding == Span("D", 0, 10)
 
 
-def test_a_reopened_line_leaves_the_doubt(dev: Device) -> None:
+def test_a_reopened_line_keeps_the_outstanding_request(dev: Device) -> None:
     dev.health.answered()
-    dev.health.outstanding = Span("D", 0, 10)
-    dev.start()
+    dev.health.left_outstanding(Span("D", 0, 10))
+    dev.restart()
     assert dev.state is State.STARTING
     assert dev.health.needs_resync
     assert dev.health.outstanding == Span("D", 0, 10)
 
 
-def test_who_is_slow_is_not_called_dead_when_nobody_waits_for_it(dev: Device) -> None:
-    dev.trouble = Garbled("it took 0.7 s", evidence=Evidence.SLOW)
-    dev.failed(NoReply("silence"), None, 0.0)
+def test_a_slow_device_keeps_that_diagnosis_when_it_does_not_reply_at_all(dev: Device) -> None:
+    dev.health.unclear(Garbled("it took 0.7 s", evidence=Evidence.SLOW), None, 0.0)
+    dev.health.unclear(NoReply("silence"), None, 0.0)
     assert "raise reply_timeout" in dev.diagnosis()
-    dev.failed(Garbled("noise"), None, 0.0)
+    dev.health.unclear(Garbled("noise"), None, 0.0)
     assert "baud rate" in dev.diagnosis()
 
 
 @pytest.mark.parametrize("evidence", [e for e in Evidence if e is not Evidence.SILENCE])
-def test_every_evidence_has_its_sentence(dev: Device, evidence: Evidence) -> None:
-    dev.failed(Garbled("what was heard", evidence=evidence), None, 0.0)
-    assert "what was heard" in dev.diagnosis()
+def test_every_kind_of_evidence_has_its_diagnosis(dev: Device, evidence: Evidence) -> None:
+    error = Garbled("the bytes", evidence=evidence)
+    dev.health.unclear(error, None, 0.0)
+    dev.record.count_failure(error)
+    assert "the bytes" in dev.diagnosis()
     assert "not understood" not in dev.diagnosis()
-    assert dev.reason is Reason.GARBLED
+    assert dev.health.reason is Reason.GARBLED
     assert dev.record.failures[evidence] == 1
 
 
-def test_silence_has_its_sentence(dev: Device) -> None:
-    dev.failed(NoReply("no reply"), None, 0.0)
+def test_silence_has_its_diagnosis(dev: Device) -> None:
+    dev.health.unclear(NoReply("no reply"), None, 0.0)
     assert dev.diagnosis().startswith("No byte came back")
-    assert dev.reason is Reason.NO_REPLY
-    dev.failed(Unclear("something else"), None, 0.0)
+    assert dev.health.reason is Reason.NO_REPLY
+    other = Unclear("something else")
+    dev.health.unclear(other, None, 0.0)
+    dev.record.count_failure(other)
     assert dev.diagnosis() == "something else"
     assert dev.record.failures["other"] == 1
 
 
-def test_the_turnaround_is_smoothed_over_about_ten(dev: Device) -> None:
-    dev.measured(0.010)
+def test_the_turnaround_is_smoothed_over_about_ten_exchanges(dev: Device) -> None:
+    dev.record.count_exchanges(1, 0.0, 0.010)
     assert dev.record.turnaround == 0.010
     for _ in range(10):
-        dev.measured(0.020)
+        dev.record.count_exchanges(1, 0.0, 0.020)
     assert dev.record.turnaround is not None
     assert 0.0155 < dev.record.turnaround < 0.0175
 
 
-def test_the_load_is_the_share_of_the_lines_time(dev: Device) -> None:
+def test_the_load_is_the_polls_share_of_the_lines_time(dev: Device) -> None:
     (block,) = dev.blocks
     assert dev.load == pytest.approx(dev.seconds(block.cost) / block.every)
     assert device([]).load == 0
 
 
 def test_a_device_without_a_readable_tag_is_a_broadcast() -> None:
-    everybody = ModbusRtu(station=0)
-    tags = (make_tag("holding:1", everybody),)
-    assert made_device("all", everybody, WIRE, everybody.timing, tags, 0.5).broadcast
+    driver = ModbusRtu(station=0)
+    tags = (make_tag("holding:1", driver),)
+    assert made_device("all", driver, WIRE, driver.timing, tags).broadcast
     assert not device([make_tag("D0")]).broadcast
 
 
-def test_a_device_without_tags_that_could_be_read_is_none() -> None:
-    """It may be told to run and to stop: a late answer must not acknowledge the next command."""
+def test_a_device_without_any_tag_is_no_broadcast() -> None:
+    """It may get commands: a late reply must not acknowledge the next command."""
     assert not device([]).broadcast
     assert device([]).health.needs_resync
 
 
-def test_nothing_is_planned_where_the_turnaround_is_as_it_was(
+def test_an_equal_turnaround_plans_nothing(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     dev, planned = device([make_tag("D0"), make_tag("D42")]), list[float]()
@@ -133,11 +146,11 @@ def test_nothing_is_planned_where_the_turnaround_is_as_it_was(
     assert planned == [0.030, 0.040]
 
 
-def test_a_measured_turnaround_that_changes_the_optimum_plans_anew() -> None:
+def test_a_measured_turnaround_that_changes_the_optimum_plans_again() -> None:
     tags = [make_tag("D0"), make_tag("D14"), make_tag("D28"), make_tag("D42")]
-    dev = device(tags)  # reckoned with the protocol's 5 ms
+    dev = device(tags)  # planned with the protocol's 5 ms
     assert len(dev.blocks) == 4
-    dev.measured(0.060)
+    dev.record.count_exchanges(1, 0.0, 0.060)
     dev.record.exchanges = 49
     assert not dev.learn_turnaround()
     dev.record.exchanges = 50
@@ -146,30 +159,30 @@ def test_a_measured_turnaround_that_changes_the_optimum_plans_anew() -> None:
     assert not dev.learn_turnaround()
 
 
-def test_a_turnaround_set_in_the_file_is_not_learned_over() -> None:
+def test_a_turnaround_set_in_the_file_is_kept() -> None:
     known = device([make_tag("D0"), make_tag("D14"), make_tag("D28")])
     dev = made_device(
         "plc", known.driver, known.wire, known.timing, known.tags, 0.5, turnaround=0.005
     )
-    dev.measured(0.5)
+    dev.record.count_exchanges(1, 0.0, 0.5)
     dev.record.exchanges = 1000
     assert not dev.learn_turnaround()
 
 
-def test_a_measured_turnaround_is_reckoned_with_though_the_plan_stays() -> None:
-    """And what the file sets (here nothing) stays what it is: a broadcast is held by that alone."""
+def test_a_measured_turnaround_is_expected_though_the_plan_stays() -> None:
+    """The configured one (here none) stays: the pause after a broadcast depends on it alone."""
     dev = device([make_tag("D0")])
     blocks = dev.blocks
-    dev.measured(0.060)
+    dev.record.count_exchanges(1, 0.0, 0.060)
     dev.record.exchanges = 50
     before = dev.load
     assert not dev.learn_turnaround()
     assert dev.blocks is blocks
-    assert (dev.turnaround.expected, dev.turnaround) == (0.060, None)
+    assert (dev.turnaround.expected, dev.turnaround.configured) == (0.060, None)
     assert dev.load > before
 
 
-def test_use_of_the_wire_is_forgotten_by_halves() -> None:
+def test_half_of_the_use_of_the_wire_is_forgotten_every_ten_seconds() -> None:
     dev = device([make_tag("D0")])
     dev.used(100.0, 96.0)
     assert dev.recent_use(100.0) == 4.0

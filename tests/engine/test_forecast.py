@@ -1,4 +1,4 @@
-"""`check`'s figures against a reckoning by hand from the frames in the Vigor manual.
+"""The figures of `check`, compared with sums by hand over the frames in the Vigor manual.
 
 On the line: 10 bits a character at 19200 baud (7E1), 5 ms of quiet before a request, and a station
 that takes 5 ms to answer.
@@ -11,8 +11,9 @@ from typing import Any
 
 import pytest
 
-from gateway.app import device_of, forecasts
+from gateway.app import forecasts
 from gateway.config import load
+from gateway.engine.device import Device
 from gateway.engine.forecast import LineForecast, forecast
 from tests.e2e.processes import vigor_line, write_config
 from tests.vectors import vectors
@@ -25,11 +26,11 @@ FORCE_M10 = LENGTH["vigor-008"] + LENGTH["vigor-009"]
 TWO_WORDS = {"a": {"address": "D1"}, "b": {"address": "D2"}}
 
 
-def takes(characters: int) -> float:
+def seconds_of(characters: int) -> float:
     return 0.005 + characters * 10 / 19200 + 0.005
 
 
-def reckoned(folder: Path, tags: dict[str, Any], **settings: Any) -> LineForecast:
+def forecast_of(folder: Path, tags: dict[str, Any], **settings: Any) -> LineForecast:
     line = vigor_line("simulator", tags, **{"turnaround": "5ms", **settings})
     path = write_config(
         folder / "c.yaml", "tcp/127.0.0.1:7447", {"hall": line}, defaults={"every": "1s"}
@@ -39,22 +40,22 @@ def reckoned(folder: Path, tags: dict[str, Any], **settings: Any) -> LineForecas
 
 
 def test_one_block_of_two_words(tmp_path: Path) -> None:
-    line = reckoned(tmp_path, TWO_WORDS)
+    line = forecast_of(tmp_path, TWO_WORDS)
     [block] = line.blocks
     assert tuple(block.block.cost) == (LENGTH["vigor-003"], LENGTH["vigor-004"])
-    assert block.seconds == pytest.approx(takes(READ_D1_D2))
-    assert line.load == pytest.approx(takes(READ_D1_D2))
-    assert line.cycle == pytest.approx(takes(READ_D1_D2))
+    assert block.seconds == pytest.approx(seconds_of(READ_D1_D2))
+    assert line.load == pytest.approx(seconds_of(READ_D1_D2))
+    assert line.cycle == pytest.approx(seconds_of(READ_D1_D2))
     assert (line.requests, line.characters) == (1, READ_D1_D2)
     assert not line.overloaded
     assert line.advice() == ""
 
 
-def test_intervals_count(tmp_path: Path) -> None:
+def test_the_load_counts_each_interval(tmp_path: Path) -> None:
     tags = {"d": {"address": "D1", "every": "250ms"}, "m": {"address": "M8", "every": "2s"}}
     tags["e"] = {"address": "D2", "every": "250ms"}
-    line = reckoned(tmp_path, tags)
-    words, bits = takes(READ_D1_D2), takes(READ_M8_M15)
+    line = forecast_of(tmp_path, tags)
+    words, bits = seconds_of(READ_D1_D2), seconds_of(READ_M8_M15)
     assert line.load == pytest.approx(4 * words + bits / 2)
     assert line.requests == pytest.approx(4.5)
     assert line.characters == pytest.approx(4 * READ_D1_D2 + READ_M8_M15 / 2)
@@ -64,8 +65,8 @@ def test_intervals_count(tmp_path: Path) -> None:
 def test_the_worst_age_is_an_interval_the_longest_wait_and_the_exchange(tmp_path: Path) -> None:
     """At worst both polls come due just as the longer exchange has begun: three in a row."""
     tags = {**TWO_WORDS, "m": {"address": "M8"}}
-    line = reckoned(tmp_path, tags)
-    words, bits = takes(READ_D1_D2), takes(READ_M8_M15)
+    line = forecast_of(tmp_path, tags)
+    words, bits = seconds_of(READ_D1_D2), seconds_of(READ_M8_M15)
     wait = words + words + bits
     ages = {row.block.tags[0].text: row.worst_age for row in line.blocks}
     assert ages == {"D1": pytest.approx(1 + wait + words), "M8": pytest.approx(1 + wait + bits)}
@@ -83,21 +84,21 @@ def test_the_worst_age_is_an_interval_the_longest_wait_and_the_exchange(tmp_path
 def test_a_write_waits_for_the_exchange_before_it(
     tmp_path: Path, address: str, rule: Any, exchanges: list[int]
 ) -> None:
-    line = reckoned(tmp_path, {"w": {"address": address, "write": rule}})
+    line = forecast_of(tmp_path, {"w": {"address": address, "write": rule}})
     [read] = line.blocks
-    assert line.worst_write == pytest.approx(read.seconds + sum(map(takes, exchanges)))
+    assert line.worst_write == pytest.approx(read.seconds + sum(map(seconds_of, exchanges)))
 
 
-def test_a_silent_station_costs_its_time_out_and_its_guard(tmp_path: Path) -> None:
+def test_an_offline_station_costs_its_time_out_and_its_late_guard(tmp_path: Path) -> None:
     tags = {"w": {"address": "D1", "write": True}}
-    line = reckoned(tmp_path, tags, reply_timeout="200ms", late_guard="1s")
+    line = forecast_of(tmp_path, tags, reply_timeout="200ms", late_guard="1s")
     assert line.worst_write_silent == pytest.approx(line.worst_write + 0.2 + 1.0)
 
 
-def test_asked_for_too_much_everything_stretches(tmp_path: Path) -> None:
+def test_on_an_overloaded_line_every_interval_is_stretched(tmp_path: Path) -> None:
     tags = {name: {**tag, "every": "20ms"} for name, tag in TWO_WORDS.items()}
-    line = reckoned(tmp_path, tags)
-    words = takes(READ_D1_D2)
+    line = forecast_of(tmp_path, tags)
+    words = seconds_of(READ_D1_D2)
     assert line.load == pytest.approx(words / 0.02)
     assert line.overloaded
     assert line.blocks[0].worst_age == pytest.approx(2 * 0.02 + words + words)
@@ -107,14 +108,14 @@ def test_asked_for_too_much_everything_stretches(tmp_path: Path) -> None:
     )
 
 
-def test_what_is_advised_fits(tmp_path: Path) -> None:
+def test_the_advised_intervals_fit(tmp_path: Path) -> None:
     tags = {f"d{i}": {"address": f"D{200 * i}", "every": "50ms"} for i in range(20)}
-    line = reckoned(tmp_path, tags)
+    line = forecast_of(tmp_path, tags)
     assert line.overloaded
     longer = {name: {**tag, "every": f"{line.cycle + 0.01:.2f}s"} for name, tag in tags.items()}
-    assert not reckoned(tmp_path, longer).overloaded
+    assert not forecast_of(tmp_path, longer).overloaded
     stretched = {name: {**t, "every": f"{50 * line.load + 1:.0f}ms"} for name, t in tags.items()}
-    assert not reckoned(tmp_path, stretched).overloaded
+    assert not forecast_of(tmp_path, stretched).overloaded
 
 
 def test_a_slower_line_takes_longer(tmp_path: Path) -> None:
@@ -129,17 +130,17 @@ def test_a_slower_line_takes_longer(tmp_path: Path) -> None:
 
 
 def test_a_disabled_device_costs_nothing(tmp_path: Path) -> None:
-    line = reckoned(tmp_path, TWO_WORDS, enabled=False)
+    line = forecast_of(tmp_path, TWO_WORDS, enabled=False)
     assert (line.blocks, line.load, line.cycle, line.worst_write) == ((), 0, 0, 0)
 
 
-def test_a_line_that_is_exactly_full_waits_for_ever_but_is_not_overloaded(tmp_path: Path) -> None:
+def test_a_line_that_is_exactly_full_is_not_overloaded(tmp_path: Path) -> None:
     path = write_config(
         tmp_path / "c.yaml", "tcp/127.0.0.1:7447", {"hall": vigor_line("simulator", TWO_WORDS)}
     )
     config = load(path)
     [section] = config.lines
-    device = device_of(section.devices[0], section)
+    device = Device(section.devices[0], section.wire)
     [block] = device.blocks
     device.blocks = (replace(block, every=device.seconds(block.cost)),)
     line = forecast("hall", [device], section.wire)

@@ -1,4 +1,4 @@
-"""Orders that wait together: several writes in one exchange, the latest of several, commands."""
+"""Requests on a simulated line: writes in one exchange, the latest of several, commands."""
 
 import asyncio
 from typing import Any
@@ -8,11 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gateway.engine.device import Device
-from gateway.errors import BadValue, Busy, GatewayError, LineDown, Offline, Refused, Unclear
+from gateway.errors import BadValue, Busy, LineDown, Offline, Refused, Unclear
 from gateway.protocols.computer_link import ComputerLink
+from gateway.protocols.vigor import Vigor
 from gateway.tags import WriteResult, WriteRule
+from tests.engine.misbehaving import intercept
+from tests.sim.bench import WIRE
 from tests.sim.links import commands, link_device, link_plant, spelt
-from tests.sim.plant import Outcome, Plant, device, plant, running, words
+from tests.sim.plant import Outcome, Plant, device, made_device, plant, running, words
 from tests.sim.virtual import on_virtual_time, run_virtual
 
 BITS = [f"M{7 * n}" for n in range(20)]
@@ -30,7 +33,7 @@ def one(*addresses: str, **options: Any) -> tuple[Plant, Device]:
 
 
 def submit_all(line: Plant, dev: Device, values: dict[str, Any]) -> dict[str, Outcome]:
-    """All before the line can say a word."""
+    """Submits all of them before the line sends anything."""
     return {text: line.submit(dev, spelt(dev, text), value) for text, value in values.items()}
 
 
@@ -54,7 +57,7 @@ def written(outcomes: dict[str, Outcome]) -> dict[str, Any]:
     ids=["20 bits", "10 words"],
 )
 @on_virtual_time
-async def test_scattered_writes_that_wait_together_go_out_as_one(
+async def test_scattered_writes_that_wait_together_are_sent_in_one_exchange(
     addresses: list[str], command: str, values: dict[str, Any]
 ) -> None:
     line, dev = one(*addresses)
@@ -74,7 +77,7 @@ async def test_scattered_writes_that_wait_together_go_out_as_one(
 
 
 @on_virtual_time
-async def test_what_does_not_fit_one_exchange_goes_out_in_the_next() -> None:
+async def test_writes_that_do_not_fit_one_exchange_are_sent_in_the_next() -> None:
     line, dev = one(*BITS, "S100", "S200")
     async with running(line):
         await asyncio.sleep(3)
@@ -89,7 +92,7 @@ async def test_what_does_not_fit_one_exchange_goes_out_in_the_next() -> None:
     "rule", [WriteRule(verify=True), WriteRule(repeat=True)], ids=["verify", "repeat"]
 )
 @on_virtual_time
-async def test_a_write_with_a_rule_of_its_own_goes_alone(rule: WriteRule) -> None:
+async def test_a_write_with_verify_or_repeat_is_sent_alone(rule: WriteRule) -> None:
     line, dev = one(*WORDS, write=rule)
     async with running(line):
         await asyncio.sleep(3)
@@ -100,7 +103,7 @@ async def test_a_write_with_a_rule_of_its_own_goes_alone(rule: WriteRule) -> Non
 
 
 @on_virtual_time
-async def test_a_driver_without_such_a_command_writes_one_after_the_other() -> None:
+async def test_a_driver_without_scattered_writes_sends_one_after_the_other() -> None:
     dev = device(words(0, 5, write=WriteRule(), every=60.0))
     line = plant([dev])
     async with running(line):
@@ -112,7 +115,7 @@ async def test_a_driver_without_such_a_command_writes_one_after_the_other() -> N
 
 
 @on_virtual_time
-async def test_one_refused_address_does_not_hide_the_others_outcomes() -> None:
+async def test_one_refused_address_leaves_the_other_writes_their_own_outcomes() -> None:
     line, dev = one(*BITS)
     line.stations[0].inner.holes = {("M", 21)}
     async with running(line):
@@ -129,7 +132,7 @@ async def test_one_refused_address_does_not_hide_the_others_outcomes() -> None:
 
 
 @on_virtual_time
-async def test_a_lost_acknowledgement_makes_every_one_unclear_and_nothing_is_sent_twice() -> None:
+async def test_a_lost_acknowledgement_makes_every_write_unclear_and_none_is_sent_twice() -> None:
     line, dev = one(*BITS)
     async with running(line):
         await asyncio.sleep(3)
@@ -143,11 +146,13 @@ async def test_a_lost_acknowledgement_makes_every_one_unclear_and_nothing_is_sen
         sent = commands(line.stations[0], asked)
         assert (sent.count("BT"), sent.count("BW")) == (1, 0)
         after = sent[sent.index("BT") + 1]
-        assert after == "TT"  # in doubt: resynchronised before anything else
+        assert after == "TT"  # the device needs a resync before anything else
 
 
 @on_virtual_time
-async def test_a_line_that_goes_down_meanwhile_makes_them_unclear_and_the_rest_not_sent() -> None:
+async def test_a_line_that_goes_down_makes_sent_writes_unclear_and_ends_waiting_ones_not_sent() -> (
+    None
+):
     line, dev = one(*BITS, *WORDS)
     async with running(line):
         await asyncio.sleep(3)
@@ -167,8 +172,8 @@ async def test_a_line_that_goes_down_meanwhile_makes_them_unclear_and_the_rest_n
 
 @pytest.mark.parametrize("obeys", [True, False])
 @on_virtual_time
-async def test_after_a_refused_group_no_late_answer_counts_for_the_next_write(obeys: bool) -> None:
-    """Each is in doubt by itself: what follows an unclear one waits for the resynchronisation."""
+async def test_after_a_refused_group_no_late_reply_counts_for_the_next_write(obeys: bool) -> None:
+    """Each write needs a resync of its own: the write after an unclear one waits for it."""
     line, dev = one("M0", "M21", "M42", "M63", guard=0.05)
     station = line.stations[0]
     station.inner.holes = {("M", 21)}
@@ -186,12 +191,7 @@ async def test_after_a_refused_group_no_late_answer_counts_for_the_next_write(ob
         await asyncio.sleep(3)
         asked = now()
         if not obeys:
-            original = station.inner._answer
-            station.inner._answer = (
-                lambda text, at: (  # type: ignore[method-assign]
-                    None if text[4:12] == "BW0M0000" else original(text, at)
-                )
-            )
+            intercept(station, lambda data: [] if data[5:13] == b"BW0M0000" else None)
         outcomes = submit_all(line, dev, dict.fromkeys(["M0", "M21", "M42", "M63"], True))
         await asyncio.sleep(5)
         assert isinstance(outcomes["M0"].once, Unclear)
@@ -205,7 +205,7 @@ async def test_after_a_refused_group_no_late_answer_counts_for_the_next_write(ob
 
 
 @on_virtual_time
-async def test_a_refused_group_to_a_device_that_then_falls_silent_is_not_sent_on() -> None:
+async def test_a_refused_group_is_not_sent_on_to_a_device_that_went_offline() -> None:
     line, dev = one("M0", "M21", "M42", retries=0)
     station = line.stations[0]
     station.inner.holes = {("M", 21)}
@@ -233,7 +233,7 @@ _CHOICE = st.sampled_from(["M0", "M40", "S7", "D5", "D90", "D91", "X20"])
     holes=st.sets(_CHOICE, max_size=1),
 )
 @settings(max_examples=40, deadline=None)
-def test_a_device_is_told_everything_in_the_order_it_was_asked_for(
+def test_a_device_gets_all_its_requests_in_their_order(
     orders: list[tuple[str, int]], holes: set[str]
 ) -> None:
     async def whole() -> None:
@@ -250,7 +250,7 @@ def test_a_device_is_told_everything_in_the_order_it_was_asked_for(
 
         async with running(line):
             await asyncio.sleep(5)
-            station.memory.write = noted  # type: ignore[method-assign]
+            station.memory.write = noted  # type: ignore[method-assign]  # notes the order
             outcomes = [line.submit(dev, spelt(dev, text), value) for text, value in orders]
             await asyncio.sleep(4)
         assert obeyed == [order for order in orders if order[0] not in holes]
@@ -297,34 +297,28 @@ async def test_without_latest_every_value_is_sent() -> None:
 # Commands
 
 
-def obey(line: Plant, dev: Device, name: str, argument: str = "") -> list[str | GatewayError]:
-    said: list[str | GatewayError] = []
-    line.line.command(dev, name, argument, said.append)
-    return said
-
-
 @on_virtual_time
-async def test_commands_reach_the_plc_and_its_answer_comes_back() -> None:
+async def test_commands_reach_the_plc_and_return_its_answer() -> None:
     line, dev = one("D5", control=True)
     async with running(line):
         await asyncio.sleep(3)
-        said = [obey(line, dev, *order) for order in (("model",), ("loopback", "HELLO"))]
+        model = line.command(dev, "model")
+        loopback = line.command(dev, "loopback", "HELLO")
         await asyncio.sleep(1)
-        assert said == [["9E (FX1N)"], ["HELLO"]]
-        running_refused = obey(line, dev, "run")
+        assert (model.once, loopback.once) == ("9E (FX1N)", "HELLO")
+        refused = line.command(dev, "run")
         await asyncio.sleep(1)
-        [refusal] = running_refused
-        assert isinstance(refusal, Refused)
-        assert refusal.code == "18"
-        stopped = obey(line, dev, "stop")
+        assert isinstance(refused.once, Refused)
+        assert refused.once.code == "18"
+        stopped = line.command(dev, "stop")
         await asyncio.sleep(1)
-        assert stopped == ["acknowledged"]
-        assert not line.stations[0].inner.running  # type: ignore[attr-defined]
-        on = obey(line, dev, "global", "on")
+        assert stopped.once == "acknowledged"
+        assert not is_running(line)
+        on = line.command(dev, "global", "on")
         await asyncio.sleep(1)
-        assert on == ["sent to all stations, none answers"]
+        assert on.once == "sent to all stations, none answers"
         assert line.stations[0].memory.read("M8", 8126) == [1]
-        assert dev.failures == 0
+        assert dev.health.consecutive_failures == 0
 
 
 @pytest.mark.parametrize(
@@ -345,7 +339,7 @@ async def test_a_command_that_may_not_be_sent_is_refused_and_not_sent(
     async with running(line):
         await asyncio.sleep(3)
         asked = now()
-        [refusal] = await _soon(obey(line, dev, name, argument))
+        refusal = await outcome(line, dev, name, argument)
         assert isinstance(refusal, BadValue)
         assert why in str(refusal)
         assert commands(line.stations[0], asked) == []
@@ -353,12 +347,12 @@ async def test_a_command_that_may_not_be_sent_is_refused_and_not_sent(
 
 @on_virtual_time
 async def test_a_device_of_another_protocol_takes_no_commands() -> None:
-    dev = device(words(0, 1))
-    dev.control = True
+    driver = Vigor(station=1)
+    dev = made_device("plc", driver, WIRE, driver.timing, words(0, 1), control=True)
     line = plant([dev])
     async with running(line):
         await asyncio.sleep(1)
-        [refusal] = await _soon(obey(line, dev, "stop"))
+        refusal = await outcome(line, dev, "stop")
         assert isinstance(refusal, BadValue)
         assert "takes no commands" in str(refusal)
 
@@ -369,12 +363,11 @@ async def test_a_command_whose_answer_is_lost_is_unclear() -> None:
     async with running(line):
         await asyncio.sleep(3)
         line.stations[0].mute = True
-        [outcome] = await _soon(obey(line, dev, "stop"))
-        assert isinstance(outcome, Unclear)
-        assert not line.stations[0].inner.running  # type: ignore[attr-defined]
+        assert isinstance(await outcome(line, dev, "stop"), Unclear)
+        assert not is_running(line)
         line.stations[0].mute = False
-        assert await _soon(obey(line, dev, "model")) == ["9E (FX1N)"]
-        assert commands(line.stations[0])[-3:] == ["RS", "TT", "PC"]  # in doubt: asked first
+        assert await outcome(line, dev, "model") == "9E (FX1N)"
+        assert commands(line.stations[0])[-3:] == ["RS", "TT", "PC"]  # the resync goes first
 
 
 @on_virtual_time
@@ -382,14 +375,13 @@ async def test_a_line_that_goes_down_during_a_command_makes_it_unclear() -> None
     line, dev = one("D5", control=True)
     async with running(line):
         await asyncio.sleep(3)
-        said = obey(line, dev, "stop")
+        stopped = line.command(dev, "stop")
         while line.bench.sent[-1][1][5:7] != b"RS":
             await asyncio.sleep(0.001)
         line.bench.vanish()
-        [outcome] = await _soon(said)
-        assert isinstance(outcome, Unclear)
-        [refused] = await _soon(obey(line, dev, "stop"))
-        assert isinstance(refused, LineDown)
+        await asyncio.sleep(2)
+        assert isinstance(stopped.once, Unclear)
+        assert isinstance(await outcome(line, dev, "stop"), LineDown)
 
 
 @on_virtual_time
@@ -400,13 +392,20 @@ async def test_a_command_is_not_overtaken_by_writes() -> None:
         asked = now()
         line.submit(dev, spelt(dev, "M0"), True)
         line.submit(dev, spelt(dev, "M40"), True)
-        obey(line, dev, "stop")
+        line.command(dev, "stop")
         line.submit(dev, spelt(dev, "S7"), True)
         await asyncio.sleep(1)
         sent = [c for c in commands(line.stations[0], asked) if c not in ("BR", "WR")]
         assert sent == ["BT", "RS", "BW"]
 
 
-async def _soon(said: list[Any]) -> list[Any]:
+async def outcome(line: Plant, dev: Device, name: str, argument: str = "") -> Any:
+    """The outcome of a command, two seconds later."""
+    found = line.command(dev, name, argument)
     await asyncio.sleep(2)
-    return said
+    return found.once
+
+
+def is_running(line: Plant) -> bool:
+    station: Any = line.stations[0].inner
+    return bool(station.running)

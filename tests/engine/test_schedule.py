@@ -1,4 +1,4 @@
-"""Each sentence of the class docstring is a test; whatever the order of calls, no poll is lost."""
+"""Each sentence of the class docstring is a test; in any order of calls no poll is lost."""
 
 from typing import Any
 
@@ -7,19 +7,20 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from gateway.engine.device import Device
-from gateway.engine.health import State
-from gateway.engine.jobs import PAUSE_FIRST, PAUSE_LONGEST, Idle, Poll, Probe
-from gateway.engine.requests import MOST_WAITING, Write
+from gateway.engine.health import PAUSE_FIRST, PAUSE_LONGEST, State
+from gateway.engine.jobs import Idle, Poll, Probe
+from gateway.engine.requests import MOST_WAITING, WRITE_EXPIRY, Write
 from gateway.engine.schedule import OFFLINE_SHARE, Schedule
 from gateway.errors import NoReply
 from gateway.planning.bad_addresses import RETRY
 from gateway.protocols.modbus import ModbusRtu
 from gateway.tags import WriteRule
-from tests.sim.plant import WIRE, device, made_device, make_tag
+from tests.sim.bench import WIRE
+from tests.sim.plant import device, made_device, make_tag
 
 
-def up(*numbers: int, every: float = 1.0, station: int = 1) -> Device:
-    """A device that answers, with one block of one word for each number."""
+def online(*numbers: int, every: float = 1.0, station: int = 1) -> Device:
+    """An online device, with one block of one word for each number."""
     found = device(
         [make_tag(f"D{n}", every=every, write=WriteRule()) for n in numbers], station=station
     )
@@ -27,23 +28,23 @@ def up(*numbers: int, every: float = 1.0, station: int = 1) -> Device:
     return found
 
 
-def write(device: Device, expires: float = 99.0) -> Write:
-    return Write(device, device.tags[0], [1], 0.0, expires, lambda _: None)
+def write(device: Device, submitted: float = 0.0) -> Write:
+    return Write(device, device.tags[0], [1], submitted)
 
 
-def doubt(device: Device) -> None:
-    device.failed(NoReply("silence"), None, 0.0)
+def fail(device: Device) -> None:
+    device.health.unclear(NoReply("silence"), None, 0.0)
 
 
-def served(schedule: Schedule, now: float) -> Poll:
+def polled(schedule: Schedule, now: float) -> Poll:
     job = schedule.next(now)
     assert isinstance(job, Poll)
     schedule.polled(job, now)
     return job
 
 
-def test_writes_go_first() -> None:
-    dev = up(0)
+def test_requests_go_first() -> None:
+    dev = online(0)
     schedule = Schedule([dev], 0.0)
     mine = write(dev)
     schedule.requests.submit(mine)
@@ -52,7 +53,7 @@ def test_writes_go_first() -> None:
 
 
 def test_but_not_twice_in_a_row_while_a_poll_is_due() -> None:
-    dev = up(0, 1000)
+    dev = online(0, 1000)
     schedule = Schedule([dev], 0.0)
     writes = [write(dev) for _ in range(4)]
     for one in writes:
@@ -66,9 +67,9 @@ def test_but_not_twice_in_a_row_while_a_poll_is_due() -> None:
     assert [isinstance(job, Poll) for job in jobs] == [False, True, False, True, False, False]
 
 
-def test_a_write_does_not_wait_for_polls_that_are_not_to_be_asked_any_more() -> None:
+def test_a_write_does_not_wait_for_replaced_polls() -> None:
     """The second write goes at once when the poll that was due has been replaced meanwhile."""
-    dev = up(0)
+    dev = online(0)
     schedule = Schedule([dev], 0.0)
     schedule.requests.submit(write(dev))
     schedule.requests.submit(second := write(dev))
@@ -79,69 +80,70 @@ def test_a_write_does_not_wait_for_polls_that_are_not_to_be_asked_any_more() -> 
 
 
 def test_polls_go_by_earliest_deadline_over_all_devices() -> None:
-    slow, fast = up(0, every=5.0), up(0, every=0.5, station=2)
+    slow, fast = online(0, every=5.0), online(0, every=0.5, station=2)
     schedule = Schedule([slow, fast], 0.0)
-    assert served(schedule, 0.0).device is fast
-    assert served(schedule, 4.9).device is fast  # due since 0.5, until 1.0
-    assert served(schedule, 4.9).device is slow
+    assert polled(schedule, 0.0).device is fast
+    assert polled(schedule, 4.9).device is fast  # due since 0.5, until 1.0
+    assert polled(schedule, 4.9).device is slow
 
 
-def test_what_somebody_wants_to_see_goes_before_other_polls() -> None:
-    dev = up(0, 1000, 2000)
+def test_an_expedited_poll_goes_before_other_polls() -> None:
+    dev = online(0, 1000, 2000)
     schedule = Schedule([dev], 0.0)
-    wanted = schedule.polls(dev)[2]
-    schedule.expedite(wanted)
-    schedule.expedite(wanted)
-    assert served(schedule, 0.0) is wanted
-    assert len({served(schedule, 0.0), served(schedule, 0.0)}) == 2
+    expedited = schedule.polls(dev)[2]
+    schedule.expedite(expedited)
+    schedule.expedite(expedited)
+    assert polled(schedule, 0.0) is expedited
+    assert len({polled(schedule, 0.0), polled(schedule, 0.0)}) == 2
     assert schedule.next(0.0) == Idle(1.0)
 
 
 def test_but_not_twice_in_a_row_while_one_is_due() -> None:
-    dev = up(0, 1000)
+    dev = online(0, 1000)
     schedule = Schedule([dev], 0.0)
-    wanted, other = schedule.polls(dev)
+    expedited, other = schedule.polls(dev)
     asked = []
     for _ in range(4):
-        schedule.expedite(wanted)
-        asked.append(served(schedule, 0.0))
-    assert asked == [wanted, other, wanted, wanted]
+        schedule.expedite(expedited)
+        asked.append(polled(schedule, 0.0))
+    assert asked == [expedited, other, expedited, expedited]
 
 
-def test_a_poll_that_is_wanted_while_it_is_asked_is_asked_once_more() -> None:
-    dev = up(0)
+def test_a_poll_expedited_while_it_is_in_flight_is_sent_once_more() -> None:
+    dev = online(0)
     schedule = Schedule([dev], 0.0)
     poll = schedule.next(0.0)
     assert isinstance(poll, Poll)
     schedule.expedite(poll)
     schedule.polled(poll, 0.1)
-    assert served(schedule, 0.1) is poll
+    assert polled(schedule, 0.1) is poll
     assert schedule.next(0.1) == Idle(1.1)
 
 
 def test_a_late_poll_is_done_once_not_once_per_missed_period() -> None:
-    dev = up(0)
+    dev = online(0)
     schedule = Schedule([dev], 0.0)
-    served(schedule, 5.3)
+    polled(schedule, 5.3)
     assert dev.record.overruns == 5
     assert schedule.next(5.3) == Idle(6.3)
 
 
 def test_a_poll_that_is_a_little_late_keeps_its_phase() -> None:
-    dev = up(0)
+    dev = online(0)
     schedule = Schedule([dev], 0.0)
     for period in range(10):
-        served(schedule, period + 0.4)
+        polled(schedule, period + 0.4)
     assert schedule.next(9.5) == Idle(10.0)
     assert dev.record.overruns == 0
 
 
-def test_a_device_in_doubt_is_probed_before_anything_else() -> None:
-    dev = up(0)
+def test_a_device_that_needs_a_resync_is_probed_before_anything_else() -> None:
+    dev = online(0)
     schedule = Schedule([dev], 0.0)
-    doubt(dev)
-    for what in (lambda: None, lambda: schedule.requests.submit(write(dev))):
-        what()
+    fail(dev)
+    for submitted in (False, True):
+        if submitted:
+            schedule.requests.submit(write(dev))
         job = schedule.next(0.0)
         assert isinstance(job, Probe)
         assert job.device is dev
@@ -151,48 +153,48 @@ def test_a_device_in_doubt_is_probed_before_anything_else() -> None:
 
 
 def test_a_write_does_not_wait_behind_one_for_a_device_that_has_just_failed() -> None:
-    dead, well = up(0), up(0, station=2)
-    schedule = Schedule([dead, well], 0.0)
-    first, second, other = write(dead), write(dead), write(well)
+    failing, well = online(0), online(0, station=2)
+    schedule = Schedule([failing, well], 0.0)
+    first, second, other = write(failing), write(failing), write(well)
     for one in (first, second, other):
         schedule.requests.submit(one)
-    doubt(dead)
+    fail(failing)
     assert isinstance(schedule.next(0.0), Probe)
     schedule.failed(2.0, took=2.0)
     assert schedule.next(2.0) is other
-    assert served(schedule, 2.0).device is well
+    assert polled(schedule, 2.0).device is well
     assert isinstance(schedule.next(4.5), Probe)
 
 
-def test_a_bad_poll_is_tried_again_within_a_minute_however_rarely_it_is_asked() -> None:
-    dev = up(0, every=86_400.0)
+def test_a_bad_poll_is_tried_again_within_a_minute_even_at_a_long_interval() -> None:
+    dev = online(0, every=86_400.0)
     schedule = Schedule([dev], 0.0)
     job = schedule.next(0.0)
     assert isinstance(job, Poll)
-    schedule.polled(job, 0.0)  # it was busy, say: nothing is known
+    schedule.polled(job, 0.0)  # the device was busy, say: no value was read
     assert isinstance(schedule.next(PAUSE_LONGEST), Poll)
 
 
-def test_a_refused_address_is_asked_for_rarely_but_then_does_not_wait_as_long_again() -> None:
-    dev = up(0)
+def test_a_bad_address_is_polled_rarely_but_keeps_its_short_deadline() -> None:
+    dev = online(0)
     (poll,) = Schedule([dev], 0.0).polls(dev)
     assert not dev.bad_addresses.refused(poll.block, 0, "28")
     assert poll.every == RETRY
     assert poll.deadline == poll.due + 1.0
 
 
-def test_a_wanted_poll_of_a_device_in_doubt_stays_wanted() -> None:
-    dev = up(0, 1000)
+def test_an_expedited_poll_of_a_device_that_needs_a_resync_stays_expedited() -> None:
+    dev = online(0, 1000)
     schedule = Schedule([dev], 0.0)
-    wanted = schedule.polls(dev)[1]
-    doubt(dev)
-    schedule.expedite(wanted)
+    expedited = schedule.polls(dev)[1]
+    fail(dev)
+    schedule.expedite(expedited)
     assert isinstance(schedule.next(0.0), Probe)
     dev.health.answered()
-    assert schedule.next(0.0) is wanted
+    assert schedule.next(0.0) is expedited
 
 
-def test_a_device_not_heard_yet_is_probed_at_once() -> None:
+def test_a_starting_device_is_probed_at_once() -> None:
     dev = device([make_tag("D0")])
     schedule = Schedule([dev], 0.0)
     assert isinstance(schedule.next(0.0), Probe)
@@ -201,17 +203,17 @@ def test_a_device_not_heard_yet_is_probed_at_once() -> None:
     assert isinstance(schedule.next(0.1), Poll)
 
 
-def test_while_polls_of_others_are_due_such_probes_get_half_of_the_time() -> None:
-    healthy = up(0, every=0.01)
-    strangers = [device([make_tag("D0")], station=n) for n in range(2, 40)]
-    schedule = Schedule([healthy, *strangers], 0.0)
+def test_while_polls_of_others_are_due_starting_devices_get_half_of_the_time() -> None:
+    healthy = online(0, every=0.01)
+    starting = [device([make_tag("D0")], station=n) for n in range(2, 40)]
+    schedule = Schedule([healthy, *starting], 0.0)
     now, probing = 0.0, 0.0
     while now < 30.0:
         match schedule.next(now):
             case Probe(found):
                 now += 0.5
                 probing += 0.5
-                doubt(found)
+                fail(found)
                 schedule.failed(now, 0.5)
                 schedule.went_offline(found, now, 0.5)
             case Poll() as poll:
@@ -221,23 +223,23 @@ def test_while_polls_of_others_are_due_such_probes_get_half_of_the_time() -> Non
 
 
 def test_a_device_that_fails_does_not_hold_up_the_others_twice_in_a_row() -> None:
-    bad, healthy = up(0, every=0.1), up(0, every=5.0, station=2)
+    bad, healthy = online(0, every=0.1), online(0, every=5.0, station=2)
     schedule = Schedule([bad, healthy], 0.0)
     poll = schedule.next(0.0)
     assert isinstance(poll, Poll)
     assert poll.device is bad
-    doubt(bad)
+    fail(bad)
     schedule.failed(1.0, 1.0)
     schedule.again(poll)
-    assert served(schedule, 1.0).device is healthy
+    assert polled(schedule, 1.0).device is healthy
     assert isinstance(schedule.next(1.0), Probe)
 
 
-def test_a_silent_device_is_left_alone_but_for_probes_at_growing_pauses() -> None:
-    dev = up(0)
+def test_an_offline_device_is_only_probed_at_growing_pauses() -> None:
+    dev = online(0)
     schedule = Schedule([dev], 0.0)
     now, pauses = 0.0, []
-    doubt(dev)
+    fail(dev)
     for _ in range(12):
         schedule.went_offline(dev, now, 0.5)
         job = schedule.next(now)
@@ -254,12 +256,12 @@ def test_a_silent_device_is_left_alone_but_for_probes_at_growing_pauses() -> Non
     assert isinstance(schedule.next(now), Poll)
 
 
-def test_all_silent_devices_together_get_a_twentieth_while_others_are_served() -> None:
-    healthy = up(0, every=0.01)
-    silent = [up(0, station=n) for n in range(2, 33)]
-    schedule = Schedule([healthy, *silent], 0.0)
-    for dev in silent:
-        doubt(dev)
+def test_all_offline_devices_together_get_a_twentieth_while_others_are_online() -> None:
+    healthy = online(0, every=0.01)
+    offline = [online(0, station=n) for n in range(2, 33)]
+    schedule = Schedule([healthy, *offline], 0.0)
+    for dev in offline:
+        fail(dev)
         schedule.went_offline(dev, 0.0, 0.5)
     now, probing, probed = 10.0, 0.0, set()
     while now < 1000.0:
@@ -273,44 +275,44 @@ def test_all_silent_devices_together_get_a_twentieth_while_others_are_served() -
                 now += 0.02
                 schedule.polled(poll, now)
     assert 0.8 * OFFLINE_SHARE <= probing / now <= OFFLINE_SHARE
-    assert probed == set(silent)  # in turn
+    assert probed == set(offline)  # in turn
 
 
-def test_with_nobody_else_to_serve_silent_devices_have_all_the_time() -> None:
-    silent = [up(0, station=n) for n in range(1, 4)]
-    schedule = Schedule(silent, 0.0)
-    for dev in silent:
-        doubt(dev)
-    for dev in silent:
+def test_offline_devices_get_all_the_time_while_none_is_online() -> None:
+    offline = [online(0, station=n) for n in range(1, 4)]
+    schedule = Schedule(offline, 0.0)
+    for dev in offline:
+        fail(dev)
+    for dev in offline:
         schedule.went_offline(dev, 0.0, 0.5)
     assert isinstance(schedule.next(1.2), Probe)
-    schedule.went_offline(silent[0], 1.7, 0.5)
+    schedule.went_offline(offline[0], 1.7, 0.5)
     assert isinstance(schedule.next(1.7), Probe)
 
 
-def test_a_silent_device_is_reachable_only_when_its_probe_is_allowed() -> None:
-    healthy, silent = up(0), up(0, station=2)
-    schedule = Schedule([healthy, silent], 0.0)
-    doubt(silent)
-    schedule.went_offline(silent, 0.0, 0.5)
+def test_an_offline_device_is_reachable_only_when_its_probe_is_allowed() -> None:
+    healthy, offline = online(0), online(0, station=2)
+    schedule = Schedule([healthy, offline], 0.0)
+    fail(offline)
+    schedule.went_offline(offline, 0.0, 0.5)
     assert schedule.reachable(healthy, 0.0)
-    assert not schedule.reachable(silent, 9.4)
-    assert schedule.reachable(silent, 9.5)
+    assert not schedule.reachable(offline, 9.4)
+    assert schedule.reachable(offline, 9.5)
 
 
-def test_a_broadcast_device_is_never_asked() -> None:
-    everybody = ModbusRtu(station=0)
-    tags = (make_tag("holding:1", everybody),)
-    dev = made_device("all", everybody, WIRE, everybody.timing, tags, 0.5)
+def test_a_broadcast_device_is_never_probed() -> None:
+    driver = ModbusRtu(station=0)
+    tags = (make_tag("holding:1", driver),)
+    dev = made_device("all", driver, WIRE, driver.timing, tags)
     assert dev.broadcast
     schedule = Schedule([dev], 0.0)
     assert schedule.next(0.0) == Idle(float("inf"))
-    doubt(dev)
+    fail(dev)
     assert not dev.health.needs_resync
 
 
-def test_a_poll_without_answers_is_asked_less_and_less() -> None:
-    dev = up(0)
+def test_a_poll_without_replies_is_sent_less_and_less() -> None:
+    dev = online(0)
     schedule = Schedule([dev], 0.0)
     now, gaps = 0.0, []
     for _ in range(9):
@@ -323,36 +325,36 @@ def test_a_poll_without_answers_is_asked_less_and_less() -> None:
         now = job.until
     assert gaps == sorted(gaps)
     assert gaps[-1] == PAUSE_LONGEST
-    served(schedule, now)
+    polled(schedule, now)
     assert schedule.next(now) == Idle(now + 1.0)
 
 
-def test_replaced_polls_are_asked_at_once_and_the_old_one_no_more() -> None:
-    dev = up(0, 1)
+def test_new_polls_are_due_at_once_and_the_replaced_one_is_sent_no_more() -> None:
+    dev = online(0, 1)
     schedule = Schedule([dev], 0.0)
     whole = schedule.next(0.0)
     assert isinstance(whole, Poll)
     halves = dev.bad_addresses.refused(whole.block, 0, "28")
     schedule.replace(whole, halves, 0.0)
-    assert {served(schedule, 0.0).block.span for _ in halves} == {b.span for b in halves}
+    assert {polled(schedule, 0.0).block.span for _ in halves} == {b.span for b in halves}
     assert schedule.next(0.0) == Idle(1.0)
 
 
-def test_a_plan_keeps_what_is_known_of_a_block() -> None:
-    dev = up(0, 1000)
+def test_a_plan_keeps_the_age_and_due_time_of_a_block() -> None:
+    dev = online(0, 1000)
     schedule = Schedule([dev], 0.0)
-    served(schedule, 0.0).last.at = 0.25
+    polled(schedule, 0.0).last.at = 0.25
     schedule.plan(dev, 0.5)
     first, second = schedule.polls(dev)
     assert first.last.at == 0.25
-    assert served(schedule, 0.5) is second
+    assert polled(schedule, 0.5) is second
     assert schedule.next(0.5) == Idle(1.0)
 
 
-def test_writes_are_withdrawn_by_device_and_expire() -> None:
-    one, two = up(0), up(0, station=2)
+def test_requests_are_withdrawn_by_device_and_expire() -> None:
+    one, two = online(0), online(0, station=2)
     schedule = Schedule([one, two], 0.0)
-    writes = [write(one), write(two), write(one, expires=1.0), write(two)]
+    writes = [write(one), write(two), write(one, submitted=1.0 - WRITE_EXPIRY), write(two)]
     for each in writes:
         assert schedule.requests.submit(each)
     assert schedule.requests.expired(0.9) == []
@@ -362,15 +364,15 @@ def test_writes_are_withdrawn_by_device_and_expire() -> None:
     assert schedule.requests.withdraw() == []
 
 
-def test_too_many_waiting_writes_are_not_taken() -> None:
-    dev = up(0)
+def test_the_queue_takes_no_more_than_its_most_requests() -> None:
+    dev = online(0)
     schedule = Schedule([dev], 0.0)
     assert all(schedule.requests.submit(write(dev)) for _ in range(MOST_WAITING))
     assert not schedule.requests.submit(write(dev))
 
 
 class AnyOrder(RuleBasedStateMachine):
-    """What a line may do to its schedule, in any order. The clock only goes on."""
+    """The calls of an engine to its schedule, in any order. The clock only goes on."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -390,25 +392,25 @@ class AnyOrder(RuleBasedStateMachine):
     def time_passes(self, seconds: float) -> None:
         self.now += seconds
 
-    def _heard(self, found: Device) -> None:
+    def _answered(self, found: Device) -> None:
         before = found.state
         found.health.answered()
         if before in (State.STARTING, State.OFFLINE):
             found.bad_addresses.abandon()
             self.schedule.came_online(found, self.now)
 
-    def _not_heard(self, found: Device) -> None:
+    def _unclear(self, found: Device) -> None:
         unknown = not found.health.online
-        doubt(found)
+        fail(found)
         self.schedule.failed(self.now, 1.0)
-        if unknown or found.failures > 2:
+        if unknown or found.health.consecutive_failures > 2:
             self.schedule.went_offline(found, self.now, 1.0)
 
-    @rule(answers=st.booleans(), refused=st.booleans(), hastened=st.booleans())
-    def next_job(self, answers: bool, refused: bool, hastened: bool) -> None:
+    @rule(answers=st.booleans(), refused=st.booleans(), expedited=st.booleans())
+    def next_job(self, answers: bool, refused: bool, expedited: bool) -> None:
         match self.schedule.next(self.now):
             case Probe(found):
-                (self._heard if answers else self._not_heard)(found)
+                (self._answered if answers else self._unclear)(found)
             case Poll() as poll:
                 assert poll.live
                 assert poll.device.health.online
@@ -416,7 +418,7 @@ class AnyOrder(RuleBasedStateMachine):
                 assert poll.due <= self.now
                 self.running = poll
                 self.now += 0.05
-                if hastened:
+                if expedited:
                     self.schedule.expedite(poll)
                 self._end(poll, answers=answers, refused=refused)
                 self.running = None
@@ -429,10 +431,10 @@ class AnyOrder(RuleBasedStateMachine):
     def _end(self, poll: Poll, *, answers: bool, refused: bool) -> None:
         found, schedule = poll.device, self.schedule
         if answers and not refused:
-            self._heard(found)
+            self._answered(found)
             schedule.polled(poll, self.now)
         elif answers:
-            self._heard(found)
+            self._answered(found)
             halves = found.bad_addresses.refused(poll.block, 0, "28")
             if halves:
                 schedule.replace(poll, halves, self.now)
@@ -442,7 +444,7 @@ class AnyOrder(RuleBasedStateMachine):
                 found.plan()
                 schedule.plan(found, self.now)
         else:
-            self._not_heard(found)
+            self._unclear(found)
             if found.state is State.OFFLINE:
                 return
             if poll.tries < 2:
@@ -451,13 +453,13 @@ class AnyOrder(RuleBasedStateMachine):
                 schedule.polled(poll, self.now, answered=False)
 
     @rule(which=st.integers(0, 2), number=st.integers(0, 9))
-    def hasten(self, which: int, number: int) -> None:
+    def expedite(self, which: int, number: int) -> None:
         polls = self.schedule.polls(self.devices[which])
         self.schedule.expedite(polls[number % len(polls)])
 
     @rule(which=st.integers(0, 2))
     def submit(self, which: int) -> None:
-        self.schedule.requests.submit(write(self.devices[which], expires=1e9))
+        self.schedule.requests.submit(write(self.devices[which], submitted=self.now))
         self.submitted += 1
 
     @precondition(lambda self: self.submitted)
@@ -471,17 +473,16 @@ class AnyOrder(RuleBasedStateMachine):
         self.schedule.plan(self.devices[which], self.now)
 
     @rule()
-    def line_up(self) -> None:
+    def open(self) -> None:
         for found in self.devices:
-            found.start()
+            found.restart()
         self.schedule.opened(self.now)
 
     def _queues(self, poll: Poll) -> int:
-        schedule = self.schedule
-        heaps = [*schedule._waiting, *schedule._ready]
-        return sum(one is poll and ticket == poll.ticket for _, ticket, one in heaps) + sum(
-            one is poll for one in schedule._urgent
-        )
+        queue = self.schedule._queue  # private: a lost poll shows only after its whole period
+        heaps = [*queue.waiting, *queue.due]
+        valid = [one for _, ticket, one in heaps if one is poll and ticket == poll.ticket]
+        return len(valid) + sum(one is poll for one in queue.expedited)
 
     def _due(self) -> list[Poll]:
         return [
@@ -493,7 +494,7 @@ class AnyOrder(RuleBasedStateMachine):
         ]
 
     @invariant()
-    def every_poll_of_a_served_device_is_in_exactly_one_queue(self) -> None:
+    def every_poll_of_an_online_device_is_in_exactly_one_queue(self) -> None:
         for found in self.devices:
             covered = {tag for poll in self.schedule.polls(found) for tag in poll.block.tags}
             assert covered == set(found.tags)
@@ -503,8 +504,8 @@ class AnyOrder(RuleBasedStateMachine):
                     assert self._queues(poll) == 1, poll
 
     @invariant()
-    def no_write_is_lost(self) -> None:
-        assert len(self.schedule.requests) == self.submitted - self.written
+    def no_request_is_lost(self) -> None:
+        assert len(self.schedule.requests.waiting) == self.submitted - self.written
 
 
 AnyOrder.TestCase.settings = settings(max_examples=60, stateful_step_count=40, deadline=None)

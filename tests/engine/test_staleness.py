@@ -16,12 +16,12 @@ def scattered(count: int, station: int = 1, every: float = 0.5) -> Device:
 
 def limit(line: Plant) -> float:
     """By the rule: twice the worst age promised, and what one failure takes."""
-    return 2 * max(worst_ages(asked(line.engine.devices))) + 0.5 + 0.5
+    return 2 * max(worst_ages(asked(line.line.engine.devices))) + 0.5 + 0.5
 
 
 @on_virtual_time
 async def test_values_turn_overdue_when_the_line_becomes_too_slow_for_them() -> None:
-    """Its own time in an exchange grows from 5 ms to 400, which no time-out notices."""
+    """Its turnaround grows from 5 ms to 400 ms, which no time-out notices."""
     dev = scattered(10)
     line = plant([dev])
     async with running(line):
@@ -37,14 +37,14 @@ async def test_values_turn_overdue_when_the_line_becomes_too_slow_for_them() -> 
         assert "not read for" in found[0][1].detail
         assert found[0][0] - slow_since < most + 0.5
         assert dev.record.overdue == len(found)
-        # What it takes is measured: then the line is as good as it can be, and known to be.
+        # The turnaround is measured, so the limits grow with it.
         assert line.good(dev)
         assert found[-1][0] - slow_since < 40
 
 
 @on_virtual_time
 async def test_no_good_value_is_older_than_its_limit() -> None:
-    """Watched from outside: one device is written to all the time, the other becomes slow."""
+    """One device is written all the time, the other becomes slow."""
     dev, other = scattered(20), scattered(20, station=2)
     line = plant([dev, other])
     read_at = dict.fromkeys((*dev.tags, *other.tags), 0.0)
@@ -53,10 +53,10 @@ async def test_no_good_value_is_older_than_its_limit() -> None:
         most = limit(line)
         line.stations[0].late = lambda _: 0.3
         for _ in range(3000):
-            if not line.line.engine.schedule.requests:
+            if not line.line.engine.schedule.requests.waiting:
                 line.submit(other, other.tags[0], 1)
             await asyncio.sleep(0.02)
-            most = max(most, limit(line))  # it grows as the slow one is measured
+            most = max(most, limit(line))  # it grows as the slow turnaround is measured
             read_at |= {sample.tag: at for at, sample in line.told}
             line.told.clear()
             now = asyncio.get_running_loop().time()
@@ -77,16 +77,18 @@ async def test_nothing_is_overdue_on_a_line_that_carries_its_load() -> None:
 
 
 @on_virtual_time
-async def test_who_is_written_to_all_the_time_is_read_like_the_others() -> None:
-    """The line is asked for twice what it carries, and half of that goes to the writes."""
+async def test_a_device_that_is_written_all_the_time_is_polled_like_the_others() -> None:
+    """The load is twice what the line carries, and half of the time goes to the writes."""
     devices = [scattered(20, station=n) for n in (1, 2, 3)]
     line = plant(devices)
     async with running(line):
         await asyncio.sleep(5)
         for _ in range(3000):
-            if not line.line.engine.schedule.requests:
+            if not line.line.engine.schedule.requests.waiting:
                 line.submit(devices[0], devices[0].tags[0], 1)
             await asyncio.sleep(0.02)
-    # What is written is read back each time; of the others none is left behind.
-    reads = [min(poll.reads for poll in line.line.engine.schedule.polls(dev)) for dev in devices]
+    # A written tag is polled at once each time; no other device is left behind.
+    reads = [
+        min(poll.record.reads for poll in line.line.engine.schedule.polls(dev)) for dev in devices
+    ]
     assert min(reads) > 0.6 * max(reads)

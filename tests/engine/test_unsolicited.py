@@ -1,9 +1,9 @@
-"""No-protocol devices through a whole line, on virtual time: heard, asked, answered, written."""
+"""No-protocol devices on a whole line, on virtual time: listening, polls, replies, writes."""
 
 import asyncio
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from structlog.testing import capture_logs
 
-from gateway.app import Gateway, device_of
-from gateway.config import Config, load
+from gateway.app import Gateway, line_of
+from gateway.config import Config, LineConfig, load
 from gateway.engine.device import Device
 from gateway.engine.health import State
+from gateway.engine.jobs import Idle, Job
 from gateway.engine.request_results import Differs
 from gateway.engine.unsolicited import REPLY_WITHIN
 from gateway.errors import GatewayError, LineDown, Refused
@@ -45,21 +46,21 @@ def now() -> float:
 
 @dataclass
 class Bench:
-    """The far end of the port, byte by byte, and all that the line told."""
+    """The far end of the port, byte by byte, and the samples of the line."""
 
     line: Line = field(init=False)
     replies: Reply = lambda _: b""
     pause: float = 0.01  # seconds until it replies
     echo: bool = False
     sent: list[tuple[float, bytes]] = field(default_factory=list)
-    told: list[tuple[float, Sample]] = field(default_factory=list)
-    lives: list[bool] = field(default_factory=list)
-    ear: Receiver | None = None
+    delivered: list[tuple[float, Sample]] = field(default_factory=list)
+    onlines: list[bool] = field(default_factory=list)
+    receiver: Receiver | None = None
 
     # The port
 
-    async def open(self, ear: Receiver) -> Port:
-        self.ear = ear
+    async def open(self, receiver: Receiver) -> Port:
+        self.receiver = receiver
         return self
 
     def write(self, data: bytes) -> None:
@@ -70,32 +71,32 @@ class Bench:
             self._later(self.pause, reply)
 
     async def close(self) -> None:
-        self.ear = None
+        self.receiver = None
 
     def say(self, data: bytes) -> None:
-        assert self.ear is not None
-        self.ear.received(data)
+        assert self.receiver is not None
+        self.receiver.received(data)
 
     def _later(self, pause: float, data: bytes) -> None:
         asyncio.get_running_loop().call_later(pause, self.say, data)
 
-    # Upstairs
+    # The sample sink
 
     def samples(self, samples: Sequence[Sample]) -> None:
-        self.told += [(now(), sample) for sample in samples]
+        self.delivered += [(now(), sample) for sample in samples]
 
     def online(self, device: Device, online: bool) -> None:
-        self.lives.append(online)
+        self.onlines.append(online)
 
-    # What tests ask
+    # For tests
 
     @property
     def words(self) -> list[bytes]:
         return [data for _, data in self.sent]
 
     def values(self, name: str) -> list[Value | Reason | None]:
-        """All that was told of a tag: its values, or why there was none."""
-        return [s.reason or s.value for _, s in self.told if s.tag.name == name]
+        """All samples of a tag: the values, or the reasons of bad ones."""
+        return [s.reason or s.value for _, s in self.delivered if s.tag.name == name]
 
     def last(self, name: str) -> Value | Reason | None:
         return self.values(name)[-1]
@@ -105,28 +106,23 @@ class Bench:
 
     async def write_tag(self, name: str, value: Value) -> WriteResult | GatewayError:
         device, tag = self.tag(name)
-        done: asyncio.Future[WriteResult | GatewayError] = (
-            asyncio.get_running_loop().create_future()
-        )
-        self.line.submit(device, tag, tag.encode(value), done.set_result)
-        return await done
+        try:
+            return await self.line.write(device, tag, tag.encode(value))
+        except GatewayError as error:
+            return error
+
+
+def made_line(config: LineConfig, bench: Bench) -> Line:
+    wall = lambda: int(now() * SECOND)  # noqa: E731
+    return line_of(config, config.devices, bench, open_port=bench.open, wall=wall)
 
 
 @asynccontextmanager
 async def running(config: Config, number: int = 0, **how: Any) -> AsyncIterator[Bench]:
     """One line of the file, open and served. It must neither end nor fail."""
     bench = Bench(**how)
-    line = config.lines[number]
-    devices = [device_of(device, line) for device in line.engine.devices]
-    bench.line = Line(
-        line.name,
-        devices,
-        line.wire,
-        bench.open,
-        bench,
-        lambda: int(now() * SECOND),
-        echo=bench.echo,
-    )
+    line = replace(config.lines[number], echo=bench.echo)
+    bench.line = made_line(line, bench)
     task = asyncio.create_task(bench.line.run())
     await asyncio.sleep(0.1)
     yield bench
@@ -141,14 +137,14 @@ def example(name: str) -> Config:
     return load(EXAMPLES / f"{name}.yaml")
 
 
-# Heard unasked
+# Unsolicited frames
 
 
 @on_virtual_time
-async def test_a_scale_streams_and_nobody_asks_it_anything() -> None:
+async def test_a_scale_streams_and_is_never_sent_a_request() -> None:
     async with running(example("scale")) as bench:
         (device,) = bench.line.engine.devices
-        assert bench.lives == []
+        assert bench.onlines == []
         for _ in range(20):
             bench.say(MOVING)
             await asyncio.sleep(0.2)
@@ -156,32 +152,30 @@ async def test_a_scale_streams_and_nobody_asks_it_anything() -> None:
             await asyncio.sleep(0.2)
         assert bench.values("weight")[-2:] == [-12.0, 1234.5]
         assert bench.last("state") == "ST"
-        assert bench.lives == [True]
+        assert bench.onlines == [True]
         assert device.state is State.ONLINE
         assert device.record.heard == 40
         assert bench.sent == []
 
 
 @on_virtual_time
-async def test_a_scale_that_falls_silent_is_stale_and_not_alive_until_it_speaks() -> None:
+async def test_a_scale_that_stops_sending_turns_stale_and_offline_until_its_next_frame() -> None:
     async with running(example("scale")) as bench:
         bench.say(STABLE * 2)
         spoke = now()
         await asyncio.sleep(10)
-        stale = [(at, s.reason) for at, s in bench.told if s.quality is Quality.BAD]
+        stale = [(at, s.reason) for at, s in bench.delivered if s.quality is Quality.BAD]
         assert [reason for _, reason in stale] == [Reason.NO_REPLY] * 2  # its two tags, once
         assert stale[0][0] - spoke == pytest.approx(2.0, abs=0.01)
-        assert bench.lives == [True, False]
+        assert bench.onlines == [True, False]
         bench.say(MOVING)
         assert bench.last("weight") == -12.0
-        assert bench.lives == [True, False, True]
+        assert bench.onlines == [True, False, True]
         assert bench.sent == []  # it is never probed
 
 
 @on_virtual_time
-async def test_what_is_not_understood_makes_all_that_is_listened_to_bad_until_the_next_frame() -> (
-    None
-):
+async def test_a_garbled_frame_makes_all_listened_fields_bad_until_the_next_frame() -> None:
     with capture_logs() as logs:
         async with running(example("scale")) as bench:
             (device,) = bench.line.engine.devices
@@ -189,7 +183,7 @@ async def test_what_is_not_understood_makes_all_that_is_listened_to_bad_until_th
             bench.say(OVERLOAD * 3)
             assert bench.last("weight") is Reason.GARBLED
             assert bench.last("state") is Reason.GARBLED
-            noted = [entry for entry in logs if entry["event"] == "not understood"]
+            noted = [entry for entry in logs if entry["event"] == "frame garbled"]
             assert [entry["bytes"] for entry in noted] == [OVERLOAD[:-2].hex(" ")]  # once
             assert "a frame that listen does not know" in device.diagnosis()
             bench.say(STABLE)
@@ -198,7 +192,7 @@ async def test_what_is_not_understood_makes_all_that_is_listened_to_bad_until_th
 
 
 @on_virtual_time
-async def test_one_field_that_does_not_parse_is_bad_alone_and_its_bytes_are_in_the_log() -> None:
+async def test_a_garbled_field_is_bad_alone_and_its_bytes_are_in_the_log() -> None:
     with capture_logs() as logs:
         async with running(example("scale")) as bench:
             bench.say(STABLE * 2)
@@ -206,7 +200,7 @@ async def test_one_field_that_does_not_parse_is_bad_alone_and_its_bytes_are_in_t
             assert bench.last("weight") is Reason.GARBLED
             assert bench.last("state") == "US"
             assert bench.line.engine.devices[0].record.failures == {"shape": 3}
-    (noted,) = [entry for entry in logs if entry["event"] == "not understood"]
+    (noted,) = [entry for entry in logs if entry["event"] == "field garbled"]
     assert noted["bytes"] == b"US,+1.2.3.4.  g".hex(" ")
 
 
@@ -222,12 +216,19 @@ async def test_two_equal_bar_codes_are_two_events_in_order() -> None:
 
 
 @on_virtual_time
-async def test_each_of_two_equal_events_is_news() -> None:
+async def test_each_of_two_equal_events_is_published() -> None:
     config = load(EXAMPLES / "barcode-reader.yaml")
     news: list[Value | Reason | None] = []
     bench = Bench()
     gateway = Gateway(config, lambda: int(now() * SECOND), lambda _: bench.open)
-    gateway.publish = lambda samples: news.extend(s.reason or s.value for s in samples)
+
+    class Publisher:
+        def publish(self, samples: Sequence[Sample]) -> None:
+            news.extend(s.reason or s.value for s in samples)
+
+        def set_online(self, device: str, online: bool) -> None: ...
+
+    gateway.subscribe(Publisher())
     tasks = [asyncio.create_task(line.run()) for line in gateway.lines]
     await asyncio.sleep(0.1)
     bench.say(b"\x02A\x03\x02A\x03")
@@ -241,14 +242,13 @@ async def test_each_of_two_equal_events_is_news() -> None:
     await asyncio.gather(*tasks, return_exceptions=True)
 
 
-async def test_an_event_is_not_published_again_when_the_network_comes_back() -> None:
+async def test_an_event_is_not_published_again_when_the_link_returns() -> None:
     tags = [tag for name in ("barcode-reader", "scale") for tag in example(name).devices[0].tags]
     repeated: list[Sample] = []
 
     class Everything:
-        @property
-        def tags(self) -> list[Tag]:
-            return tags
+        def __init__(self) -> None:
+            self.tags = tags
 
         def sample(self, tag: Tag) -> Sample:
             return good(tag, 1, 0)
@@ -262,18 +262,18 @@ async def test_an_event_is_not_published_again_when_the_network_comes_back() -> 
 
 
 @on_virtual_time
-async def test_a_silent_device_costs_nothing() -> None:
-    """Nothing is sent, and the line is not even woken."""
+async def test_a_device_that_sends_nothing_costs_nothing() -> None:
+    """Nothing is sent, and the line does not even wake."""
     async with running(example("barcode-reader")) as bench:
         rounds = 0
-        looked = bench.line.engine.schedule.next
+        original = bench.line.engine.next
 
-        def counted(at: float) -> Any:
+        def counted(now: float) -> Job:
             nonlocal rounds
             rounds += 1
-            return looked(at)
+            return original(now)
 
-        bench.line.engine.schedule.next = counted  # type: ignore[method-assign,assignment]  # it counts
+        bench.line.engine.next = counted  # type: ignore[method-assign]  # it counts
         asyncio.get_running_loop().call_later(86400, lambda: None)
         await asyncio.sleep(86400)
         assert rounds == 0
@@ -281,7 +281,7 @@ async def test_a_silent_device_costs_nothing() -> None:
 
 
 @on_virtual_time
-async def test_a_frame_that_only_a_silence_ends_is_heard_when_it_has_passed(tmp_path: Path) -> None:
+async def test_a_frame_ended_by_silence_is_read_after_the_silence(tmp_path: Path) -> None:
     path = tmp_path / "plant.yaml"
     path.write_text(
         "lines: {hall: {port: COM1, devices: {scale: {protocol: frames, framing: {gap: 50ms},"
@@ -299,11 +299,11 @@ async def test_a_frame_that_only_a_silence_ends_is_heard_when_it_has_passed(tmp_
         assert bench.values("w") == [1234]
 
 
-# Answered
+# Replies
 
 
 @on_virtual_time
-async def test_the_k120s_weighing_machine_is_answered_every_time() -> None:
+async def test_the_k120s_weighing_machine_gets_a_reply_every_time() -> None:
     frame, answer = BY_ID["noproto-k120s-001"].frame, BY_ID["noproto-k120s-002"].frame
     async with running(example("weighing-machine")) as bench:
         await asyncio.sleep(1)
@@ -319,7 +319,7 @@ async def test_the_k120s_weighing_machine_is_answered_every_time() -> None:
 
 
 @on_virtual_time
-async def test_the_echo_of_an_answer_is_nothing_that_the_device_said() -> None:
+async def test_the_echo_of_a_reply_is_no_frame_of_the_device() -> None:
     frame, answer = BY_ID["noproto-k120s-001"].frame, BY_ID["noproto-k120s-002"].frame
     async with running(example("weighing-machine"), echo=True) as bench:
         await asyncio.sleep(1)
@@ -331,7 +331,7 @@ async def test_the_echo_of_an_answer_is_nothing_that_the_device_said() -> None:
 
 
 @on_virtual_time
-async def test_an_answer_that_its_framing_cannot_carry_is_not_sent(tmp_path: Path) -> None:
+async def test_a_reply_that_its_framing_cannot_carry_is_not_sent(tmp_path: Path) -> None:
     path = tmp_path / "plant.yaml"
     path.write_text(
         "lines: {hall: {port: COM1, devices: {plc: {protocol: frames,"
@@ -346,7 +346,7 @@ async def test_an_answer_that_its_framing_cannot_carry_is_not_sent(tmp_path: Pat
         assert bench.words == [b"OKAB!"]
 
 
-# Asked and written
+# Polls and writes
 
 
 def sums(text: str) -> bytes:
@@ -373,17 +373,17 @@ class Inverter:
 
 
 @on_virtual_time
-async def test_an_inverter_is_asked_every_half_second() -> None:
+async def test_an_inverter_is_polled_every_half_second() -> None:
     async with running(example("inverter"), replies=Inverter()) as bench:
         await asyncio.sleep(10)
         assert 18 <= len(bench.values("frequency")) <= 22
         assert set(bench.values("frequency")) == {49.98}
         assert set(bench.words) == {sums("F?")}
-        assert bench.lives == [True]
+        assert bench.onlines == [True]
 
 
 @on_virtual_time
-async def test_an_inverter_is_told_its_speed() -> None:
+async def test_the_speed_of_an_inverter_is_written() -> None:
     inverter = Inverter()
     async with running(example("inverter"), replies=inverter) as bench:
         await asyncio.sleep(1)
@@ -397,7 +397,7 @@ async def test_an_inverter_is_told_its_speed() -> None:
 
 
 @on_virtual_time
-async def test_a_limit_holds_for_what_is_really_sent() -> None:
+async def test_a_limit_holds_for_the_value_that_is_sent() -> None:
     async with running(example("inverter"), replies=Inverter()) as bench:
         _, tag = bench.tag("setpoint")
         assert bytes(tag.encode(60)) == b"060.00"
@@ -409,32 +409,34 @@ async def test_a_limit_holds_for_what_is_really_sent() -> None:
 
 
 @on_virtual_time
-async def test_a_reply_whose_field_does_not_parse_is_garbled_and_the_device_stays_up() -> None:
+async def test_a_reply_with_a_garbled_field_turns_it_bad_and_the_device_stays_online() -> None:
     inverter = Inverter()
     async with running(example("inverter"), replies=inverter) as bench:
         await asyncio.sleep(1)
         inverter.frequency = "0.49.9"
         await asyncio.sleep(2)
         assert bench.last("frequency") is Reason.GARBLED
-        assert bench.lives == [True]
+        assert bench.onlines == [True]
         inverter.frequency = "012.50"
         await asyncio.sleep(1)
         assert bench.last("frequency") == 12.5
 
 
 @on_virtual_time
-async def test_an_inverter_that_is_switched_off_is_silent_and_is_probed_with_its_question() -> None:
+async def test_an_inverter_that_is_switched_off_goes_offline_and_is_probed_with_its_request() -> (
+    None
+):
     inverter = Inverter()
     async with running(example("inverter"), replies=inverter) as bench:
         await asyncio.sleep(1)
         inverter.mute = True
         await asyncio.sleep(20)
         assert bench.last("frequency") is Reason.NO_REPLY
-        assert bench.lives == [True, False]
+        assert bench.onlines == [True, False]
         inverter.mute = False
         await asyncio.sleep(61)
         assert bench.last("frequency") == 49.98
-        assert bench.lives == [True, False, True]
+        assert bench.onlines == [True, False, True]
 
 
 @pytest.mark.parametrize("number", [0, 1], ids=["as-text", "converted"])
@@ -497,7 +499,7 @@ async def test_a_reply_ends_by_a_silence_and_a_write_is_read_back(tmp_path: Path
         done = await bench.write_tag("speed", 60)
         assert isinstance(done, WriteResult)
         assert (held, done.value, done.verified) == (b"600.0", 60.0, True)
-        deaf = True  # it says yes, and does nothing
+        deaf = True  # it acknowledges and does nothing
         assert isinstance(await bench.write_tag("speed", 70), Differs)
         await asyncio.sleep(2)
         assert bench.last("speed") == 60.0
@@ -523,8 +525,8 @@ lines:
 
 
 @on_virtual_time
-async def test_a_device_that_is_never_asked_is_written_to_but_never_probed(tmp_path: Path) -> None:
-    """Whether it lives, only its own words tell; a write that fails is tried, each time anew."""
+async def test_a_device_without_polls_is_written_but_never_probed(tmp_path: Path) -> None:
+    """Only its own frames show that it is online; each write is sent though others failed."""
     path = tmp_path / "plant.yaml"
     path.write_text(PRINTER)
     async with running(load(path)) as bench:
@@ -532,20 +534,20 @@ async def test_a_device_that_is_never_asked_is_written_to_but_never_probed(tmp_p
         done = await bench.write_tag("loud", "HELLO")
         assert isinstance(done, WriteResult)
         assert done.acknowledged is False
-        assert bench.lives == []
+        assert bench.onlines == []
         for _ in range(5):
             assert not isinstance(await bench.write_tag("proud", 7), WriteResult)
-        assert bench.lives == []
+        assert bench.onlines == []
         await asyncio.sleep(100)
         assert bench.words == [b"PRINT HELLO\r", *[b"SET 007\r"] * 5]
         bench.replies = lambda _: b"OK\r"
         assert isinstance(await bench.write_tag("proud", 8), WriteResult)
-        assert bench.lives == [True]
+        assert bench.onlines == [True]
         assert device.state is State.ONLINE
         assert bench.values("state") == []
 
 
-ASKED_AND_HEARD = """
+POLLED_AND_UNSOLICITED = """
 lines:
   hall:
     port: COM1
@@ -563,11 +565,11 @@ lines:
 
 
 @on_virtual_time
-async def test_what_a_device_says_while_it_is_asked_something_else_is_not_lost(
+async def test_an_unsolicited_frame_during_a_poll_is_not_lost(
     tmp_path: Path,
 ) -> None:
     path = tmp_path / "plant.yaml"
-    path.write_text(ASKED_AND_HEARD)
+    path.write_text(POLLED_AND_UNSOLICITED)
     async with running(load(path), replies=lambda _: b"\x02K7\x03\x02W12\x03") as bench:
         await asyncio.sleep(2)
         asked = len(bench.sent)
@@ -609,13 +611,13 @@ async def test_a_reader_and_a_polled_plc_share_a_line(tmp_path: Path) -> None:
         said = 0
         for n in range(100):
             await asyncio.sleep(0.173)
-            if bench.line._turn is not None and bench.line._turn.sent:
-                continue  # two at once on one wire: nobody could read either
+            if bench.sent and now() - bench.sent[-1][0] < 2 * bench.pause:
+                continue  # a poll is in flight: both frames would be lost
             said += 1
             before = len(bench.sent)
             bench.say(b"\x0240063")
             await asyncio.sleep(0.03)
-            assert len(bench.sent) == before  # nobody speaks into its frame
+            assert len(bench.sent) == before  # the frame is not interrupted
             bench.say(b"%03d\x03" % n)
         assert said > 50
         assert len(bench.values("code")) == said
@@ -624,7 +626,7 @@ async def test_a_reader_and_a_polled_plc_share_a_line(tmp_path: Path) -> None:
 
 
 @on_virtual_time
-async def test_a_frame_that_never_ends_does_not_keep_the_line_from_others(tmp_path: Path) -> None:
+async def test_an_endless_frame_keeps_the_line_only_for_a_while(tmp_path: Path) -> None:
     path = tmp_path / "plant.yaml"
     path.write_text(SHARED)
     station = VigorStation(1)
@@ -645,22 +647,20 @@ async def test_a_frame_that_never_ends_does_not_keep_the_line_from_others(tmp_pa
 
 
 @on_virtual_time
-async def test_an_answer_that_comes_too_late_is_not_sent() -> None:
+async def test_a_reply_that_waited_too_long_is_not_sent() -> None:
     frame = BY_ID["noproto-k120s-001"].frame
     async with running(example("weighing-machine")) as bench:
         await asyncio.sleep(1)
         bench.say(frame)
-        assert bench.line._listening.next(now() + REPLY_WITHIN) is None  # the line was held up
+        assert isinstance(bench.line.engine.next(now() + REPLY_WITHIN), Idle)  # the line was busy
         await asyncio.sleep(1)
         assert bench.sent == []
 
 
 @on_virtual_time
-async def test_when_the_port_goes_and_comes_back_listening_begins_anew() -> None:
+async def test_listening_begins_again_when_the_port_was_lost_and_reopened() -> None:
     bench = Bench()
-    config = example("scale").lines[0]
-    devices = [device_of(device, config) for device in config.devices]
-    bench.line = Line("l", devices, config.wire, bench.open, bench, lambda: 0)
+    bench.line = made_line(example("scale").lines[0], bench)
     task = asyncio.create_task(bench.line.run())
     await asyncio.sleep(0.1)
     bench.say(STABLE + STABLE[:7])
@@ -690,10 +690,8 @@ async def test_when_the_port_goes_and_comes_back_listening_begins_anew() -> None
         max_size=25,
     )
 )
-def test_whatever_is_heard_nothing_is_raised_out_of_the_line(
-    name: str, pieces: list[tuple[bytes, float]]
-) -> None:
-    async def heard() -> None:
+def test_no_received_bytes_end_the_line(name: str, pieces: list[tuple[bytes, float]]) -> None:
+    async def receive() -> None:
         async with running(example(name)) as bench:
             for data, pause in pieces:
                 bench.say(data)
@@ -702,6 +700,6 @@ def test_whatever_is_heard_nothing_is_raised_out_of_the_line(
 
     loop = VirtualLoop()
     try:
-        loop.run_until_complete(heard())
+        loop.run_until_complete(receive())
     finally:
         loop.close()

@@ -1,4 +1,4 @@
-"""Whatever set of addresses a device refuses, halving finds it and the rest is merged again."""
+"""Halving finds any set of refused addresses, and merges the others again."""
 
 import math
 
@@ -13,7 +13,7 @@ from tests.sim.plant import device, make_tag
 
 
 class Asker:
-    """Does with a device's blocks what the line does, and counts."""
+    """Polls a device's blocks as the engine does, and counts the exchanges."""
 
     def __init__(self, device: Device, missing: set[int]) -> None:
         self.device = device
@@ -25,7 +25,7 @@ class Asker:
         return not any(start <= n < start + size for n in self.missing)
 
     def ask(self, block: Block) -> bool:
-        """True when the device was planned anew."""
+        """True when the device was planned again."""
         refusals = self.device.bad_addresses
         self.exchanges += 1
         if self.there(block):
@@ -45,7 +45,7 @@ class Asker:
         return False
 
     def settle(self) -> None:
-        """Rounds over all blocks until one goes by in which nothing new is learnt."""
+        """Polls all blocks in rounds, until a round brings nothing new."""
         for _ in range(200):
             blocks = self.device.blocks
             for block in blocks:
@@ -68,7 +68,7 @@ def bad_numbers(found: Device) -> set[int]:
 @settings(max_examples=200, deadline=None)
 @given(st.sets(st.integers(0, 63), min_size=1), st.sets(st.integers(0, 63), max_size=6))
 def test_any_set_of_bad_addresses_is_found(numbers: set[int], missing: set[int]) -> None:
-    """Those of tags are named; holes in the gaps are planned around; all else is read."""
+    """Bad tags are named, holes in gaps are planned around, all other tags are read."""
     found = words(*sorted(numbers))
     asker = Asker(found, missing)
     asker.settle()

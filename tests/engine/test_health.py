@@ -1,0 +1,250 @@
+"""Health of one device: the table of its states, and each method."""
+
+import itertools
+
+import pytest
+
+from gateway.engine.health import (
+    MOST_UNANSWERED,
+    PAUSE_FIRST,
+    PAUSE_LONGEST,
+    TRANSITIONS,
+    Event,
+    Health,
+    State,
+    diagnosis,
+)
+from gateway.errors import Evidence, Garbled, GatewayError, LineDown, NoReply, Unclear
+from gateway.protocols.driver import Span
+from gateway.tags import Reason
+
+S, E = State, Event
+SPAN, OTHER = Span("D", 0, 10), Span("D", 50, 1)
+SILENCE = NoReply("no reply")
+TABLE = {
+    #              starting    online      failing     offline
+    E.ANSWERED: (S.ONLINE, S.ONLINE, S.ONLINE, S.ONLINE),
+    E.UNCLEAR: (S.STARTING, S.FAILING, S.FAILING, S.OFFLINE),
+    E.GAVE_UP: (S.OFFLINE, S.OFFLINE, S.OFFLINE, S.OFFLINE),
+    E.RESTARTED: (S.STARTING, S.STARTING, S.STARTING, S.STARTING),
+}
+ROWS = [
+    (state, event, after)
+    for event, afters in TABLE.items()
+    for state, after in zip(State, afters, strict=True)
+]
+
+
+def health(state: State = S.ONLINE, *, answerable: bool = True) -> Health:
+    """A device in this state, by the shortest way."""
+    found = Health(answerable=answerable)
+    match state:
+        case S.ONLINE:
+            found.answered()
+        case S.FAILING:
+            found.answered()
+            found.unclear(SILENCE, SPAN, 0.0)
+        case S.OFFLINE:
+            found.gave_up(0.0, 1.0)
+    assert found.state is state
+    return found
+
+
+def happen(found: Health, event: Event) -> None:
+    match event:
+        case E.ANSWERED:
+            found.answered()
+        case E.UNCLEAR:
+            found.unclear(SILENCE, SPAN, 0.0)
+        case E.GAVE_UP:
+            found.gave_up(0.0, 1.0)
+        case E.RESTARTED:
+            found.restart()
+
+
+# The table
+
+
+def test_the_table_has_each_pair_of_state_and_event_and_no_other() -> None:
+    assert set(TRANSITIONS) == set(itertools.product(State, Event))
+    assert set(TRANSITIONS.values()) == set(State)
+    assert {(state, event): after for state, event, after in ROWS} == TRANSITIONS
+
+
+@pytest.mark.parametrize(("state", "event", "after"), ROWS)
+def test_each_event_leads_to_the_state_in_the_table(
+    state: State, event: Event, after: State
+) -> None:
+    found = health(state)
+    happen(found, event)
+    assert found.state is after
+    assert found.online == (after in (S.ONLINE, S.FAILING))
+
+
+# Each method
+
+
+def test_a_new_device_is_starting_and_needs_a_resync() -> None:
+    found = Health()
+    assert (found.state, found.online, found.needs_resync) == (S.STARTING, False, True)
+    assert (found.outstanding, found.trouble, found.consecutive_failures) == (None, None, 0)
+
+
+@pytest.mark.parametrize(
+    ("state", "came"),
+    [(S.STARTING, True), (S.OFFLINE, True), (S.FAILING, False), (S.ONLINE, False)],
+)
+def test_a_reply_tells_if_the_device_came_online(state: State, came: bool) -> None:
+    assert health(state).answered() is came
+
+
+def test_a_reply_ends_failures_resync_outstanding_request_trouble_and_pause() -> None:
+    found = health(S.FAILING)
+    found.gave_up(5.0, 1.0)
+    found.answered()
+    assert found.consecutive_failures == 0
+    assert not found.needs_resync
+    assert found.outstanding is None
+    assert found.trouble is None
+    assert found.pause == 0.0
+    assert found.outstanding_requests(-1.0) == 0
+
+
+def test_an_unclear_end_counts_and_needs_a_resync() -> None:
+    found = health()
+    for count in (1, 2, 3):
+        found.unclear(SILENCE, SPAN, float(count))
+        assert found.consecutive_failures == count
+    assert found.needs_resync
+    assert found.outstanding == SPAN
+    assert found.trouble is SILENCE
+
+
+def test_an_unclear_probe_keeps_the_older_outstanding_request() -> None:
+    found = health(S.FAILING)
+    found.unclear(SILENCE, None, 1.0)
+    assert found.outstanding == SPAN
+    found.unclear(SILENCE, OTHER, 1.0)
+    assert found.outstanding == OTHER
+
+
+def test_too_slow_is_kept_over_no_reply_but_not_over_other_trouble() -> None:
+    found, seen = health(), list[GatewayError | None]()
+    slow, noise = Garbled("0.7 s", evidence=Evidence.SLOW), Garbled("noise")
+    for error in (slow, SILENCE, noise, SILENCE):
+        found.unclear(error, SPAN, 0.0)
+        seen.append(found.trouble)
+    assert seen == [slow, slow, noise, SILENCE]
+
+
+def test_a_restart_needs_a_resync_and_keeps_the_outstanding_request() -> None:
+    found, lost = health(S.FAILING), LineDown("unplugged")
+    found.restart(lost)
+    assert found.trouble is lost
+    assert found.consecutive_failures == 0
+    assert found.needs_resync
+    assert found.outstanding == SPAN
+    found.restart()
+    assert found.trouble is None
+
+
+def test_a_restart_keeps_the_pause_of_an_offline_device() -> None:
+    found = health(S.OFFLINE)
+    found.restart()
+    assert found.pause == PAUSE_FIRST
+    found.gave_up(0.0, 1.0)
+    assert found.pause == 2 * PAUSE_FIRST
+
+
+def test_a_transaction_cut_off_by_the_loss_of_the_port_leaves_its_request_outstanding() -> None:
+    found = health()
+    found.left_outstanding(SPAN)
+    assert (found.state, found.needs_resync, found.outstanding) == (S.ONLINE, True, SPAN)
+    found.left_outstanding(None)
+    assert found.outstanding == SPAN
+
+
+@pytest.mark.parametrize("last", [True, False])
+def test_the_last_late_reply_completes_the_resync_and_an_earlier_one_does_not(last: bool) -> None:
+    found = health(S.FAILING)
+    found.replied_late(0.7, 0.5, last=last)
+    assert found.state is S.FAILING  # only a reply in time brings it online
+    assert found.needs_resync is not last
+    assert found.outstanding_requests(-1.0) == (0 if last else 1)
+    assert isinstance(found.trouble, Garbled)
+    assert found.trouble.evidence is Evidence.SLOW
+    assert str(found.trouble) == "it took 0.70 s, reply_timeout is 0.5 s"
+
+
+def test_the_pause_between_probes_doubles_up_to_the_longest() -> None:
+    found, pauses = health(), list[float]()
+    for _ in range(9):
+        found.gave_up(100.0, 1.1)
+        pauses.append(found.pause)
+        assert found.next_probe == 100.0 + 1.1 * found.pause
+    assert pauses == [min(PAUSE_FIRST * 2**n, PAUSE_LONGEST) for n in range(9)]
+
+
+def test_probe_soon_allows_the_next_probe_at_once() -> None:
+    found = health(S.OFFLINE)
+    assert found.next_probe > 0.0
+    found.probe_soon()
+    assert found.next_probe == 0.0
+
+
+def test_probe_tokens_grow_by_two() -> None:
+    found = health()
+    first = found.next_probe_token()
+    assert [found.next_probe_token(), found.next_probe_token()] == [first + 2, first + 4]
+
+
+def test_requests_without_a_reply_are_counted_from_a_time_on() -> None:
+    found = health()
+    for at in (1.0, 2.0, 3.0):
+        found.unclear(SILENCE, SPAN, at)
+    assert [found.outstanding_requests(since) for since in (0.0, 1.0, 2.5, 3.0)] == [3, 2, 1, 0]
+    for at in range(2 * MOST_UNANSWERED):
+        found.unclear(SILENCE, SPAN, 10.0 + at)
+    assert found.outstanding_requests(0.0) == MOST_UNANSWERED
+
+
+def test_the_reason_of_bad_values_follows_the_trouble() -> None:
+    found, reasons = health(), list[Reason]()
+    for error in (SILENCE, Garbled("noise"), Unclear("other")):
+        found.unclear(error, SPAN, 0.0)
+        reasons.append(found.reason)
+    assert reasons == [Reason.NO_REPLY, Reason.GARBLED, Reason.NO_REPLY]
+
+
+@pytest.mark.parametrize("event", Event)
+def test_a_device_that_cannot_answer_never_needs_a_resync(event: Event) -> None:
+    found = health(S.STARTING, answerable=False)
+    assert not found.needs_resync
+    happen(found, event)
+    found.left_outstanding(SPAN)
+    assert not found.needs_resync
+
+
+def test_damaged_unsolicited_bytes_are_trouble_until_the_next_good_frame() -> None:
+    found, damage = health(answerable=False), Garbled("noise")
+    found.not_understood(damage)
+    assert found.trouble is damage
+    assert found.state is S.ONLINE
+    found.understood()
+    assert found.trouble is None
+
+
+# The diagnosis
+
+
+def test_no_trouble_has_no_diagnosis() -> None:
+    assert diagnosis(None, "other causes") == ""
+
+
+def test_the_diagnosis_of_silence_adds_the_causes_that_the_protocol_knows() -> None:
+    assert diagnosis(SILENCE, "Is it in RUN?").endswith(" Is it in RUN?")
+    assert diagnosis(SILENCE, "").endswith(".")
+
+
+def test_other_trouble_is_its_own_diagnosis() -> None:
+    assert diagnosis(LineDown("unplugged"), "other causes") == "unplugged"

@@ -1,0 +1,107 @@
+"""The queue of polls: by due time, then by deadline, and expedited ones first."""
+
+import random
+
+from gateway.engine.device import Device
+from gateway.engine.jobs import EXPEDITED, NOT_QUEUED, Poll
+from gateway.engine.poll_queue import ROOM, PollQueue
+from tests.sim.plant import device, make_tag
+
+
+def online() -> Device:
+    found = device([make_tag("D0", every=1.0), make_tag("D900", every=5.0)])
+    found.health.answered()
+    return found
+
+
+def polls(of: Device, *dues: float, block: int = 0) -> list[Poll]:
+    return [Poll(of, of.blocks[block], due) for due in dues]
+
+
+def queue(*pushed: Poll) -> PollQueue:
+    made = PollQueue()
+    made.push_all(pushed)
+    return made
+
+
+def first(made: PollQueue, now: float) -> Poll | None:
+    return made.due[0][2] if made.ripen(now) and made.due else None
+
+
+def test_a_poll_is_due_from_its_due_time_on() -> None:
+    [poll] = polls(online(), 2.0)
+    made = queue(poll)
+    assert not made.ripen(1.9)
+    assert made.ripen(2.0)
+    assert first(made, 2.0) is poll
+
+
+def test_due_polls_go_by_deadline() -> None:
+    of = online()
+    [slow], [fast] = polls(of, 0.0, block=1), polls(of, 3.0)
+    made = queue(slow, fast)
+    assert first(made, 2.0) is slow
+    assert first(made, 3.0) is fast  # until 4.0, the slow one until 5.0
+
+
+def test_of_equal_polls_the_one_pushed_first_goes_first() -> None:
+    same = polls(online(), 0.0, 0.0, 0.0)
+    assert first(queue(*same), 0.0) is same[0]
+
+
+def test_a_pushed_poll_leaves_a_stale_entry_behind() -> None:
+    [poll] = polls(online(), 0.0)
+    made = queue(poll)
+    poll.due = 5.0
+    made.push(poll)
+    assert not made.ripen(4.9)
+    assert first(made, 5.0) is poll
+    assert list(made.valid()) == [poll]
+
+
+def test_an_expedited_poll_goes_first_once_and_is_not_pushed_until_taken() -> None:
+    ready, late = polls(online(), 0.0, 9.0)
+    made = queue(ready, late)
+    made.expedite(late)
+    made.expedite(late)
+    made.push(late)
+    assert made.ripen(0.0)
+    assert list(made.expedited) == [late]
+    assert late.ticket == EXPEDITED
+    made.expedited.remove(late)
+    late.ticket = NOT_QUEUED
+    made.push(late)
+    assert first(made, 9.0) is ready
+
+
+def test_polls_of_a_device_that_is_not_online_are_left_out() -> None:
+    of = online()
+    poll, other = polls(of, 0.0, 0.0)
+    made = queue(poll)
+    made.expedite(other)
+    of.health.gave_up(0.0, 1.0)
+    made.push(poll)
+    assert not made.ripen(0.0)
+    assert list(made.valid()) == []
+
+
+def test_replaced_polls_are_left_out() -> None:
+    poll, kept = polls(online(), 0.0, 0.0)
+    made = queue(poll, kept)
+    poll.live = False
+    assert first(made, 0.0) is kept
+    made.push(poll)
+    assert list(made.valid()) == [kept]
+
+
+def test_stale_entries_are_dropped_when_there_are_many() -> None:
+    many = polls(online(), *[0.0] * 10)
+    made, chance = PollQueue(), random.Random(1)
+    for n in range(2000):
+        poll = chance.choice(many)
+        poll.due = float(n) + chance.random()
+        made.push(poll)
+        made.ripen(n / 2)
+        assert len(made.waiting) <= 2 * len(many) + ROOM + 1
+        assert len(made.due) <= 2 * len(many) + ROOM + 1
+    assert first(made, 1e9) is min(made.valid(), key=lambda poll: (poll.deadline, poll.ticket))

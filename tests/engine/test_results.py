@@ -1,0 +1,270 @@
+"""Results of polls and probes: what follows for the values, the plan, the log and the record."""
+
+import pytest
+
+from gateway.engine.device import LEARN_EVERY
+from gateway.engine.health import State
+from gateway.engine.jobs import Idle, Poll, Resynced, Settle, Settled, Traffic
+from gateway.engine.results import BUSY_PAUSE
+from gateway.errors import DeviceError, Garbled, Refusal, Refused, Unsteady
+from gateway.tags import Quality, Reason
+from tests.engine.rig import REPLIED, SILENCE, Rig, link_device, tcp_device
+from tests.sim.plant import device, make_tag
+
+UNITS = [1, 2, 3, 4, 5, 6]
+ADDRESS = Refused("no such address", code="06", refusal=Refusal.ADDRESS)
+BUSY = Refused("busy", code="05", refusal=Refusal.BUSY)
+DAMAGED = Refused("sum check", code="02", refusal=Refusal.DAMAGED)
+OTHER = Refused("not allowed", code="10")
+
+
+def online(retries: int = 1) -> Rig:
+    rig = Rig(link_device(retries=retries))
+    rig.bring(State.ONLINE)
+    rig.logged.clear()
+    return rig
+
+
+def polled(rig: Rig) -> Poll:
+    job = rig.transacted()
+    assert isinstance(job, Poll)
+    return job
+
+
+def events(rig: Rig) -> list[str]:
+    found = [event.event for event in rig.logged]
+    rig.logged.clear()
+    return found
+
+
+# Good reads
+
+
+def test_a_good_read_makes_a_sample_of_each_tag_with_the_time_of_its_reply() -> None:
+    rig = online()
+    rig.conclude(polled(rig), UNITS)
+    assert [(s.tag.text, s.value, s.time) for s in rig.samples] == [
+        (f"D{n}", n + 1, rig.time) for n in range(6)
+    ]
+
+
+def test_good_reads_are_counted_with_their_mean_and_worst_gap() -> None:
+    rig = online()
+    for took in (0.02, 0.02, 0.52):
+        poll = polled(rig)
+        rig.conclude(poll, UNITS, took=took)
+    assert poll.record.reads == 3
+    assert poll.record.worst_gap > poll.record.mean_gap > 0.9
+
+
+def test_a_device_that_comes_online_is_logged_and_its_polls_are_due_at_once() -> None:
+    rig = Rig()
+    rig.conclude(rig.transacted(), Resynced(1))
+    assert events(rig) == ["device online"]
+    assert polled(rig).due == rig.now
+
+
+def test_a_good_poll_after_a_late_reply_ends_the_failures() -> None:
+    """Otherwise a device that is slow now and then would go offline though most polls are read."""
+    rig = online()
+    for _ in range(5):
+        rig.fail(polled(rig), late=0.1)
+        assert rig.device.state == "failing"
+        rig.conclude(polled(rig), UNITS)
+        assert rig.device.state == "online"
+        assert rig.device.health.consecutive_failures == 0
+        assert rig.device.diagnosis() == ""
+
+
+# Refusals
+
+
+@pytest.mark.parametrize("refusal", [ADDRESS, BUSY, DAMAGED, OTHER])
+def test_each_refusal_is_counted_and_shows_that_the_device_is_online(refusal: Refused) -> None:
+    rig = online()
+    rig.fail(polled(rig), late=0.1)
+    rig.conclude(polled(rig), refusal, REPLIED)
+    assert rig.device.record.refusals == {refusal.code: 1}
+    assert rig.device.state is State.ONLINE
+
+
+def test_a_busy_device_is_polled_again_after_growing_pauses() -> None:
+    rig = online(retries=2)
+    pauses = list[float]()
+    for _ in range(2):
+        rig.conclude(polled(rig), BUSY, REPLIED)
+        idle = rig.next()
+        assert isinstance(idle, Idle)
+        pauses.append(idle.until - rig.now)
+    assert pauses == pytest.approx([BUSY_PAUSE, 2 * BUSY_PAUSE])
+    assert rig.samples == []
+    rig.conclude(polled(rig), BUSY, REPLIED)
+    assert {sample.reason for sample in rig.samples} == {Reason.REFUSED}
+
+
+def test_a_request_that_arrived_damaged_is_sent_again_at_once() -> None:
+    rig = online(retries=2)
+    poll = polled(rig)
+    for _ in range(2):
+        rig.conclude(poll, DAMAGED, REPLIED)
+        assert rig.next() is poll
+    rig.conclude(poll, DAMAGED, REPLIED)
+    assert {sample.reason for sample in rig.samples} == {Reason.REFUSED}
+
+
+def test_any_other_refusal_makes_the_tags_bad_at_once() -> None:
+    rig = online()
+    rig.conclude(polled(rig), OTHER, REPLIED)
+    assert [(s.reason, s.detail) for s in rig.samples] == [(Reason.REFUSED, "not allowed")] * 6
+    assert isinstance(rig.next(), Idle)
+
+
+def test_a_bad_address_is_found_by_halves_and_the_others_are_planned_again() -> None:
+    rig = online()
+    for _ in range(20):
+        job = rig.next()
+        if isinstance(job, Idle):
+            break
+        assert isinstance(job, Poll)
+        span = job.block.span
+        if span.start <= 2 < span.start + span.size:
+            rig.conclude(job, ADDRESS, REPLIED)
+        else:
+            rig.conclude(job, UNITS[span.start : span.start + span.size])
+    assert events(rig) == ["address refused"]
+    [bad] = rig.device.bad_addresses.bad
+    assert (bad.start, bad.size) == (2, 1)
+    found = {sample.tag.text: sample.quality for sample in rig.samples}
+    assert found.pop("D2") is Quality.BAD
+    assert set(found.values()) == {Quality.GOOD}
+    assert len(rig.device.blocks) == 3
+    rig.now += 400.0
+    while rig.device.bad_addresses.bad:
+        job = polled(rig)
+        rig.conclude(job, UNITS[: job.block.span.size])
+    assert events(rig) == ["address returned"]
+    assert len(rig.device.blocks) == 1
+
+
+def test_a_block_that_was_read_before_is_asked_once_more_before_it_is_halved() -> None:
+    """Noise can turn the request into one for another address."""
+    rig = online()
+    poll = polled(rig)
+    rig.conclude(poll, UNITS)
+    assert polled(rig) is poll
+    rig.conclude(poll, ADDRESS, REPLIED)
+    assert rig.next() is poll
+    rig.conclude(poll, ADDRESS, REPLIED)
+    assert polled(rig).block.span.size < poll.block.span.size
+
+
+def test_unsteady_reads_are_repeated_before_the_tags_turn_bad() -> None:
+    rig = online()
+    poll = polled(rig)
+    rig.conclude(poll, Unsteady("differ"), REPLIED)
+    assert rig.samples == []
+    assert rig.next() is poll
+    rig.conclude(poll, Unsteady("differ"), REPLIED)
+    assert {(s.reason, s.detail) for s in rig.samples} == {(Reason.GARBLED, "differ")}
+    assert rig.device.state is State.ONLINE
+
+
+# Unclear ends
+
+
+@pytest.mark.parametrize(
+    ("error", "reason"),
+    [(SILENCE, Reason.NO_REPLY), (Garbled("noise"), Reason.GARBLED)],
+)
+def test_after_the_last_retry_the_device_goes_offline_with_bad_values(
+    error: DeviceError, reason: Reason
+) -> None:
+    rig = online(retries=0)
+    job = polled(rig)
+    rig.conclude(job, error)
+    rig.conclude(rig.transacted(), Settled(None))
+    assert rig.device.state is State.OFFLINE
+    assert {sample.reason for sample in rig.samples} == {reason}
+    assert {sample.detail for sample in rig.samples} == {rig.device.diagnosis()}
+    assert events(rig) == ["transaction failed", "device offline"]
+    assert sum(rig.device.record.failures.values()) == 1
+
+
+def test_a_failed_probe_of_an_offline_device_is_no_second_warning() -> None:
+    rig = Rig()
+    rig.bring(State.OFFLINE)
+    assert events(rig) == ["transaction failed", "device offline"]
+    rig.fail(rig.transacted())
+    assert events(rig) == ["transaction failed"]
+
+
+def test_an_unclear_end_forgets_the_monitor_list() -> None:
+    rig = online()
+    rig.device.expect_list((rig.device.blocks[0].span,))
+    rig.conclude(polled(rig), SILENCE)
+    assert rig.device.registered == ()
+
+
+def test_the_line_waits_for_late_replies_of_online_devices_alone() -> None:
+    rig = Rig()
+    guards = list[float]()
+    for _ in range(2):
+        rig.conclude(rig.transacted(), SILENCE)
+        settle = rig.next()
+        assert isinstance(settle, Settle)
+        guards.append(settle.guard)
+        rig.conclude(settle, Settled(None))
+    assert guards == [rig.device.settings.late_guard, 0.0]
+
+
+def test_a_late_reply_is_counted_and_diagnosed_as_slow() -> None:
+    rig = online()
+    rig.fail(polled(rig), late=0.1)
+    assert rig.device.record.late == 1
+    assert "raise reply_timeout" in rig.device.diagnosis()
+    assert "it took 0.60 s, reply_timeout is 0.5 s" in rig.device.diagnosis()
+    assert isinstance(rig.next(), Poll)  # no resync is needed
+
+
+def test_a_late_reply_completes_no_resync_while_older_requests_are_outstanding() -> None:
+    rig = online(retries=3)
+    rig.fail(polled(rig))
+    rig.fail(rig.transacted(), late=0.1)
+    assert rig.device.health.needs_resync
+
+
+def test_a_poll_of_several_at_once_without_a_reply_turns_bad_after_its_own_retries() -> None:
+    rig = Rig(tcp_device(2))
+    rig.bring(State.ONLINE)
+    silent = rig.device.tags[0]
+    for _ in range(6):
+        job = rig.transacted()
+        if not isinstance(job, Poll):
+            rig.conclude(job, Resynced(9))
+            continue
+        for poll in (job, *rig.engine.alongside(job, rig.now)):
+            rig.conclude(poll, SILENCE if silent in poll.block.tags else [7])
+        if isinstance(settle := rig.next(), Settle):
+            rig.conclude(settle, Settled(None))
+    bad = [sample for sample in rig.samples if sample.quality is Quality.BAD]
+    assert bad
+    assert {sample.tag for sample in bad} == {silent}
+    assert rig.device.health.online
+
+
+# Learning
+
+
+def test_a_measured_turnaround_that_changes_the_optimum_plans_again_and_is_logged() -> None:
+    tags = [make_tag(text) for text in ("D0", "D14", "D28", "D42")]
+    rig = Rig(device(tags))  # planned with the protocol's 5 ms
+    rig.bring(State.ONLINE)
+    rig.logged.clear()
+    assert len(rig.device.blocks) == 4
+    slow = Traffic(sent=17, heard=20, exchanges=1, turnaround=0.06)
+    for _ in range(LEARN_EVERY):
+        poll = polled(rig)
+        rig.conclude(poll, [7] * poll.block.span.size, slow)
+    assert events(rig) == ["plan updated"]
+    assert len(rig.device.blocks) < 4
+    assert {poll.block for poll in rig.engine.schedule.polls(rig.device)} == set(rig.device.blocks)
