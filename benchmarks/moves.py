@@ -8,6 +8,7 @@ coroutine that goes on counts as called once more. `--calls` prints the calls.
 
 import argparse
 import asyncio
+import itertools
 import logging
 import sys
 from collections.abc import Sequence
@@ -101,7 +102,7 @@ async def record(port: int) -> Recorded:
 
 def moves(calls: Sequence[Call]) -> int:
     files = [call.file for call in calls]
-    return sum(before != after for before, after in zip(files, files[1:], strict=False))
+    return sum(before != after for before, after in itertools.pairwise(files))
 
 
 def main() -> None:
