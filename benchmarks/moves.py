@@ -1,8 +1,9 @@
 """Files entered and moves between files for one poll and one write: `python -m benchmarks.moves`.
 
 A line with a real TCP port asks a simulated Vigor station in another process. A profile hook
-records the calls into gateway/ from one `Engine.next` to the next, without stations/ and simulator/. A move is a call in another file than the call before. A coroutine that goes on
-counts as called once more. `--calls` prints the calls.
+records the calls into gateway/ from one `Engine.next` to the next, without stations/ and
+simulator/. A move is a call in another file than the call before. A coroutine that goes on counts
+as called once more. `--calls` prints the calls.
 """
 
 import argparse
