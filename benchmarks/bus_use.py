@@ -14,15 +14,16 @@ import logging
 import random
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import structlog
 
 from benchmarks.words import words
-from gateway.engine.device import Device
+from gateway.engine.device import Device, DeviceSettings
+from gateway.engine.engine import Engine
 from gateway.engine.forecast import forecast
 from gateway.errors import GatewayError
 from gateway.line.line import Line
@@ -35,7 +36,7 @@ from gateway.stations.computer_link import ComputerLinkStation
 from gateway.stations.modbus import ModbusStation
 from gateway.stations.station import Station
 from gateway.stations.vigor import VigorStation
-from gateway.tags import Sample, Tag, WriteResult
+from gateway.tags import Sample, Tag
 from gateway.transport import SerialPath, SerialSettings, open_port
 
 TURNAROUND = 0.005
@@ -100,15 +101,8 @@ async def writing(line: Line, device: Device, tag: Tag, took: list[float]) -> No
     while True:
         await asyncio.sleep(0.29 + 0.13 * random.random())
         number += 1
-        told = asyncio.Event()
-
-        def done(outcome: WriteResult | GatewayError, told: asyncio.Event = told) -> None:
-            if isinstance(outcome, WriteResult):
-                took.append(outcome.took)
-            told.set()
-
-        line.submit(device, tag, tag.encode(number), done)
-        await told.wait()
+        with suppress(GatewayError):
+            took.append((await line.write(device, tag, tag.encode(number))).took)
 
 
 async def measure(name: str, baud: int, seconds: float, *, writes: bool = False) -> Result:
@@ -123,18 +117,20 @@ async def measure(name: str, baud: int, seconds: float, *, writes: bool = False)
     assert child.stdout is not None
     path = child.stdout.readline().strip()
     driver, wire = setting.driver(), WireTiming(baud, setting.bits)
-    device = Device(
-        "plc", driver, wire, driver.timing, tags(setting.area), 0.5, turnaround=TURNAROUND
+    settings = DeviceSettings(
+        name="plc",
+        driver=driver,
+        timing=driver.timing,
+        turnaround=TURNAROUND,
+        tags=tags(setting.area),
     )
+    device = Device(settings, wire)
     # 8N1 on the pty whatever the format: a pty cannot do parity.
     serial = SerialSettings(baud, "8N1")
     line = Line(
-        "bench",
-        [device],
-        wire,
-        lambda ear: open_port(SerialPath(path), serial, ear),
+        Engine("bench", [device], wire),
+        lambda receiver: open_port(SerialPath(path), serial, receiver),
         Counting(),
-        time.time_ns,
     )
     tasks = [asyncio.create_task(line.run())]
     took: list[float] = []

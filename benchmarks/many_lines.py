@@ -17,7 +17,8 @@ from pathlib import Path
 
 import structlog
 
-from gateway.engine.device import Device
+from gateway.engine.device import Device, DeviceSettings
+from gateway.engine.engine import Engine
 from gateway.line.line import Line
 from gateway.planning.wire_timing import WireTiming
 from gateway.protocols.vigor import Vigor
@@ -59,12 +60,15 @@ def devices(line: int, stations: int) -> list[Device]:
         name = f"line{line}-plc{station}"
         tags = tuple(make_tag(f"D{n}", every=5.0, device=name) for n in range(TAGS))
         driver = Vigor(station=station)
-        found.append(Device(name, driver, WIRE, driver.timing, tags, 0.5, turnaround=0.005))
+        settings = DeviceSettings(
+            name=name, driver=driver, timing=driver.timing, turnaround=0.005, tags=tags
+        )
+        found.append(Device(settings, WIRE))
     return found
 
 
 def opener(stations: Sequence[VigorStation]) -> Callable[[Receiver], Awaitable[Port]]:
-    return lambda ear: open_simulator(stations, WIRE, ear)
+    return lambda receiver: open_simulator(stations, WIRE, receiver)
 
 
 def run(lines: int, stations: int, seconds: float) -> tuple[float, float, float, int]:
@@ -81,10 +85,8 @@ def run(lines: int, stations: int, seconds: float) -> tuple[float, float, float,
         tasks = []
         for number, plant in enumerate(plants):
             served = [VigorStation(device.driver.station) for device in plant]
-
-            line = Line(
-                f"line{number}", plant, WIRE, opener(served), watching, lambda: 0, seed=number
-            )
+            engine = Engine(f"line{number}", plant, WIRE, number)
+            line = Line(engine, opener(served), watching, wall=lambda: 0, seed=number)
             tasks.append(asyncio.create_task(line.run()))
         await asyncio.sleep(seconds)
         for task in tasks:

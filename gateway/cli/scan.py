@@ -7,7 +7,7 @@ from itertools import product
 from gateway.config import parsers
 from gateway.engine.device import Device, DeviceSettings
 from gateway.errors import ConfigError, Garbled, LineDown, Refused, Unclear
-from gateway.line.channel import Channel
+from gateway.line.channel import Channel, Echo
 from gateway.line.transaction import Transaction
 from gateway.line.wire_log import WireLog
 from gateway.planning.wire_timing import WireTiming, character_bits
@@ -172,7 +172,7 @@ class _Scan:
 
     async def ask(self) -> None:
         port = await self._plan.open_port(self._serial, self)
-        channel = Channel(port, self._wire, WireLog("scan"), echo=None)
+        channel = Channel(port, self._wire, WireLog("scan"), echo=Echo("scan", None))
         try:
             for probe_token, station in enumerate(self._plan.stations):
                 if (found := await self._seek(channel, station, probe_token)) is not None:

@@ -16,16 +16,8 @@ from gateway.line.line import REOPEN_LONGEST
 from gateway.planning.wire_timing import WireTiming
 from gateway.protocols.vigor import Vigor
 from gateway.tags import Quality, Reason, Tag, WriteResult, WriteRule
-from tests.sim.plant import (
-    WIRE,
-    Plant,
-    clockwork,
-    device,
-    make_tag,
-    plant,
-    running,
-    words,
-)
+from tests.sim.bench import WIRE
+from tests.sim.plant import Plant, clockwork, device, make_tag, plant, running, words
 from tests.sim.virtual import on_virtual_time
 from tests.sim.witness import Witness
 

@@ -15,12 +15,11 @@ from gateway.protocols.computer_link import NO_REPLY_CAUSES, ComputerLink
 from gateway.protocols.vigor import Vigor
 from gateway.stations.vigor import VigorStation
 from gateway.tags import Quality, Reason, WriteResult, WriteRule
+from tests.sim.bench import Bench, Unruly
 from tests.sim.links import commands, link_device, link_plant, link_station, spelt
 from tests.sim.plant import (
     SECOND,
-    Bench,
     Plant,
-    Unruly,
     clock_word,
     clockwork,
     device,

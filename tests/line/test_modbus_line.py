@@ -27,7 +27,8 @@ from gateway.protocols.modbus import (
 from gateway.stations.modbus import ModbusStation
 from gateway.tags import Quality, Reason, Tag, WriteResult, WriteRule
 from gateway.transport import Receiver
-from tests.sim.plant import WIRE, Bench, Plant, Unruly, clock_word, made_device, make_tag, running
+from tests.sim.bench import WIRE, Bench, Unruly
+from tests.sim.plant import Plant, clock_word, made_device, make_tag, running
 from tests.sim.virtual import on_virtual_time
 from tests.sim.witness import Witness
 from tests.vectors import vectors

@@ -235,7 +235,7 @@ MUTANTS = (
         "line/channel.py",
         "        if when < self._due:\n",
         "        if self._timer is None:\n",
-        "tests/line/test_clock.py",
+        "tests/line/test_channel.py",
     ),
     Mutant(
         "failing devices get more than half of the wire's time",

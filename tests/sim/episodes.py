@@ -70,7 +70,8 @@ def line_episodes(
     pace: str,
 ) -> list[Episode]:
     """Of a line and of all that hangs on it; none of a device at which everybody is spoken to."""
-    stations, wires = _STATION_KINDS, _LINE_KINDS
+    stations: tuple[str, ...] = _STATION_KINDS
+    wires: tuple[str, ...] = _LINE_KINDS
     if line["port"].startswith("tcp:"):
         stations, wires = _NET_STATION_KINDS, _NET_LINE_KINDS
     if pace in _ONLY:
@@ -119,11 +120,15 @@ def _series(
     at = chance.expovariate(1 / pause)
     while kinds and at < seconds - CALM:
         kind = chance.choice(kinds)
-        last = _LASTS.get(kind, lambda c: c.choice((2.0, 20.0, 60.0, 300.0)) * c.uniform(0.5, 1))
+        last = _LASTS.get(kind, _usual)
         end = min(at + last(chance), seconds - CALM)
         found.append(Episode(at, end, line, device, kind, _STRENGTHS.get(kind, _half)(chance)))
         at = end + chance.expovariate(1 / pause)
     return found
+
+
+def _usual(chance: random.Random) -> float:
+    return chance.choice((2.0, 20.0, 60.0, 300.0)) * chance.uniform(0.5, 1)
 
 
 def _half(chance: random.Random) -> float:

@@ -52,7 +52,8 @@ class Expectations:
     def every(self, bus: Bus, device: Device, tag: Tag) -> float:
         """How often it is to be heard of."""
         if tag.span.area == LISTENED and isinstance(device.driver, FrameDriver):
-            (stale,) = {one.stale_after for one in device.driver.settings.listen.values()} - {None}
+            listened = device.driver.settings.listen.values()
+            (stale,) = {one.stale_after for one in listened if one.stale_after is not None}
             return stale / 10  # as it was drawn
         return tag.every
 

@@ -18,8 +18,10 @@ from pathlib import Path
 from tests.sim.broken import MUTANTS, Mutant
 
 ROOT = Path(__file__).parents[2]
-TREE = ("gateway", "tests", "benchmarks", "docs", "examples", "README.md", "pyproject.toml")
-TREE += ("config.example.yaml", "config.schema.json")
+TREE = (
+    *("gateway", "tests", "benchmarks", "docs", "examples", "README.md", "pyproject.toml"),
+    *("config.example.yaml", "config.schema.json"),
+)
 PATIENCE = 60.0  # seconds for each check
 
 

@@ -7,6 +7,7 @@ import asyncio
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 from gateway.engine import requests
@@ -61,7 +62,7 @@ def words(first: int, count: int, **settings: Any) -> list[Tag]:
 def clockwork(memory: Memory, numbers: Sequence[int]) -> None:
     """Words of D that say what time it is: milliseconds, each by its own offset."""
     for n in numbers:
-        memory.animate("D", n, lambda now, n=n: clock_word(now, n))
+        memory.animate("D", n, partial(clock_word, n=n))
 
 
 def clock_word(now: float, n: int) -> int:

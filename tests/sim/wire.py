@@ -10,6 +10,7 @@ import random
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Protocol
 
 from gateway.errors import LineDown
@@ -222,7 +223,7 @@ class SimWire:
         for first in range(0, len(sending.data), chunk):
             piece = sending.data[first : first + chunk]
             due = sending.start + (first + len(piece)) * self.wire.character
-            self._at(due, lambda piece=piece: self._deliver(sending, piece))
+            self._at(due, partial(self._deliver, sending, piece))
 
     def _deliver(self, sending: _Sending, piece: bytes) -> None:
         if self._ear is None or self.hanging:

@@ -129,7 +129,7 @@ class World:
         by_number: dict[int, Troubled],
         chance: random.Random,
     ) -> SimWire:
-        data_bits, parity, stop = config.serial.format
+        data_bits, parity, stop = tuple(config.serial.format)
         shape = Format(int(data_bits), parity != "N", int(stop), self.drawn.zeros[config.name])
         stations = list(by_number.values())
 
@@ -139,7 +139,7 @@ class World:
             return stations if number == ALL.get(protocol) else [by_number[number]]
 
         return SimWire(
-            *(config.wire, shape, stations, chance, bus, config.echo),
+            *(config.wire, shape, stations, chance, bus, bool(config.echo)),
             chunk=self.drawn.chunks[config.name],
             addressed=None if bus.protocol in ("vigor", "frames") else addressed,
         )

@@ -1,0 +1,102 @@
+"""Figures of the code's shape: `python -m benchmarks.structure`."""
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+ROOT = Path(__file__).parent.parent / "gateway"
+CIRCLING = re.compile(r"(What|Who|Whoever|Whether|Where|How|That|Those)\b")
+PROTOCOLS = re.compile(r"\b(vigor|modbus|computer_link|frames)\b", re.IGNORECASE)
+STATE = {"health", "record", "device", "dev"}  # names under which modules hold device state
+
+
+def modules() -> Iterator[tuple[str, ast.Module]]:
+    for path in sorted(ROOT.rglob("*.py")):
+        yield str(path.relative_to(ROOT)), ast.parse(path.read_text())
+
+
+def docstrings(tree: ast.Module) -> Iterator[str]:
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            yield ast.get_docstring(node) or ""
+
+
+def names_protocol(tree: ast.Module) -> bool:
+    """The module imports from a protocol's folder."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and PROTOCOLS.search(node.module or ""):
+            return True
+    return False
+
+
+def fields(node: ast.ClassDef) -> int:
+    """Attributes assigned in the class or to `self` anywhere in it."""
+    found = {
+        item.target.id
+        for item in node.body
+        if isinstance(item, ast.AnnAssign) and isinstance(item.target, ast.Name)
+    }
+    for item in ast.walk(node):
+        if (
+            isinstance(item, ast.Attribute)
+            and isinstance(item.ctx, ast.Store)
+            and isinstance(item.value, ast.Name)
+            and item.value.id == "self"
+        ):
+            found.add(item.attr)
+    return len(found)
+
+
+def arguments(node: ast.ClassDef) -> int:
+    """Arguments of the constructor, without `self`."""
+    for item in node.body:
+        if isinstance(item, ast.FunctionDef) and item.name == "__init__":
+            return len(item.args.args) + len(item.args.kwonlyargs) - 1
+    return 0
+
+
+def assigns_state(tree: ast.Module) -> bool:
+    """The module assigns an attribute of a device, its health or its record."""
+    for node in ast.walk(tree):
+        if not isinstance(node, ast.Attribute) or not isinstance(node.ctx, ast.Store):
+            continue
+        owner = node.value
+        name = owner.attr if isinstance(owner, ast.Attribute) else getattr(owner, "id", "")
+        if name in STATE:
+            return True
+    return False
+
+
+def is_settings(file: str, node: ast.ClassDef) -> bool:
+    """Frozen dataclasses and models of the file are settings records."""
+    frozen = any("frozen=True" in ast.unparse(decorator) for decorator in node.decorator_list)
+    return frozen or file.startswith("config/")
+
+
+def main() -> None:
+    found = list(modules())
+    classes = [
+        (fields(node), arguments(node), f"{file}: {node.name}")
+        for file, tree in found
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ClassDef) and not is_settings(file, node)
+    ]
+    outside = [
+        file
+        for file, tree in found
+        if not file.startswith(("protocols/", "stations/")) and names_protocol(tree)
+    ]
+    circling = sum(bool(CIRCLING.match(text)) for _, tree in found for text in docstrings(tree))
+    assigning = [file for file, tree in found if assigns_state(tree)]
+    largest, widest = max(classes), max(classes, key=lambda each: each[1])
+    print(f"modules directly in gateway/: {len(list(ROOT.glob('*.py')))}")
+    print(f"modules outside protocols/ and stations/ that import a protocol: {outside}")
+    print(f"docstrings that begin with What, Who, Whether, Where, How, That: {circling}")
+    print(f"most fields of a class: {largest[0]} ({largest[2]})")
+    print(f"most arguments of a constructor: {widest[1]} ({widest[2]})")
+    print(f"modules that assign state of a device from outside: {assigning}")
+
+
+if __name__ == "__main__":
+    main()
