@@ -62,6 +62,8 @@ def assigns_state(tree: ast.Module) -> bool:
         if not isinstance(node, ast.Attribute) or not isinstance(node.ctx, ast.Store):
             continue
         owner = node.value
+        if isinstance(owner, ast.Attribute) and getattr(owner.value, "id", "") == "self":
+            continue  # its own: the engine's record is that of the line
         name = owner.attr if isinstance(owner, ast.Attribute) else getattr(owner, "id", "")
         if name in STATE:
             return True

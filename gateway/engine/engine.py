@@ -306,9 +306,8 @@ class Engine:
     def opened(self, now: float) -> list[Effect]:
         """The port was opened: every device must answer again."""
         self.is_open = True
-        record = self.record
-        record.opened += 1
-        record.since, record.trouble = now, ""
+        self.record.opened += 1
+        self.record.since, self.record.trouble = now, ""
         self._in_flight = InFlight()
         for device in self.devices:
             device.restart()

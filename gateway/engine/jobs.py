@@ -41,12 +41,12 @@ class Poll:
     ticket: int = NOT_QUEUED  # its one valid place in the queues
     register: bool = False  # its monitor list must be registered first
     last: LastRead = field(default_factory=LastRead)
-    record: PollRecord = field(default_factory=PollRecord)
+    counts: PollRecord = field(default_factory=PollRecord)
 
     def forget(self, now: float) -> float:
         """Its values turn bad. Returns their age."""
         age = 0.0 if self.last.at is None else now - self.last.at
-        self.record.worst_gap = max(self.record.worst_gap, age)
+        self.counts.worst_gap = max(self.counts.worst_gap, age)
         self.last.at = None
         return age
 

@@ -1,7 +1,8 @@
 """Applies the result of a write or command, so that each client gets exactly one outcome."""
 
 from gateway.engine.device import Device
-from gateway.engine.effects import Effects
+from gateway.engine.effects import Effects, RequestEnded
+from gateway.engine.health import State
 from gateway.engine.jobs import (
     Confirm,
     Repeat,
@@ -98,7 +99,8 @@ class RequestResults:
                 self._pause(device)
                 return write.result(now, time, acknowledged=False)
             case Sent(held=held, refused_back=refused):
-                self._results.answered(device, now, time)
+                if device.health.needs_resync or device.health.state is not State.ONLINE:
+                    self._results.answered(device, now, time)
                 if refused is not None:
                     return Differs(f"acknowledged, but reading back was refused: {refused}")
                 if held is not None and not write.holds(held):
@@ -161,7 +163,7 @@ class RequestResults:
         self._effects.pause(device.turnaround.configured or BROADCAST_PAUSE)
 
     def _end(self, request: Request, outcome: Outcome, now: float) -> None:
-        self._effects.ended(request, outcome)
+        self._effects.collected.append(RequestEnded(request, outcome))
         if isinstance(request, Write):
             request.device.record.count_write(now - request.submitted)
             poll = self._schedule.reader(request.device, request.tag)

@@ -2,7 +2,7 @@
 
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from gateway.engine.device import Device
@@ -35,6 +35,11 @@ class Write:
     units: Sequence[int]
     submitted: float
     alone: bool = False  # it was refused together with others: it is sent alone now
+    value: Value = field(init=False)  # what the device holds after it, rounded to its steps
+
+    def __post_init__(self) -> None:
+        value = self.tag.from_units(self.units)
+        self.value = False if value is None else value
 
     @property
     def expires(self) -> float:
@@ -66,9 +71,7 @@ class Write:
         self, now: float, time: int, *, verified: bool = False, acknowledged: bool = True
     ) -> WriteResult:
         """It was carried out. `now` by the line's clock, `time` in ns since 1970."""
-        value: Value | None = self.tag.from_units(self.units)
-        known = False if value is None else value
-        return WriteResult(known, time, now - self.submitted, verified, acknowledged)
+        return WriteResult(self.value, time, now - self.submitted, verified, acknowledged)
 
 
 @dataclass(slots=True, eq=False)

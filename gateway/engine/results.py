@@ -58,20 +58,20 @@ class Results:
         health, last = device.health, poll.last
         if health.needs_resync or health.state is not State.ONLINE:
             self.answered(device, now, time)
-        record = poll.record
+        counts = poll.counts
         if last.at is not None:
             gap = now - last.at
-            if gap > record.worst_gap:
-                record.worst_gap = gap
-            record.mean_gap += (gap - record.mean_gap) / max(1, min(10, record.reads))
-        record.reads += 1
+            if gap > counts.worst_gap:
+                counts.worst_gap = gap
+            counts.mean_gap += (gap - counts.mean_gap) / max(1, min(10, counts.reads))
+        counts.reads += 1
         last.at, last.ever = now, True
         self._effects.collected.append(Samples(self._samples(poll, units, time)))
         if block.of_fields:
             self._count_garbled(device, units)
         self._schedule.polled(poll, now)
         bad = device.bad_addresses
-        if bad.searching or bad.bad:
+        if bad.bad or bad.searches:
             if bad.read(block):
                 self._effects.info("address returned", device=device.name, block=describe(block))
                 self._plan(device, now)

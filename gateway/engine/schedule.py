@@ -209,7 +209,7 @@ class Schedule:
         behind = int((poll.asked - poll.due) / every)
         if behind:
             device.record.count_overruns(behind)
-            poll.record.overruns += behind
+            poll.counts.overruns += behind
         poll.due = (poll.asked if behind or poll.missed else poll.due) + every
         if not poll.phased:
             poll.phased = True

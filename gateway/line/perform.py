@@ -41,7 +41,7 @@ async def perform(job: Transacted, transaction: Transaction) -> Result:
 
 
 async def _perform(job: Transacted, transaction: Transaction) -> Result:
-    driver: Any = job.device.driver
+    driver: Any = job.device.settings.driver
     match job:
         case Settle(guard=guard, gap=gap):
             return Settled(await transaction.settle(guard, gap))
@@ -90,7 +90,7 @@ async def _read_once(talk: Talk[Any], device: Device, block: Block) -> Sequence[
 
 async def _write(write: Write, talk: Talk[Any]) -> Sent:
     """One write, with all that its tag asks for. A bit is changed in the word as it is."""
-    driver, tag = write.device.driver, write.tag
+    driver, tag = write.device.settings.driver, write.tag
     units = write.units
     if tag.address.bit is not None:
         (word,) = await driver.read(talk, tag.span)

@@ -52,7 +52,7 @@ def device_document(device: Device, polls: Sequence[Poll]) -> Document:
 
 def _request(poll: Poll) -> Document:
     """One block: its configured interval and the measured one."""
-    record = poll.record
+    record = poll.counts
     return {
         "tags": describe(poll.block),
         "every": poll.block.every,

@@ -77,7 +77,7 @@ class BadAddresses:
     cost: CostOf
     bad: dict[Span, BadRange] = field(default_factory=dict)
     _cuts: set[tuple[str, int]] = field(default_factory=set)
-    _roots: list[_Node] = field(default_factory=list)
+    searches: list[_Node] = field(default_factory=list)  # refused blocks, not yet settled
     _leaves: dict[Span, _Node] = field(default_factory=dict)
 
     @property
@@ -87,7 +87,7 @@ class BadAddresses:
 
     @property
     def searching(self) -> bool:
-        return bool(self._roots)
+        return bool(self.searches)
 
     def refused(self, block: Block, now: int, code: str) -> tuple[Block, ...]:
         """Returns the two halves to read instead of `block`; empty when it is the bad address."""
@@ -98,7 +98,7 @@ class BadAddresses:
             return ()
         if node is None:
             node = _Node(block.span)
-            self._roots.append(node)
+            self.searches.append(node)
         halves = self._halves(block, node)
         if not halves:
             node.good = False
@@ -125,16 +125,16 @@ class BadAddresses:
 
         Returns True then: the device is to be planned again.
         """
-        if not self._roots or not all(root.settled() for root in self._roots):
+        if not self.searches or not all(root.settled() for root in self.searches):
             return False
-        for root in self._roots:
+        for root in self.searches:
             self._cuts |= root.cuts()
         self.abandon()
         return True
 
     def abandon(self) -> None:
         """Drops the searches: the device gets other blocks, and a bad address is found again."""
-        self._roots.clear()
+        self.searches.clear()
         self._leaves.clear()
 
     def known(self) -> KnownBad:

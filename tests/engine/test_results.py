@@ -53,8 +53,8 @@ def test_good_reads_are_counted_with_their_mean_and_worst_gap() -> None:
     for took in (0.02, 0.02, 0.52):
         poll = polled(rig)
         rig.conclude(poll, UNITS, took=took)
-    assert poll.record.reads == 3
-    assert poll.record.worst_gap > poll.record.mean_gap > 0.9
+    assert poll.counts.reads == 3
+    assert poll.counts.worst_gap > poll.counts.mean_gap > 0.9
 
 
 def test_a_device_that_comes_online_is_logged_and_its_polls_are_due_at_once() -> None:

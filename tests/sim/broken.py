@@ -46,7 +46,7 @@ MUTANTS = (
     Mutant(
         "Vigor: any sum is right",
         "protocols/vigor/codec.py",
-        "if byte_sum(whole[1:-2]) != check:",
+        'if b"%02X" % (sum(whole[1:-2]) & 0xFF) != check:',
         "if False:",
         "tests/protocols/test_vigor.py",
         (20, 6, 59, 48, 54),

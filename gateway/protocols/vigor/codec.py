@@ -5,7 +5,6 @@ from binascii import unhexlify
 from dataclasses import dataclass
 
 from gateway.errors import Evidence, Garbled
-from gateway.protocols.checksums import byte_sum
 
 STX, ETX, ACK = b"\x02", b"\x03", b"\x06"
 HEX_DIGITS = b"0123456789ABCDEF"  # lower case is illegal on the wire
@@ -52,7 +51,7 @@ def encode(frame: Frame) -> bytes:
         case Reply(station, command, status, data):
             start, rest = ACK, (command + status + data.hex().upper()).encode("latin-1")
     summed = b"%02X" % station + rest + ETX
-    return start + summed + byte_sum(summed)
+    return start + summed + b"%02X" % (sum(summed) & 0xFF)
 
 
 # ACK; station, command, status; data; then ETX and the sum, or a wrong character. An ACK without
@@ -103,7 +102,7 @@ def _reply(match: re.Match[bytes]) -> Reply:
         raise Garbled("a reply without an end", whole, evidence=Evidence.TRUNCATED)
     if stray is not None:
         raise Garbled(f"{stray.hex().upper()}h in the data of a reply", whole)
-    if byte_sum(whole[1:-2]) != check:
+    if b"%02X" % (sum(whole[1:-2]) & 0xFF) != check:
         raise Garbled("a reply with a wrong sum", whole, evidence=Evidence.CHECKSUM)
     if len(digits) % 2:
         raise Garbled("a reply with half a byte of data", whole, evidence=Evidence.SHAPE)

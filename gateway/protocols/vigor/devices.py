@@ -1,6 +1,5 @@
 """The devices of a Vigor PLC and their byte addresses (manual B-5-3)."""
 
-import struct
 from collections.abc import Sequence
 from functools import lru_cache
 from itertools import chain
@@ -103,15 +102,3 @@ def bytes_from_bits(bits: Sequence[int]) -> bytes:
         sum(bit << place for place, bit in enumerate(bits[at : at + 8]))
         for at in range(0, len(bits), 8)
     )
-
-
-def words_from_bytes(data: bytes, unit: Unit) -> tuple[int, ...]:
-    """Returns words or double words, low byte first."""
-    if unit is Unit.DWORD:
-        return struct.unpack(f"<{len(data) // 4}I", data)
-    return struct.unpack(f"<{len(data) // 2}H", data)
-
-
-def bytes_from_words(words: Sequence[int], unit: Unit) -> bytes:
-    """The inverse; every word must fit."""
-    return struct.pack(f"<{len(words)}{'I' if unit is Unit.DWORD else 'H'}", *words)

@@ -1,5 +1,6 @@
 """Reads and writes the devices of Vigor M, VB and VH PLCs over the computer link (manual B-5)."""
 
+import struct
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -38,9 +39,7 @@ from gateway.protocols.vigor.devices import (
     bit_address,
     bits_from_bytes,
     bytes_from_bits,
-    bytes_from_words,
     cover,
-    words_from_bytes,
 )
 
 # Characters of a 51 request and of a 61 request without data; of a 70 or 71 request.
@@ -121,7 +120,8 @@ class Vigor:
         unit = AREAS[span.area].unit
         if unit is Unit.BIT:
             return bits_from_bytes(data)[covered.ahead : covered.ahead + span.size]
-        return words_from_bytes(data, unit)
+        form = f"<{len(data) // 4}I" if unit is Unit.DWORD else f"<{len(data) // 2}H"
+        return struct.unpack(form, data)  # low byte first
 
     async def write(self, talk: Talk[Frame], span: Span, units: Sequence[int]) -> bool:
         """Writes, and waits for the acknowledgement.
@@ -143,7 +143,8 @@ class Vigor:
         if unit is Unit.BIT:
             data = bytes_from_bits(await self._with_neighbours(talk, covered, units))
         else:
-            data = bytes_from_words(units, unit)
+            form = f"<{len(units)}{'I' if unit is Unit.DWORD else 'H'}"
+            data = struct.pack(form, *units)
         body = b"%04X%02X" % (covered.address, covered.size) + data.hex().upper().encode("ascii")
         await self._write_body(talk, WRITE, body)
         return True
