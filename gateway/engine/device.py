@@ -7,7 +7,7 @@ from typing import Literal
 from gateway.engine.health import Health, State, diagnosis
 from gateway.engine.records import Record
 from gateway.errors import LineDown
-from gateway.planning.bad_addresses import RETRY, BadAddresses
+from gateway.planning.bad_addresses import BadAddresses
 from gateway.planning.monitor_lists import with_monitor_list
 from gateway.planning.planner import Block, plan
 from gateway.planning.wire_timing import WireTiming
@@ -181,8 +181,8 @@ class Device:
 
     def interval(self, block: Block) -> float:
         """How often the block is polled: bad addresses only rarely."""
-        bad = self.bad_addresses.bad
-        return max(RETRY, block.every) if bad and block.span in bad else block.every
+        bad = self.bad_addresses.bad.get(block.span)
+        return block.every if bad is None else max(bad.retry, block.every)
 
     # The monitor list in the PLC
 

@@ -133,13 +133,13 @@ class Results:
             self._schedule.again(poll)  # it was read before: noise can change a request
             return
         if error.refusal is Refusal.ADDRESS:
+            known = block.span in device.bad_addresses.bad
             halves = device.bad_addresses.refused(block, time, error.code)
             if halves:
                 self._schedule.replace(poll, halves, now)
                 return
-            self._effects.warning(
-                "address refused", device=device.name, block=describe(block), why=str(error)
-            )
+            log = self._effects.debug if known else self._effects.warning
+            log("address refused", device=device.name, block=describe(block), why=str(error))
         self._end_badly(poll, Reason.REFUSED, error, now, time)
         self._end_search(device, now)
 

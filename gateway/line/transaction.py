@@ -147,7 +147,9 @@ class Transaction:
         channel = self._channel
         if channel.wire_log.active:
             channel.wire_log.heard(data)
-        channel.quiet_since = channel.now()
+        now = channel.quiet_since = channel.now()
+        if self._open and self._open[0].until <= now:
+            self._expire()  # the loop stood still: these bytes may be as old as the request
         self.traffic.heard += len(data)
         if channel.echo.strip and not (data := channel.echo.without(data)):
             return

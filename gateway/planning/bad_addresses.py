@@ -6,14 +6,15 @@ addresses again, with cuts around the bad ones.
 """
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 from gateway.planning.planner import Block, Cuts, items_of
 from gateway.protocols.driver import Cost, Span
 from gateway.tags import Tag
 
-RETRY = 300.0  # seconds between two tries of a bad address
+# Seconds between two tries of a bad address: a short refusal costs little, a missing one as well.
+RETRIES = (2.0, 10.0, 60.0, 300.0)
 CostOf = Callable[[Span], Cost | None]
 
 
@@ -25,6 +26,12 @@ class BadRange:
     since: int  # ns since 1970
     code: str
     tags: tuple[Tag, ...]
+    refusals: int = 0  # since it was found
+
+    @property
+    def retry(self) -> float:
+        """Seconds until it is tried again."""
+        return RETRIES[min(self.refusals, len(RETRIES) - 1)]
 
 
 class KnownBad(NamedTuple):
@@ -92,7 +99,8 @@ class BadAddresses:
     def refused(self, block: Block, now: int, code: str) -> tuple[Block, ...]:
         """Returns the two halves to read instead of `block`; empty when it is the bad address."""
         node = self._leaves.pop(block.span, None)
-        if block.span in self.bad:
+        if (known := self.bad.get(block.span)) is not None:
+            self.bad[block.span] = replace(known, refusals=known.refusals + 1)
             if node is not None:
                 node.good = False
             return ()
@@ -108,7 +116,8 @@ class BadAddresses:
     def read(self, block: Block) -> bool:
         """Records a good read.
 
-        Returns True when the block was bad before: then the device is to be planned again.
+        Returns True when the block was bad before: then the device is to be planned again, and
+        the other bad addresses are tried soon. They may have returned together.
         """
         node = self._leaves.pop(block.span, None)
         if node is not None:
@@ -116,8 +125,9 @@ class BadAddresses:
         if self.bad.pop(block.span, None) is None:
             return False
         self._cuts -= _bounds(block.span)
-        for span in self.bad:  # a neighbour may share a boundary
+        for span, other in self.bad.items():  # a neighbour may share a boundary
             self._cuts |= _bounds(span)
+            self.bad[span] = replace(other, refusals=0)
         return True
 
     def settle(self) -> bool:
@@ -151,7 +161,7 @@ class BadAddresses:
             if [(i.start, i.end) for i in items_of(inside)] == [
                 (span.start, span.start + span.size)
             ]:
-                self.bad[span] = BadRange(span, since, code, inside)
+                self.bad[span] = BadRange(span, since, code, inside, refusals=len(RETRIES))
                 self._cuts |= _bounds(span)
 
     def _halves(self, block: Block, node: _Node) -> tuple[Block, ...]:

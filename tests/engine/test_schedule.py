@@ -12,7 +12,7 @@ from gateway.engine.jobs import Idle, Poll, Probe
 from gateway.engine.requests import MOST_WAITING, WRITE_EXPIRY, Write
 from gateway.engine.schedule import OFFLINE_SHARE, Schedule
 from gateway.errors import NoReply
-from gateway.planning.bad_addresses import RETRY
+from gateway.planning.bad_addresses import RETRIES
 from gateway.protocols.modbus import ModbusRtu
 from gateway.tags import WriteRule
 from tests.sim.bench import WIRE
@@ -179,7 +179,7 @@ def test_a_bad_address_is_polled_rarely_but_keeps_its_short_deadline() -> None:
     dev = online(0)
     (poll,) = Schedule([dev], 0.0).polls(dev)
     assert not dev.bad_addresses.refused(poll.block, 0, "28")
-    assert poll.every == RETRY
+    assert poll.every == RETRIES[0]
     assert poll.deadline == poll.due + 1.0
 
 

@@ -652,14 +652,30 @@ async def test_a_refused_address_is_found_and_the_rest_is_good_within_a_second()
         await asyncio.sleep(10)
         settled, refused = now(), dev.record.refusals["28"]
         await asyncio.sleep(280)
-        assert dev.record.refusals["28"] == refused
+        assert dev.record.refusals["28"] == refused + 2 * len(bad)  # after 10 s, after a minute
         station.holes = {("D", 59)}
-        await asyncio.sleep(60)
+        await asyncio.sleep(100)
         assert line.now[bad[0]].quality is Quality.GOOD
         assert line.now[bad[1]].quality is Quality.GOOD
         assert [b.span.size for b in dev.blocks] == [59, 1]
-        assert dev.record.refusals["28"] - refused <= 3
-        assert len(line.reads(dev, settled)) >= 335
+        assert dev.record.refusals["28"] - refused <= 2 * len(bad) + 4
+        assert len(line.reads(dev, settled)) >= 375
+
+
+@on_virtual_time
+async def test_a_refusal_of_a_moment_costs_seconds_not_minutes() -> None:
+    dev = device(words(0, 20))
+    line = plant([dev])
+    station = line.stations[0].inner
+    async with running(line):
+        await asyncio.sleep(5.5)
+        station.holes = {("D", n) for n in range(5)}  # its program is being loaded, say
+        await asyncio.sleep(1.5)
+        station.holes = set()
+        await asyncio.sleep(5)
+        assert line.good(dev)
+        await asyncio.sleep(5)
+        assert [b.span.size for b in dev.blocks] == [20]
 
 
 # Noise

@@ -18,7 +18,7 @@ from gateway.protocols.vigor import Vigor
 from gateway.stations.modbus import ModbusStation
 from gateway.stations.vigor import VigorStation
 from tests.sim.plant import made_device
-from tests.sim.virtual import on_virtual_time
+from tests.sim.virtual import VirtualLoop, on_virtual_time
 
 WIRE = WireTiming(9600, 10)
 SPAN = Span("D", 0, 2)
@@ -369,3 +369,21 @@ async def test_the_turnaround_is_the_stations_own_time() -> None:
     talk = opened(port)
     await read(talk)
     assert talk.traffic.turnaround == pytest.approx(0.04)
+
+
+@on_virtual_time
+async def test_a_reply_that_waited_while_the_loop_stood_still_is_late() -> None:
+    """Its bytes may have arrived at any moment since, so no sample may carry this time."""
+    port = Far()
+    port.station.memory.write("D", 0, [7, 8])
+    talk = opened(port)
+    port.after = lambda _: None
+    asking = asyncio.create_task(read(talk))
+    await asyncio.sleep(0.01)
+    loop = asyncio.get_running_loop()
+    assert isinstance(loop, VirtualLoop)
+    loop.pass_time(3.0)
+    talk.received(b"".join(port.station.hear(port.sent[0][1], now())))
+    with pytest.raises(NoReply):
+        await asking
+    assert await talk.settle(0.5, 0.02) == 0.0

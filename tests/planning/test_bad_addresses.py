@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gateway.engine.device import Device
-from gateway.planning.bad_addresses import RETRY
+from gateway.planning.bad_addresses import RETRIES
 from gateway.planning.planner import Block
 from gateway.protocols.driver import Span
 from tests.sim.plant import device, make_tag
@@ -150,9 +150,30 @@ def test_a_bad_range_keeps_its_time_code_and_tags() -> None:
     assert found.bad_addresses.bad[block.span].since == 77
 
 
-def test_a_bad_address_is_read_rarely() -> None:
+def test_a_bad_address_is_read_more_and_more_rarely() -> None:
     found = words(3)
     (block,) = found.blocks
     assert found.interval(block) == 1.0
-    found.bad_addresses.refused(block, 0, "28")
-    assert found.interval(block) == RETRY
+    intervals = []
+    for _ in range(6):
+        found.bad_addresses.refused(block, 0, "28")
+        intervals.append(found.interval(block))
+    assert intervals == [*RETRIES, RETRIES[-1], RETRIES[-1]]
+
+
+def test_one_address_that_returned_has_all_others_tried_soon() -> None:
+    found = words(3, 300)
+    one, other = found.blocks
+    for block in (one, other):
+        for _ in range(4):
+            found.bad_addresses.refused(block, 0, "28")
+    assert found.bad_addresses.read(one)
+    assert found.interval(one) == 1.0
+    assert found.interval(other) == RETRIES[0]
+
+
+def test_an_address_known_to_be_bad_from_an_earlier_run_is_read_rarely() -> None:
+    earlier, found = words(3), words(3)
+    earlier.bad_addresses.refused(earlier.blocks[0], 0, "28")
+    found.bad_addresses.restore(earlier.bad_addresses.known(), found.tags)
+    assert found.interval(found.blocks[0]) == RETRIES[-1]

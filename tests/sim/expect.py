@@ -9,7 +9,7 @@ from gateway.engine.device import Device
 from gateway.engine.engine import Engine
 from gateway.engine.health import State
 from gateway.line.line import Line
-from gateway.planning.bad_addresses import RETRY
+from gateway.planning.bad_addresses import RETRIES
 from gateway.protocols.frames import FrameDriver
 from gateway.protocols.frames.driver import LISTENED
 from gateway.tags import Quality, Reason, Tag
@@ -22,7 +22,7 @@ from tests.sim.wire import SimWire
 SPOKEN = 0.35  # seconds: the longest frames of a seed, there and back
 LONGEST_PAUSE = 66.0  # between two probes of a silent device
 DISTURBING = ("late", *UNTIMELY)  # late answers to probes are not waited for, and may hit others
-UNTRIED = RETRY + 60.0  # seconds: an address that was refused is not asked for so long
+UNTRIED = RETRIES[-1] + 60.0  # seconds: an address that was refused is not asked for so long
 
 
 @dataclass(eq=False)
