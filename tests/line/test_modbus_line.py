@@ -6,7 +6,7 @@ import itertools
 import random
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Literal
 
 import pytest
 from structlog.testing import capture_logs
@@ -63,7 +63,14 @@ def registers(driver: AnyDriver, *sizes: int, every: float = 0.2) -> list[Tag]:
 
 
 def station_of(driver: Driver, **settings: Any) -> ModbusStation:
-    framing = {ModbusRtu: "rtu", ModbusAscii: "ascii", ModbusTcp: "tcp"}[type(driver)]
+    framing: Literal["rtu", "ascii", "tcp"]
+    match driver:
+        case ModbusRtu():
+            framing = "rtu"
+        case ModbusAscii():
+            framing = "ascii"
+        case ModbusTcp():
+            framing = "tcp"
     return ModbusStation(
         station=driver.station, framing=framing, dialect=driver.addressing, **settings
     )
@@ -440,11 +447,11 @@ async def test_a_dead_slave_is_not_brought_to_life_by_the_echo_of_a_loopback() -
     line.stations[0].mute = True
     async with running(line):
         await asyncio.sleep(60)
-        assert dev.state is State.OFFLINE
+        assert line.state(dev) is State.OFFLINE
         assert not any(alive for _, _, alive in line.lives)
         line.stations[0].mute = False
         await asyncio.sleep(70)
-        assert dev.state is State.ONLINE
+        assert line.state(dev) is State.ONLINE
 
 
 # Several questions open at once
