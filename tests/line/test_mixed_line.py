@@ -35,10 +35,6 @@ ONE_FORMAT = WireTiming(19200, 10)  # 7E1, of all of them
 NUMBERS = (0, 300, 600)
 
 
-def now() -> float:
-    return asyncio.get_running_loop().time()
-
-
 def mixed(every: float = 0.3) -> Plant:
     """A Vigor, a format 1 and a format 4 PLC."""
     vigor = Vigor(station=1)

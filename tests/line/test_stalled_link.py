@@ -23,7 +23,7 @@ from gateway.tags import Quality, Reason, Tag, WriteResult, WriteRule
 from gateway.transport import Receiver
 from tests.sim.bench import WIRE, Bench
 from tests.sim.plant import Outcome, Plant, device, made_device, make_tag, plant, running
-from tests.sim.virtual import on_virtual_time
+from tests.sim.virtual import now, on_virtual_time
 
 GUARD = 0.5
 
@@ -74,10 +74,6 @@ class DeviceServer(Bench):
             for answer in answers:
                 await asyncio.sleep(len(answer) * WIRE.character + self.late(self._random))
                 self.received(answer)
-
-
-def now() -> float:
-    return asyncio.get_running_loop().time()
 
 
 def behind(
