@@ -133,7 +133,7 @@ def show_memory(count: float) -> None:
     print(f"{int(count):7} tags in memory: {grown:7.1f} MB, {spent:5.2f} s", flush=True)
 
 
-rows = {"run": show_run, "memory": show_memory}
+rows: dict[str, Callable[..., None]] = {"run": show_run, "memory": show_memory}
 
 
 def main() -> None:

@@ -168,8 +168,8 @@ def count(endpoint: str) -> None:
         print("ready", flush=True)
         for _ in sys.stdin:
             print(arrived, time.process_time(), flush=True)
-        subscriber.undeclare()
-        blocks.undeclare()
+        subscriber.undeclare()  # type: ignore[no-untyped-call]  # zenoh has no types for it
+        blocks.undeclare()  # type: ignore[no-untyped-call]
 
 
 def flood(endpoint: str, seconds: float) -> None:
@@ -186,7 +186,9 @@ def flood(endpoint: str, seconds: float) -> None:
     sent = rounds = 0
     end = time.monotonic() + seconds
     with zenoh.open(configure(ZenohConfig(mode=ZenohMode.CLIENT, connect=(endpoint,)))) as session:
-        ignore = zenoh.handlers.Callback(lambda _: None, indirect=False)
+        ignore: zenoh.handlers.Callback[zenoh.Reply] = zenoh.handlers.Callback(
+            lambda _: None, indirect=False
+        )
         while time.monotonic() < end:
             for payload in junk:
                 session.get("plant/d1/t0/@set", ignore, payload=payload, timeout=0.5)
@@ -255,7 +257,7 @@ class Arrived(NamedTuple):
     samples: int
     seconds: float  # of processor time, all threads
 
-    def __sub__(self, other: "Arrived") -> "Arrived":  # type: ignore[override]
+    def __sub__(self, other: "Arrived") -> "Arrived":
         return Arrived(self.samples - other.samples, self.seconds - other.seconds)
 
 
@@ -316,9 +318,12 @@ def bare(tags: int, devices: int, seconds: float, *, like_ours: bool) -> Rate:
         zenoh.open(configure(ZenohConfig(listen=(endpoint,)))) as session,
         other("count", endpoint) as process,
     ):
-        put, stamp, kept = session.put, session.new_timestamp, []
+        put, stamp = session.put, session.new_timestamp
+        kept: list[object] = []
         if like_ours:
-            ignore = zenoh.handlers.Callback(lambda _: None, indirect=False)
+            ignore: zenoh.handlers.Callback[zenoh.Query] = zenoh.handlers.Callback(
+                lambda _: None, indirect=False
+            )
             for device in range(devices):
                 kept.append(session.declare_queryable(f"plant/d{device}/**/@set", ignore))
                 kept.append(session.liveliness().declare_token(f"plant/d{device}"))
@@ -470,7 +475,7 @@ def main(arguments: Iterable[str] | None = None) -> None:
     parser.add_argument("--devices", type=int, default=100)
     parser.add_argument("--seconds", type=float, default=5.0)
     parser.add_argument("--flood", type=float, default=0.0)
-    options = parser.parse_args(arguments)  # type: ignore[arg-type]  # any iterable will do
+    options = parser.parse_args(arguments)
     structlog.configure(processors=[_quiet])
     load = options.tags, options.devices, options.seconds
     best = bare(*load, like_ours=False)

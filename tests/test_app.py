@@ -231,7 +231,7 @@ async def test_where_the_clock_does_not_tell_which_reading_it_was_another_follow
     ]
     line.engine.is_open = True
     # Only the call counts here: no line runs.
-    line.expedite = lambda _, tag: expedited.append(tag)  # type: ignore[method-assign]
+    line.expedite = lambda device, tag: expedited.append(tag)  # type: ignore[method-assign]
     poll.asked = 7.0
     asking = asyncio.create_task(gateway.fresh(speed, 0.0))
     await asyncio.sleep(0)

@@ -21,7 +21,7 @@ from tests.e2e.processes import (
     vigor_line,
     write_config,
 )
-from tests.zenoh_peer import Heard, Subscription, ZenohPeer, free_endpoint
+from tests.zenoh_peer import Received, Subscription, ZenohPeer, free_endpoint
 
 TAGS = {
     "speed": {"address": "D10", "scale": 0.1},
@@ -113,7 +113,7 @@ async def test_values_arrive_and_writes_are_done(
         assert all(sample.encoding == "application/json" for sample in samples.samples)
 
 
-def _shows(name: str, value: object, sample: Heard) -> bool:
+def _shows(name: str, value: object, sample: Received) -> bool:
     return sample.key == f"plant/mixer/{name}" and bool(sample.json["value"] == value)
 
 

@@ -4,11 +4,7 @@ import asyncio
 from collections.abc import Callable
 
 from gateway.line.channel import NEVER, Alarm
-from tests.sim.virtual import on_virtual_time
-
-
-def now() -> float:
-    return asyncio.get_running_loop().time()
+from tests.sim.virtual import now, on_virtual_time
 
 
 def noting(rung: list[float], *again: float) -> Callable[[], float]:

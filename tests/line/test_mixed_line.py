@@ -35,10 +35,6 @@ ONE_FORMAT = WireTiming(19200, 10)  # 7E1, of all of them
 NUMBERS = (0, 300, 600)
 
 
-def now() -> float:
-    return asyncio.get_running_loop().time()
-
-
 def mixed(every: float = 0.3) -> Plant:
     """A Vigor, a format 1 and a format 4 PLC."""
     vigor = Vigor(station=1)
@@ -63,7 +59,7 @@ def mixed(every: float = 0.3) -> Plant:
 
 def wrong(line: Plant) -> list[tuple[float, str, object]]:
     """Good values that their station cannot have held during the last second."""
-    found = []
+    found: list[tuple[float, str, object]] = []
     for at, sample in line.told:
         n, value = sample.tag.address.number, sample.value
         if sample.quality is Quality.GOOD and isinstance(value, int):
@@ -173,9 +169,9 @@ async def test_on_demand_blocks_before_replies_are_counted_and_never_taken_for_o
     station = line.stations[0]
     hear, chance, said = station.inner.hear, random.Random(1), 0
 
-    def chatty(data: bytes, at: float) -> list[bytes]:
+    def chatty(data: bytes, now: float) -> list[bytes]:
         nonlocal said
-        replies = hear(data, at)
+        replies = hear(data, now)
         if replies and replies[0][:1] == b"\x02" and chance.random() < 0.5:
             size = len(replies[0]) - 8
             said += 1
@@ -241,8 +237,8 @@ async def test_an_on_demand_block_instead_of_an_answer_is_no_answer() -> None:
     async with running(line):
         await asyncio.sleep(2)
         hear = station.inner.hear
-        station.inner.hear = lambda data, at: (  # type: ignore[method-assign]
-            [on_demand(line, "7777")] if hear(data, at) else []
+        station.inner.hear = lambda data, now: (  # type: ignore[method-assign]
+            [on_demand(line, "7777")] if hear(data, now) else []
         )
         await asyncio.sleep(8)
         assert dev.state is State.OFFLINE

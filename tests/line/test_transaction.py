@@ -18,14 +18,10 @@ from gateway.protocols.vigor import Vigor
 from gateway.stations.modbus import ModbusStation
 from gateway.stations.vigor import VigorStation
 from tests.sim.plant import made_device
-from tests.sim.virtual import VirtualLoop, on_virtual_time
+from tests.sim.virtual import VirtualLoop, now, on_virtual_time
 
 WIRE = WireTiming(9600, 10)
 SPAN = Span("D", 0, 2)
-
-
-def now() -> float:
-    return asyncio.get_running_loop().time()
 
 
 class Far:

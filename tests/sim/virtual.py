@@ -88,3 +88,8 @@ def on_virtual_time(test: Callable[P, Awaitable[None]]) -> Callable[P, None]:
             run_virtual(whole())
 
     return run
+
+
+def now() -> float:
+    """The time of the running loop."""
+    return asyncio.get_running_loop().time()

@@ -1,0 +1,159 @@
+"""Several Modbus TCP requests open at once."""
+
+import asyncio
+import random
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import pytest
+
+from gateway.engine.device import Device
+from gateway.errors import LineDown
+from gateway.planning.wire_timing import WireTiming
+from gateway.protocols.modbus import (
+    MbapCodec,
+    ModbusTcp,
+)
+from gateway.tags import Quality, Reason
+from gateway.transport import Receiver
+from tests.line.slaves import NETWORK, plant, registers, slave
+from tests.sim.bench import Bench
+from tests.sim.plant import Plant, running
+from tests.sim.virtual import now, on_virtual_time
+from tests.sim.witness import Witness
+
+
+@dataclass
+class Network(Bench):
+    """A Modbus TCP device: each question has its own latency, None for one that is lost."""
+
+    latency: Callable[[int], float | None] = lambda _: 0.02  # by the question's number, from 0
+    cut_at: int = -1  # the question in whose answer the connection breaks
+    numbers: list[int] = field(default_factory=list)  # transactions, as they were asked
+    answered: list[int] = field(default_factory=list)
+    open_now: int = 0
+    open_most: int = 0
+    codec: MbapCodec = field(default_factory=MbapCodec)
+
+    async def open(self, stations: Sequence[Any], wire: WireTiming, ear: Receiver) -> "Network":
+        self.opened.append(now())
+        self.ear, self.codec, self.open_now = ear, MbapCodec(), 0
+        self.station = stations[0]
+        return self
+
+    async def close(self) -> None:
+        self.ear = None
+
+    def write(self, data: bytes) -> None:
+        self.sent.append((now(), data))
+        for frame in self.codec.feed(data):
+            number = len(self.numbers)
+            self.numbers.append(frame.transaction)
+            wait = self.latency(number)
+            if wait is not None:
+                self.open_now += 1
+                self.open_most = max(self.open_most, self.open_now)
+                question = MbapCodec().encode(frame)
+                ear = self.ear
+                asyncio.get_running_loop().call_later(wait, self._answer, number, question, ear)
+
+    def _answer(self, number: int, question: bytes, ear: Receiver | None) -> None:
+        if ear is None or ear is not self.ear:
+            return
+        (reply,) = self.station.hear(question, now())
+        self.open_now -= 1
+        self.answered.append(self.numbers[number])
+        if number == self.cut_at:
+            ear.received(reply[:11])
+            self.ear = None
+            ear.lost(LineDown("closed by the other side"))
+        else:
+            ear.received(reply)
+
+
+def windowed(window: int, blocks: int = 8, every: float = 0.01, **timing: Any) -> Device:
+    driver = ModbusTcp(window=window)
+    tags = registers(driver, *[3] * blocks, every=every)  # too far apart for one question
+    return slave(driver, tags, wire=NETWORK, **{"reply_timeout": 0.3, **timing})
+
+
+def network(device: Device, **settings: Any) -> tuple[Plant, Network, Witness]:
+    bench = Network(**settings)
+    line = plant([device], wire=NETWORK, bench=bench)
+    return line, bench, Witness(line)
+
+
+@pytest.mark.parametrize("window", [1, 2, 4, 8])
+@on_virtual_time
+async def test_as_many_questions_are_open_at_once_as_the_window_says(window: int) -> None:
+    """With 20 ms of latency that many times the reads are done."""
+    dev = windowed(window)
+    line, bench, witness = network(dev)
+    async with running(line):
+        await asyncio.sleep(1)
+        start = good_before = dev.record.exchanges
+        await asyncio.sleep(10)
+    assert bench.open_most == window
+    rate = (dev.record.exchanges - good_before) / 10
+    assert 0.9 * window / 0.02 <= rate <= window / 0.02 + 1
+    assert start > 0
+    assert witness.wrong == []
+    assert dev.record.turnaround == pytest.approx(0.02 / window, rel=0.2)
+
+
+@on_virtual_time
+async def test_answers_in_any_order_are_matched_by_their_number() -> None:
+    chance = random.Random(5)
+    dev = windowed(8)
+    line, bench, witness = network(dev, latency=lambda _: chance.uniform(0.001, 0.1))
+    async with running(line):
+        await asyncio.sleep(60)
+    assert bench.answered != sorted(bench.answered)
+    assert witness.wrong == []
+    assert witness.right > 10_000
+    assert not dev.record.failures
+    assert dev.record.unasked == 0
+
+
+@pytest.mark.parametrize("after", [None, 0.4])
+@on_virtual_time
+async def test_a_question_that_times_out_does_not_spoil_those_beside_it(
+    after: float | None,
+) -> None:
+    """Lost, or answered within the guard; the others of its round are good."""
+    dev = windowed(4, blocks=4)
+    lost = 42
+    line, bench, witness = network(dev, latency=lambda n: after if n == lost else 0.02)
+    async with running(line):
+        while len(bench.numbers) <= lost:
+            await asyncio.sleep(0.01)
+        asked = now()
+        await asyncio.sleep(0.25)  # before the time-out
+        told = {s.tag.span.start // 1000 for at, s in line.told if at >= asked}
+        assert len(told) == 3
+        await asyncio.sleep(2)
+        assert line.good(dev)
+    assert dev.record.failures == {"silence": 1}
+    assert dev.record.late == (0 if after is None else 1)
+    assert all(s.quality is Quality.GOOD for at, s in line.told if at > 1001)
+    assert witness.wrong == []
+
+
+@on_virtual_time
+async def test_a_connection_cut_in_mid_frame_is_opened_anew_and_half_the_frame_is_forgotten() -> (
+    None
+):
+    dev = windowed(4, blocks=4, every=0.2)
+    line, bench, witness = network(dev, cut_at=21)
+    async with running(line):
+        await asyncio.sleep(10)
+        assert line.good(dev)
+    assert len(bench.opened) == 2
+    cut = line.turned(dev.tags[0], Quality.BAD, 1000.5)
+    assert {s.reason for at, s in line.told if at == cut and s.quality is Quality.BAD} == {
+        Reason.LINE_DOWN
+    }
+    assert line.turned(dev.tags[0], Quality.GOOD, cut) - cut < 0.5
+    assert witness.wrong == []
+    assert not dev.record.failures
