@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 
-from gateway.engine.ages import asked_of, worst_ages
+from gateway.engine.ages import polled_block, worst_ages
 from gateway.engine.device import Device
 from gateway.engine.effects import Effects
 from gateway.engine.health import State
@@ -65,7 +65,7 @@ class Staleness:
         plan = [(d, self._schedule.polls(d), d.turnaround.expected) for d in online]
         polls = [poll for _, polls, _ in plan for poll in polls]
         if plan != self._plan:
-            blocks = [asked_of(poll.device, poll.block) for poll in polls]
+            blocks = [polled_block(poll.device, poll.block) for poll in polls]
             self._plan, self._ages = plan, worst_ages(blocks)
         return polls, self._ages
 
