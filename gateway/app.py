@@ -1,4 +1,4 @@
-"""A gateway without Zenoh: the lines of a configuration, and the last sample of every tag."""
+"""Connects the lines of a configuration with the last sample of every tag, without Zenoh."""
 
 import asyncio
 import time
@@ -29,7 +29,7 @@ OpenPort = Callable[[Receiver], Awaitable[Port]]
 
 
 def opener(line: LineConfig) -> OpenPort:
-    """Opens the line's port: the real one, or its devices simulated in memory."""
+    """Returns a function that opens the port of the line, or its simulated devices in memory."""
     if isinstance(line.port, SimulatorAddress):
         stations = [station_for(device.driver, device.tags) for device in line.devices]
         return lambda receiver: open_simulator(stations, line.wire, receiver)
@@ -45,14 +45,14 @@ def line_of(
     wall: Callable[[], int] = time.time_ns,
     seed: int = 0,
 ) -> Line:
-    """The line with these of its devices. `wall`: ns since 1970."""
+    """Makes a line with some or all of its devices. `wall`: ns since 1970."""
     engine = Engine(config.name, [Device(one, config.wire) for one in devices], config.wire, seed)
-    where = open_port or opener(config)
-    return Line(engine, where, sink, echo=config.echo, wall=wall, seed=seed)
+    opens = open_port or opener(config)
+    return Line(engine, opens, sink, echo=config.echo, wall=wall, seed=seed)
 
 
 def forecasts(config: Config) -> list[LineForecast]:
-    """The load and the ages that each line of the file will have."""
+    """Calculates the load and the worst ages of each line of the file."""
     return [
         forecast(
             line.name,
@@ -64,7 +64,7 @@ def forecasts(config: Config) -> list[LineForecast]:
 
 
 class Subscriber(Protocol):
-    """Receives all that a gateway has to publish, on the event loop."""
+    """Receives the samples to publish and the device states, on the event loop."""
 
     def publish(self, samples: Sequence[Sample]) -> None: ...
 
@@ -115,7 +115,7 @@ class Gateway:
             self._places[device.name] = (line, device)
 
     def subscribe(self, subscriber: Subscriber) -> None:
-        """`subscriber` receives what is published from now on, after earlier subscribers."""
+        """Adds a subscriber. It receives each sample after the earlier subscribers."""
         self._subscribers.append(subscriber)
 
     def add_document(self, path: str, document: Callable[[], Document]) -> None:
@@ -161,7 +161,10 @@ class Gateway:
             self._publish(changed)  # history keeps it too
 
     async def write(self, tag: Tag, value: Value) -> WriteResult:
-        """Returns when the device has acknowledged. Raises `GatewayError`, `BadValue` first."""
+        """Returns when the device has acknowledged.
+
+        Raises `BadValue` before anything is sent, otherwise a `GatewayError`.
+        """
         if tag.device not in self._places:
             raise Offline(f"device {tag.device} is disabled; nothing was sent")
         units = tag.encode(value)
@@ -175,7 +178,10 @@ class Gateway:
         return speaker(self.config, line)
 
     async def control(self, device: str, command: str, argument: str = "") -> CommandResult:
-        """Returns the device's answer. Raises `GatewayError`, `BadValue` first."""
+        """Returns the reply of the device.
+
+        Raises `BadValue` before anything is sent, otherwise a `GatewayError`.
+        """
         check_command(self.config, device, command)
         line, receiver = self._places[device]
         loop = asyncio.get_running_loop()
@@ -184,9 +190,9 @@ class Gateway:
         return CommandResult(answer, self._wall(), loop.time() - started)
 
     def is_fresh(self, tag: Tag, max_age: float) -> bool:
-        """It was read less than `max_age` seconds ago, or cannot be read now.
+        """True if the last read is younger than `max_age` seconds, or no read is possible now.
 
-        By the monotonic clock, which nobody sets.
+        The age is monotonic time: a change of the system clock must not change it.
         """
         poll = self._poll(tag)
         if poll is None or not self._places[tag.device][0].engine.is_open:
@@ -196,9 +202,10 @@ class Gateway:
         return asyncio.get_running_loop().time() - poll.last.at < max_age
 
     async def fresh(self, tag: Tag, max_age: float) -> Sample:
-        """The last sample if it `is_fresh`, otherwise the next read; clients share one read.
+        """Returns the last sample if it `is_fresh`, otherwise that of the next read.
 
-        Bad where the device does not answer. Raises `Busy` when the line did not get to it.
+        Several clients share one read. The sample is bad if the device does not answer. Raises
+        `Busy` if the line had no time for the read.
         """
         poll = self._poll(tag)
         if poll is None or self.is_fresh(tag, max_age):
@@ -219,7 +226,7 @@ class Gateway:
                 del self._waiting[tag]
 
     def _answer(self, sample: Sample) -> None:
-        """A read that started before the request does not satisfy it."""
+        """Answers waiting clients. A read that started before the request does not satisfy it."""
         tag = sample.tag
         poll = self._poll(tag)
         for reader in self._waiting[tag]:
@@ -231,7 +238,7 @@ class Gateway:
                 self._expedite(tag)
 
     def _poll(self, tag: Tag) -> Poll | None:
-        """The poll that reads the tag; None where its value arrives unsolicited."""
+        """Returns the poll that reads the tag; None if the value is unsolicited."""
         if tag.device not in self._places:
             return None
         line, device = self._places[tag.device]
@@ -242,7 +249,7 @@ class Gateway:
         line.expedite(device, tag)
 
     def status(self) -> Mapping[str, Document]:
-        """Documents by path: `status`, `lines/<line>`, `devices/<device>`."""
+        """Returns documents by path: `status`, `lines/<line>`, `devices/<device>`."""
         now = asyncio.get_running_loop().time()
         documents: dict[str, Document] = {
             "status": {

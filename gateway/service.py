@@ -1,4 +1,4 @@
-"""The service: lines, Zenoh and history together, from start to SIGTERM."""
+"""The service: runs lines, Zenoh and history in one process, from start to SIGTERM."""
 
 import asyncio
 import gc
@@ -19,51 +19,54 @@ from gateway.northbound import Northbound, StandbySettings
 from gateway.tags import Sample
 
 log = structlog.get_logger("gateway")
-# Seconds. The publishing thread must not hold up the lines for Python's usual 5 ms.
-SWITCH = 0.0005
-# New objects until Python looks for cycles among them; every 5th time also among the older, and
-# every 100th of those among all: with 50,000 tags that holds everything up for 10 ms.
-COLLECT = (5000, 5, 100)
+# Seconds. Python's usual 5 ms of the publishing thread would delay the lines.
+THREAD_SWITCH = 0.0005
+# New objects before a collection of the first generation; every 5th collects the second, and
+# every 100th of those all: with 50,000 tags a full collection stops the process for 10 ms.
+GC_THRESHOLDS = (5000, 5, 100)
 
-KEEP_EVERY = 10.0  # seconds
-# Seconds from the signal, of the 2 there are: Zenoh takes 1.5 at most, the disk has what is left.
+SAVE_EVERY = 10.0  # seconds
+# Seconds after the signal; 2 are allowed. Zenoh takes at most 1.5, the disk gets the rest.
 END_WITHIN = 1.7
-KEPT_WITHIN = 0.5  # seconds that a lost state file is worth
+STATE_FILE_WITHIN = 0.5  # seconds; a lost state file costs only a new search
 
 
 async def run(config: Config, started: Callable[[], None] = lambda: None) -> None:
-    """The service, until SIGTERM or SIGINT. Raises `GatewayError` when it cannot start.
+    """Runs the service until SIGTERM or SIGINT. Raises `GatewayError` when it cannot start.
 
-    `started` is called when everything is open on Zenoh: once, or whenever this gateway of a
+    Calls `started` when everything is open on Zenoh: once, or each time that this gateway of a
     standby group becomes active.
     """
-    sys.setswitchinterval(SWITCH)
-    gc.set_threshold(*COLLECT)
+    sys.setswitchinterval(THREAD_SWITCH)
+    gc.set_threshold(*GC_THRESHOLDS)
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop.set)
     while await _serve(config, stop, started):
-        log.warning("from now on this gateway stands by")
+        log.warning("gateway stands by", why="another gateway of the group is active")
 
 
 async def _serve(config: Config, stop: asyncio.Event, started: Callable[[], None]) -> bool:
-    """Until it is to stop, or another gateway of its group took over: then True, to start over."""
+    """Runs one gateway until `stop`, or until another gateway of its group replaces it.
+
+    Returns True if it was replaced: then it starts again, as standby.
+    """
     gateway = Gateway(config)
     gc.collect()
-    gc.freeze()  # tags live as long as the gateway: no need to look at them again and again
+    gc.freeze()  # tags live as long as the gateway: each collection skips them
     history = _history(config)
     northbound = _northbound(config, gateway, history)
     state_file = None if config.state_file is None else StateFile(config.state_file)
     if state_file is not None:
         state_file.restore(gateway.enabled_devices)
     gateway.subscribe(northbound)
-    if history is not None:  # all that is published is kept, for clients that miss it
+    if history is not None:  # clients may have missed what was published
         gateway.subscribe(_Recording(history))
         gateway.add_document("history", history.document)
-    async with AsyncExitStack() as ending:  # what began last ends first
-        face = asyncio.create_task(northbound.run(), name="zenoh")
-        ending.push_async_callback(_put_away, face, history, state_file)
+    async with AsyncExitStack() as cleanup:  # in reverse order of the start
+        zenoh = asyncio.create_task(northbound.run(), name="zenoh")
+        cleanup.push_async_callback(_close, zenoh, history, state_file)
         exclusive, active, opened, replaced, stopping = events = [
             asyncio.create_task(event.wait())
             for event in (
@@ -75,19 +78,19 @@ async def _serve(config: Config, stop: asyncio.Event, started: Callable[[], None
             )
         ]
         for event in events:
-            ending.callback(event.cancel)
+            cleanup.callback(event.cancel)
         lines: list[asyncio.Task[None]] = []
-        await _first(exclusive, face, stopping)
+        await _first(exclusive, zenoh, stopping)
         if exclusive.done():  # otherwise another process may have this file and these lines
             if history is not None:
                 history.start()
-            await _first(active, face, stopping)
+            await _first(active, zenoh, stopping)
             if active.done():
-                lines = await _on_the_wire(gateway, history, state_file, ending)
-        await _first(opened, face, stopping, replaced)
+                lines = await _start_lines(gateway, history, state_file, cleanup)
+        await _first(opened, zenoh, stopping, replaced)
         if opened.done():
             started()
-        await _first(face, stopping, replaced, *lines)
+        await _first(zenoh, stopping, replaced, *lines)
     return northbound.replaced.is_set() and not stop.is_set()
 
 
@@ -107,56 +110,58 @@ def _northbound(config: Config, gateway: Gateway, history: Historian | None) -> 
     )
 
 
-async def _on_the_wire(
+async def _start_lines(
     gateway: Gateway,
     history: Historian | None,
     state_file: StateFile | None,
-    ending: AsyncExitStack,
+    cleanup: AsyncExitStack,
 ) -> list[asyncio.Task[None]]:
     if history is not None:
         history.record(gateway.mirror.samples())  # "starting" marks the restart
     if state_file is not None:
-        await ending.enter_async_context(_kept(state_file, gateway))
+        await cleanup.enter_async_context(_saved(state_file, gateway))
     lines = [asyncio.create_task(line.run(), name=line.engine.name) for line in gateway.lines]
-    ending.push_async_callback(_ended, lines)  # first of all, so that the last outcomes go out
+    cleanup.push_async_callback(_end, lines)  # first, so that the last outcomes are published
     return lines
 
 
 @asynccontextmanager
-async def _kept(state_file: StateFile, gateway: Gateway) -> AsyncIterator[None]:
-    """What is learned meanwhile is written down, now and then and at the end."""
+async def _saved(state_file: StateFile, gateway: Gateway) -> AsyncIterator[None]:
+    """Saves the state file regularly, and at the end."""
     state_file.start()
-    keeping = asyncio.create_task(_keep(state_file, gateway), name="state")
+    saving = asyncio.create_task(_save_regularly(state_file, gateway), name="state")
     try:
         yield
     finally:
         state_file.save_last(state_file.snapshot(gateway.enabled_devices))
-        await _ended([keeping])
+        await _end([saving])
 
 
-async def _keep(state_file: StateFile, gateway: Gateway) -> None:
+async def _save_regularly(state_file: StateFile, gateway: Gateway) -> None:
     while True:
-        await asyncio.sleep(KEEP_EVERY)
+        await asyncio.sleep(SAVE_EVERY)
         state_file.save_soon(state_file.snapshot(gateway.enabled_devices))
 
 
-async def _put_away(
-    face: asyncio.Task[None], history: Historian | None, state_file: StateFile | None
+async def _close(
+    zenoh: asyncio.Task[None], history: Historian | None, state_file: StateFile | None
 ) -> None:
-    """First Zenoh, so that what is told last is kept too, then the files: a disk may stand still,
-    and nobody on the network shall have to wait for it."""
+    """Ends Zenoh, then the files: they keep the last outcomes too.
+
+    A disk may hang, and clients on the network must not wait for it.
+    """
     by = time.monotonic() + END_WITHIN
     try:
-        await _ended([face])
+        await _end([zenoh])
     finally:
         if history is not None:
             left = by - time.monotonic()
             if not await asyncio.to_thread(history.close, left):
-                log.error("history did not end in time: what the disk has not taken is lost")
+                log.error("history close timed out", so="samples that are not on disk are lost")
         if state_file is not None:
-            left = min(KEPT_WITHIN, by - time.monotonic())
+            left = min(STATE_FILE_WITHIN, by - time.monotonic())
             if not await asyncio.to_thread(state_file.close, left):
-                log.warning("the disk did not take in time what was learned of the devices")
+                log.warning("state file close timed out", so="the last changes are not saved")
 
 
 def _history(config: Config) -> Historian | None:
@@ -165,9 +170,9 @@ def _history(config: Config) -> Historian | None:
 
 
 class _Recording:
-    """Subscribes history to what is published.
+    """Records published samples in the history.
 
-    A sample is recorded before the loop takes a question of a client that has seen it.
+    A client can query a sample as soon as it received it: recording comes first.
     """
 
     def __init__(self, history: Historian) -> None:
@@ -180,8 +185,8 @@ class _Recording:
         """History keeps no device states."""
 
 
-async def _ended(tasks: Sequence[asyncio.Task[None]]) -> None:
-    """Cancel and await; what a task failed with by itself is raised here."""
+async def _end(tasks: Sequence[asyncio.Task[None]]) -> None:
+    """Cancels the tasks and awaits them. Raises the error of a task that failed."""
     for task in tasks:
         task.cancel()
     for outcome in await asyncio.gather(*tasks, return_exceptions=True):

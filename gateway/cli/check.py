@@ -89,7 +89,7 @@ def _blocks(line: LineForecast) -> Table:
             seconds(row.seconds),
             seconds(row.worst_age),
         )
-    for device, tags in line.unasked:
+    for device, tags in line.unsolicited:
         table.add_row(f"  {device.name}", "unsolicited", str(tags))
     return table
 

@@ -29,7 +29,7 @@ class RequestEnded(NamedTuple):
 
 
 class Pause(NamedTuple):
-    """The line stays quiet for so many seconds: stations take in a broadcast."""
+    """The line is silent for so many seconds, while stations process a broadcast."""
 
     seconds: float
 
@@ -54,7 +54,7 @@ class Effects:
         self.collected: list[Effect] = []
 
     def take(self) -> list[Effect]:
-        """All effects since the last call."""
+        """Returns all effects since the last call."""
         collected, self.collected = self.collected, []
         return collected
 
@@ -62,7 +62,7 @@ class Effects:
         self.collected.append(Samples(samples))
 
     def bad(self, tags: Sequence[Tag], reason: Reason, time: int, detail: str) -> None:
-        """The tags turn bad at `time` (ns since 1970)."""
+        """Turns the tags bad at `time` (ns since 1970)."""
         self.collected.append(Samples([bad(tag, reason, time, detail) for tag in tags]))
 
     def online(self, device: Device, online: bool) -> None:

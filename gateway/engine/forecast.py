@@ -1,10 +1,10 @@
-"""What a configuration will do to its lines, by calculation alone: the promise `check` prints."""
+"""Calculates the load of each line, and the ages of its values, before anything is sent."""
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from gateway.engine.ages import asked, load_of, worst_ages
+from gateway.engine.ages import load_of, polled_blocks, worst_ages
 from gateway.engine.device import Device
 from gateway.planning.planner import Block, plan
 from gateway.planning.wire_timing import WireTiming
@@ -14,7 +14,7 @@ from gateway.tags import Tag
 
 @dataclass(frozen=True, slots=True)
 class BlockForecast:
-    """One request: how long its exchange takes and how old its values get, in seconds."""
+    """One block: the seconds of its transaction, and the worst age of its values."""
 
     device: Device
     block: Block
@@ -24,26 +24,26 @@ class BlockForecast:
 
 @dataclass(frozen=True, slots=True)
 class LineForecast:
-    """One line while all its stations answer. Times in seconds."""
+    """One line while all its devices reply. Times in seconds."""
 
     name: str
     wire: WireTiming
     blocks: tuple[BlockForecast, ...]
-    load: float  # 1.0: all the time the wire has
+    load: float  # share of the wire time; 1.0: all of it
     requests: float  # per second
     characters: float  # per second, both ways
-    cycle: float  # one round of every block
-    worst_write: float  # from asking to the acknowledgement
-    worst_write_silent: float  # the same while a station has just gone silent
-    shortest: float  # the shortest interval at which all tags could be polled alike
-    unasked: tuple[tuple[Device, int], ...]  # devices with tags that come unasked: how many
+    cycle: float  # one poll of every block
+    worst_write: float  # from the request of the client to the acknowledgement
+    worst_write_silent: float  # the same when a device stopped to reply
+    shortest: float  # the shortest interval that is possible for all tags
+    unsolicited: tuple[tuple[Device, int], ...]  # devices with their number of unsolicited tags
 
     @property
     def overloaded(self) -> bool:
         return self.load > 1
 
     def advice(self) -> str:
-        """What would fit, in one sentence; empty when the file's wishes do."""
+        """Returns a sentence with possible intervals; empty if the line is not overloaded."""
         if not self.overloaded:
             return ""
         shortest = math.ceil(self.shortest * 100) / 100
@@ -55,14 +55,14 @@ class LineForecast:
 
 
 def forecast(name: str, devices: Sequence[Device], wire: WireTiming) -> LineForecast:
-    """Reckon a line from its plan."""
-    blocks = asked(devices)
+    """Calculates the forecast of a line from the plans of its devices."""
+    blocks = polled_blocks(devices)
     load = load_of(blocks)
     longest = max((one.seconds for one in blocks), default=0.0)
     write = max((_longest_write(device) for device in devices), default=0.0)
     silence = max((device.longest_reply for device in devices), default=0.0)
     cycle = sum(one.seconds for one in blocks)
-    unasked = [(device, _unsolicited(device)) for device in devices]
+    unsolicited = [(device, _unsolicited_tags(device)) for device in devices]
     return LineForecast(
         name=name,
         wire=wire,
@@ -76,12 +76,12 @@ def forecast(name: str, devices: Sequence[Device], wire: WireTiming) -> LineFore
         worst_write=longest + write,
         worst_write_silent=longest + write + silence,
         shortest=sum(_round(device) for device in devices) if load > 1 else cycle,
-        unasked=tuple((device, tags) for device, tags in unasked if tags),
+        unsolicited=tuple((device, tags) for device, tags in unsolicited if tags),
     )
 
 
-def _unsolicited(device: Device) -> int:
-    """The number of its tags that cannot be polled."""
+def _unsolicited_tags(device: Device) -> int:
+    """Returns the number of its tags that cannot be polled."""
     driver = device.driver
     if not isinstance(driver, Unsolicited):
         return 0
@@ -89,7 +89,7 @@ def _unsolicited(device: Device) -> int:
 
 
 def _round(device: Device) -> float:
-    """One reading of all tags, planned as if all had the same interval."""
+    """Returns the seconds of one read of all tags, planned as if all had the same interval."""
     alike = [replace(tag, every=1.0) for tag in device.tags]
     blocks = plan(alike, device.driver, device.seconds, device.bad_addresses.cuts)
     return sum(device.seconds(block.cost) for block in blocks)
@@ -100,7 +100,7 @@ def _longest_write(device: Device) -> float:
 
 
 def _write_seconds(device: Device, tag: Tag) -> float:
-    """All exchanges of one write of the tag: change a bit, read back."""
+    """Returns the seconds of all transactions of one write of the tag, with its reads."""
     cost, back = device.driver.write_cost(tag.span), device.driver.cost(tag.span)
     seconds = 0.0 if cost is None else device.seconds(cost)
     if back is not None:

@@ -1,4 +1,4 @@
-"""Health of one device: a state machine that says when it is polled, probed, or left alone.
+"""Health of one device: a state machine that decides if the device is polled or probed.
 
 The table `TRANSITIONS` holds every change of state. No other module assigns a field of `Health`.
 """
@@ -17,7 +17,7 @@ MOST_UNANSWERED = 64  # unanswered requests whose times are kept
 
 
 class State(StrEnum):
-    """How far a device can be trusted to answer."""
+    """States of a device. Only an online or failing device is polled."""
 
     STARTING = "starting"  # no reply since the line was opened
     ONLINE = "online"  # its last transaction ended with a reply
@@ -26,11 +26,11 @@ class State(StrEnum):
 
 
 class Event(StrEnum):
-    """What changes the state."""
+    """Events that change the state."""
 
-    ANSWERED = "answered"  # a transaction ended with a reply, good or "no"
-    UNCLEAR = "unclear"  # a transaction ended without one
-    GAVE_UP = "gave up"  # it did so once more than `retries` allows
+    ANSWERED = "answered"  # a transaction ended with a reply, perhaps an error reply
+    UNCLEAR = "unclear"  # a transaction ended without a reply
+    GAVE_UP = "gave up"  # more transactions ended without a reply than `retries` allows
     RESTARTED = "restarted"  # the line was opened, or lost
 
 
@@ -57,10 +57,10 @@ TRANSITIONS: Mapping[tuple[State, Event], State] = {
 
 @dataclass(slots=True, eq=False)
 class Health:
-    """The state of one device, and what is known of replies that may still arrive.
+    """The state of one device, and its outstanding requests.
 
-    `answerable` is False for a device that is only written to or only speaks unsolicited: it
-    is never probed.
+    `answerable` is False for a device that is only written to, or only sends unsolicited frames:
+    the line does not probe it.
     """
 
     answerable: bool = True
@@ -79,14 +79,14 @@ class Health:
         self.needs_resync = self.answerable
 
     def restart(self, trouble: LineDown | None = None) -> None:
-        """The line was opened, or lost: a reply from before may still arrive."""
+        """Starts again after the line was opened or lost: an older reply may still arrive."""
         self._move(Event.RESTARTED)
         self.trouble = trouble
         self.consecutive_failures = 0
         self.needs_resync = self.answerable
 
     def answered(self) -> bool:
-        """A transaction ended with a reply. Returns True when the device comes online."""
+        """Notes a reply. Returns True if the device comes online."""
         came = not self.online
         self._move(Event.ANSWERED)
         self.consecutive_failures = 0
@@ -97,9 +97,9 @@ class Health:
         return came
 
     def unclear(self, error: DeviceError, outstanding: Span | None, now: float) -> None:
-        """A transaction ended unclear; its reply may still arrive.
+        """Notes a transaction without a reply, which may still arrive.
 
-        `outstanding`: what was asked; None for a probe, which leaves an older one as it was.
+        `outstanding`: the requested span. None for a probe: an older span stays outstanding.
         """
         self._move(Event.UNCLEAR)
         self.consecutive_failures += 1
@@ -111,15 +111,15 @@ class Health:
             self.outstanding = outstanding
 
     def left_outstanding(self, outstanding: Span | None) -> None:
-        """The port was lost in the middle of a transaction."""
+        """Notes that the port was lost during a transaction."""
         self.needs_resync = self.answerable
         if outstanding is not None:
             self.outstanding = outstanding
 
     def replied_late(self, took: float, reply_timeout: float, *, last: bool) -> None:
-        """The right reply arrived after its time-out, `took` seconds after the request.
+        """Notes the correct reply after its time-out, `took` seconds after the request.
 
-        `last`: no other request can still be answered, so the next frame is no older reply.
+        `last`: no other request is outstanding, so the next frame is no older reply.
         """
         if last:
             self.needs_resync = False
@@ -129,30 +129,30 @@ class Health:
         )
 
     def gave_up(self, now: float, spread: float) -> None:
-        """The device goes offline, or stays so: the pause before its next probe doubles.
+        """Makes the device offline, and doubles the pause before its next probe.
 
-        `spread`: a factor about 1 that keeps probes of many devices apart.
+        `spread`: a random factor near 1, so that many devices are not probed at once.
         """
         self._move(Event.GAVE_UP)
         self.pause = min(max(2 * self.pause, PAUSE_FIRST), PAUSE_LONGEST)
         self.next_probe = now + self.pause * spread
 
     def probe_soon(self) -> None:
-        """A client waits for the device: probe it as soon as the share of the wire allows."""
+        """Ends the pause, because a client waits; the share of wire time still limits the probe."""
         self.next_probe = 0.0
 
     def next_probe_token(self) -> int:
-        """For a resync. The token after it stays free, for asking once more."""
+        """Returns a token for a resync. The token after it is free for a second resync request."""
         self._probe_token += 2
         return self._probe_token
 
     def outstanding_requests(self, since: float) -> int:
-        """How many requests sent after `since` have no reply."""
+        """Counts the requests sent after `since` that have no reply."""
         return sum(sent > since for sent in self._unanswered)
 
     @property
     def reason(self) -> Reason:
-        """Why its values are bad."""
+        """The reason of its bad values."""
         return Reason.GARBLED if isinstance(self.trouble, Garbled) else Reason.NO_REPLY
 
     @property
@@ -164,21 +164,21 @@ class Health:
         self.state = TRANSITIONS[self.state, event]
         self.online = self.state in (State.ONLINE, State.FAILING)
 
-    # Bytes of a device that only speaks unsolicited
+    # Frames of a device that only sends unsolicited frames
 
     def understood(self) -> None:
-        """It was understood again."""
+        """Notes a correct frame."""
         self.trouble = None
 
     def not_understood(self, damage: Garbled) -> None:
-        """It spoke, but not in whole frames."""
+        """Notes bytes that are no frame."""
         self.trouble = damage
 
 
 def diagnosis(trouble: GatewayError | None, silent_causes: str) -> str:
-    """One sentence for people: the likely cause of the trouble; empty when there is none.
+    """Returns the likely cause of the trouble as a sentence; empty when there is none.
 
-    `silent_causes`: what the protocol knows of devices that do not answer.
+    `silent_causes`: causes of no reply that are special to the protocol.
     """
     match trouble:
         case None:
@@ -196,13 +196,13 @@ _SILENCE = (
     "other master is on the line."
 )
 _ADVICE = {
-    Evidence.ECHO: "Only our own request came back: the adapter echoes; set `echo: true`, "
-    "and the station itself is silent",
-    Evidence.NOISE: "Bytes came that are no frame: check baud rate, parity and data bits",
-    Evidence.CHECKSUM: "Frames come with a wrong sum: noise, missing termination, or sum check "
-    "set differently on both sides",
-    Evidence.STATION: "Another station answered: check the station numbers",
-    Evidence.SHAPE: "The answer was to some other question, or in another format",
-    Evidence.SLOW: "It answers, but too late: raise reply_timeout",
-    Evidence.TRUNCATED: "Answers break off: noise, or a device server that cuts packets",
+    Evidence.ECHO: "Only our own request came back: the adapter echoes; set `echo: true`. "
+    "The station itself does not reply",
+    Evidence.NOISE: "Bytes arrived that are no frame: check baud rate, parity and data bits",
+    Evidence.CHECKSUM: "Frames arrive with a wrong check sum: noise, missing termination, or sum "
+    "check set differently on both sides",
+    Evidence.STATION: "Another station replied: check the station numbers",
+    Evidence.SHAPE: "The reply belongs to another request, or has another format",
+    Evidence.SLOW: "The device replies too late: raise reply_timeout",
+    Evidence.TRUNCATED: "Replies break off: noise, or a device server that cuts packets",
 }

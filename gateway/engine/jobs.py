@@ -20,31 +20,31 @@ class LastRead:
     """The last good read of a block."""
 
     at: float | None = None  # by the line's clock; None: the block's values are bad
-    ever: bool = False  # there was one
-    units: Sequence[int] | None = None  # what was read
-    samples: Sequence[Sample] | None = None  # what was made of it
+    ever: bool = False  # the block was read at least once
+    units: Sequence[int] | None = None  # as read
+    samples: Sequence[Sample] | None = None  # made of the units
 
 
 @dataclass(slots=True, eq=False)
 class Poll:
-    """A job: read one block. It also holds when the block is due. Times by the line's clock."""
+    """A job: read one block. Also holds its due time and its last read, by the line's clock."""
 
     device: Device
     block: Block
     due: float
     tries: int = 0
-    missed: int = 0  # rounds in a row without a reply, though the device answers otherwise
+    missed: int = 0  # rounds in a row without a reply, while the device replies to others
     asked: float = 0.0  # when it was handed out last
-    expedited: bool = False  # before its turn, as a client waits for it
+    expedited: bool = False  # before its time, because a client waits
     phased: bool = True  # it has found its place in the period
-    live: bool = True  # False once the device was planned again
+    live: bool = True  # False after the device was planned again
     ticket: int = NOT_QUEUED  # its one valid place in the queues
     register: bool = False  # its monitor list must be registered first
     last: LastRead = field(default_factory=LastRead)
     counts: PollRecord = field(default_factory=PollRecord)
 
     def forget(self, now: float) -> float:
-        """Its values turn bad. Returns their age."""
+        """Forgets the last read, because its values turn bad. Returns their age."""
         age = 0.0 if self.last.at is None else now - self.last.at
         self.counts.worst_gap = max(self.counts.worst_gap, age)
         self.last.at = None
@@ -52,7 +52,7 @@ class Poll:
 
     @property
     def every(self) -> float:
-        """Seconds until it is due again: more and more where no reply comes."""
+        """Seconds until it is due again. They grow while no reply arrives."""
         every = self.device.interval(self.block)
         if self.missed:
             every = max(every, min(PAUSE_FIRST * 2.0 ** min(self.missed, 10), PAUSE_LONGEST))
@@ -60,7 +60,7 @@ class Poll:
 
     @property
     def deadline(self) -> float:
-        """A bad address is polled rarely, but then it does not wait as long."""
+        """The latest time to start the poll: its interval after due, also for a bad address."""
         return self.due + self.block.every
 
 
@@ -69,14 +69,14 @@ class Probe:
     """A job: resync with a device by a harmless request with its own token."""
 
     device: Device
-    outstanding: Span | None  # its reply must not be taken for an older one's
+    outstanding: Span | None  # a late reply to it must not look like the reply to the probe
     token: int
-    again: bool = False  # the line has settled: any reply is this one's
+    again: bool = False  # the line has settled: any reply belongs to this probe
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WriteTogether:
-    """A job: several writes to one device in one exchange."""
+    """A job: several writes to one device in one request."""
 
     device: Device
     writes: Sequence[Write]
@@ -84,7 +84,7 @@ class WriteTogether:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Confirm:
-    """A job: resync, then read back what an unclear write left in the device."""
+    """A job: resync, then read back the tag of an unclear write."""
 
     device: Device
     write: Write
@@ -95,7 +95,7 @@ class Confirm:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Repeat:
-    """A job: the same write once more, as its tag allows."""
+    """A job: the same write again, if the rule of its tag allows it."""
 
     device: Device
     write: Write
@@ -127,7 +127,7 @@ class Settle:
     guard: float
     gap: float
     after: Unfinished
-    error: DeviceError | None = None  # None: the reply may have been an older request's
+    error: DeviceError | None = None  # None: the reply may belong to an older request
     before: State = State.ONLINE  # of the device before it failed
     sent: bool = True  # something was sent at all
     failed: Sequence[tuple[Poll, DeviceError]] = ()  # polls of the same transaction
@@ -135,7 +135,7 @@ class Settle:
 
 @dataclass(frozen=True, slots=True)
 class Idle:
-    """Nothing to send until then, unless something comes in."""
+    """No job until then, unless bytes or a request arrive."""
 
     until: float
 
@@ -146,18 +146,18 @@ Job = Transacted | Idle
 
 @dataclass(slots=True)
 class InFlight:
-    """The job that was handed out, and what follows it before any other."""
+    """The current job of the line, and the job that must follow it."""
 
     job: Transacted | None = None
     begun: float = 0.0  # by the line's clock
-    charged: Device | None = None  # pays for the time: a poll in its turn, or a probe
+    charged: Device | None = None  # its use of the wire grows: by polls that were due, and probes
     open_polls: int = 0
     failed: list[tuple[Poll, DeviceError]] = field(default_factory=list)
     continuation: Transacted | None = None
     shared: "Traffic | None" = None  # of polls that share one transaction
 
     def traffic_of_all(self, shared: "Traffic", traffic: "Traffic") -> "Traffic":
-        """The traffic of all polls of a transaction once the last has ended, else none."""
+        """Returns the traffic of all polls of a transaction when the last poll ends, else none."""
         shared.sent += traffic.sent
         shared.heard += traffic.heard
         shared.exchanges += traffic.exchanges
@@ -168,10 +168,10 @@ class InFlight:
         return shared
 
     def resume(self, now: float) -> Transacted:
-        """Hands out the continuation. What confirms or repeats a write has its own time."""
+        """Returns the continuation. `Confirm` and `Repeat` begin their own time."""
         job, self.continuation = self.continuation, None
         if job is None:
-            raise AssertionError("nothing follows")
+            raise AssertionError("no continuation")
         self.job = job
         if isinstance(job, Confirm | Repeat):
             self.begun = now
@@ -179,7 +179,7 @@ class InFlight:
 
 
 def requests_of(job: Job) -> Sequence[Request]:
-    """The requests that the job carries out."""
+    """Returns the requests that the job carries out."""
     match job:
         case Write() | Command():
             return (job,)
@@ -193,7 +193,7 @@ def requests_of(job: Job) -> Sequence[Request]:
 
 
 def span_of(job: Unfinished) -> Span | None:
-    """The span whose reply may still arrive after the job; None leaves an older one as it was."""
+    """Returns the span that is outstanding if the job gets no reply; None: the older one stays."""
     match job:
         case Poll():
             return job.block.span
@@ -211,33 +211,33 @@ def span_of(job: Unfinished) -> Span | None:
 
 @dataclass(slots=True)
 class Traffic:
-    """What passed on the wire for a job."""
+    """Characters and requests of a job on the wire."""
 
     sent: int = 0  # characters
     heard: int = 0  # characters
-    exchanges: int = 0  # requests answered
-    turnaround: float = 0.0  # seconds that the station took for them, beyond the characters
+    exchanges: int = 0  # requests with a reply
+    turnaround: float = 0.0  # seconds of the station for them, without the characters
 
 
 @dataclass(frozen=True, slots=True)
 class Resynced:
-    """A probe was answered. Its reply can be told from those of so many open requests."""
+    """A probe was answered. Its reply differs from that of `told_from` outstanding requests."""
 
     told_from: int
 
 
 @dataclass(frozen=True, slots=True)
 class Sent:
-    """A write was carried out, or sent to stations that never acknowledge."""
+    """A write was acknowledged, or sent to stations that never acknowledge."""
 
     acknowledged: bool = True
-    held: Sequence[int] | None = None  # read back; None: the tag does not say `verify`
+    held: Sequence[int] | None = None  # the units read back; None: without `verify`
     refused_back: DeviceError | None = None  # reading back was refused
 
 
 @dataclass(frozen=True, slots=True)
 class Settled:
-    """The line is quiet again. `late`: seconds from the time-out to the late reply, if it came."""
+    """The line has settled. `late`: seconds from the time-out to the late reply, if any."""
 
     late: float | None
 

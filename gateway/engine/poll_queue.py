@@ -1,4 +1,4 @@
-"""Polls of one line by due time, then by deadline."""
+"""Sorts the polls of one line: by due time while they wait, by deadline when they are due."""
 
 import heapq
 import itertools
@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 
 from gateway.engine.jobs import EXPEDITED, Poll
 
-ROOM = 16  # entries a heap may hold beside twice the valid ones
+ROOM = 16  # entries of a heap in addition to twice the valid ones
 Heap = list[tuple[float, int, Poll]]
 
 
@@ -15,7 +15,7 @@ class PollQueue:
     """Two heaps: polls that wait until they are due, and due polls by deadline.
 
     Deletion is lazy: a poll's `ticket` names its one valid entry. All other entries are stale,
-    and are dropped when they come up or when there are too many.
+    and are dropped when they are first, or when there are too many.
     """
 
     __slots__ = ("_most_due", "_most_waiting", "_tickets", "due", "expedited", "waiting")
@@ -23,12 +23,14 @@ class PollQueue:
     def __init__(self) -> None:
         self.waiting: Heap = []  # by due time
         self.due: Heap = []  # by deadline; after `ripen` the first entry is valid
-        self.expedited: deque[Poll] = deque()  # before all due polls; after `ripen` likewise
+        self.expedited: deque[Poll] = (
+            deque()
+        )  # before all due polls; after `ripen` the first is valid
         self._tickets = itertools.count()
         self._most_waiting = self._most_due = ROOM
 
     def push(self, poll: Poll) -> None:
-        """The poll waits until it is due. Polls of a device that is not online are left out."""
+        """Adds a poll that waits until it is due, if its device is online."""
         if not (poll.live and poll.device.health.online) or poll.ticket == EXPEDITED:
             return
         poll.ticket = next(self._tickets)
@@ -43,13 +45,13 @@ class PollQueue:
             self.push(poll)
 
     def expedite(self, poll: Poll) -> None:
-        """The poll goes before all due polls."""
+        """Puts the poll before all due polls."""
         if poll.ticket != EXPEDITED:
             poll.ticket = EXPEDITED
             self.expedited.append(poll)
 
     def ripen(self, now: float) -> bool:
-        """Moves polls that have come due to their heap. True when there is one to hand out."""
+        """Moves polls that became due to their heap. Returns True if a poll can be sent."""
         waiting, due, expedited = self.waiting, self.due, self.expedited
         while waiting and waiting[0][0] <= now:
             _, ticket, poll = heapq.heappop(waiting)
@@ -65,7 +67,7 @@ class PollQueue:
         return bool(due or expedited)
 
     def valid(self) -> Iterator[Poll]:
-        """The due polls, in no order."""
+        """Yields the due polls, in no order."""
         return (entry[2] for entry in self.due if _is_valid(entry))
 
 
@@ -75,6 +77,6 @@ def _is_valid(entry: tuple[float, int, Poll]) -> bool:
 
 
 def _tidy(heap: Heap) -> int:
-    """Restores the heap. Returns the most entries it may have until it is looked through again."""
+    """Restores the heap. Returns the number of entries at which it is cleaned again."""
     heapq.heapify(heap)
     return 2 * len(heap) + ROOM

@@ -12,32 +12,32 @@ class LineRecord:
 
     opened: int = 0
     since: float = 0.0  # when it was opened last, by the line's clock
-    open_before: float = 0.0  # how long it was open the times before
+    open_before: float = 0.0  # seconds that it was open before that
     busy: float = 0.0  # characters on the wire, both ways
-    turnarounds: float = 0.0  # waiting for stations that answered
+    turnarounds: float = 0.0  # of stations that replied
     unasked: int = 0  # bytes that arrived outside of a transaction
     trouble: str = ""  # why the port is not open
 
 
 @dataclass(slots=True)
 class Record:
-    """Counts since the start. Times in seconds."""
+    """Counts of a device since the start. Times in seconds."""
 
     exchanges: int = 0
     writes: int = 0
     wire_time: float = 0.0
     late: int = 0  # replies after the time-out
     unasked: int = 0  # stray frames
-    heard: int = 0  # unsolicited frames that were understood
-    overruns: int = 0  # polls left out because the one before was late
-    overdue: int = 0  # blocks whose values turned bad because they were not read for too long
+    heard: int = 0  # correct unsolicited frames
+    overruns: int = 0  # polls that were skipped because the one before was late
+    overdue: int = 0  # blocks whose values became too old
     failures: Counter[str] = field(default_factory=Counter)  # by evidence
-    refusals: Counter[str] = field(default_factory=Counter)  # by the maker's code
-    turnaround: float | None = None  # what the station takes, measured
+    refusals: Counter[str] = field(default_factory=Counter)  # by the code of the device
+    turnaround: float | None = None  # measured
     slowest_write: float = 0.0
 
     def count_exchanges(self, exchanges: int, characters: float, turnarounds: float) -> None:
-        """So many requests were answered; seconds of the wire, and of the station's own time."""
+        """Counts requests with a reply, and the seconds of their characters and turnarounds."""
         self.wire_time += characters + turnarounds
         if exchanges:
             self.exchanges += exchanges
@@ -80,6 +80,6 @@ class PollRecord:
     """Counts of one block since it was planned. Times in seconds."""
 
     reads: int = 0  # good ones
-    overruns: int = 0  # rounds left out because the one before was late
+    overruns: int = 0  # rounds that were skipped because the one before was late
     mean_gap: float = 0.0  # between two good reads, smoothed over about ten
     worst_gap: float = 0.0

@@ -21,17 +21,17 @@ from gateway.engine.schedule import Schedule
 from gateway.errors import Busy, DeviceError, LineDown, Refused, Unclear
 
 BROADCAST_PAUSE = 0.1  # seconds
-STOPPED = "the gateway stopped before the acknowledgement came; it may have been done"
+STOPPED = "the gateway stopped before the acknowledgement arrived; it may be done"
 
 
 class Differs(Unclear):
-    """The write was acknowledged, but reading back does not show it."""
+    """The write was acknowledged, but the device holds another value."""
 
 
 class RequestResults:
     """The rules for results of writes and commands.
 
-    A write is never simply sent again: its tag says what follows an unclear end.
+    After an unclear end, the rule of the tag decides if a write is sent again.
     """
 
     def __init__(self, schedule: Schedule, results: Results, effects: Effects) -> None:
@@ -42,7 +42,7 @@ class RequestResults:
     def conclude(
         self, job: RequestJob, result: Result, traffic: Traffic, now: float, time: int
     ) -> Unclear | Repeat | None:
-        """Returns what is left to do: to settle after an unclear end, or to write once more."""
+        """Returns the next step: settle after an unclear end, or write again."""
         if isinstance(result, Unclear):
             return result
         if isinstance(result, LineDown):
@@ -62,7 +62,7 @@ class RequestResults:
         return None
 
     def settled(self, settle: Settle, now: float) -> Confirm | None:
-        """The line is quiet after an unclear end. Returns what the tag's rule allows next."""
+        """Ends the request after an unclear end, or returns the step that the tag allows."""
         job, error = settle.after, settle.error
         if error is None:
             return None
@@ -80,7 +80,7 @@ class RequestResults:
         return None
 
     def abandon(self, job: Transacted, why: LineDown | None, now: float) -> None:
-        """The port was lost in the middle of the job. `why` None: the gateway stops."""
+        """Ends the requests of a job when the port is lost. `why` None: the gateway stops."""
         for request in requests_of(job):
             span, what = None, "the command"
             if isinstance(request, Write):
@@ -92,7 +92,7 @@ class RequestResults:
     def _written(
         self, write: Write, result: Result, first: DeviceError | None, now: float, time: int
     ) -> Outcome:
-        """`first`: the unclear end of the first try, of a write that was repeated."""
+        """Returns the outcome. `first`: the unclear end of the first try of a repeated write."""
         device = write.device
         match result:
             case Sent(acknowledged=False):
@@ -109,7 +109,7 @@ class RequestResults:
                 return write.result(now, time, verified=held is not None)
             case Refused():
                 self._refused(device, result, now, time)
-                return first or result  # a refused repetition says nothing of the first try
+                return first or result  # a refused repetition says nothing about the first try
         raise TypeError(f"{result!r} is no result of a write")
 
     def _written_together(self, job: WriteTogether, result: Result, now: float, time: int) -> None:
@@ -124,7 +124,7 @@ class RequestResults:
             self._end(write, write.result(now, time), now)
 
     def _confirmed(self, job: Confirm, result: Result, now: float, time: int) -> Repeat | None:
-        """`result`: the units read back, None where the tag does not say `verify`."""
+        """Ends the write, or returns its repetition. `result.held`: None without `verify`."""
         if not isinstance(result, Sent | Refused):
             raise TypeError(f"{result!r} is no result of a write")
         write, rule = job.write, job.write.tag.write
@@ -159,7 +159,7 @@ class RequestResults:
         device.record.count_refusal(error)
 
     def _pause(self, device: Device) -> None:
-        """After a broadcast the stations need time to take it in, and none replies."""
+        """Pauses after a broadcast: the stations need time for it, and none replies."""
         self._effects.pause(device.turnaround.configured or BROADCAST_PAUSE)
 
     def _end(self, request: Request, outcome: Outcome, now: float) -> None:
@@ -168,4 +168,4 @@ class RequestResults:
             request.device.record.count_write(now - request.submitted)
             poll = self._schedule.reader(request.device, request.tag)
             if poll is not None:
-                self._schedule.expedite(poll)  # the new value is read at once
+                self._schedule.expedite(poll)  # the client sees the new value soon

@@ -16,7 +16,7 @@ MOST_WAITING = 1000  # requests
 
 
 class CommandResult(NamedTuple):
-    """A device's answer to a command; `time` in ns since 1970, `took` in seconds."""
+    """The reply of a device to a command; `time` in ns since 1970, `took` in seconds."""
 
     answer: str
     time: int
@@ -34,8 +34,8 @@ class Write:
     tag: Tag
     units: Sequence[int]
     submitted: float
-    alone: bool = False  # it was refused together with others: it is sent alone now
-    value: Value = field(init=False)  # what the device holds after it, rounded to its steps
+    alone: bool = False  # refused together with others: it is now sent alone
+    value: Value = field(init=False)  # as the device will hold it, rounded to its steps
 
     def __post_init__(self) -> None:
         value = self.tag.from_units(self.units)
@@ -43,23 +43,23 @@ class Write:
 
     @property
     def expires(self) -> float:
-        """When it is no longer sent: its client has given up."""
+        """The time after which it is not sent, because the client no longer waits."""
         return self.submitted + WRITE_EXPIRY
 
     @property
     def plain(self) -> bool:
-        """One exchange is enough, so it may share that exchange with others."""
+        """True if one request is enough, which it can share with other writes."""
         rule = self.tag.write
         needs_more = rule is not None and (rule.verify or rule.repeat)
         return not (self.alone or needs_more) and self.tag.address.bit is None
 
     @property
     def latest(self) -> bool:
-        """Of several that wait, only the last is sent."""
+        """True if only the last of several waiting writes is sent."""
         return self.tag.write is not None and self.tag.write.latest
 
     def holds(self, units: Sequence[int]) -> bool:
-        """The device holds what was written. `units`: as read back from it."""
+        """Returns True if `units`, as read back, are the written value."""
         if self.tag.shape is not None:  # bytes are written, a value is read
             return self.tag.decode(units) == self.tag.from_units(self.units)
         bit = self.tag.address.bit
@@ -70,13 +70,13 @@ class Write:
     def result(
         self, now: float, time: int, *, verified: bool = False, acknowledged: bool = True
     ) -> WriteResult:
-        """It was carried out. `now` by the line's clock, `time` in ns since 1970."""
+        """Returns the result. `now` by the line's clock, `time` in ns since 1970."""
         return WriteResult(self.value, time, now - self.submitted, verified, acknowledged)
 
 
 @dataclass(slots=True, eq=False)
 class Command:
-    """Run, stop, loopback, model ... for one device."""
+    """A command to one device: run, stop, loopback, model and others."""
 
     device: Device
     name: str
@@ -85,7 +85,7 @@ class Command:
 
     @property
     def expires(self) -> float:
-        """When it is no longer sent: its client has given up."""
+        """The time after which it is not sent, because the client no longer waits."""
         return self.submitted + WRITE_EXPIRY
 
 
@@ -93,7 +93,7 @@ Request = Write | Command
 
 
 def can_share(writes: Sequence[Write]) -> bool:
-    """All these writes to one device fit in one exchange."""
+    """Returns True if all these writes to one device fit in one request."""
     driver = writes[0].device.driver
     if not isinstance(driver, ScatteredWriter) or not all(write.plain for write in writes):
         return False
@@ -101,17 +101,17 @@ def can_share(writes: Sequence[Write]) -> bool:
 
 
 def why_not_commanded(driver: AnyDriver, command: str, *, control: bool) -> str:
-    """The reason why a device does not take this command; empty where it does."""
+    """Returns the reason to refuse a command; empty if the device accepts it."""
     known = driver.controls if isinstance(driver, Controllable) else frozenset()
     if not known:
         return f"a {driver.protocol} device takes no commands"
     if command not in known:
         return f"{command!r} is none of its commands: {', '.join(sorted(known))}"
-    return "" if control else "the file does not say `control: true` of it"
+    return "" if control else "`control: true` is missing in the file"
 
 
 class RequestQueue:
-    """The waiting requests of one line. Those of one device stay in their order."""
+    """The waiting requests of one line. Requests to one device keep their order."""
 
     def __init__(self) -> None:
         self.waiting: deque[Request] = deque()
@@ -129,20 +129,20 @@ class RequestQueue:
         return None
 
     def submit(self, request: Request) -> bool:
-        """False when too many requests wait already."""
+        """Adds a request. Returns False if too many requests wait already."""
         if len(self.waiting) >= MOST_WAITING:
             return False
         self.waiting.append(request)
         return True
 
     def superseded(self, write: Write) -> list[Request]:
-        """Takes out the waiting writes that `write` replaces: its tag says `latest`."""
+        """Takes out the waiting writes that `write` replaces, if its tag has `latest`."""
         if not write.latest:
             return []
         return self._out(lambda other: isinstance(other, Write) and other.tag is write.tag)
 
     def companions(self, write: Write) -> list[Write]:
-        """Takes out the device's next writes that fit in one exchange with this one."""
+        """Takes out the next writes to the device that fit in one request with this one."""
         found: list[Write] = []
         for request in self.waiting:
             if request.device is not write.device:
@@ -155,13 +155,13 @@ class RequestQueue:
         return found
 
     def each_alone(self, writes: Sequence[Write]) -> None:
-        """They were refused together, so none was carried out: they are next, one by one."""
+        """Puts back writes that were refused together, so none was done: now one by one."""
         for write in reversed(writes):
             write.alone = True
             self.waiting.appendleft(write)
 
     def withdraw(self, device: Device | None = None) -> list[Request]:
-        """Takes out the waiting requests (to one device) that will not be sent."""
+        """Takes out all waiting requests, or those to one device."""
         return self._out(lambda request: device is None or request.device is device)
 
     def expired(self, now: float) -> list[Request]:

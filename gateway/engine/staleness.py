@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 
-from gateway.engine.ages import asked_of, worst_ages
+from gateway.engine.ages import polled_block, worst_ages
 from gateway.engine.device import Device
 from gateway.engine.effects import Effects
 from gateway.engine.health import State
@@ -33,11 +33,11 @@ class Staleness:
         self._logged: dict[Device, float] = {}
 
     def stop(self) -> None:
-        """The line is closed: all its values are bad."""
+        """Stops, because the line is closed and all its values are bad."""
         self.due = NEVER
 
     def look(self, now: float, time: int) -> None:
-        """Turns bad what is too old. `time`: ns since 1970."""
+        """Turns values bad that are too old. `time`: ns since 1970."""
         self.due = NEVER
         for poll, limit in self._limits():
             if poll.last.at is None:
@@ -48,7 +48,7 @@ class Staleness:
                 self._turn_bad(poll, now, time)
 
     def _limits(self) -> Iterator[tuple[Poll, float]]:
-        """How old the values of each poll may get. Those of devices not online are bad already."""
+        """Yields the age limit of each poll of an online device; other values are bad already."""
         devices = self._schedule.devices
         failing = any(device.health.state is State.FAILING for device in devices)
         stretch = 1.0 if failing else 2.0
@@ -60,12 +60,12 @@ class Staleness:
                 yield poll, stretch * age + longest_reply
 
     def _worst_ages(self) -> tuple[list[Poll], list[float]]:
-        """Computed again only where the plan has changed."""
+        """Returns the polls with their worst ages, calculated again only after a new plan."""
         online = [device for device in self._schedule.devices if device.health.online]
         plan = [(d, self._schedule.polls(d), d.turnaround.expected) for d in online]
         polls = [poll for _, polls, _ in plan for poll in polls]
         if plan != self._plan:
-            blocks = [asked_of(poll.device, poll.block) for poll in polls]
+            blocks = [polled_block(poll.device, poll.block) for poll in polls]
             self._plan, self._ages = plan, worst_ages(blocks)
         return polls, self._ages
 

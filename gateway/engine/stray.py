@@ -1,4 +1,4 @@
-"""Stray frames: counted, and explained in the log by the driver that knows them."""
+"""Stray frames: counted, and explained in the log by the driver."""
 
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -8,14 +8,15 @@ from gateway.engine.effects import Effects
 from gateway.errors import Garbled
 from gateway.protocols.driver import Codec, StrayFrames
 
-LOG_EVERY = 10.0  # seconds for each device; frames in between are logged for debugging only
+LOG_EVERY = 10.0  # seconds for each device; other frames are logged at level debug
 PAUSE = 0.1  # seconds without a byte after which a frame begins
 
 
 class Stray:
-    """Frames of one line that are no reply to any request.
+    """Counts and logs frames of one line that are no reply to any request.
 
-    A PLC counts as having forgotten its monitor list then: another master may have spoken to it.
+    Another master may have sent them and changed the monitor list of a PLC. So the line registers
+    the list again.
     """
 
     def __init__(self, line: str, devices: Sequence[Device], effects: Effects) -> None:
@@ -27,20 +28,20 @@ class Stray:
         self._logged: dict[Device, float] = {}
 
     def received(self, data: bytes, now: float) -> None:
-        """Bytes that arrived outside of a transaction."""
+        """Takes bytes that arrived outside of a transaction."""
         if now - self._last > PAUSE:
             self._codecs.clear()
         self._last = now
         for device in self._devices:
             device.forget_list()
             if isinstance(device.driver, StrayFrames):
-                heard = self._feed(device, data)
-                own = [frame for frame in heard if device.driver.from_this_station(frame)]
+                found = self._feed(device, data)
+                own = [frame for frame in found if device.driver.from_this_station(frame)]
                 device.record.count_stray(len(own))
                 self.frames(device, own, now)
 
     def frames(self, device: Device, frames: Iterable[Any], now: float) -> None:
-        """Whole frames, already counted."""
+        """Logs complete frames that are already counted."""
         for frame in frames:
             device.forget_list()
             if not isinstance(device.driver, StrayFrames):

@@ -1,4 +1,4 @@
-"""Unsolicited frames of one line: bytes in, samples out, replies back."""
+"""Unsolicited frames of one line: bytes in, samples and replies out."""
 
 from collections import deque
 from collections.abc import Collection, Iterable, Sequence
@@ -19,22 +19,24 @@ from gateway.protocols.unsolicited import (
 )
 from gateway.tags import Reason, Tag, of_field
 
-REPLY_WITHIN = 1.0  # seconds; a device that waited longer has given up
+REPLY_WITHIN = 1.0  # seconds; after that the device no longer waits
 MOST_REPLIES = 16  # waiting
-HELD_FOR = 1.0  # seconds that an incomplete frame may keep the line from all others
+HELD_FOR = 1.0  # seconds that an incomplete frame may hold up the line
 NEVER = float("inf")
 
 
 @dataclass(slots=True, eq=False)
-class _Speaker:
+class _Sender:
     """A device that sends unsolicited frames, and the tags of its fields."""
 
     device: Device
     listener: UnsolicitedListener
     unsolicited: Collection[str]
     tags: dict[str, list[Tag]] = field(default_factory=dict)  # by field
-    understood: bool = True  # its last frame was
-    unreadable: set[str] = field(default_factory=set)  # fields, in the last frame with them
+    understood: bool = True  # its last frame was correct
+    unreadable: set[str] = field(
+        default_factory=set
+    )  # fields that were garbled in their last frame
 
     def __post_init__(self) -> None:
         for tag in self.device.tags:
@@ -47,7 +49,7 @@ class _Speaker:
 
 
 def unsolicited_tags(device: Device) -> list[Tag]:
-    """The tags whose values arrive unsolicited and in no other way."""
+    """Returns the tags whose values arrive only unsolicited."""
     driver = device.driver
     if not isinstance(driver, Unsolicited):
         return []
@@ -55,10 +57,10 @@ def unsolicited_tags(device: Device) -> list[Tag]:
 
 
 class UnsolicitedFrames:
-    """The listeners of one line. A line without a device that speaks unsolicited has none."""
+    """The listeners of one line: one for each device that sends unsolicited frames."""
 
     def __init__(self, devices: Sequence[Device], results: Results, effects: Effects) -> None:
-        self.speakers: list[_Speaker] = []
+        self.speakers: list[_Sender] = []
         self._devices = devices
         self._results = results
         self._effects = effects
@@ -66,52 +68,52 @@ class UnsolicitedFrames:
         self._held_since: float | None = None
 
     def opened(self, now: float) -> None:
-        """The port was opened, perhaps in the middle of a frame."""
+        """Starts the listeners. The port may have been opened in the middle of a frame."""
         self._replies.clear()
         self._held_since = None
         self.speakers = [
-            _Speaker(device, device.driver.listener(now), device.driver.unsolicited)
+            _Sender(device, device.driver.listener(now), device.driver.unsolicited)
             for device in self._devices
             if isinstance(device.driver, Unsolicited) and device.driver.sends_unsolicited
         ]
 
     def received(self, data: bytes, now: float, time: int) -> None:
-        """Bytes that arrived outside of a transaction."""
-        for speaker in self.speakers:
-            self._apply(speaker, speaker.listener.received(data, now), now, time)
+        """Takes bytes that arrived outside of a transaction."""
+        for sender in self.speakers:
+            self._apply(sender, sender.listener.received(data, now), now, time)
 
     def unmatched(self, device: Device, frame: Any, now: float, time: int) -> None:
-        """A frame that arrived during a transaction with this device and is not its reply."""
-        for speaker in self.speakers:
-            if speaker.device is device:
-                self._apply(speaker, speaker.listener.unmatched(frame, now), now, time)
+        """Takes a frame that arrived in a transaction with this device and is not its reply."""
+        for sender in self.speakers:
+            if sender.device is device:
+                self._apply(sender, sender.listener.unmatched(frame, now), now, time)
 
     def transaction_ended(self, device: Device, now: float, *, sent: int, heard: int) -> None:
-        """An incomplete frame from before is void."""
-        for speaker in self.speakers:
-            if heard or (sent and speaker.device is not device):
-                speaker.listener.restart(now)
+        """Drops incomplete frames that began before the transaction."""
+        for sender in self.speakers:
+            if heard or (sent and sender.device is not device):
+                sender.listener.restart(now)
 
     @property
     def due(self) -> float:
-        """When `tick` must be called, though nothing was received."""
+        """The time at which `tick` must be called if no byte arrives."""
         dues = (due for each in self.speakers if (due := each.listener.due) is not None)
         return min(dues, default=NEVER)
 
     def tick(self, now: float, time: int) -> None:
-        """Time has passed: silence ends frames, and fields turn stale."""
-        for speaker in self.speakers:
-            if (due := speaker.listener.due) is not None and due <= now:
-                self._apply(speaker, speaker.listener.tick(now), now, time)
+        """Lets silence end frames, and turns old fields stale."""
+        for sender in self.speakers:
+            if (due := sender.listener.due) is not None and due <= now:
+                self._apply(sender, sender.listener.tick(now), now, time)
 
     def next(self, now: float) -> Answer | Idle | None:
-        """The job that goes before all others: a reply, or to stay quiet during a frame."""
+        """Returns a job that precedes all others: a reply, or `Idle` during a frame."""
         while self._replies:
             reply = self._replies.popleft()
             if now < reply.until:
                 return reply
             self._effects.warning(
-                "reply dropped", device=reply.device.name, why="the line was busy for too long"
+                "reply dropped", device=reply.device.name, why="the line was busy too long"
             )
         until = self._busy_until(now)
         return None if until is None else Idle(until)
@@ -127,63 +129,61 @@ class UnsolicitedFrames:
         return end if now < end else None
 
     def _apply(
-        self, speaker: _Speaker, events: Iterable[UnsolicitedEvent], now: float, time: int
+        self, sender: _Sender, events: Iterable[UnsolicitedEvent], now: float, time: int
     ) -> None:
         for event in events:
             match event:
                 case UnsolicitedFrame():
-                    self._understood(speaker, event, now, time)
+                    self._understood(sender, event, now, time)
                 case Garbled():
-                    self._garbled(speaker, event, time)
+                    self._garbled(sender, event, time)
                 case Stale(fields):
-                    self._stale(speaker, fields, time)
+                    self._stale(sender, fields, time)
 
-    def _understood(
-        self, speaker: _Speaker, frame: UnsolicitedFrame, now: float, time: int
-    ) -> None:
-        device = speaker.device
+    def _understood(self, sender: _Sender, frame: UnsolicitedFrame, now: float, time: int) -> None:
+        device = sender.device
         device.record.count_unsolicited()
-        speaker.understood = True
+        sender.understood = True
         if device.broadcast:  # a device that is polled must reply to count as online
             device.health.understood()
             self._results.answered(device, now, time)
-        self._count_unreadable(speaker, frame)
+        self._count_unreadable(sender, frame)
         samples = [
             of_field(tag, value, time)
             for name, value in frame.values.items()
-            for tag in speaker.tags.get(name, ())
+            for tag in sender.tags.get(name, ())
         ]
         if samples:
             self._effects.samples(samples)
         if frame.reply is not None:
             self._queue_reply(device, frame.reply, now)
 
-    def _count_unreadable(self, speaker: _Speaker, frame: UnsolicitedFrame) -> None:
-        """Fields that could be read before are logged."""
+    def _count_unreadable(self, sender: _Sender, frame: UnsolicitedFrame) -> None:
+        """Counts garbled fields. Logs a field that was correct before."""
         for name, value in frame.values.items():
             if not isinstance(value, Garbled):
-                speaker.unreadable.discard(name)
+                sender.unreadable.discard(name)
                 continue
-            speaker.device.record.count_failure(value)
-            if name not in speaker.unreadable:
-                speaker.unreadable.add(name)
-                self._log("field garbled", speaker.device, value)
+            sender.device.record.count_failure(value)
+            if name not in sender.unreadable:
+                sender.unreadable.add(name)
+                self._log("field garbled", sender.device, value)
 
-    def _garbled(self, speaker: _Speaker, damage: Garbled, time: int) -> None:
-        device = speaker.device
+    def _garbled(self, sender: _Sender, damage: Garbled, time: int) -> None:
+        device = sender.device
         if device.broadcast:
             device.health.not_understood(damage)
-        if speaker.understood:  # damage after damage is logged once
+        if sender.understood:  # repeated damage is logged once
             self._log("frame garbled", device, damage)
-        speaker.understood = False
+        sender.understood = False
         device.record.count_failure(damage)
-        self._bad(speaker, speaker.tags, Reason.GARBLED, str(damage), time)
+        self._bad(sender, sender.tags, Reason.GARBLED, str(damage), time)
 
-    def _stale(self, speaker: _Speaker, fields: Iterable[str], time: int) -> None:
-        device = speaker.device
-        detail = "not heard for longer than its stale_after"
-        self._bad(speaker, fields, Reason.NO_REPLY, detail, time)
-        if device.broadcast and speaker.listener.all_stale and device.health.online:
+    def _stale(self, sender: _Sender, fields: Iterable[str], time: int) -> None:
+        device = sender.device
+        detail = "not received for longer than its stale_after"
+        self._bad(sender, fields, Reason.NO_REPLY, detail, time)
+        if device.broadcast and sender.listener.all_stale and device.health.online:
             device.restart()
             self._effects.online(device, False)
             self._effects.warning("device offline", device=device.name, why=detail)
@@ -197,11 +197,11 @@ class UnsolicitedFrames:
             self._replies.append(Answer(device, frame, now + REPLY_WITHIN))
 
     def _bad(
-        self, speaker: _Speaker, fields: Iterable[str], reason: Reason, detail: str, time: int
+        self, sender: _Sender, fields: Iterable[str], reason: Reason, detail: str, time: int
     ) -> None:
-        if tags := speaker.tags_of(fields):
+        if tags := sender.tags_of(fields):
             self._effects.bad(tags, reason, time, detail)
 
     def _log(self, event: str, device: Device, damage: Garbled) -> None:
-        heard = damage.data.hex(" ")
-        self._effects.info(event, device=device.name, why=str(damage), bytes=heard)
+        data = damage.data.hex(" ")
+        self._effects.info(event, device=device.name, why=str(damage), bytes=data)

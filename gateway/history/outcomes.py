@@ -1,4 +1,4 @@
-"""Outcomes of writes that wait for the disk. Queries find them here meanwhile."""
+"""Outcomes of writes that wait for the disk, where queries already find them."""
 
 import threading
 from collections import deque

@@ -1,4 +1,4 @@
-"""The limits of the history file: its size, and the age of its samples. History thread only."""
+"""Limits the size of the history file and the age of its samples, on the history thread."""
 
 import time
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""The way of samples and outcomes from memory to the open history file. History thread only."""
+"""Moves samples and outcomes from memory to the open history file, on the history thread."""
 
 import sqlite3
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Queries from the network. Each one is answered or refused, and always finished.
+"""Answers or refuses each query from the network, and always finishes it.
 
 The event loop sorts them, waits for the plant where it must, and hands the replies to the
 answering threads.

@@ -1,4 +1,4 @@
-"""Publishing again what subscribers may have missed.
+"""Publishes samples again that subscribers may have missed.
 
 All values after a link has returned, because Zenoh stores nothing; bad values with their heartbeat.
 Good values are repeated as they are read. A value of an event tag is published once; only its bad

@@ -36,7 +36,7 @@ from tests.zenoh_peer import ZenohPeer, free_endpoint
 
 TAGS = {f"d{n}": {"address": f"D{n}"} for n in range(700, 708)}
 # The command itself, with a state file that is written more often.
-SOON = "import gateway.service as s; s.KEEP_EVERY = 0.05; from gateway.cli.main import main; main()"
+SOON = "import gateway.service as s; s.SAVE_EVERY = 0.05; from gateway.cli.main import main; main()"
 # The command itself, with a history that fails at the first sample.
 BROKEN = """
 from gateway.history.file import HistoryFile
@@ -225,7 +225,7 @@ def test_a_stalled_disk_does_not_delay_the_end(tmp_path: Path) -> None:
     with Program(sys.executable, "-c", SOON, "run", path) as program:
         program.says("Zenoh session ready")
         assert program.end() == 0
-        assert program.has_said("did not take in time what was learned")
+        assert program.has_said("state file close timed out")
         assert not program.has_said("Traceback")
 
 
@@ -249,9 +249,9 @@ async def test_history_gets_the_time_that_zenoh_leaves() -> None:
     history, state_file = Disk(), Disk()
     as_history: Any = history
     as_state_file: Any = state_file
-    face = asyncio.create_task(zenoh())
+    zenoh_task = asyncio.create_task(zenoh())
     await asyncio.sleep(0)
     # Private: the order and the times of the end are the subject; `run` needs signals and ports.
-    await service._put_away(face, as_history, as_state_file)
+    await service._close(zenoh_task, as_history, as_state_file)
     assert history.given <= service.END_WITHIN - zenoh_takes < 2
-    assert state_file.given <= service.KEPT_WITHIN
+    assert state_file.given <= service.STATE_FILE_WITHIN

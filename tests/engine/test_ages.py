@@ -4,7 +4,7 @@ import random
 
 import pytest
 
-from gateway.engine.ages import asked, load_of, worst_ages
+from gateway.engine.ages import load_of, polled_blocks, worst_ages
 from gateway.engine.device import Device
 from gateway.engine.jobs import Idle, Poll
 from gateway.engine.requests import Write
@@ -63,7 +63,7 @@ def ages(devices: list[Device], seconds: float, written: Device | None = None) -
 
 def over(found: dict[Poll, float]) -> float:
     """The worst age as a share of the promised one."""
-    blocks = asked([*dict.fromkeys(poll.device for poll in found)])
+    blocks = polled_blocks([*dict.fromkeys(poll.device for poll in found)])
     promised = dict(zip([(b.device, b.block) for b in blocks], worst_ages(blocks), strict=True))
     return max(age / promised[poll.device, poll.block] for poll, age in found.items())
 
@@ -71,7 +71,7 @@ def over(found: dict[Poll, float]) -> float:
 @pytest.mark.parametrize("seed", range(12))
 def test_no_value_gets_older_than_promised(seed: int) -> None:
     devices = random_devices(random.Random(seed))
-    overloaded = load_of(asked(devices)) > 1
+    overloaded = load_of(polled_blocks(devices)) > 1
     assert over(ages(devices, 120.0)) <= (1.25 if overloaded else 1.0)
 
 
@@ -98,6 +98,6 @@ def test_a_device_that_is_written_all_the_time_is_polled_like_the_others() -> No
 
 def test_intervals_of_one_device_wait_alike() -> None:
     """By earliest deadline the slow ones are not stretched as the fast ones are."""
-    [fast, slow] = worst_ages(asked([answering(1, *[0.1] * 10, *[10.0] * 100)]))[::109]
+    [fast, slow] = worst_ages(polled_blocks([answering(1, *[0.1] * 10, *[10.0] * 100)]))[::109]
     assert fast > 0.3
     assert slow - fast == pytest.approx(2 * (10.0 - 0.1))

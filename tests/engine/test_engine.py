@@ -21,7 +21,7 @@ from typing import get_args
 
 import pytest
 
-from gateway.engine.ages import asked, worst_ages
+from gateway.engine.ages import polled_blocks, worst_ages
 from gateway.engine.effects import Effect
 from gateway.engine.health import State
 from gateway.engine.jobs import (
@@ -727,7 +727,7 @@ def test_old_values_turn_bad_at_the_deadline() -> None:
         found += rig.note(rig.engine.expire(rig.now, rig.time))
     assert kinds(found) == "bad:overdue"
     [poll] = rig.engine.schedule.polls(rig.device)
-    [age] = worst_ages(asked([rig.device]))
+    [age] = worst_ages(polled_blocks([rig.device]))
     assert rig.now - read == pytest.approx(2 * age + rig.device.longest_reply)
     assert poll.last.at is None
 

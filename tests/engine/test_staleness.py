@@ -2,7 +2,7 @@
 
 import asyncio
 
-from gateway.engine.ages import asked, worst_ages
+from gateway.engine.ages import polled_blocks, worst_ages
 from gateway.engine.device import Device
 from gateway.tags import Quality, Reason
 from tests.sim.plant import Plant, device, make_tag, plant, running
@@ -16,7 +16,7 @@ def scattered(count: int, station: int = 1, every: float = 0.5) -> Device:
 
 def limit(line: Plant) -> float:
     """By the rule: twice the worst age promised, and what one failure takes."""
-    return 2 * max(worst_ages(asked(line.line.engine.devices))) + 0.5 + 0.5
+    return 2 * max(worst_ages(polled_blocks(line.line.engine.devices))) + 0.5 + 0.5
 
 
 @on_virtual_time

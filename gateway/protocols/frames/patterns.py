@@ -1,4 +1,4 @@
-"""Regular expressions for frames that no frame can keep busy for long.
+"""Regular expressions whose matching time is short for every frame.
 
 Python's matcher tries every way to divide a frame among the repeats of a pattern; of some
 patterns a frame of 40 bytes takes years, and the whole gateway would stand still. So the ways
