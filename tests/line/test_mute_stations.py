@@ -1,4 +1,4 @@
-"""Stations that do not reply: their values turn bad, and the others keep their share of the line."""
+"""Stations that do not reply: their values turn bad, the others keep their share of the line."""
 
 import asyncio
 

@@ -2,6 +2,11 @@
 
 from dataclasses import dataclass
 
+LINE = " ".join(
+    f"tests/line/test_{name}.py"
+    for name in ("late_replies", "load", "mute_stations", "ports", "requests", "damaged_replies")
+)
+
 
 @dataclass(frozen=True)
 class Mutant:
@@ -23,7 +28,7 @@ MUTANTS = (
         "engine/engine.py",
         "            0.0 if before is State.OFFLINE else device.settings.late_guard,\n",
         "            0.0,\n",
-        "tests/line/test_line.py",
+        LINE,
         (54, 55, 53, 48),
         "late",
     ),
@@ -32,7 +37,7 @@ MUTANTS = (
         "engine/health.py",
         "the line waits no longer\n        self.needs_resync = self.answerable\n",
         "the line waits no longer\n",
-        "tests/line/test_line.py",
+        LINE,
         (54, 55, 53, 14, 48),
         "tardy",
     ),
@@ -169,7 +174,7 @@ MUTANTS = (
         "engine/request_results.py",
         "elif rule is not None and rule.repeat and now < write.expires:",
         "elif rule is not None and now < write.expires:",
-        "tests/line/test_writing.py tests/line/test_line.py",
+        "tests/line/test_writing.py " + LINE,
         (20, 14, 12),
     ),
     Mutant(
@@ -177,7 +182,7 @@ MUTANTS = (
         "engine/requests.py",
         "        return list(units) == list(self.units)\n",
         "        return True\n",
-        "tests/line/test_writing.py tests/line/test_line.py",
+        "tests/line/test_writing.py " + LINE,
         (20, 14, 12, 59, 23, 44),
     ),
     Mutant(
@@ -185,28 +190,28 @@ MUTANTS = (
         "engine/results.py",
         "        if not unknown and health.consecutive_failures <= device.timing.retries:\n",
         "        if not unknown:\n",
-        "tests/line/test_line.py",
+        LINE,
     ),
     Mutant(
         "values of an offline device stay good",
         "engine/effects.py",
         "bad(tag, reason, time, detail) for tag in tags]",
         "bad(tag, reason, time, detail) for tag in tags if reason is not Reason.NO_REPLY]",
-        "tests/line/test_line.py",
+        LINE,
     ),
     Mutant(
         "values stay good when the port is lost",
         "engine/engine.py",
         "            self._effects.bad(device.tags, Reason.LINE_DOWN, time, why)\n",
         "            pass\n",
-        "tests/line/test_line.py",
+        LINE,
     ),
     Mutant(
         "an echo is taken for a reply",
         "line/transaction.py",
         "        if channel.echo.strip and not (data := channel.echo.without(data)):\n",
         "        if False:\n",
-        "tests/line/test_transaction.py tests/line/test_line.py",
+        "tests/line/test_transaction.py " + LINE,
         (6, 2),
     ),
     Mutant(
@@ -242,7 +247,7 @@ MUTANTS = (
         "engine/schedule.py",
         "        self._failing_lane = now + took\n",
         "        self._failing_lane = now\n",
-        "tests/engine/test_schedule.py tests/line/test_line.py",
+        "tests/engine/test_schedule.py " + LINE,
     ),
     Mutant(
         "age by a clock that is set",
@@ -273,7 +278,7 @@ MUTANTS = (
         "line/channel.py",
         "        await self._port.close()\n",
         "            pass\n",
-        "tests/line/test_line.py tests/test_app.py",
+        LINE + " tests/test_app.py",
     ),
     Mutant(
         "nothing is overdue",
@@ -315,49 +320,49 @@ MUTANTS = (
         "engine/health.py",
         "    (_S.ONLINE, _E.UNCLEAR): _S.FAILING,\n",
         "    (_S.ONLINE, _E.UNCLEAR): _S.ONLINE,\n",
-        "tests/engine tests/line/test_line.py",
+        "tests/engine " + LINE,
     ),
     Mutant(
         "an offline device never comes back",
         "engine/health.py",
         "    (_S.OFFLINE, _E.ANSWERED): _S.ONLINE,\n",
         "    (_S.OFFLINE, _E.ANSWERED): _S.OFFLINE,\n",
-        "tests/engine tests/line/test_line.py",
+        "tests/engine " + LINE,
     ),
     Mutant(
         "a reopened line polls without a probe first",
         "engine/health.py",
         "    (_S.ONLINE, _E.RESTARTED): _S.STARTING,\n",
         "    (_S.ONLINE, _E.RESTARTED): _S.ONLINE,\n",
-        "tests/engine tests/line/test_line.py",
+        "tests/engine " + LINE,
     ),
     Mutant(
         "the pause between two probes does not grow",
         "engine/health.py",
         "min(max(2 * self.pause, PAUSE_FIRST), PAUSE_LONGEST)",
         "PAUSE_FIRST",
-        "tests/engine tests/line/test_line.py",
+        "tests/engine " + LINE,
     ),
     Mutant(
         "a waiting request sets no deadline",
         "engine/engine.py",
         "            deadline = min(deadline, self.schedule.requests.first.expires)\n",
         "            pass\n",
-        "tests/engine tests/line/test_line.py",
+        "tests/engine " + LINE,
     ),
     Mutant(
         "a request that waited too long is sent",
         "engine/engine.py",
         "        for request in self.schedule.requests.expired(now):\n",
         "        for request in ():\n",
-        "tests/engine tests/line/test_line.py",
+        "tests/engine " + LINE,
     ),
     Mutant(
         "the line ignores the engine's deadline",
         "line/line.py",
         "        if self.engine.deadline != self._armed:\n",
         "        if False:\n",
-        "tests/line/test_line.py",
+        LINE,
     ),
     Mutant(
         "the line does not settle after an unclear end",
@@ -380,7 +385,7 @@ MUTANTS = (
         "engine/engine.py",
         "        why = str(error)\n        self._end_request_in_flight(error, now)\n",
         "        why = str(error)\n",
-        "tests/engine tests/line/test_line.py",
+        "tests/engine " + LINE,
     ),
     Mutant(
         "an unclear write is not confirmed",
