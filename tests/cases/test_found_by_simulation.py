@@ -125,7 +125,7 @@ async def test_seed_118_lean_one_refusal_costs_an_address_that_was_there_no_five
         since = asyncio.get_running_loop().time()
         await asyncio.sleep(3)
         assert hall.reads(mixer, since)
-        assert not [told for _, told in hall.told if told.reason is Reason.REFUSED]
+        assert not [sample for _, sample in hall.reported if sample.reason is Reason.REFUSED]
         # Where it is gone for good, that is believed the second time.
         station.inner.holes.add(("D", 100))
         await asyncio.sleep(3)
@@ -164,7 +164,9 @@ async def test_seed_20_lean_an_address_that_is_back_is_asked_for_as_often_as_bef
         assert hall.reason(away) is Reason.REFUSED
         hall.stations[0].inner.holes.clear()
         await asyncio.sleep(400)
-        good = [at for at, told in hall.told if told.tag is away and told.value is not None]
+        good = [
+            at for at, sample in hall.reported if sample.tag is away and sample.value is not None
+        ]
         assert asyncio.get_running_loop().time() - good[-1] < 6.0
         assert len([at for at in good if at > good[-1] - 52]) > 10
 

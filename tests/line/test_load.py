@@ -10,7 +10,7 @@ from tests.sim.virtual import now, on_virtual_time
 
 
 @on_virtual_time
-async def test_an_overloaded_line_is_busy_all_the_time_and_starves_nobody() -> None:
+async def test_an_overloaded_line_is_always_busy_and_starves_no_block() -> None:
     devices = [
         device(
             [
@@ -42,14 +42,14 @@ async def test_an_overloaded_line_is_busy_all_the_time_and_starves_nobody() -> N
         assert dev.record.overruns > 100
         for block in dev.blocks:
             tag = block.tags[0]
-            times = [at for at, s in line.told if s.tag is tag and at >= start]
+            times = [at for at, s in line.reported if s.tag is tag and at >= start]
             cycle = sum(d.seconds(b.cost) for d in devices for b in d.blocks)
             ages = [b - a for a, b in itertools.pairwise(times)]
             assert max(ages) <= 2 * block.every + cycle
 
 
 @on_virtual_time
-async def test_a_late_poll_is_done_once() -> None:
+async def test_a_late_poll_is_sent_once() -> None:
     slow, fast = clocks(5, station=1, every=0.5), clocks(5, station=2, every=0.5)
     line = plant([slow, fast])
     wind_up(line)
@@ -66,7 +66,7 @@ async def test_a_late_poll_is_done_once() -> None:
 
 
 @on_virtual_time
-async def test_above_19200_baud_the_clock_is_watched() -> None:
+async def test_at_115200_baud_a_block_is_read_every_20_ms() -> None:
     wire = WireTiming(115200, 10)
     dev = device(words(0, 20, every=0.02), wire=wire)
     line = plant([dev], wire=wire)
@@ -76,8 +76,8 @@ async def test_above_19200_baud_the_clock_is_watched() -> None:
 
 
 @on_virtual_time
-async def test_on_a_full_line_devices_share_the_wire_by_time_not_by_number_of_blocks() -> None:
-    """One asks for eight long blocks, the other for one short one: both get half of the time."""
+async def test_devices_share_a_full_line_by_time_not_by_number_of_blocks() -> None:
+    """One device has eight long blocks, the other three short ones: each gets half of the time."""
     greedy = device(
         [tag for n in range(8) for tag in words(n * 500, 60, every=0.2)], name="greedy", station=1
     )
