@@ -105,3 +105,19 @@ async def test_polls_are_spread_over_their_period_after_the_first_round() -> Non
         dues = sorted(poll.due % 10 for poll in line.line.engine.schedule.polls(dev))
     gaps = [b - a for a, b in itertools.pairwise(dues)]
     assert sum(gap > 0.2 for gap in gaps) >= 6, dues
+
+
+@on_virtual_time
+async def test_the_turnaround_is_learned_in_spite_of_a_refused_address() -> None:
+    tags = [make_tag(f"D{66 * n}", device="plc1", every=0.5) for n in range(10)]
+    dev = device(tags, reply_timeout=0.5)
+    line = plant([dev])
+    line.stations[0].inner.holes.add(("D", 66))
+    async with running(line):
+        await asyncio.sleep(20)
+        line.stations[0].late = lambda _: 0.4
+        await asyncio.sleep(120)
+        assert dev.turnaround.expected == pytest.approx(0.405, abs=0.02)
+        known = dev.record.overdue
+        await asyncio.sleep(60)
+        assert dev.record.overdue == known

@@ -1,18 +1,14 @@
 """Links that stall and then deliver all replies at once, or that are never quiet."""
 
 import asyncio
-import random
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 import pytest
 
-from gateway.engine.device import Device
 from gateway.engine.health import State
 from gateway.errors import Busy, LineDown
-from gateway.planning.wire_timing import WireTiming
 from gateway.protocols.checksums import crc16
 from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.driver import AnyDriver
@@ -20,74 +16,10 @@ from gateway.protocols.modbus import ModbusAscii, ModbusRtu
 from gateway.protocols.vigor import Vigor
 from gateway.simulator.plant import station_for
 from gateway.tags import Quality, Reason, Tag, WriteResult, WriteRule
-from gateway.transport import Receiver
-from tests.sim.bench import WIRE, Bench
-from tests.sim.plant import Outcome, Plant, device, made_device, make_tag, plant, running
+from tests.line.device_server import GUARD, DeviceServer, behind
+from tests.sim.bench import WIRE
+from tests.sim.plant import Outcome, Plant, made_device, make_tag, running
 from tests.sim.virtual import now, on_virtual_time
-
-GUARD = 0.5
-
-
-@dataclass
-class DeviceServer(Bench):
-    """Passes requests to the PLC one by one, each after the reply to the one before.
-
-    While it is stalled it keeps them and loses none, as TCP does.
-    """
-
-    late: Callable[[random.Random], float] = lambda _: 0.0  # seconds on top, for each reply
-    deaf_to: Callable[[bytes], bool] = lambda _: False  # requests that are lost on the wire
-    latency: float = 0.0  # seconds, of what comes back
-    flows: asyncio.Event = field(default_factory=asyncio.Event)
-    _queue: "asyncio.Queue[bytes]" = field(default_factory=asyncio.Queue)
-    _task: "asyncio.Task[None] | None" = None
-
-    async def open(
-        self, stations: Sequence[Any], wire: WireTiming, ear: Receiver
-    ) -> "DeviceServer":
-        self.ear, (self._station,) = ear, stations
-        self.flows.set()
-        self._task = asyncio.create_task(self._serve())
-        return self
-
-    def write(self, data: bytes) -> None:
-        self.sent.append((now(), data))
-        self._queue.put_nowait(data)
-
-    async def close(self) -> None:
-        if self._task is not None:
-            self._task.cancel()
-
-    def received(self, data: bytes) -> None:
-        if self.ear is not None:
-            asyncio.get_running_loop().call_later(self.latency, self.ear.received, data)
-
-    async def _serve(self) -> None:
-        while True:
-            request = await self._queue.get()
-            await self.flows.wait()
-            await asyncio.sleep(len(request) * WIRE.character)
-            if self.echo:
-                self.received(request)
-            await asyncio.sleep(0.005)
-            answers = [] if self.deaf_to(request) else self._station.hear(request, now())
-            for answer in answers:
-                await asyncio.sleep(len(answer) * WIRE.character + self.late(self._random))
-                self.received(answer)
-
-
-def behind(
-    server: DeviceServer,
-    driver: AnyDriver,
-    *tags: Tag,
-    echo_in_file: bool = True,
-    **timing: Any,
-) -> tuple[Plant, Device, Any]:
-    """The line, its device, and the memory of its PLC."""
-    dev = made_device("plc", driver, WIRE, replace(driver.timing, **timing), tags, GUARD)
-    station = station_for(driver, [])
-    line = Plant([dev], [station], server, WIRE, echo_in_file=echo_in_file)  # type: ignore[list-item]
-    return line, dev, station.memory
 
 
 def wrong_values(line: Plant) -> list[object]:
@@ -335,22 +267,6 @@ async def test_port_loss_while_the_line_settles_is_reported_at_once(
         at, name, online = line.online_changes[-1]
         assert (name, online) == ("plc", False)
         assert at == pytest.approx(gone, abs=0.01)
-
-
-@on_virtual_time
-async def test_the_turnaround_is_learned_in_spite_of_a_refused_address() -> None:
-    tags = [make_tag(f"D{66 * n}", device="plc1", every=0.5) for n in range(10)]
-    dev = device(tags, reply_timeout=0.5)
-    line = plant([dev])
-    line.stations[0].inner.holes.add(("D", 66))
-    async with running(line):
-        await asyncio.sleep(20)
-        line.stations[0].late = lambda _: 0.4
-        await asyncio.sleep(120)
-        assert dev.turnaround.expected == pytest.approx(0.405, abs=0.02)
-        known = dev.record.overdue
-        await asyncio.sleep(60)
-        assert dev.record.overdue == known
 
 
 @on_virtual_time
