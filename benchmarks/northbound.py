@@ -39,7 +39,7 @@ from gateway.engine.requests import CommandResult
 from gateway.northbound import Northbound
 from gateway.northbound.session import configure
 from gateway.protocols.driver import Address, Span, Unit
-from gateway.service import COLLECT, SWITCH
+from gateway.service import GC_THRESHOLDS, THREAD_SWITCH
 from gateway.tags import Sample, Tag, WriteResult, WriteRule, good
 from gateway.tags.mirror import Mirror
 from gateway.values import Layout, Value, parse_type
@@ -348,8 +348,8 @@ def bare(tags: int, devices: int, seconds: float, *, like_ours: bool) -> Rate:
 
 
 async def gateway(tags: int, devices: int, seconds: float, for_flood: float) -> Rate:
-    sys.setswitchinterval(SWITCH)  # both as the service does
-    gc.set_threshold(*COLLECT)
+    sys.setswitchinterval(THREAD_SWITCH)  # both as the service does
+    gc.set_threshold(*GC_THRESHOLDS)
     endpoint = free_endpoint()
     before = memory()
     made = plant(tags, devices)

@@ -3,6 +3,8 @@
 import asyncio
 import itertools
 
+import pytest
+
 from gateway.planning.wire_timing import WireTiming
 from tests.line.clocks import clocks, wind_up
 from tests.sim.plant import device, make_tag, plant, running, words
