@@ -1,4 +1,4 @@
-"""From a configuration to a running gateway, without Zenoh: samples up, writes down."""
+"""A running gateway without Zenoh: published samples, fresh reads, writes."""
 
 import asyncio
 import time
@@ -28,25 +28,25 @@ TAGS = {
 
 
 class Watched:
-    """A gateway, and all it published."""
+    """A gateway, and all that it published."""
 
     def __init__(self, gateway: Gateway) -> None:
         self.gateway = gateway
-        self.told: list[Sample] = []
-        self.alive: list[tuple[str, bool]] = []
-        self._news = asyncio.Event()
+        self.published: list[Sample] = []
+        self.online_changes: list[tuple[str, bool]] = []
+        self._changed = asyncio.Event()
         gateway.subscribe(self)
 
     def publish(self, samples: Sequence[Sample]) -> None:
-        self.told += samples
-        self._news.set()
+        self.published += samples
+        self._changed.set()
 
     def set_online(self, device: str, online: bool) -> None:
-        self.alive.append((device, online))
-        self._news.set()
+        self.online_changes.append((device, online))
+        self._changed.set()
 
     def latest(self, key: str) -> Sample | None:
-        return next((s for s in reversed(self.told) if s.tag.key == key), None)
+        return next((s for s in reversed(self.published) if s.tag.key == key), None)
 
     async def until_good(self, *keys: str) -> None:
         def good(key: str) -> bool:
@@ -55,8 +55,8 @@ class Watched:
 
         async with asyncio.timeout(10):
             while not all(good(key) for key in keys):
-                self._news.clear()
-                await self._news.wait()
+                self._changed.clear()
+                await self._changed.wait()
 
 
 def made(folder: Path, **device: Any) -> Watched:
@@ -81,25 +81,25 @@ def tag(watched: Watched, name: str) -> Any:
     return found
 
 
-def test_before_it_runs_everything_is_starting(tmp_path: Path) -> None:
+def test_before_the_lines_run_every_tag_is_starting(tmp_path: Path) -> None:
     watched = made(tmp_path)
     for name in TAGS:
         sample = watched.gateway.sample(tag(watched, name))
         assert (sample.value, sample.quality, sample.reason) == (None, Quality.BAD, Reason.STARTING)
-    assert watched.gateway.tag("mixer/nobody") is None
+    assert watched.gateway.tag("mixer/missing") is None
 
 
 async def test_values_are_published_and_kept(tmp_path: Path) -> None:
     async with running(made(tmp_path)) as watched:
         await watched.until_good(*(f"mixer/{name}" for name in TAGS))
-        assert watched.alive == [("mixer", True)]
+        assert watched.online_changes == [("mixer", True)]
         for name in TAGS:
             sample = watched.gateway.sample(tag(watched, name))
             assert sample.quality is Quality.GOOD
             assert abs(sample.time - time.time_ns()) < 5e9
 
 
-async def test_a_write_ends_with_what_the_device_holds(tmp_path: Path) -> None:
+async def test_a_verified_write_returns_the_value_of_the_device(tmp_path: Path) -> None:
     async with running(made(tmp_path)) as watched:
         await watched.until_good("mixer/recipe")
         written = await watched.gateway.write(tag(watched, "recipe"), 7)
@@ -125,7 +125,7 @@ async def test_a_write_to_a_line_that_is_not_open_fails_at_once(tmp_path: Path) 
         await watched.gateway.write(tag(watched, "recipe"), 7)
 
 
-async def test_a_disabled_device_is_never_spoken_to(tmp_path: Path) -> None:
+async def test_a_disabled_device_gets_no_request(tmp_path: Path) -> None:
     async with running(made(tmp_path, enabled=False)) as watched:
         gateway = watched.gateway
         assert {gateway.sample(tag(watched, name)).reason for name in TAGS} == {Reason.DISABLED}
@@ -135,7 +135,7 @@ async def test_a_disabled_device_is_never_spoken_to(tmp_path: Path) -> None:
         assert [line.engine.devices for line in gateway.lines] == [[]]
 
 
-async def test_a_fresh_value_is_read_now(tmp_path: Path) -> None:
+async def test_a_fresh_value_is_read_on_demand(tmp_path: Path) -> None:
     async with running(made(tmp_path, every="1h")) as watched:
         await watched.until_good("mixer/speed")
         known = watched.gateway.sample(tag(watched, "speed"))
@@ -146,7 +146,7 @@ async def test_a_fresh_value_is_read_now(tmp_path: Path) -> None:
         assert fresh.time >= before
 
 
-async def test_simultaneous_askers_share_one_exchange(tmp_path: Path) -> None:
+async def test_simultaneous_clients_share_one_read(tmp_path: Path) -> None:
     async with running(made(tmp_path, every="1h")) as watched:
         await watched.until_good(*(f"mixer/{name}" for name in TAGS))
         [device] = watched.gateway.lines[0].engine.devices
@@ -157,7 +157,7 @@ async def test_simultaneous_askers_share_one_exchange(tmp_path: Path) -> None:
         assert device.record.exchanges == before + 1
 
 
-async def test_a_fresh_value_of_a_line_that_is_not_open_is_what_is_known(tmp_path: Path) -> None:
+async def test_on_a_line_that_is_not_open_fresh_returns_the_last_sample(tmp_path: Path) -> None:
     watched = made(tmp_path)
     sample = await watched.gateway.fresh(tag(watched, "speed"), 0.0)
     assert (sample.value, sample.quality) == (None, Quality.BAD)
@@ -167,7 +167,7 @@ async def test_a_fresh_value_of_a_line_that_is_not_open_is_what_is_known(tmp_pat
 async def slow_line(
     folder: Path, every: str = "1s"
 ) -> AsyncIterator[tuple[Watched, Unruly, Bench]]:
-    """One station that looks at its memory at once and takes 0.4 s to answer."""
+    """A line with one station that reads its memory at once and replies 0.4 s later."""
     lines = {"hall": vigor_line("simulator", {"speed": {"address": "D10"}}, reply_timeout="2s")}
     path = write_config(folder / "c.yaml", "tcp/127.0.0.1:7447", lines, defaults={"every": every})
     station, bench = Unruly(VigorStation(1), late=lambda _: 0.4), Bench()
@@ -177,8 +177,8 @@ async def slow_line(
         yield watched, station, bench
 
 
-async def asked(station: Unruly) -> None:
-    """Until the next question has arrived there, which is answered by what it held then."""
+async def until_read(station: Unruly) -> None:
+    """Waits for the next request at the station. The reply holds the values of this moment."""
     before = len(station.heard)
     while len(station.heard) == before:
         await asyncio.sleep(0.001)
@@ -186,18 +186,18 @@ async def asked(station: Unruly) -> None:
 
 @pytest.mark.parametrize("max_age", [0.0, 0.1])
 @on_virtual_time
-async def test_a_reading_that_had_begun_before_the_question_is_no_answer(
+async def test_a_read_that_started_before_the_request_does_not_satisfy_it(
     tmp_path: Path, max_age: float
 ) -> None:
     async with slow_line(tmp_path) as (watched, station, _):
-        await asked(station)
+        await until_read(station)
         station.memory.write("D", 10, [4711])
         fresh = await watched.gateway.fresh(tag(watched, "speed"), max_age)
         assert fresh.value == 4711
 
 
 @on_virtual_time
-async def test_a_value_that_came_this_moment_is_not_younger_than_0_s(tmp_path: Path) -> None:
+async def test_a_sample_of_this_moment_is_not_younger_than_0_s(tmp_path: Path) -> None:
     async with slow_line(tmp_path, every="1h") as (watched, station, _):
         for value in (1, 2, 3):
             station.memory.write("D", 10, [value])
@@ -205,11 +205,11 @@ async def test_a_value_that_came_this_moment_is_not_younger_than_0_s(tmp_path: P
 
 
 @on_virtual_time
-async def test_who_waits_for_a_reading_hears_at_once_that_there_will_be_none(
+async def test_port_loss_ends_the_wait_for_a_fresh_value_at_once(
     tmp_path: Path,
 ) -> None:
     async with slow_line(tmp_path) as (watched, station, bench):
-        await asked(station)
+        await until_read(station)
         asking = asyncio.create_task(watched.gateway.fresh(tag(watched, "speed"), 0.0))
         await asyncio.sleep(0)
         bench.vanish()
@@ -219,10 +219,10 @@ async def test_who_waits_for_a_reading_hears_at_once_that_there_will_be_none(
 
 
 @on_virtual_time
-async def test_where_the_clock_does_not_tell_which_reading_it_was_another_follows(
+async def test_a_read_that_starts_at_the_time_of_the_request_is_repeated(
     tmp_path: Path,
 ) -> None:
-    """Clocks with ticks of 15 ms are about."""
+    """Some clocks have ticks of 15 ms."""
     watched = made(tmp_path)
     gateway, speed, expedited = watched.gateway, tag(watched, "speed"), list[Tag]()
     [line] = gateway.lines
@@ -230,7 +230,7 @@ async def test_where_the_clock_does_not_tell_which_reading_it_was_another_follow
         p for p in line.engine.schedule.polls(line.engine.devices[0]) if speed in p.block.tags
     ]
     line.engine.is_open = True
-    # Only the call counts here: no line runs.
+    # No line runs: only the call is of interest.
     line.expedite = lambda device, tag: expedited.append(tag)  # type: ignore[method-assign]
     poll.asked = 7.0
     asking = asyncio.create_task(gateway.fresh(speed, 0.0))
@@ -244,7 +244,7 @@ async def test_where_the_clock_does_not_tell_which_reading_it_was_another_follow
 
 
 @on_virtual_time
-async def test_what_comes_unasked_is_answered_as_it_is_known_at_once(tmp_path: Path) -> None:
+async def test_fresh_returns_the_last_sample_of_an_unsolicited_tag_at_once(tmp_path: Path) -> None:
     reader = {
         "protocol": "frames",
         "framing": {"header": "<STX>", "terminator": "<ETX>"},
@@ -253,14 +253,14 @@ async def test_what_comes_unasked_is_answered_as_it_is_known_at_once(tmp_path: P
     }
     lines = {"door": {"port": "COM1", "devices": {"reader": reader}}}
     path = write_config(tmp_path / "c.yaml", "tcp/127.0.0.1:7447", lines)
-    ears: list[Receiver] = []
+    receivers: list[Receiver] = []
 
     class Mute:
         async def close(self) -> None:
             pass
 
-    async def opened(ear: Receiver) -> Any:
-        ears.append(ear)
+    async def opened(receiver: Receiver) -> Any:
+        receivers.append(receiver)
         return Mute()
 
     async with running(Watched(Gateway(load(path), open_line=lambda _: opened))) as watched:
@@ -269,29 +269,29 @@ async def test_what_comes_unasked_is_answered_as_it_is_known_at_once(tmp_path: P
         code = gateway.tag("reader/code")
         assert code is not None
         assert (await gateway.fresh(code, 0.0)).reason is Reason.STARTING
-        ears[0].received(b"\x024006381333931\x03")
+        receivers[0].received(b"\x024006381333931\x03")
         for max_age in (0.0, 60.0):
             assert (await gateway.fresh(code, max_age)).value == "4006381333931"
         assert asyncio.get_running_loop().time() == since
 
 
-def test_what_moved_within_its_deadband_and_is_published_again_is_news_to_all(
+def test_a_republished_change_within_the_deadband_reaches_every_subscriber(
     tmp_path: Path,
 ) -> None:
-    """History too, which would be farther off than the deadband from then on."""
+    """History needs it too: its next sample is compared with this one."""
     lines = {"hall": vigor_line("simulator", {"level": {"address": "D10", "deadband": 5}})}
     path = write_config(tmp_path / "c.yaml", "tcp/127.0.0.1:7447", lines)
     watched = Watched(Gateway(load(path)))
     gateway, level = watched.gateway, tag(watched, "level")
-    told = watched.told
+    published = watched.published
     for value in (100, 104):
         gateway.samples([good(level, value, time.time_ns())])
-    assert [sample.value for sample in told] == [100]
+    assert [sample.value for sample in published] == [100]
     for _ in range(2):
         gateway.mark_published([gateway.sample(level)])
-    assert [sample.value for sample in told] == [100, 104]
+    assert [sample.value for sample in published] == [100, 104]
     gateway.samples([good(level, 96, time.time_ns())])
-    assert [sample.value for sample in told] == [100, 104, 96]
+    assert [sample.value for sample in published] == [100, 104, 96]
 
 
 def test_zenoh_gets_the_files_settings(tmp_path: Path) -> None:
@@ -301,7 +301,7 @@ def test_zenoh_gets_the_files_settings(tmp_path: Path) -> None:
     assert settings.listen == ("tcp/127.0.0.1:7447",)
 
 
-def test_the_plan_is_that_of_the_running_lines(tmp_path: Path) -> None:
+def test_the_forecast_has_the_blocks_of_the_running_lines(tmp_path: Path) -> None:
     watched = made(tmp_path)
     [expected] = forecasts(watched.gateway.config)
     [line] = watched.gateway.lines

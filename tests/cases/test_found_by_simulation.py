@@ -1,4 +1,4 @@
-"""What simulated hours of faults found, one test each; `make sim` found them by these seeds."""
+"""Faults that the simulation found, one test each, with the seed of `make sim`."""
 
 import asyncio
 import json
@@ -57,7 +57,7 @@ class Reads:
 
 @on_virtual_time
 async def test_seed_4_lean_a_clock_set_back_makes_no_old_value_fresh(tmp_path: Path) -> None:
-    """An hour back, and a value of a minute ago seemed to come from the future."""
+    """After an hour back, the value of a minute ago had a time in the future."""
     loop = asyncio.get_running_loop()
     set_back = 0
 
@@ -78,8 +78,8 @@ async def test_seed_4_lean_a_clock_set_back_makes_no_old_value_fresh(tmp_path: P
 
 
 @on_virtual_time
-async def test_nobody_who_asked_in_vain_is_remembered(tmp_path: Path) -> None:
-    """While a device is silent no sample of it comes, however often it is asked for."""
+async def test_a_client_that_gave_up_is_not_remembered(tmp_path: Path) -> None:
+    """A silent device sends no sample, so no sample removes the waiting clients."""
     config = load(_file(tmp_path, speed={"address": "D100", "every": "1h"}))
     gateway = Gateway(config)
     (tag,) = (tag for found in config.devices for tag in found.tags)
@@ -95,8 +95,8 @@ async def test_nobody_who_asked_in_vain_is_remembered(tmp_path: Path) -> None:
 
 
 @on_virtual_time
-async def test_seed_0_busy_hastened_polls_leave_no_places_behind() -> None:
-    """Somebody looks all the time at what is read once a day."""
+async def test_seed_0_busy_expedited_polls_leave_no_entries() -> None:
+    """A client reads all the time a block that is due once a day."""
     mixer = device(words(100, 1, every=86_400.0))
     hall = plant([mixer])
     async with running(hall):
@@ -110,8 +110,8 @@ async def test_seed_0_busy_hastened_polls_leave_no_places_behind() -> None:
 
 
 @on_virtual_time
-async def test_seed_118_lean_one_refusal_costs_an_address_that_was_there_no_five_minutes() -> None:
-    """A character lost on the way, and the rest was a question with a right sum to nowhere."""
+async def test_seed_118_lean_one_refusal_does_not_make_a_good_address_bad() -> None:
+    """A request lost one character; the rest had a right sum and a bad address."""
     mixer = device(words(100, 1))
     hall = plant([mixer])
     station = hall.stations[0]
@@ -125,8 +125,8 @@ async def test_seed_118_lean_one_refusal_costs_an_address_that_was_there_no_five
         since = asyncio.get_running_loop().time()
         await asyncio.sleep(3)
         assert hall.reads(mixer, since)
-        assert not [told for _, told in hall.told if told.reason is Reason.REFUSED]
-        # Where it is gone for good, that is believed the second time.
+        assert not [sample for _, sample in hall.reported if sample.reason is Reason.REFUSED]
+        # The second refusal in a row makes the address bad.
         station.inner.holes.add(("D", 100))
         await asyncio.sleep(3)
         assert hall.reason(mixer.tags[0]) is Reason.REFUSED
@@ -134,10 +134,10 @@ async def test_seed_118_lean_one_refusal_costs_an_address_that_was_there_no_five
 
 @pytest.mark.parametrize("echo", [False, True], ids=["plain", "echo"])
 @on_virtual_time
-async def test_seeds_0_and_2_lean_stations_are_left_time_to_take_in_what_goes_to_all(
+async def test_seeds_0_and_2_lean_a_broadcast_is_followed_by_a_pause(
     echo: bool,
 ) -> None:
-    """Not as much as one PLC takes to answer, once that is known; and an echo is no end of it."""
+    """The measured turnaround of one PLC does not shorten it, and an echo does not end it."""
     mixer = link_device(ComputerLink(station=1), "D100", every=0.02, control=True)
     hall = Plant([mixer], [Unruly(link_station(mixer.driver))], Bench(echo=echo))  # type: ignore[arg-type]
     async with running(hall):
@@ -152,8 +152,8 @@ async def test_seeds_0_and_2_lean_stations_are_left_time_to_take_in_what_goes_to
 
 
 @on_virtual_time
-async def test_seed_20_lean_an_address_that_is_back_is_asked_for_as_often_as_before() -> None:
-    """Read well for the first time, it waited as long as one that is refused: five minutes."""
+async def test_seed_20_lean_an_address_that_returned_is_polled_as_often_as_before() -> None:
+    """After its first good read it was due after the five minutes of a bad address."""
     mixer = device([*words(100, 1, every=5.0), *words(900, 1, every=5.0)])
     hall = plant([mixer])
     away = mixer.tags[1]
@@ -164,13 +164,15 @@ async def test_seed_20_lean_an_address_that_is_back_is_asked_for_as_often_as_bef
         assert hall.reason(away) is Reason.REFUSED
         hall.stations[0].inner.holes.clear()
         await asyncio.sleep(400)
-        good = [at for at, told in hall.told if told.tag is away and told.value is not None]
+        good = [
+            at for at, sample in hall.reported if sample.tag is away and sample.value is not None
+        ]
         assert asyncio.get_running_loop().time() - good[-1] < 6.0
         assert len([at for at in good if at > good[-1] - 52]) > 10
 
 
-def test_seed_13_storm_polls_that_come_and_go_behind_a_late_one_leave_no_places() -> None:
-    """A device that is written to all the time has had its share; its polls wait, others do not."""
+def test_seed_13_storm_polls_queued_behind_a_late_one_leave_no_entries() -> None:
+    """Writes use up the share of one device: its polls wait, those of the other do not."""
     greedy, modest = device(words(100, 1, every=0.1)), device(words(200, 2, every=0.1), station=2)
     schedule, now = Schedule([greedy, modest], 0.0), 0.0
     for each in (greedy, modest):
@@ -186,8 +188,8 @@ def test_seed_13_storm_polls_that_come_and_go_behind_a_late_one_leave_no_places(
     assert len(schedule._queue.due) < 200  # private: a leak shows in no public figure
 
 
-def test_seed_7_lean_polls_that_were_planned_anew_leave_no_places() -> None:
-    """Addresses come and go, so the device is planned anew; what it was to be asked is void."""
+def test_seed_7_lean_polls_of_an_older_plan_leave_no_entries() -> None:
+    """The device is planned again and again; the polls of older plans are stale."""
     mixer = device(words(100, 2, every=86_400.0))
     schedule = Schedule([mixer], 0.0)
     mixer.health.answered()

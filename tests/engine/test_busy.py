@@ -60,13 +60,13 @@ async def test_a_device_busy_twice_is_polled_again_at_growing_pauses_and_keeps_i
     async with running(line):
         await asyncio.sleep(5)
         assert line.good(dev)
-        line.told.clear()
+        line.reported.clear()
         station.left = 2
         await asyncio.sleep(12)
         first, second, third = station.asked[:3]
         assert BUSY_PAUSE <= second - first < BUSY_PAUSE + 0.1
         assert 2 * BUSY_PAUSE <= third - second < 2 * BUSY_PAUSE + 0.1
-        assert {sample.quality for _, sample in line.told} == {Quality.GOOD}
+        assert {sample.quality for _, sample in line.reported} == {Quality.GOOD}
         assert dev.state is State.ONLINE
         assert dev.record.refusals == {"06": 2}
 

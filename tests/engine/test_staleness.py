@@ -27,12 +27,12 @@ async def test_values_turn_overdue_when_the_line_becomes_too_slow_for_them() -> 
     async with running(line):
         await asyncio.sleep(20)
         assert line.good(dev)
-        line.told.clear()
+        line.reported.clear()
         slow_since = asyncio.get_running_loop().time()
         line.stations[0].late = lambda _: 0.4
         most = limit(line)
         await asyncio.sleep(60)
-        found = [(at, s) for at, s in line.told if s.quality is Quality.BAD]
+        found = [(at, s) for at, s in line.reported if s.quality is Quality.BAD]
         assert {s.reason for _, s in found} == {Reason.OVERDUE}
         assert "not read for" in found[0][1].detail
         assert found[0][0] - slow_since < most + 0.5
@@ -57,8 +57,8 @@ async def test_no_good_value_is_older_than_its_limit() -> None:
                 line.submit(other, other.tags[0], 1)
             await asyncio.sleep(0.02)
             most = max(most, limit(line))  # it grows as the slow turnaround is measured
-            read_at |= {sample.tag: at for at, sample in line.told}
-            line.told.clear()
+            read_at |= {sample.tag: at for at, sample in line.reported}
+            line.reported.clear()
             now = asyncio.get_running_loop().time()
             good = [tag for tag in read_at if line.now[tag].quality is Quality.GOOD]
             assert all(now - read_at[tag] <= most for tag in good)
@@ -72,7 +72,7 @@ async def test_nothing_is_overdue_on_a_line_that_carries_its_load() -> None:
     async with running(line):
         await asyncio.sleep(600)
     assert dev.record.overdue == other.record.overdue == 0
-    bad = {s.reason for _, s in line.told if s.quality is Quality.BAD}
+    bad = {s.reason for _, s in line.reported if s.quality is Quality.BAD}
     assert bad == set()
 
 

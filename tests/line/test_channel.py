@@ -1,14 +1,21 @@
-"""One timer for all time-outs of a line: never late, and called once for each end."""
+"""The open port: its alarm, its echo, the silence before a request."""
 
 import asyncio
 from collections.abc import Callable
 
-from gateway.line.channel import NEVER, Alarm
+import pytest
+from structlog.testing import capture_logs
+
+from gateway.errors import Garbled, LineDown
+from gateway.line.channel import KEPT, LONGEST_WAIT, NEVER, Alarm, Channel, Echo
+from gateway.line.wire_log import WireLog
+from gateway.planning.wire_timing import WireTiming
+from tests.line.fake_port import FakePort
 from tests.sim.virtual import now, on_virtual_time
 
 
 def noting(rung: list[float], *again: float) -> Callable[[], float]:
-    """Who looks, and the times to look again that it asks for, one after another."""
+    """Returns a callback that notes its calls in `rung` and asks for the times `again`."""
     answers = list(again)
 
     def look() -> float:
@@ -19,7 +26,7 @@ def noting(rung: list[float], *again: float) -> Callable[[], float]:
 
 
 @on_virtual_time
-async def test_it_goes_off_in_time_and_only_once() -> None:
+async def test_the_alarm_goes_off_in_time_and_once() -> None:
     rung: list[float] = []
     start = now()
     Alarm().by(start + 0.5, noting(rung))
@@ -28,7 +35,7 @@ async def test_it_goes_off_in_time_and_only_once() -> None:
 
 
 @on_virtual_time
-async def test_who_says_so_is_called_again() -> None:
+async def test_the_alarm_goes_off_again_at_the_returned_times() -> None:
     rung: list[float] = []
     start = now()
     Alarm().by(start + 0.5, noting(rung, start + 2, start + 3))
@@ -37,7 +44,7 @@ async def test_who_says_so_is_called_again() -> None:
 
 
 @on_virtual_time
-async def test_an_earlier_end_than_the_one_waited_for_is_not_missed() -> None:
+async def test_the_alarm_does_not_overlook_an_earlier_time() -> None:
     rung: list[float] = []
     alarm, start = Alarm(), now()
     alarm.by(start + 5, noting(rung))
@@ -47,8 +54,8 @@ async def test_an_earlier_end_than_the_one_waited_for_is_not_missed() -> None:
 
 
 @on_virtual_time
-async def test_a_later_end_is_looked_for_by_the_last_who_asked() -> None:
-    """The timer of the first is left running: whoever looks then says when to come again."""
+async def test_the_alarm_calls_the_last_callback_only() -> None:
+    """The timer of the first keeps running; the last callback returns the next time."""
     before: list[float] = []
     rung: list[float] = []
     alarm, start = Alarm(), now()
@@ -57,3 +64,193 @@ async def test_a_later_end_is_looked_for_by_the_last_who_asked() -> None:
     await asyncio.sleep(10)
     assert before == []
     assert rung == [start + 1, start + 5]
+
+
+# Echo
+
+REQUEST, REPLY = b"\x01\x03\x00\x05", b"\x01\x03\x02\x04\xd2"
+
+
+@pytest.mark.parametrize(
+    ("heard", "found"),
+    [
+        (REQUEST + REPLY, True),
+        (b"\x00" + REQUEST + REPLY, True),
+        (REPLY, False),
+        (REQUEST, None),  # an echo, or an acknowledgement that repeats the request
+        (REQUEST + b"\x00\xff", None),  # too short for a reply: noise
+        (b"\x01\x03\x00\x04" + REPLY, None),  # longer than the reply: a damaged echo
+    ],
+)
+def test_the_echo_is_learned_from_what_arrived_until_the_reply(
+    heard: bytes, found: bool | None
+) -> None:
+    echo = Echo("hall", None)
+    assert echo.found is None
+    echo.learn(REQUEST, heard, len(REPLY))
+    assert echo.found is found
+    assert not echo.strip
+
+
+def test_an_echo_once_found_stays_found_until_a_reply_without_one() -> None:
+    echo = Echo("hall", None)
+    echo.learn(REQUEST, REQUEST + REPLY, len(REPLY))
+    echo.learn(REQUEST, REQUEST, len(REPLY))
+    assert echo.found is True
+    echo.learn(REQUEST, REPLY, len(REPLY))
+    assert echo.found is False
+
+
+def test_an_echo_is_logged_once_for_each_line_and_not_at_every_opening() -> None:
+    echo = Echo("hall", None)
+    with capture_logs() as logs:
+        for _ in range(3):
+            echo.opened()
+            assert echo.found is None
+            echo.learn(REQUEST, REQUEST + REPLY, len(REPLY))
+            assert echo.found is True
+    assert [(entry["event"], entry["line"]) for entry in logs] == [("adapter echoes", "hall")]
+
+
+def test_the_file_decides_before_any_reply() -> None:
+    assert Echo("hall", True).strip
+    assert Echo("hall", True).found is True
+    assert not Echo("hall", False).strip
+    assert Echo("hall", False).found is False
+
+
+@pytest.mark.parametrize("before", [b"", b"\x00", b"\xff" * 40])
+def test_the_echo_is_dropped_with_all_before_it(before: bytes) -> None:
+    echo = Echo("hall", True)
+    echo.sent(REQUEST)
+    assert echo.without(before + REQUEST + REPLY) == REPLY
+    assert echo.without(REPLY) == REPLY  # no second echo is expected
+
+
+def test_the_echo_is_dropped_when_it_arrives_byte_by_byte() -> None:
+    echo = Echo("hall", True)
+    echo.sent(REQUEST)
+    data = b"\x00" + REQUEST + REPLY
+    assert b"".join(echo.without(bytes([byte])) for byte in data) == REPLY
+
+
+def test_nothing_counts_until_the_echo_is_whole() -> None:
+    echo = Echo("hall", True)
+    echo.sent(REQUEST)
+    assert echo.without(REPLY) == b""
+    assert echo.early == REPLY
+    assert echo.without(REPLY) == b""
+    assert echo.early == REPLY + REPLY
+
+
+def test_a_bounded_part_of_the_bytes_before_an_echo_is_kept() -> None:
+    echo = Echo("hall", True)
+    echo.sent(REQUEST)
+    for _ in range(100):
+        assert echo.without(b"\xaa" * 50) == b""
+    assert len(echo.early) <= KEPT + len(REQUEST)
+    assert echo.without(REQUEST + REPLY) == REPLY
+
+
+def test_the_rest_of_an_echo_is_dropped_after_its_transaction() -> None:
+    echo = Echo("hall", True)
+    echo.sent(REQUEST)
+    assert echo.without_rest(REQUEST[:2]) == b""
+    assert echo.without_rest(REQUEST[2:] + b"\x02") == b"\x02"
+    assert echo.without_rest(REQUEST) == REQUEST
+
+
+def test_other_bytes_after_a_transaction_end_the_wait_for_the_echo() -> None:
+    echo = Echo("hall", True)
+    echo.sent(REQUEST)
+    assert echo.without_rest(b"\x07" + REQUEST) == b"\x07" + REQUEST
+    assert echo.without_rest(REQUEST) == REQUEST
+
+
+# The silence before a request
+
+
+def channel(baudrate: int = 9600) -> Channel:
+    return Channel(FakePort(), WireTiming(baudrate, 10), WireLog("hall"), Echo("hall", None))
+
+
+@pytest.mark.parametrize("baudrate", [9600, 19200, 38400, 115200])
+@on_virtual_time
+async def test_the_silence_counts_from_the_last_busy_moment(baudrate: int) -> None:
+    port, start = channel(baudrate), now()
+    port.quiet_since = start + 0.004
+    await port.quiet(0.005)
+    assert 0.009 - 1e-9 <= now() - start <= 0.0091
+
+
+@on_virtual_time
+async def test_a_silence_that_is_over_is_not_waited_for() -> None:
+    port, start = channel(), now()
+    port.quiet_since = start - 0.005
+    await port.quiet(0.005)
+    assert now() == start
+
+
+class LateLoop:
+    """Makes sleeps of the loop end up to a millisecond late, as event loops do."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        sleep = asyncio.sleep
+        self.asked: list[float] = []
+
+        async def late(seconds: float) -> None:
+            self.asked.append(seconds)
+            await sleep(seconds + (0.0009 if seconds else 0.0))
+
+        monkeypatch.setattr(asyncio, "sleep", late)
+
+
+@pytest.mark.parametrize(("baudrate", "late"), [(19200, 0.0009), (38400, 0.0)])
+@on_virtual_time
+async def test_above_19200_baud_the_last_millisecond_is_spent_at_the_clock(
+    monkeypatch: pytest.MonkeyPatch, baudrate: int, late: float
+) -> None:
+    port, start = channel(baudrate), now()
+    port.quiet_since = start
+    loop = LateLoop(monkeypatch)
+    await port.quiet(0.005)
+    assert now() - start == pytest.approx(0.005 + late, abs=5e-5)
+    assert (loop.asked.count(0) > 1) == (late == 0.0)
+
+
+@pytest.mark.parametrize("baudrate", [9600, 115200])
+@on_virtual_time
+async def test_a_line_that_is_never_quiet_is_garbled_after_a_second(baudrate: int) -> None:
+    port, start = channel(baudrate), now()
+
+    async def babble() -> None:
+        while True:
+            port.quiet_since = now()
+            await asyncio.sleep(0.002)
+
+    port.quiet_since = start
+    babbling = asyncio.create_task(babble())
+    with pytest.raises(Garbled, match="never quiet, nothing was sent"):
+        await port.quiet(0.005)
+    babbling.cancel()
+    assert LONGEST_WAIT <= now() - start < LONGEST_WAIT + 0.02
+
+
+@on_virtual_time
+async def test_a_pause_delays_the_next_request() -> None:
+    port = channel()
+    port.send(b"1")
+    sent = now()
+    port.pause(0.1)
+    await port.quiet(0.005)
+    assert now() - sent == pytest.approx(0.105)
+
+
+@on_virtual_time
+async def test_a_lost_port_sends_nothing() -> None:
+    far = FakePort()
+    port = Channel(far, WireTiming(9600, 10), WireLog("hall"), Echo("hall", None))
+    port.lost_by = LineDown("unplugged")
+    with pytest.raises(LineDown, match="unplugged"):
+        port.send(b"1")
+    assert far.sent == []

@@ -3,6 +3,8 @@
 import asyncio
 import itertools
 
+import pytest
+
 from gateway.planning.wire_timing import WireTiming
 from tests.line.clocks import clocks, wind_up
 from tests.sim.plant import device, make_tag, plant, running, words
@@ -10,7 +12,7 @@ from tests.sim.virtual import now, on_virtual_time
 
 
 @on_virtual_time
-async def test_an_overloaded_line_is_busy_all_the_time_and_starves_nobody() -> None:
+async def test_an_overloaded_line_is_always_busy_and_starves_no_block() -> None:
     devices = [
         device(
             [
@@ -42,14 +44,14 @@ async def test_an_overloaded_line_is_busy_all_the_time_and_starves_nobody() -> N
         assert dev.record.overruns > 100
         for block in dev.blocks:
             tag = block.tags[0]
-            times = [at for at, s in line.told if s.tag is tag and at >= start]
+            times = [at for at, s in line.reported if s.tag is tag and at >= start]
             cycle = sum(d.seconds(b.cost) for d in devices for b in d.blocks)
             ages = [b - a for a, b in itertools.pairwise(times)]
             assert max(ages) <= 2 * block.every + cycle
 
 
 @on_virtual_time
-async def test_a_late_poll_is_done_once() -> None:
+async def test_a_late_poll_is_sent_once() -> None:
     slow, fast = clocks(5, station=1, every=0.5), clocks(5, station=2, every=0.5)
     line = plant([slow, fast])
     wind_up(line)
@@ -66,7 +68,7 @@ async def test_a_late_poll_is_done_once() -> None:
 
 
 @on_virtual_time
-async def test_above_19200_baud_the_clock_is_watched() -> None:
+async def test_at_115200_baud_a_block_is_read_every_20_ms() -> None:
     wire = WireTiming(115200, 10)
     dev = device(words(0, 20, every=0.02), wire=wire)
     line = plant([dev], wire=wire)
@@ -76,8 +78,8 @@ async def test_above_19200_baud_the_clock_is_watched() -> None:
 
 
 @on_virtual_time
-async def test_on_a_full_line_devices_share_the_wire_by_time_not_by_number_of_blocks() -> None:
-    """One asks for eight long blocks, the other for one short one: both get half of the time."""
+async def test_devices_share_a_full_line_by_time_not_by_number_of_blocks() -> None:
+    """One device has eight long blocks, the other three short ones: each gets half of the time."""
     greedy = device(
         [tag for n in range(8) for tag in words(n * 500, 60, every=0.2)], name="greedy", station=1
     )
@@ -105,3 +107,19 @@ async def test_polls_are_spread_over_their_period_after_the_first_round() -> Non
         dues = sorted(poll.due % 10 for poll in line.line.engine.schedule.polls(dev))
     gaps = [b - a for a, b in itertools.pairwise(dues)]
     assert sum(gap > 0.2 for gap in gaps) >= 6, dues
+
+
+@on_virtual_time
+async def test_the_turnaround_is_learned_in_spite_of_a_refused_address() -> None:
+    tags = [make_tag(f"D{66 * n}", device="plc1", every=0.5) for n in range(10)]
+    dev = device(tags, reply_timeout=0.5)
+    line = plant([dev])
+    line.stations[0].inner.holes.add(("D", 66))
+    async with running(line):
+        await asyncio.sleep(20)
+        line.stations[0].late = lambda _: 0.4
+        await asyncio.sleep(120)
+        assert dev.turnaround.expected == pytest.approx(0.405, abs=0.02)
+        known = dev.record.overdue
+        await asyncio.sleep(60)
+        assert dev.record.overdue == known

@@ -1,4 +1,4 @@
-"""One wire with Computer Link PLCs of both formats and a Vigor; PLCs that speak out of turn."""
+"""Computer Link PLCs of both formats and a Vigor on one line; unsolicited on-demand blocks."""
 
 import asyncio
 import random
@@ -60,7 +60,7 @@ def mixed(every: float = 0.3) -> Plant:
 def wrong(line: Plant) -> list[tuple[float, str, object]]:
     """Good values that their station cannot have held during the last second."""
     found: list[tuple[float, str, object]] = []
-    for at, sample in line.told:
+    for at, sample in line.reported:
         n, value = sample.tag.address.number, sample.value
         if sample.quality is Quality.GOOD and isinstance(value, int):
             assert sample.time == int(at * SECOND)
@@ -90,7 +90,7 @@ async def test_three_protocol_variants_on_one_wire_are_all_healthy() -> None:
 
 @pytest.mark.parametrize("dead", [0, 1, 2])
 @on_virtual_time
-async def test_one_that_dies_disturbs_neither_of_the_others(dead: int) -> None:
+async def test_a_mute_plc_does_not_disturb_the_others(dead: int) -> None:
     line = mixed()
     async with running(line):
         await asyncio.sleep(5)
@@ -106,8 +106,8 @@ async def test_one_that_dies_disturbs_neither_of_the_others(dead: int) -> None:
 
 
 @on_virtual_time
-async def test_late_and_lost_answers_on_a_mixed_wire_never_make_a_wrong_value() -> None:
-    """The one that answers late is resynchronised by a loopback that cannot be mistaken."""
+async def test_late_and_lost_replies_never_make_a_wrong_value() -> None:
+    """Each resync sends a loopback whose text was never sent before."""
     line = mixed(every=0.2)
     for station in line.stations:
         station.late = lambda c: 0.3 + c.uniform(0.05, 0.5) if c.random() < 0.1 else 0.0
@@ -120,12 +120,12 @@ async def test_late_and_lost_answers_on_a_mixed_wire_never_make_a_wrong_value() 
     for dev, station in zip(line.devices[1:], line.stations[1:], strict=True):
         assert dev.record.late > 20
         assert commands(station).count("TT") > 20
-        said = {data[9:] for _, data in station.heard if data[5:7] == b"TT"}
-        assert len(said) == commands(station).count("TT")  # no two alike
+        texts = {data[9:] for _, data in station.heard if data[5:7] == b"TT"}
+        assert len(texts) == commands(station).count("TT")  # no two are equal
 
 
 @on_virtual_time
-async def test_nak_06_to_one_address_in_the_middle_of_a_block() -> None:
+async def test_nak_06_finds_the_one_refused_address_of_a_block() -> None:
     dev = link_device(ComputerLink(station=5), *[f"D{n}" for n in range(40)])
     line = link_plant([dev])
     line.stations[0].inner.holes = {("D", 17)}
@@ -143,7 +143,7 @@ async def test_nak_06_to_one_address_in_the_middle_of_a_block() -> None:
         assert dev.record.failures == {}
 
 
-# Blocks that nobody asked for
+# On-demand blocks
 
 
 def talkative(*, monitor: bool = False) -> tuple[Plant, Device]:
@@ -161,38 +161,38 @@ def on_demand(line: Plant, data: str = "1E61") -> bytes:
 
 @pytest.mark.parametrize("monitor", [False, True])
 @on_virtual_time
-async def test_on_demand_blocks_before_replies_are_counted_and_never_taken_for_one(
+async def test_an_on_demand_block_before_a_reply_is_counted_and_no_reply(
     monitor: bool,
 ) -> None:
-    """Of exactly the shape of the answer, but for the PC number FE."""
+    """The block has the shape of the reply, except for its PC number FE."""
     line, dev = talkative(monitor=monitor)
     station = line.stations[0]
-    hear, chance, said = station.inner.hear, random.Random(1), 0
+    chance, sent = random.Random(1), 0
 
     def chatty(data: bytes, now: float) -> list[bytes]:
-        nonlocal said
-        replies = hear(data, now)
+        nonlocal sent
+        replies = station.inner.hear(data, now)
         if replies and replies[0][:1] == b"\x02" and chance.random() < 0.5:
             size = len(replies[0]) - 8
-            said += 1
+            sent += 1
             return [on_demand(line, "7" * size), *replies]
         return replies
 
-    station.inner.hear = chatty  # type: ignore[method-assign]
+    station.answer = chatty
     checks = Witness(line)
     async with running(line):
         await asyncio.sleep(60)
-    assert said > 25
-    assert said - dev.record.unasked in (0, 1)  # perhaps one is on its way
+    assert sent > 25
+    assert sent - dev.record.unasked in (0, 1)  # perhaps one is on its way
     assert checks.wrong == []
     assert checks.right > 400
     assert dev.record.failures == {}
 
 
 @on_virtual_time
-async def test_on_demand_blocks_between_exchanges_are_counted_and_never_taken_for_a_reply() -> None:
+async def test_an_on_demand_block_between_transactions_is_counted_and_no_reply() -> None:
     line, dev = talkative()
-    checks, said = Witness(line), 0
+    checks, sent = Witness(line), 0
     async with running(line):
         await asyncio.sleep(2)
         for _ in range(50):
@@ -202,14 +202,14 @@ async def test_on_demand_blocks_between_exchanges_are_counted_and_never_taken_fo
             block = on_demand(line)
             for start in range(0, len(block), 4):
                 line.bench.received(block[start : start + 4])
-            said += 1
-    assert said - dev.record.unasked in (0, 1)  # perhaps one is on its way
-    assert line.line.engine.record.unasked >= said * 12
+            sent += 1
+    assert sent - dev.record.unasked in (0, 1)  # perhaps one is on its way
+    assert line.line.engine.record.unasked >= sent * 12
     assert checks.wrong == []
     assert dev.record.failures == {}
 
 
-def test_on_demand_blocks_are_told_in_the_log_but_do_not_fill_it() -> None:
+def test_on_demand_blocks_are_logged_at_info_only_now_and_then() -> None:
     async def whole() -> None:
         line, _ = talkative()
         async with running(line):
@@ -222,27 +222,26 @@ def test_on_demand_blocks_are_told_in_the_log_but_do_not_fill_it() -> None:
 
     with capture_logs() as logs:
         run_virtual(whole())
-    told = [entry for entry in logs if entry["event"] == "stray frame"]
-    assert len(told) == 100
-    assert {entry["what"] for entry in told} == {"on-demand data of station 5: 1E61"}
-    at_info = [entry for entry in told if entry["log_level"] == "info"]
+    strays = [entry for entry in logs if entry["event"] == "stray frame"]
+    assert len(strays) == 100
+    assert {entry["what"] for entry in strays} == {"on-demand data of station 5: 1E61"}
+    at_info = [entry for entry in strays if entry["log_level"] == "info"]
     assert len(at_info) == 3
     assert at_info[-1]["count"] > at_info[0]["count"] == 1
 
 
 @on_virtual_time
-async def test_an_on_demand_block_instead_of_an_answer_is_no_answer() -> None:
+async def test_an_on_demand_block_instead_of_a_reply_is_no_reply() -> None:
     line, dev = talkative()
     station = line.stations[0]
     async with running(line):
         await asyncio.sleep(2)
-        hear = station.inner.hear
-        station.inner.hear = lambda data, now: (  # type: ignore[method-assign]
-            [on_demand(line, "7777")] if hear(data, now) else []
+        station.answer = lambda data, now: (
+            [on_demand(line, "7777")] if station.inner.hear(data, now) else []
         )
         await asyncio.sleep(8)
         assert dev.state is State.OFFLINE
-        assert 0x7777 not in {sample.value for _, sample in line.told}
+        assert 0x7777 not in {sample.value for _, sample in line.reported}
         assert all(line.now[tag].quality is Quality.BAD for tag in dev.tags)
 
 
@@ -250,7 +249,7 @@ async def test_an_on_demand_block_instead_of_an_answer_is_no_answer() -> None:
 
 
 @on_virtual_time
-async def test_a_plc_that_does_not_answer_is_diagnosed_with_the_causes_it_may_have() -> None:
+async def test_the_diagnosis_of_a_silent_plc_names_the_known_causes() -> None:
     dev = link_device(ComputerLink(station=5), "D0")
     line = link_plant([dev])
     async with running(line):
@@ -266,7 +265,7 @@ async def test_a_plc_that_does_not_answer_is_diagnosed_with_the_causes_it_may_ha
 
 
 @on_virtual_time
-async def test_other_protocols_are_not_diagnosed_with_them() -> None:
+async def test_the_diagnosis_of_other_protocols_does_not_name_them() -> None:
     dev = device([make_tag("D0")])
     line = plant([dev])
     line.stations[0].mute = True

@@ -19,8 +19,8 @@ from tests.sim.virtual import on_virtual_time
 
 
 @on_virtual_time
-async def test_on_an_echoing_line_a_silent_slave_does_not_acknowledge_by_its_echo() -> None:
-    """The good answer to functions 05 and 06 is the request itself."""
+async def test_with_echo_in_the_file_an_echo_is_no_acknowledgement() -> None:
+    """The normal reply to functions 05 and 06 is the request itself."""
     driver = ModbusRtu(station=1)
     tags = [
         make_tag("holding:5", driver, type="uint16", write=WriteRule()),
@@ -43,12 +43,12 @@ async def test_on_an_echoing_line_a_silent_slave_does_not_acknowledge_by_its_ech
             line.stations[0].mute = False
             await asyncio.sleep(70)
         assert dev.record.failures[Evidence.SILENCE] >= 2
-        assert [line.now[tag].value for tag in tags] == [1234, True]  # a mute slave obeys nothing
+        assert [line.now[tag].value for tag in tags] == [1234, True]  # a mute slave writes nothing
 
 
 @pytest.mark.parametrize("driver", [ModbusRtu(station=1), ModbusAscii(station=1)])
 @on_virtual_time
-async def test_an_echo_the_file_does_not_speak_of_is_no_acknowledgement(driver: Driver) -> None:
+async def test_without_echo_in_the_file_an_echo_is_no_acknowledgement(driver: Driver) -> None:
     tags = writable(driver)
     dev = slave(driver, tags)
     line = plant([dev], bench=Bench(echo=True), echo_in_file=False)
@@ -70,7 +70,7 @@ async def test_an_echo_the_file_does_not_speak_of_is_no_acknowledgement(driver: 
 
 
 @on_virtual_time
-async def test_an_echo_the_file_does_not_speak_of_is_told_once() -> None:
+async def test_without_echo_in_the_file_an_echo_is_logged_once() -> None:
     driver = ModbusRtu(station=1)
     line = plant([slave(driver, writable(driver))], bench=Bench(echo=True), echo_in_file=False)
     with capture_logs() as logs:
@@ -80,14 +80,14 @@ async def test_an_echo_the_file_does_not_speak_of_is_told_once() -> None:
             await asyncio.sleep(5)
             line.bench.come_back()
             await asyncio.sleep(60)
-    told = [entry for entry in logs if "adapter echoes" in entry["event"]]
-    assert [(entry["event"], entry["log_level"]) for entry in told] == [
+    logged = [entry for entry in logs if "adapter echoes" in entry["event"]]
+    assert [(entry["event"], entry["log_level"]) for entry in logged] == [
         ("adapter echoes", "warning")
     ]
 
 
 @on_virtual_time
-async def test_where_nothing_echoes_a_write_takes_one_exchange() -> None:
+async def test_without_an_echo_a_write_takes_one_transaction() -> None:
     driver = ModbusRtu(station=1)
     tags = writable(driver)
     dev = slave(driver, tags, reply_timeout=2.0)
@@ -104,8 +104,8 @@ async def test_where_nothing_echoes_a_write_takes_one_exchange() -> None:
 
 
 @on_virtual_time
-async def test_a_dead_slave_is_not_brought_to_life_by_the_echo_of_a_loopback() -> None:
-    """Function 08 is answered with the request, too."""
+async def test_an_echoed_loopback_does_not_bring_a_mute_slave_online() -> None:
+    """The reply to function 08 is the request, too."""
     driver = ModbusRtu(station=1, diagnostics=True)
     dev = slave(driver, writable(driver))
     line = plant([dev], bench=Bench(echo=True), echo_in_file=False)
@@ -113,7 +113,7 @@ async def test_a_dead_slave_is_not_brought_to_life_by_the_echo_of_a_loopback() -
     async with running(line):
         await asyncio.sleep(60)
         assert line.state(dev) is State.OFFLINE
-        assert not any(alive for _, _, alive in line.lives)
+        assert not any(online for _, _, online in line.online_changes)
         line.stations[0].mute = False
         await asyncio.sleep(70)
         assert line.state(dev) is State.ONLINE

@@ -38,7 +38,7 @@ def good_reads(plant: Plant, since: float = 0.0) -> int:
 async def test_late_replies_never_make_a_wrong_value(
     kind: type[ModbusRtu | ModbusAscii], share: float, sizes: tuple[int, ...]
 ) -> None:
-    """Late by 50 to 150 ms beyond the time-out; the four cases of a framing are 10,000 reads."""
+    """50 to 150 ms after the time-out; the four cases of a framing are 10,000 reads."""
     timeout, drivers = 0.3, [kind(station=n) for n in (1, 2)]
     devices = [slave(d, registers(d, *sizes), reply_timeout=timeout) for d in drivers]
     line = plant(devices, seed=int(share * 100))
@@ -63,7 +63,7 @@ async def test_late_replies_never_make_a_wrong_value(
 @pytest.mark.parametrize("kind", [ModbusRtu, ModbusAscii])
 @pytest.mark.parametrize("every", [0.05, 1.0])
 @on_virtual_time
-async def test_four_slaves_keep_95_percent_of_their_reads_beside_a_silent_one(
+async def test_four_slaves_beside_a_silent_one_keep_95_percent_of_their_reads(
     kind: type[ModbusRtu | ModbusAscii], every: float
 ) -> None:
     async def reads(numbers: Sequence[int]) -> int:
@@ -82,7 +82,7 @@ async def test_four_slaves_keep_95_percent_of_their_reads_beside_a_silent_one(
 
 @pytest.mark.parametrize("kind", [ModbusRtu, ModbusAscii])
 @on_virtual_time
-async def test_a_broadcast_is_written_and_nothing_is_waited_for_but_the_turnaround(
+async def test_a_broadcast_is_followed_by_the_turnaround_and_no_reply(
     kind: type[ModbusRtu | ModbusAscii],
 ) -> None:
     everybody, ears = kind(station=0), [kind(station=n) for n in (1, 2)]
@@ -124,7 +124,7 @@ def vector(name: str) -> bytes:
 
 @dataclass
 class Twisted:
-    """Between wire and station: its answers are not what they should be."""
+    """A station whose replies are changed on their way out."""
 
     inner: ModbusStation
     twist: Callable[[bytes], bytes]  # PDU -> PDU
@@ -142,7 +142,7 @@ class Twisted:
 
 
 def twisted(line: Plant, number: int, twist: Callable[[bytes], bytes]) -> Twisted:
-    """From now on the station answers like this."""
+    """Changes the replies of the station from now on."""
     station: Any = line.stations[number]
     station.inner = Twisted(station.inner, twist)
     twisted: Twisted = station.inner
@@ -151,7 +151,7 @@ def twisted(line: Plant, number: int, twist: Callable[[bytes], bytes]) -> Twiste
 
 @pytest.mark.parametrize("code", [5, 6])
 @on_virtual_time
-async def test_a_busy_slave_is_left_alone_longer_each_time(code: int) -> None:
+async def test_a_busy_slave_is_polled_after_a_growing_pause(code: int) -> None:
     drivers = [ModbusRtu(station=n) for n in (1, 2)]
     devices = [slave(d, registers(d, 10, every=5.0 if d.station == 1 else 0.1)) for d in drivers]
     line = plant(devices)
@@ -173,7 +173,7 @@ async def test_a_busy_slave_is_left_alone_longer_each_time(code: int) -> None:
 
 
 @on_virtual_time
-async def test_exception_02_is_halved_down_to_the_registers_that_are_not_there() -> None:
+async def test_exception_02_is_halved_down_to_the_missing_registers() -> None:
     driver = ModbusRtu(station=1)
     dev = slave(driver, registers(driver, 60, every=0.5))
     line = plant([dev], holes=[("holding", 23, 24), ("holding", 59, 59)])
@@ -197,7 +197,7 @@ async def test_exception_02_is_halved_down_to_the_registers_that_are_not_there()
     [("vigor", "D300", "D", True), ("plain", "holding:300", "holding", False)],
 )
 @on_virtual_time
-async def test_function_06_answered_with_address_0_is_done_for_vigor_alone(
+async def test_only_vigor_may_acknowledge_function_06_with_address_0(
     addressing: Any, text: str, area: str, done: bool
 ) -> None:
     driver = ModbusRtu(station=1, addressing=addressing)
@@ -216,7 +216,7 @@ async def test_function_06_answered_with_address_0_is_done_for_vigor_alone(
 
 @dataclass
 class Listening(Bench):
-    """Keeps when something was heard as well."""
+    """Keeps the time of each received piece as well."""
 
     heard: list[float] = field(default_factory=list)
 
@@ -226,7 +226,7 @@ class Listening(Bench):
 
 
 @on_virtual_time
-async def test_three_dialects_share_one_rtu_line_and_ex485lnk_has_its_silence() -> None:
+async def test_three_dialects_share_one_line_and_ex485lnk_gets_its_silence() -> None:
     names = {"vigor": ("D100", "M5"), "k120s": ("D0100", "M0010"), "ex485lnk": ("BFM#4", "BFM#5")}
     devices = []
     for number, (addressing, texts) in enumerate(names.items(), 1):

@@ -26,11 +26,11 @@ from tests.sim.witness import Witness
 
 @dataclass
 class Network(Bench):
-    """A Modbus TCP device: each question has its own latency, None for one that is lost."""
+    """A Modbus TCP device with a latency for each request; None: the request is lost."""
 
-    latency: Callable[[int], float | None] = lambda _: 0.02  # by the question's number, from 0
-    cut_at: int = -1  # the question in whose answer the connection breaks
-    numbers: list[int] = field(default_factory=list)  # transactions, as they were asked
+    latency: Callable[[int], float | None] = lambda _: 0.02  # by the number of the request, from 0
+    cut_at: int = -1  # the request in whose reply the connection breaks
+    numbers: list[int] = field(default_factory=list)  # transactions, in the order of the requests
     answered: list[int] = field(default_factory=list)
     open_now: int = 0
     open_most: int = 0
@@ -54,14 +54,14 @@ class Network(Bench):
             if wait is not None:
                 self.open_now += 1
                 self.open_most = max(self.open_most, self.open_now)
-                question = MbapCodec().encode(frame)
+                request = MbapCodec().encode(frame)
                 ear = self.ear
-                asyncio.get_running_loop().call_later(wait, self._answer, number, question, ear)
+                asyncio.get_running_loop().call_later(wait, self._answer, number, request, ear)
 
-    def _answer(self, number: int, question: bytes, ear: Receiver | None) -> None:
+    def _answer(self, number: int, request: bytes, ear: Receiver | None) -> None:
         if ear is None or ear is not self.ear:
             return
-        (reply,) = self.station.hear(question, now())
+        (reply,) = self.station.hear(request, now())
         self.open_now -= 1
         self.answered.append(self.numbers[number])
         if number == self.cut_at:
@@ -74,7 +74,7 @@ class Network(Bench):
 
 def windowed(window: int, blocks: int = 8, every: float = 0.01, **timing: Any) -> Device:
     driver = ModbusTcp(window=window)
-    tags = registers(driver, *[3] * blocks, every=every)  # too far apart for one question
+    tags = registers(driver, *[3] * blocks, every=every)  # too far apart for one request
     return slave(driver, tags, wire=NETWORK, **{"reply_timeout": 0.3, **timing})
 
 
@@ -86,8 +86,8 @@ def network(device: Device, **settings: Any) -> tuple[Plant, Network, Witness]:
 
 @pytest.mark.parametrize("window", [1, 2, 4, 8])
 @on_virtual_time
-async def test_as_many_questions_are_open_at_once_as_the_window_says(window: int) -> None:
-    """With 20 ms of latency that many times the reads are done."""
+async def test_the_window_is_the_number_of_open_requests(window: int) -> None:
+    """With 20 ms of latency the reads multiply by the window."""
     dev = windowed(window)
     line, bench, witness = network(dev)
     async with running(line):
@@ -103,7 +103,7 @@ async def test_as_many_questions_are_open_at_once_as_the_window_says(window: int
 
 
 @on_virtual_time
-async def test_answers_in_any_order_are_matched_by_their_number() -> None:
+async def test_replies_in_any_order_are_matched_by_transaction_number() -> None:
     chance = random.Random(5)
     dev = windowed(8)
     line, bench, witness = network(dev, latency=lambda _: chance.uniform(0.001, 0.1))
@@ -118,10 +118,10 @@ async def test_answers_in_any_order_are_matched_by_their_number() -> None:
 
 @pytest.mark.parametrize("after", [None, 0.4])
 @on_virtual_time
-async def test_a_question_that_times_out_does_not_spoil_those_beside_it(
+async def test_a_time_out_leaves_the_other_open_requests_alone(
     after: float | None,
 ) -> None:
-    """Lost, or answered within the guard; the others of its round are good."""
+    """The request is lost, or its reply comes within the guard; the others are good."""
     dev = windowed(4, blocks=4)
     lost = 42
     line, bench, witness = network(dev, latency=lambda n: after if n == lost else 0.02)
@@ -130,20 +130,18 @@ async def test_a_question_that_times_out_does_not_spoil_those_beside_it(
             await asyncio.sleep(0.01)
         asked = now()
         await asyncio.sleep(0.25)  # before the time-out
-        told = {s.tag.span.start // 1000 for at, s in line.told if at >= asked}
-        assert len(told) == 3
+        read = {s.tag.span.start // 1000 for at, s in line.reported if at >= asked}
+        assert len(read) == 3
         await asyncio.sleep(2)
         assert line.good(dev)
     assert dev.record.failures == {"silence": 1}
     assert dev.record.late == (0 if after is None else 1)
-    assert all(s.quality is Quality.GOOD for at, s in line.told if at > 1001)
+    assert all(s.quality is Quality.GOOD for at, s in line.reported if at > 1001)
     assert witness.wrong == []
 
 
 @on_virtual_time
-async def test_a_connection_cut_in_mid_frame_is_opened_anew_and_half_the_frame_is_forgotten() -> (
-    None
-):
+async def test_a_connection_cut_in_a_frame_is_reopened_without_the_half_frame() -> None:
     dev = windowed(4, blocks=4, every=0.2)
     line, bench, witness = network(dev, cut_at=21)
     async with running(line):
@@ -151,7 +149,7 @@ async def test_a_connection_cut_in_mid_frame_is_opened_anew_and_half_the_frame_i
         assert line.good(dev)
     assert len(bench.opened) == 2
     cut = line.turned(dev.tags[0], Quality.BAD, 1000.5)
-    assert {s.reason for at, s in line.told if at == cut and s.quality is Quality.BAD} == {
+    assert {s.reason for at, s in line.reported if at == cut and s.quality is Quality.BAD} == {
         Reason.LINE_DOWN
     }
     assert line.turned(dev.tags[0], Quality.GOOD, cut) - cut < 0.5

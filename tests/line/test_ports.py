@@ -18,7 +18,7 @@ from tests.sim.virtual import now, on_virtual_time
 
 
 @on_virtual_time
-async def test_a_port_that_vanishes_turns_every_tag_and_comes_back() -> None:
+async def test_every_tag_turns_bad_at_port_loss_and_good_after_it() -> None:
     devices = [clocks(10, 10, station=n) for n in (1, 2)]
     line = plant(devices)
     wind_up(line)
@@ -39,7 +39,7 @@ async def test_a_port_that_vanishes_turns_every_tag_and_comes_back() -> None:
 
 
 @on_virtual_time
-async def test_a_port_lost_in_the_quiet_after_a_time_out_is_told_at_once() -> None:
+async def test_port_loss_after_a_time_out_is_reported_at_once() -> None:
     dev = clocks(10, guard=20.0)
     line = plant([dev])
     async with running(line):
@@ -52,7 +52,7 @@ async def test_a_port_lost_in_the_quiet_after_a_time_out_is_told_at_once() -> No
 
 
 @on_virtual_time
-async def test_the_pause_between_tries_grows_to_ten_seconds_and_starts_anew() -> None:
+async def test_the_pause_between_tries_grows_to_ten_seconds_at_every_loss() -> None:
     line = plant([clocks(10)])
     async with running(line):
         await asyncio.sleep(60)
@@ -71,7 +71,7 @@ async def test_the_pause_between_tries_grows_to_ten_seconds_and_starts_anew() ->
 
 
 @on_virtual_time
-async def test_a_port_that_stays_away_is_told_once_and_not_at_every_try() -> None:
+async def test_a_missing_port_is_warned_of_once_and_not_at_every_try() -> None:
     line = plant([clocks(5)])
     with capture_logs() as logs:
         async with running(line):
@@ -82,13 +82,13 @@ async def test_a_port_that_stays_away_is_told_once_and_not_at_every_try() -> Non
                 line.bench.come_back()
                 await asyncio.sleep(REOPEN_LONGEST * 3)
     down = [entry["why"] for entry in logs if entry["event"] == "line down"]
-    told = [e["why"] for e in logs if e["event"] == "line down" and e["log_level"] == "warning"]
+    warned = [e["why"] for e in logs if e["event"] == "line down" and e["log_level"] == "warning"]
     assert len(down) > 40
-    assert told == ["unplugged", "unplugged"]  # once for each time it went
+    assert warned == ["unplugged", "unplugged"]  # once for each time it went
 
 
 @on_virtual_time
-async def test_a_bug_in_a_driver_takes_its_line_down_and_no_more(
+async def test_a_driver_bug_takes_down_its_own_line_only(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     broken, sound = plant([clocks(10)]), plant([clocks(10)])
@@ -112,7 +112,7 @@ async def test_a_bug_in_a_driver_takes_its_line_down_and_no_more(
 
 
 @on_virtual_time
-async def test_a_bug_in_the_middle_of_a_write_answers_it(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_driver_bug_during_a_write_ends_it_unclear(monkeypatch: pytest.MonkeyPatch) -> None:
     tag = make_tag("D0", write=WriteRule())
     line = plant([device([tag])])
 

@@ -1,4 +1,4 @@
-"""`verify_reads`: a value is believed when two readings in a row say the same."""
+"""`verify_reads`: a sample is good when two reads in a row are equal."""
 
 import asyncio
 
@@ -9,20 +9,20 @@ from tests.sim.virtual import on_virtual_time
 
 
 @on_virtual_time
-async def test_two_readings_that_agree_are_believed_and_both_were_sent() -> None:
+async def test_two_equal_reads_make_one_good_sample() -> None:
     mixer = device(words(100, 2), verify_reads=2)
     hall = plant([mixer])
     async with running(hall):
         await asyncio.sleep(10)
-        samples = [told for _, told in hall.told if told.tag is mixer.tags[0]]
-        good = sum(told.quality is Quality.GOOD for told in samples)
+        samples = [sample for _, sample in hall.reported if sample.tag is mixer.tags[0]]
+        good = sum(sample.quality is Quality.GOOD for sample in samples)
         reads = sum(data[3:5] == b"51" and b"1CC804" in data for _, data in hall.bench.sent)
         assert good >= 9
         assert reads == 2 * good
 
 
 @on_virtual_time
-async def test_a_value_that_is_another_each_time_is_never_believed() -> None:
+async def test_a_value_that_differs_at_each_read_stays_bad() -> None:
     mixer = device(words(100, 1), verify_reads=2)
     hall = plant([mixer])
     hall.stations[0].memory.animate("D", 100, lambda now: int(now * 1000) & 0xFFFF)
@@ -35,7 +35,7 @@ async def test_a_value_that_is_another_each_time_is_never_believed() -> None:
 
 
 @on_virtual_time
-async def test_a_device_is_not_taken_for_silent_because_one_of_its_values_moves() -> None:
+async def test_a_device_with_one_changing_value_stays_online() -> None:
     mixer = device([*words(100, 1), *words(900, 1)], verify_reads=2)
     hall = plant([mixer])
     hall.stations[0].memory.animate("D", 100, lambda now: int(now * 1000) & 0xFFFF)
@@ -44,6 +44,6 @@ async def test_a_device_is_not_taken_for_silent_because_one_of_its_values_moves(
         moving, still = mixer.tags
         assert hall.now[moving].quality is Quality.BAD
         assert mixer.state is State.ONLINE
-        samples = [told for _, told in hall.told if told.tag is still]
-        assert [told.quality for told in samples[1:]] == [Quality.GOOD] * (len(samples) - 1)
+        samples = [sample for _, sample in hall.reported if sample.tag is still]
+        assert [sample.quality for sample in samples[1:]] == [Quality.GOOD] * (len(samples) - 1)
         assert len(samples) >= 19

@@ -15,7 +15,7 @@ from tests.sim.virtual import now, on_virtual_time
 
 
 @on_virtual_time
-async def test_under_full_load_a_write_waits_for_one_exchange_or_two() -> None:
+async def test_under_full_load_a_write_waits_for_at_most_two_transactions() -> None:
     dev = device(
         [
             *words(0, 50, every=0.02),
@@ -56,7 +56,7 @@ async def test_a_stream_of_writes_starves_no_block() -> None:
             line.submit(dev, dev.tags[-1], value)
             await asyncio.sleep(0.03)
         for tag in (dev.tags[0], dev.tags[10]):
-            times = [at for at, s in line.told if s.tag is tag and start <= at]
+            times = [at for at, s in line.reported if s.tag is tag and start <= at]
             assert max(b - a for a, b in itertools.pairwise(times)) < 1.5
 
 
@@ -68,10 +68,8 @@ async def test_an_expired_write_is_never_sent() -> None:
     station = line.stations[0]
     async with running(line):
         await asyncio.sleep(1)
-        # Private: the station decides this between two frames.
-        answer = station.inner._answer
-        station.inner._answer = (  # type: ignore[method-assign]
-            lambda request, now: None if request[3:5] == b"61" else answer(request, now)
+        station.answer = lambda data, now: (
+            [] if data[3:5] == b"61" else station.inner.hear(data, now)
         )
         outcomes = [line.submit(dev, dev.tags[0], value) for value in range(50)]
         asked = now()
@@ -86,9 +84,7 @@ async def test_an_expired_write_is_never_sent() -> None:
 
 
 @on_virtual_time
-async def test_when_the_port_goes_a_write_in_flight_is_unclear_and_those_waiting_fail_at_once() -> (
-    None
-):
+async def test_port_loss_leaves_the_sent_write_unclear_and_fails_waiting_writes() -> None:
     dev = device([make_tag("D0", write=WriteRule()), *words(10, 20)])
     line = plant([dev])
     async with running(line):
@@ -109,7 +105,7 @@ async def test_when_the_port_goes_a_write_in_flight_is_unclear_and_those_waiting
 
 @pytest.mark.parametrize("moment", [0.0, 0.003, 0.01, 0.03, 0.1, 0.5])
 @on_virtual_time
-async def test_a_cancelled_line_answers_every_write_once(moment: float) -> None:
+async def test_a_cancelled_line_ends_every_write_once(moment: float) -> None:
     dev = device([make_tag("D0", write=WriteRule()), *words(10, 20)])
     line = plant([dev])
     async with running(line) as task:
@@ -129,7 +125,7 @@ async def test_a_cancelled_line_answers_every_write_once(moment: float) -> None:
 
 
 @on_virtual_time
-async def test_a_bit_of_a_word_is_changed_where_it_is() -> None:
+async def test_a_bit_write_keeps_the_other_bits_of_the_word() -> None:
     tags = [make_tag(f"D7.{bit}", write=WriteRule(verify=True), every=0.3) for bit in range(16)]
     line = plant([device(tags)])
     memory = line.stations[0].memory
@@ -147,7 +143,7 @@ async def test_a_bit_of_a_word_is_changed_where_it_is() -> None:
 
 
 @on_virtual_time
-async def test_a_written_value_is_seen_at_once() -> None:
+async def test_a_written_value_is_read_before_the_next_poll_is_due() -> None:
     slow = make_tag("D0", write=WriteRule(), every=60.0)
     line = plant([device([slow])])
     async with running(line):
@@ -159,7 +155,7 @@ async def test_a_written_value_is_seen_at_once() -> None:
 
 
 @on_virtual_time
-async def test_a_refused_write_says_the_makers_code() -> None:
+async def test_a_refused_write_reports_the_error_code() -> None:
     tag = make_tag("D0", write=WriteRule())
     line = plant([device([tag, *words(10, 2)])])
     async with running(line):

@@ -1,18 +1,14 @@
-"""Wires behind which answers come late and many at once, or which never fall silent."""
+"""Links that stall and then deliver all replies at once, or that are never quiet."""
 
 import asyncio
-import random
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 import pytest
 
-from gateway.engine.device import Device
 from gateway.engine.health import State
 from gateway.errors import Busy, LineDown
-from gateway.planning.wire_timing import WireTiming
 from gateway.protocols.checksums import crc16
 from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.driver import AnyDriver
@@ -20,92 +16,28 @@ from gateway.protocols.modbus import ModbusAscii, ModbusRtu
 from gateway.protocols.vigor import Vigor
 from gateway.simulator.plant import station_for
 from gateway.tags import Quality, Reason, Tag, WriteResult, WriteRule
-from gateway.transport import Receiver
-from tests.sim.bench import WIRE, Bench
-from tests.sim.plant import Outcome, Plant, device, made_device, make_tag, plant, running
+from tests.line.device_server import GUARD, DeviceServer, behind
+from tests.sim.bench import WIRE
+from tests.sim.plant import Outcome, Plant, made_device, make_tag, running
 from tests.sim.virtual import now, on_virtual_time
 
-GUARD = 0.5
 
-
-@dataclass
-class DeviceServer(Bench):
-    """Requests reach the PLC one after the other, each when the one before has its answer.
-
-    While it is stalled none goes on, and none is lost: so it is with TCP.
-    """
-
-    late: Callable[[random.Random], float] = lambda _: 0.0  # seconds on top, for each answer
-    deaf_to: Callable[[bytes], bool] = lambda _: False  # requests that are lost on the wire
-    latency: float = 0.0  # seconds, of what comes back
-    flows: asyncio.Event = field(default_factory=asyncio.Event)
-    _queue: "asyncio.Queue[bytes]" = field(default_factory=asyncio.Queue)
-    _task: "asyncio.Task[None] | None" = None
-
-    async def open(
-        self, stations: Sequence[Any], wire: WireTiming, ear: Receiver
-    ) -> "DeviceServer":
-        self.ear, (self._station,) = ear, stations
-        self.flows.set()
-        self._task = asyncio.create_task(self._serve())
-        return self
-
-    def write(self, data: bytes) -> None:
-        self.sent.append((now(), data))
-        self._queue.put_nowait(data)
-
-    async def close(self) -> None:
-        if self._task is not None:
-            self._task.cancel()
-
-    def received(self, data: bytes) -> None:
-        if self.ear is not None:
-            asyncio.get_running_loop().call_later(self.latency, self.ear.received, data)
-
-    async def _serve(self) -> None:
-        while True:
-            request = await self._queue.get()
-            await self.flows.wait()
-            await asyncio.sleep(len(request) * WIRE.character)
-            if self.echo:
-                self.received(request)
-            await asyncio.sleep(0.005)
-            answers = [] if self.deaf_to(request) else self._station.hear(request, now())
-            for answer in answers:
-                await asyncio.sleep(len(answer) * WIRE.character + self.late(self._random))
-                self.received(answer)
-
-
-def behind(
-    server: DeviceServer,
-    driver: AnyDriver,
-    *tags: Tag,
-    echo_in_file: bool = True,
-    **timing: Any,
-) -> tuple[Plant, Device, Any]:
-    """The line, its device, and the memory of its PLC."""
-    dev = made_device("plc", driver, WIRE, replace(driver.timing, **timing), tags, GUARD)
-    station = station_for(driver, [])
-    line = Plant([dev], [station], server, WIRE, echo_in_file=echo_in_file)  # type: ignore[list-item]
-    return line, dev, station.memory
-
-
-def told_wrong(line: Plant) -> list[object]:
-    """Where each word holds its own number."""
-    good = (sample for _, sample in line.told if sample.quality is Quality.GOOD)
+def wrong_values(line: Plant) -> list[object]:
+    """The wrong good values, where each word holds its own number."""
+    good = (sample for _, sample in line.reported if sample.quality is Quality.GOOD)
     return [(s.tag.text, s.value) for s in good if s.value != s.tag.address.number]
 
 
 @pytest.mark.parametrize(
     ("retries", "stall"), [(2, 6.0), (2, 12.0), (2, 30.0), (4, 4.0), (6, 5.0), (10, 8.0)]
 )
-@pytest.mark.parametrize("wanted", [True, False])
+@pytest.mark.parametrize("expedited", [True, False])
 @pytest.mark.parametrize("driver", [ModbusRtu(station=1), ModbusAscii(station=1), Vigor(station=1)])
 @on_virtual_time
-async def test_after_a_stall_no_old_answer_is_taken_for_a_new_one(
-    driver: AnyDriver, wanted: bool, retries: int, stall: float
+async def test_after_a_stall_no_old_reply_is_taken_for_a_new_one(
+    driver: AnyDriver, expedited: bool, retries: int, stall: float
 ) -> None:
-    """Nothing is lost: the answers to all that was asked meanwhile come one after the other."""
+    """No request is lost: the replies to all of them arrive one after the other."""
     area = "D" if driver.protocol == "vigor" else "holding:"
     numbers = (100, 1000, 1001, 2000, 2001, 2002, 3000, 3001, 3002, 3003)
     tags = [make_tag(f"{area}{n}", driver, device="plc", type="uint16") for n in numbers]
@@ -121,16 +53,16 @@ async def test_after_a_stall_no_old_answer_is_taken_for_a_new_one(
             end = now() + stall
             while now() < end:
                 await asyncio.sleep(1.0)
-                if wanted:
+                if expedited:
                     line.line.expedite(dev, tags[0])
             server.flows.set()
         await asyncio.sleep(20)
         assert line.good(dev)
-    assert told_wrong(line) == []
+    assert wrong_values(line) == []
 
 
 @on_virtual_time
-async def test_after_a_stall_one_bit_is_written_into_the_word_as_it_is() -> None:
+async def test_after_a_stall_a_bit_write_keeps_the_other_bits_of_the_word() -> None:
     driver = ModbusRtu(station=1)
     bit = make_tag("holding:500.3", driver, device="plc", write=WriteRule(verify=True))
     words = [
@@ -154,7 +86,7 @@ async def test_after_a_stall_one_bit_is_written_into_the_word_as_it_is() -> None
 
 
 @dataclass
-class Few:
+class FewRegisters:
     """A Modbus RTU slave with these holding registers and no others."""
 
     held: dict[int, int]
@@ -170,10 +102,10 @@ class Few:
 
 @pytest.mark.parametrize("longest", [2.0, 3.0])
 @on_virtual_time
-async def test_late_refusals_of_what_a_slave_does_not_have_acknowledge_nothing(
+async def test_late_refusals_acknowledge_no_write(
     longest: float,
 ) -> None:
-    """An exception names no question: those to our own probes come late, too."""
+    """An exception names no request: those to our own probes come late, too."""
     driver = ModbusRtu(station=1, write_single=False)
     numbers = (100, 101, 200, 201, 300)
     rule = WriteRule()
@@ -188,7 +120,7 @@ async def test_late_refusals_of_what_a_slave_does_not_have_acknowledge_nothing(
     held: dict[int, set[int]] = {number: {number} for number in numbers}  # ever
     for number in numbers:
         inner.memory.write("holding", number, [number])
-    line = Plant([dev], [Few(dict.fromkeys(numbers, 0), inner)], server, WIRE)  # type: ignore[list-item]
+    line = Plant([dev], [FewRegisters(dict.fromkeys(numbers, 0), inner)], server, WIRE)  # type: ignore[list-item]
     false: list[object] = []
 
     def judged(tag: Tag, value: int, written: asyncio.Future[WriteResult]) -> None:
@@ -204,7 +136,7 @@ async def test_late_refusals_of_what_a_slave_does_not_have_acknowledge_nothing(
             written.add_done_callback(partial(judged, tag, value))
             await asyncio.sleep(0.7)
     assert false == []
-    good = [s for _, s in line.told if s.quality is Quality.GOOD]
+    good = [s for _, s in line.reported if s.quality is Quality.GOOD]
     assert len(good) > 300
     assert all(sample.value in held[sample.tag.address.number] for sample in good)
 
@@ -219,10 +151,10 @@ async def test_late_refusals_of_what_a_slave_does_not_have_acknowledge_nothing(
     ],
 )
 @on_virtual_time
-async def test_a_line_that_is_never_quiet_is_no_reason_to_be_silent(
+async def test_on_a_line_that_is_never_quiet_values_turn_bad_and_writes_end(
     driver: AnyDriver, address: str
 ) -> None:
-    """A stuck transceiver or another master: values turn bad, writes are answered."""
+    """A stuck transceiver, or another master."""
     tag = make_tag(address, driver, device="plc", write=WriteRule())
     server = DeviceServer()
     line, dev, _ = behind(server, driver, tag)
@@ -273,8 +205,8 @@ async def test_the_echo_of_our_own_area_c_acknowledges_no_write(delay: float) ->
 
 
 @on_virtual_time
-async def test_a_write_behind_a_long_wait_is_answered_when_its_time_is_over() -> None:
-    """Not only when the conversation before it ends."""
+async def test_a_write_behind_a_long_transaction_ends_at_its_expiry() -> None:
+    """It does not wait for the end of the transaction before it."""
     driver = Vigor(station=1)
     tags = [make_tag(f"D{n}", driver, device="plc", write=WriteRule()) for n in (100, 1000)]
     server = DeviceServer()
@@ -292,7 +224,7 @@ async def test_a_write_behind_a_long_wait_is_answered_when_its_time_is_over() ->
 
 
 @on_virtual_time
-async def test_on_a_line_that_is_down_no_device_is_up() -> None:
+async def test_no_device_is_online_on_a_lost_line() -> None:
     driver = Vigor(station=1)
     server = DeviceServer()
     tag = make_tag("D100", driver, device="plc")
@@ -313,7 +245,7 @@ async def test_on_a_line_that_is_down_no_device_is_up() -> None:
 
 @pytest.mark.parametrize("reply_timeout", [0.5, 5.0])
 @on_virtual_time
-async def test_a_port_that_goes_while_the_line_settles_is_noticed_at_once(
+async def test_port_loss_while_the_line_settles_is_reported_at_once(
     reply_timeout: float,
 ) -> None:
     driver = ModbusRtu(station=1)
@@ -332,47 +264,31 @@ async def test_a_port_that_goes_while_the_line_settles_is_noticed_at_once(
         gone = now()
         server.ear.lost(LineDown("pulled out"))
         await asyncio.sleep(0.01)
-        at, name, online = line.lives[-1]
+        at, name, online = line.online_changes[-1]
         assert (name, online) == ("plc", False)
         assert at == pytest.approx(gone, abs=0.01)
 
 
 @on_virtual_time
-async def test_one_refused_address_does_not_keep_the_turnaround_from_being_learned() -> None:
-    tags = [make_tag(f"D{66 * n}", device="plc1", every=0.5) for n in range(10)]
-    dev = device(tags, reply_timeout=0.5)
-    line = plant([dev])
-    line.stations[0].inner.holes.add(("D", 66))
-    async with running(line):
-        await asyncio.sleep(20)
-        line.stations[0].late = lambda _: 0.4
-        await asyncio.sleep(120)
-        assert dev.turnaround.expected == pytest.approx(0.405, abs=0.02)
-        known = dev.record.overdue
-        await asyncio.sleep(60)
-        assert dev.record.overdue == known
-
-
-@on_virtual_time
-async def test_writes_refused_together_are_answered_when_their_time_is_over() -> None:
-    """They are put back one by one, after the timer had found nobody waiting."""
+async def test_writes_refused_together_end_at_their_expiry() -> None:
+    """They return to the queue one by one, after the timer found it empty."""
     driver = ComputerLink(station=1)
     tags = [make_tag(f"D{n}", driver, device="plc", write=WriteRule()) for n in (100, 200, 300)]
     server = DeviceServer()
     line, dev, _ = behind(server, driver, *tags, reply_timeout=15.0)
     refuse = b"\x1501FF06"
-    answer = line.stations[0].hear
+    hear = line.stations[0].hear
 
-    def hear(data: bytes, now: float) -> list[bytes]:
-        return [refuse] if data[5:7] == b"WT" else answer(data, now)
+    def refusing(data: bytes, now: float) -> list[bytes]:
+        return [refuse] if data[5:7] == b"WT" else hear(data, now)
 
-    line.stations[0].hear = hear  # type: ignore[method-assign]
+    line.stations[0].hear = refusing  # type: ignore[method-assign]  # no `Unruly` here
     async with running(line):
         await asyncio.sleep(5)
         line.submit(dev, tags[2], 7)  # arms the timer, and is done
         await asyncio.sleep(4.98)
         outcomes = [line.submit(dev, tag, n) for n, tag in enumerate(tags[:2])]
-        server.deaf_to = lambda request: request[5:7] == b"WW"  # one by one they get lost
+        server.deaf_to = lambda request: request[5:7] == b"WW"  # sent one by one they are lost
         await asyncio.sleep(20.0)
         late = outcomes[1]
         assert isinstance(late.once, Busy)

@@ -1,87 +1,23 @@
-"""One transaction: time-outs, late replies, echoes, noise and lost ports, byte by byte."""
+"""One transaction: time-outs, late replies, echoes, noise and lost ports."""
 
 import asyncio
-from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import pytest
 
 from gateway.errors import Evidence, Garbled, LineDown, NoReply, Refused
-from gateway.line.channel import Channel, Echo
-from gateway.line.transaction import Transaction
-from gateway.line.wire_log import WireLog
-from gateway.planning.wire_timing import WireTiming
-from gateway.protocols.driver import AnyDriver, Span
+from gateway.protocols.driver import Span
 from gateway.protocols.modbus import ModbusRtu
 from gateway.protocols.vigor import Vigor
 from gateway.stations.modbus import ModbusStation
 from gateway.stations.vigor import VigorStation
-from tests.sim.plant import made_device
+from tests.line.fake_port import SPAN, WIRE, EchoingPort, FakePort, opened, read
 from tests.sim.virtual import VirtualLoop, now, on_virtual_time
-
-WIRE = WireTiming(9600, 10)
-SPAN = Span("D", 0, 2)
-
-
-class Far:
-    """A port with a station behind it, which answers when the test says so."""
-
-    def __init__(self, station: Any = None) -> None:
-        self.station = station or VigorStation(1)
-        self.sent: list[tuple[float, bytes]] = []
-        self.after: Callable[[int], float | None] = lambda number: 0.1  # None: not at all
-        self.spoil: Callable[[bytes], bytes] = lambda data: data
-        self.talk: Transaction | None = None
-
-    def write(self, data: bytes) -> None:
-        self.sent.append((now(), data))
-        reply = b"".join(self.station.hear(data, now()))
-        delay = self.after(len(self.sent))
-        if reply and delay is not None:
-            self.say(self.spoil(reply), delay)
-
-    def say(self, data: bytes, delay: float = 0.0) -> None:
-        asyncio.get_running_loop().call_later(delay, self._deliver, data)
-
-    def _deliver(self, data: bytes) -> None:
-        assert self.talk is not None
-        self.talk.received(data)
-
-    async def close(self) -> None: ...
-
-
-def opened(
-    port: Far,
-    driver: AnyDriver | None = None,
-    *,
-    quiet_since: float = 0.0,
-    baudrate: int = 9600,
-    echo: bool = False,
-    needs_resync: bool = False,
-    unmatched: list[Any] | None = None,
-) -> Transaction:
-    """A transaction on the port. `unmatched` collects the frames that are no reply."""
-    driver = driver or Vigor(station=1)
-    wire = WireTiming(baudrate, 10)
-    timing = replace(driver.timing, reply_timeout=0.3, silence=0.005, silence_chars=0.0)
-    device = made_device("plc", driver, wire, timing, ())
-    if not needs_resync:
-        device.health.answered()
-    channel = Channel(port, wire, WireLog("test"), Echo("test", echo))
-    channel.quiet_since = quiet_since
-    frames = [] if unmatched is None else unmatched
-    port.talk = Transaction(channel, device, lambda _, frame: frames.append(frame))
-    return port.talk
-
-
-def read(talk: Transaction, span: Span = SPAN) -> Any:
-    return Vigor(station=1).read(talk, span)
 
 
 @on_virtual_time
-async def test_an_answer_in_pieces_is_an_answer() -> None:
-    port = Far()
+async def test_a_reply_in_pieces_is_a_reply() -> None:
+    port = FakePort()
     port.station.memory.write("D", 0, [7, 8])
     talk = opened(port)
     port.after = lambda _: None
@@ -95,8 +31,8 @@ async def test_an_answer_in_pieces_is_an_answer() -> None:
 
 
 @on_virtual_time
-async def test_a_time_out_is_the_characters_own_time_and_the_stations() -> None:
-    port = Far()
+async def test_a_time_out_adds_the_time_of_the_characters_to_reply_timeout() -> None:
+    port = FakePort()
     port.after = lambda _: None
     start = now()
     with pytest.raises(NoReply):
@@ -107,30 +43,30 @@ async def test_a_time_out_is_the_characters_own_time_and_the_stations() -> None:
 
 @on_virtual_time
 async def test_the_silence_before_a_request_is_kept_by_the_clock() -> None:
-    port = Far()
+    port = FakePort()
     await read(opened(port, quiet_since=now() + 0.02))
     assert port.sent[0][0] == pytest.approx(now() - 0.1)
     assert port.sent[0][0] >= 1000.0 + 0.025
 
 
-@pytest.mark.parametrize("baudrate", [9600, 115200])  # above 19200 it looks at the clock
+@pytest.mark.parametrize("baudrate", [9600, 115200])  # above 19200 the channel looks at the clock
 @on_virtual_time
-async def test_watching_the_clock_ends_the_silence_neither_early_nor_much_late(
+async def test_the_silence_ends_neither_early_nor_much_late(
     baudrate: int,
 ) -> None:
-    port, start = Far(), now()
+    port, start = FakePort(), now()
     await read(opened(port, quiet_since=start, baudrate=baudrate))
     assert 0.005 - 1e-9 <= port.sent[0][0] - start <= 0.0051
 
 
 @on_virtual_time
-async def test_bytes_heard_before_the_request_answer_nothing() -> None:
-    """Half a late reply before the question and half of it after: still a late reply."""
-    before = Far()
+async def test_bytes_from_before_the_request_are_no_reply() -> None:
+    """A late reply of which one half arrives before the request is still late."""
+    before = FakePort()
     before.station.memory.write("D", 0, [666, 666])
     await read(opened(before))
     late = b"".join(before.station.hear(before.sent[0][1], 0.0))
-    port = Far()
+    port = FakePort()
     port.station.memory.write("D", 0, [1, 1])
     port.after = lambda _: None
     talk = opened(port, quiet_since=now())
@@ -146,8 +82,8 @@ async def test_bytes_heard_before_the_request_answer_nothing() -> None:
 
 
 @on_virtual_time
-async def test_settling_ends_when_the_late_answer_has_passed() -> None:
-    port = Far()
+async def test_settling_ends_with_the_late_reply() -> None:
+    port = FakePort()
     port.after = lambda _: 0.5
     talk = opened(port)
     with pytest.raises(NoReply):
@@ -160,8 +96,8 @@ async def test_settling_ends_when_the_late_answer_has_passed() -> None:
 
 
 @on_virtual_time
-async def test_settling_ends_with_the_guard_when_nothing_comes() -> None:
-    port = Far()
+async def test_settling_without_a_late_reply_ends_with_the_guard() -> None:
+    port = FakePort()
     port.after = lambda _: None
     talk = opened(port)
     with pytest.raises(NoReply):
@@ -173,10 +109,10 @@ async def test_settling_ends_with_the_guard_when_nothing_comes() -> None:
 
 @pytest.mark.parametrize("needs_resync", [False, True])
 @on_virtual_time
-async def test_a_late_refusal_is_a_late_answer_unless_it_may_answer_something_older(
+async def test_a_late_refusal_is_the_late_reply_unless_a_resync_is_needed(
     needs_resync: bool,
 ) -> None:
-    port = Far(VigorStation(1, holes=[("D", 0)]))
+    port = FakePort(VigorStation(1, holes=[("D", 0)]))
     port.after = lambda _: 0.5
     talk = opened(port, needs_resync=needs_resync)
     with pytest.raises(NoReply):
@@ -186,14 +122,14 @@ async def test_a_late_refusal_is_a_late_answer_unless_it_may_answer_something_ol
 
 
 @on_virtual_time
-async def test_another_frame_does_not_end_the_guard() -> None:
-    port = Far()
+async def test_an_unmatched_frame_does_not_end_the_settling() -> None:
+    port = FakePort()
     port.after = lambda _: None
     frames: list[Any] = []
     talk = opened(port, unmatched=frames)
     with pytest.raises(NoReply):
         await read(talk)
-    other = Far()
+    other = FakePort()
     await read(opened(other), Span("D", 0, 5))
     frame = b"".join(other.station.hear(other.sent[0][1], 0.0))
     port.say(frame, 0.1)
@@ -206,7 +142,7 @@ async def test_another_frame_does_not_end_the_guard() -> None:
 
 @on_virtual_time
 async def test_settling_can_be_cancelled() -> None:
-    port = Far()
+    port = FakePort()
     port.after = lambda _: None
     talk = opened(port)
     with pytest.raises(NoReply):
@@ -219,8 +155,8 @@ async def test_settling_can_be_cancelled() -> None:
 
 
 @on_virtual_time
-async def test_after_nonsense_it_waits_for_quiet() -> None:
-    port = Far()
+async def test_settling_after_a_garbled_reply_waits_for_quiet() -> None:
+    port = FakePort()
     port.spoil = lambda data: data[:-1] + b"?"
     talk = opened(port)
     with pytest.raises(Garbled) as caught:
@@ -243,13 +179,13 @@ async def test_after_nonsense_it_waits_for_quiet() -> None:
     ],
 )
 @on_virtual_time
-async def test_what_was_heard_instead_says_what_is_wrong(heard: str, evidence: Evidence) -> None:
-    port = Far()
+async def test_the_evidence_of_a_time_out_is_what_was_heard(heard: str, evidence: Evidence) -> None:
+    port = FakePort()
     port.after = lambda _: None
     talk = opened(port)
     asking = asyncio.create_task(read(talk))
     await asyncio.sleep(0.01)
-    other = Far(VigorStation(2 if heard == "station" else 1))
+    other = FakePort(VigorStation(2 if heard == "station" else 1))
     driver = Vigor(station=other.station.station)
     span = Span("D", 0, 3) if heard == "shape" else SPAN
     await driver.read(opened(other, driver), span)
@@ -263,8 +199,8 @@ async def test_what_was_heard_instead_says_what_is_wrong(heard: str, evidence: E
 
 
 @on_virtual_time
-async def test_a_lost_port_ends_the_question_and_all_that_would_follow() -> None:
-    port = Far()
+async def test_port_loss_ends_the_open_request_and_all_after_it() -> None:
+    port = FakePort()
     port.after = lambda _: None
     talk = opened(port)
     asking = asyncio.create_task(read(talk))
@@ -279,8 +215,8 @@ async def test_a_lost_port_ends_the_question_and_all_that_would_follow() -> None
 
 @pytest.mark.parametrize("garbled", [False, True])
 @on_virtual_time
-async def test_a_lost_port_ends_the_settling(garbled: bool) -> None:
-    port = Far()
+async def test_port_loss_ends_the_settling(garbled: bool) -> None:
+    port = FakePort()
     port.after = lambda _: 0.1 if garbled else None
     port.spoil = lambda data: data[:-1] + b"?"
     talk = opened(port)
@@ -295,8 +231,8 @@ async def test_a_lost_port_ends_the_settling(garbled: bool) -> None:
 
 
 @on_virtual_time
-async def test_noise_between_two_questions_of_a_turn_does_no_harm() -> None:
-    port = Far()
+async def test_noise_between_two_requests_of_a_transaction_is_dropped() -> None:
+    port = FakePort()
     talk = opened(port)
     await read(talk)
     broken = b"".join(port.station.hear(port.sent[0][1], 0.0))[:-1] + b"?"
@@ -306,29 +242,17 @@ async def test_noise_between_two_questions_of_a_turn_does_no_harm() -> None:
 
 @on_virtual_time
 async def test_a_refusal_is_raised_at_once() -> None:
-    port = Far(VigorStation(1, holes=[("D", 0)]))
+    port = FakePort(VigorStation(1, holes=[("D", 0)]))
     start = now()
     with pytest.raises(Refused):
         await read(opened(port))
     assert now() - start == pytest.approx(0.1)
 
 
-class Echoing(Far):
-    """A two-wire adapter: what is sent comes back, with what its switching adds before it."""
-
-    added = b""
-    adapter = True
-
-    def write(self, data: bytes) -> None:
-        if self.adapter:
-            self.say(self.added + data, 0.01)
-        super().write(data)
-
-
 @pytest.mark.parametrize("added", [b"", b"\x00", b"\xff\x06"])
 @on_virtual_time
-async def test_an_echo_is_dropped_whatever_comes_before_it(added: bytes) -> None:
-    port = Echoing()
+async def test_an_echo_is_dropped_with_the_bytes_before_it(added: bytes) -> None:
+    port = EchoingPort()
     port.added = added
     port.station.memory.write("D", 0, [3, 4])
     assert await read(opened(port, echo=True)) == (3, 4)
@@ -336,21 +260,21 @@ async def test_an_echo_is_dropped_whatever_comes_before_it(added: bytes) -> None
 
 @pytest.mark.parametrize("added", [b"", b"\x00"])
 @on_virtual_time
-async def test_an_echo_is_never_taken_for_an_acknowledgement(added: bytes) -> None:
-    """Modbus acknowledges the writing of one register with the very bytes of the request."""
+async def test_an_echo_is_no_acknowledgement(added: bytes) -> None:
+    """Modbus acknowledges the write of one register with the bytes of the request."""
     driver = ModbusRtu(station=1)
-    port = Echoing(ModbusStation(station=1, framing="rtu"))
+    port = EchoingPort(ModbusStation(station=1, framing="rtu"))
     port.added = added
-    port.after = lambda _: None  # the station is dead
+    port.after = lambda _: None  # the station is mute
     talk = opened(port, driver, echo=True)
     with pytest.raises((NoReply, Garbled)):
         await driver.write(talk, Span("holding", 5, 1), [42])
 
 
 @on_virtual_time
-async def test_where_the_echo_is_missing_nothing_is_believed() -> None:
+async def test_without_the_expected_echo_no_reply_counts() -> None:
     driver = ModbusRtu(station=1)
-    port = Echoing(ModbusStation(station=1, framing="rtu"))
+    port = EchoingPort(ModbusStation(station=1, framing="rtu"))
     port.adapter = False
     port.spoil = lambda data: b"\x01" + data
     with pytest.raises(Garbled, match="did not come back"):
@@ -359,7 +283,7 @@ async def test_where_the_echo_is_missing_nothing_is_believed() -> None:
 
 @on_virtual_time
 async def test_the_turnaround_is_the_stations_own_time() -> None:
-    port = Far()
+    port = FakePort()
     request, reply = Vigor(station=1).cost(SPAN)  # type: ignore[misc]
     port.after = lambda _: (request + reply) * WIRE.character + 0.04
     talk = opened(port)
@@ -370,7 +294,7 @@ async def test_the_turnaround_is_the_stations_own_time() -> None:
 @on_virtual_time
 async def test_a_reply_that_waited_while_the_loop_stood_still_is_late() -> None:
     """Its bytes may have arrived at any moment since, so no sample may carry this time."""
-    port = Far()
+    port = FakePort()
     port.station.memory.write("D", 0, [7, 8])
     talk = opened(port)
     port.after = lambda _: None

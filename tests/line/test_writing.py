@@ -1,4 +1,4 @@
-"""One write from the first byte to its outcome: what each rule allows and what is said of it."""
+"""The outcome of one write, by the rules of its tag."""
 
 import asyncio
 
@@ -19,20 +19,22 @@ def one(rule: WriteRule, text: str = "D0") -> tuple[Plant, Device, Tag]:
 
 
 def deafen(line: Plant, command: bytes, times: int = 1, *, obeys: bool = False) -> None:
-    """The station does not answer the next `times` requests of this command."""
-    station = line.stations[0].inner
-    answer = station._answer  # private: the station's rule is changed between two frames
+    """The station does not reply to the next `times` requests of this command.
 
-    def sometimes(request: bytes, now: float) -> object:
+    `obeys`: it carries them out.
+    """
+    station = line.stations[0]
+
+    def sometimes(request: bytes, now: float) -> list[bytes]:
         nonlocal times
         if request[3:5] == command and times:
             times -= 1
             if obeys:
-                answer(request, now)
-            return None
-        return answer(request, now)
+                station.inner.hear(request, now)
+            return []
+        return station.inner.hear(request, now)
 
-    station._answer = sometimes  # type: ignore[method-assign,assignment]
+    station.answer = sometimes
 
 
 async def write(line: Plant, value: int = 5) -> Outcome:
@@ -57,7 +59,7 @@ async def test_an_acknowledged_write_is_done() -> None:
 
 @pytest.mark.parametrize("obeys", [False, True])
 @on_virtual_time
-async def test_without_a_rule_a_write_that_was_not_acknowledged_is_unclear(obeys: bool) -> None:
+async def test_without_a_rule_an_unacknowledged_write_ends_unclear(obeys: bool) -> None:
     line, _, _ = one(WriteRule())
     async with running(line):
         await asyncio.sleep(1)
@@ -68,7 +70,7 @@ async def test_without_a_rule_a_write_that_was_not_acknowledged_is_unclear(obeys
 
 @pytest.mark.parametrize("obeys", [False, True])
 @on_virtual_time
-async def test_verify_reads_back_what_became_of_it(obeys: bool) -> None:
+async def test_verify_reads_an_unacknowledged_write_back(obeys: bool) -> None:
     line, _, _ = one(WriteRule(verify=True))
     async with running(line):
         await asyncio.sleep(1)
@@ -95,7 +97,7 @@ async def test_repeat_sends_once_more() -> None:
 
 
 @on_virtual_time
-async def test_verify_and_repeat_send_again_only_what_was_not_done() -> None:
+async def test_verify_and_repeat_send_again_only_a_lost_write() -> None:
     line, _, _ = one(WriteRule(verify=True, repeat=True))
     async with running(line):
         await asyncio.sleep(1)
@@ -112,28 +114,27 @@ async def test_verify_and_repeat_send_again_only_what_was_not_done() -> None:
 
 
 @on_virtual_time
-async def test_a_refusal_of_the_repetition_says_nothing_of_the_first_try() -> None:
-    """The first was obeyed, only its acknowledgement was lost: "refused" would be a lie."""
+async def test_a_refused_repetition_leaves_the_write_unclear() -> None:
+    """The station carried out the first try; only its acknowledgement was lost."""
     line, _, _tag = one(WriteRule(repeat=True))
     async with running(line):
         await asyncio.sleep(1)
-        station = line.stations[0].inner
-        answer, tries = station._answer, 0
+        station, tries = line.stations[0].inner, 0
 
-        def once(request: bytes, now: float) -> object:
+        def once(request: bytes, now: float) -> list[bytes]:
             nonlocal tries
             if request[3:5] != b"61":
-                return answer(request, now)
+                return station.hear(request, now)
             tries += 1
             if tries == 1:
-                answer(request, now)
-                return None
+                station.hear(request, now)
+                return []
             station.holes = {("D", 0)}
-            refusal = answer(request, now)
+            refusal = station.hear(request, now)
             station.holes = set()
             return refusal
 
-        station._answer = once  # type: ignore[method-assign,assignment]
+        line.stations[0].answer = once
         outcome = (await write(line)).once
     assert station.memory.read("D", 0) == [5]
     assert tries == 2
@@ -141,20 +142,19 @@ async def test_a_refusal_of_the_repetition_says_nothing_of_the_first_try() -> No
 
 
 @on_virtual_time
-async def test_a_refused_reading_back_does_not_make_the_write_refused() -> None:
+async def test_a_refused_read_back_leaves_the_write_unclear() -> None:
     line, dev, _ = one(WriteRule(verify=True))
     async with running(line):
         await asyncio.sleep(1)
         station = line.stations[0].inner
-        answer = station._answer
 
-        def after(request: bytes, now: float) -> object:
-            reply = answer(request, now)
+        def after(request: bytes, now: float) -> list[bytes]:
+            replies = station.hear(request, now)
             if request[3:5] == b"61":
                 station.holes = {("D", 0)}
-            return reply
+            return replies
 
-        station._answer = after  # type: ignore[method-assign,assignment]
+        line.stations[0].answer = after
         outcome = (await write(line)).once
     assert station.memory.read("D", 0) == [5]
     assert isinstance(outcome, Unclear)
@@ -163,7 +163,7 @@ async def test_a_refused_reading_back_does_not_make_the_write_refused() -> None:
 
 
 @on_virtual_time
-async def test_a_device_that_holds_something_else_is_said_so() -> None:
+async def test_verify_reports_a_differing_value() -> None:
     line, dev, _ = one(WriteRule(verify=True))
     line.stations[0].memory.write = lambda area, start, values: None  # type: ignore[method-assign]
     async with running(line):
@@ -176,7 +176,7 @@ async def test_a_device_that_holds_something_else_is_said_so() -> None:
 
 
 @on_virtual_time
-async def test_a_write_refused_is_not_repeated() -> None:
+async def test_a_refused_write_is_not_repeated() -> None:
     line, dev, _ = one(WriteRule(repeat=True, verify=True))
     async with running(line):
         await asyncio.sleep(1)
@@ -188,7 +188,7 @@ async def test_a_write_refused_is_not_repeated() -> None:
 
 
 @on_virtual_time
-async def test_a_repetition_is_not_sent_after_the_write_has_expired() -> None:
+async def test_an_expired_write_is_not_repeated() -> None:
     tag = make_tag("D0", write=WriteRule(repeat=True), every=30.0)
     dev = device([tag], reply_timeout=4.0, guard=2.0)
     line = plant([dev])
@@ -202,7 +202,7 @@ async def test_a_repetition_is_not_sent_after_the_write_has_expired() -> None:
 
 
 @on_virtual_time
-async def test_reading_the_word_of_a_bit_failing_sends_nothing() -> None:
+async def test_a_bit_write_whose_word_cannot_be_read_sends_no_write() -> None:
     line, _, _ = one(WriteRule(), "D7.3")
     async with running(line):
         await asyncio.sleep(1)
@@ -214,7 +214,7 @@ async def test_reading_the_word_of_a_bit_failing_sends_nothing() -> None:
 
 
 @on_virtual_time
-async def test_a_bit_area_is_written_bit_by_bit() -> None:
+async def test_a_bit_of_a_bit_area_is_written_alone() -> None:
     line, _, tag = one(WriteRule(verify=True), "M12")
     async with running(line):
         await asyncio.sleep(1)

@@ -211,7 +211,7 @@ async def test_after_every_fault_the_list_is_registered_again(fault: Any) -> Non
         again = commands(station, since)
         assert again.count("WM") == 1
         assert again[-1] == "MN"
-        published = [sample for at, sample in line.told if at >= since]
+        published = [sample for at, sample in line.reported if at >= since]
         assert 7777 not in {sample.value for sample in published}
         assert not [s for s in published if s.reason is Reason.REFUSED]
 
@@ -230,7 +230,7 @@ async def test_a_registration_without_an_acknowledgement_is_repeated() -> None:
         await asyncio.sleep(20)
         assert line.good(dev)
         assert commands(station).count("WM") == 3
-        assert 7777 not in {sample.value for _, sample in line.told}
+        assert 7777 not in {sample.value for _, sample in line.reported}
 
 
 # Falling back

@@ -1,4 +1,4 @@
-"""A station that does not behave, and the port between a line and its simulated wire."""
+"""A station with faults, and the port between a line and its simulated wire."""
 
 import asyncio
 import random
@@ -19,15 +19,17 @@ TURNAROUND = 0.005
 
 @dataclass
 class Unruly:
-    """A station that does not behave. Answers keep their order, as a PLC's do."""
+    """A station with faults. Its replies keep their order, as those of a PLC do."""
 
     inner: VigorStation
     seed: int = 0
     late: Callable[[random.Random], float] = lambda _: 0.0  # seconds on top, drawn for each reply
-    delay: float = 0.0  # what the simulated wire adds to the turnaround
+    delay: float = 0.0  # which the simulated wire adds to the turnaround
     lose: float = 0.0  # share of replies that are lost
     cut: float = 0.0  # share of replies that break off
     wire: WireTiming = WIRE
+    # Replies instead of `inner`, to the request and at the time it gets.
+    answer: Callable[[bytes, float], list[bytes]] | None = None
     heard: list[tuple[float, bytes]] = field(default_factory=list)  # its requests
     lost: int = 0
 
@@ -50,7 +52,7 @@ class Unruly:
     def hear(self, data: bytes, now: float) -> list[bytes]:
         if data[1:3] == b"%02X" % self.inner.station:
             self.heard.append((now, data))
-        replies = self.inner.hear(data, now)
+        replies = (self.answer or self.inner.hear)(data, now)
         if not replies:
             return []
         if self._random.random() < self.lose:
@@ -66,12 +68,12 @@ class Unruly:
 
 @dataclass
 class Bench:
-    """The port between line and wire, and what passed through it."""
+    """The port between line and wire, and the bytes that passed through it."""
 
     noise: float = 0.0  # share of bytes with one bit turned, both ways
     echo: bool = False  # a two-wire adapter: what is sent comes back
-    before_echo: bytes = b""  # what its switching adds
-    gone: str = ""  # why the port is not there
+    before_echo: bytes = b""  # bytes that its switching adds
+    gone: str = ""  # the reason why the port is lost
     seed: int = 0
     opened: list[float] = field(default_factory=list)  # every try
     sent: list[tuple[float, bytes]] = field(default_factory=list)

@@ -2,11 +2,6 @@
 
 from dataclasses import dataclass
 
-LINE = " ".join(
-    f"tests/line/test_{name}.py"
-    for name in ("late_replies", "load", "mute_stations", "ports", "requests", "damaged_replies")
-)
-
 
 @dataclass(frozen=True)
 class Mutant:
@@ -28,7 +23,7 @@ MUTANTS = (
         "engine/engine.py",
         "            0.0 if before is State.OFFLINE else device.settings.late_guard,\n",
         "            0.0,\n",
-        LINE,
+        "tests/line/test_late_replies.py",
         (54, 55, 53, 48),
         "late",
     ),
@@ -37,7 +32,7 @@ MUTANTS = (
         "engine/health.py",
         "the line waits no longer\n        self.needs_resync = self.answerable\n",
         "the line waits no longer\n",
-        LINE,
+        "tests/line/test_late_replies.py",
         (54, 55, 53, 14, 48),
         "tardy",
     ),
@@ -105,7 +100,7 @@ MUTANTS = (
         "protocols/modbus/master.py",
         "            if frame.station != station or frame.transaction != number:",
         "            if frame.station != station:",
-        "tests/protocols/test_modbus.py tests/line/test_modbus_line.py",
+        "tests/protocols/test_modbus.py tests/line/test_modbus_window.py",
         (176, 174, 128),
         "lean",
         1.0,
@@ -115,7 +110,7 @@ MUTANTS = (
         "engine/engine.py",
         "self.schedule.alongside(poll, poll.device.window - 1, now)",
         "self.schedule.alongside(poll, poll.device.window, now)",
-        "tests/line/test_modbus_line.py",
+        "tests/line/test_modbus_window.py",
         (1, 2, 7),
         "lean",
         0.05,
@@ -174,7 +169,7 @@ MUTANTS = (
         "engine/request_results.py",
         "elif rule is not None and rule.repeat and now < write.expires:",
         "elif rule is not None and now < write.expires:",
-        "tests/line/test_writing.py " + LINE,
+        "tests/line/test_writing.py tests/line/test_requests.py",
         (20, 14, 12),
     ),
     Mutant(
@@ -182,7 +177,7 @@ MUTANTS = (
         "engine/requests.py",
         "        return list(units) == list(self.units)\n",
         "        return True\n",
-        "tests/line/test_writing.py " + LINE,
+        "tests/line/test_writing.py tests/line/test_requests.py",
         (20, 14, 12, 59, 23, 44),
     ),
     Mutant(
@@ -190,28 +185,28 @@ MUTANTS = (
         "engine/results.py",
         "        if not unknown and health.consecutive_failures <= device.timing.retries:\n",
         "        if not unknown:\n",
-        LINE,
+        "tests/line/test_mute_stations.py",
     ),
     Mutant(
         "values of an offline device stay good",
         "engine/effects.py",
         "bad(tag, reason, time, detail) for tag in tags]",
         "bad(tag, reason, time, detail) for tag in tags if reason is not Reason.NO_REPLY]",
-        LINE,
+        "tests/line/test_mute_stations.py",
     ),
     Mutant(
         "values stay good when the port is lost",
         "engine/engine.py",
         "            self._effects.bad(device.tags, Reason.LINE_DOWN, time, why)\n",
         "            pass\n",
-        LINE,
+        "tests/line/test_ports.py",
     ),
     Mutant(
         "an echo is taken for a reply",
         "line/transaction.py",
         "        if channel.echo.strip and not (data := channel.echo.without(data)):\n",
         "        if False:\n",
-        "tests/line/test_transaction.py " + LINE,
+        "tests/line/test_transaction.py tests/line/test_damaged_replies.py",
         (6, 2),
     ),
     Mutant(
@@ -219,7 +214,7 @@ MUTANTS = (
         "protocols/modbus/master.py",
         "        echo = None if self.numbered or not talk.may_echo else request\n",
         "        echo = None\n",
-        "tests/line/test_modbus_line.py",
+        "tests/line/test_modbus_echo.py",
     ),
     Mutant(
         "unchanged samples outlive a sample published in between",
@@ -247,7 +242,7 @@ MUTANTS = (
         "engine/schedule.py",
         "        self._failing_lane = now + took\n",
         "        self._failing_lane = now\n",
-        "tests/engine/test_schedule.py " + LINE,
+        "tests/engine/test_schedule.py tests/line/test_mute_stations.py",
     ),
     Mutant(
         "age by a clock that is set",
@@ -278,7 +273,7 @@ MUTANTS = (
         "line/channel.py",
         "        await self._port.close()\n",
         "            pass\n",
-        LINE + " tests/test_app.py",
+        "tests/line/test_ports.py tests/test_app.py",
     ),
     Mutant(
         "nothing is overdue",
@@ -320,49 +315,49 @@ MUTANTS = (
         "engine/health.py",
         "    (_S.ONLINE, _E.UNCLEAR): _S.FAILING,\n",
         "    (_S.ONLINE, _E.UNCLEAR): _S.ONLINE,\n",
-        "tests/engine " + LINE,
+        "tests/engine tests/line/test_mute_stations.py",
     ),
     Mutant(
         "an offline device never comes back",
         "engine/health.py",
         "    (_S.OFFLINE, _E.ANSWERED): _S.ONLINE,\n",
         "    (_S.OFFLINE, _E.ANSWERED): _S.OFFLINE,\n",
-        "tests/engine " + LINE,
+        "tests/engine tests/line/test_mute_stations.py",
     ),
     Mutant(
         "a reopened line polls without a probe first",
         "engine/health.py",
         "    (_S.ONLINE, _E.RESTARTED): _S.STARTING,\n",
         "    (_S.ONLINE, _E.RESTARTED): _S.ONLINE,\n",
-        "tests/engine " + LINE,
+        "tests/engine tests/line/test_ports.py",
     ),
     Mutant(
         "the pause between two probes does not grow",
         "engine/health.py",
         "min(max(2 * self.pause, PAUSE_FIRST), PAUSE_LONGEST)",
         "PAUSE_FIRST",
-        "tests/engine " + LINE,
+        "tests/engine tests/line/test_mute_stations.py",
     ),
     Mutant(
         "a waiting request sets no deadline",
         "engine/engine.py",
         "            deadline = min(deadline, self.schedule.requests.first.expires)\n",
         "            pass\n",
-        "tests/engine " + LINE,
+        "tests/engine tests/line/test_requests.py",
     ),
     Mutant(
         "a request that waited too long is sent",
         "engine/engine.py",
         "        for request in self.schedule.requests.expired(now):\n",
         "        for request in ():\n",
-        "tests/engine " + LINE,
+        "tests/engine tests/line/test_requests.py",
     ),
     Mutant(
         "the line ignores the engine's deadline",
         "line/line.py",
         "        if self.engine.deadline != self._armed:\n",
         "        if False:\n",
-        LINE,
+        "tests/line/test_requests.py tests/line/test_stalled_link.py",
     ),
     Mutant(
         "the line does not settle after an unclear end",
@@ -385,7 +380,7 @@ MUTANTS = (
         "engine/engine.py",
         "        why = str(error)\n        self._end_request_in_flight(error, now)\n",
         "        why = str(error)\n",
-        "tests/engine " + LINE,
+        "tests/engine tests/line/test_requests.py",
     ),
     Mutant(
         "an unclear write is not confirmed",

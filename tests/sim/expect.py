@@ -167,7 +167,7 @@ class Expectations:
                 self._look_at_ages()
             for line in gateway.lines:
                 self._look_at_queues(line.engine)
-            # A leak shows in no public figure.
+            # Private: a leak shows in no public figure.
             waiting = sum(map(len, gateway._waiting.values()))
             if waiting > 2 * len(judge.enabled):
                 judge.broke(f"{waiting} clients that asked for fresh values are still remembered")

@@ -1,6 +1,6 @@
-"""A line with simulated Vigor stations, and knobs for everything that can go wrong with it.
+"""A line with simulated Vigor stations, and knobs for its faults.
 
-What the line tells, sends and hears is kept with its time, so that a test can ask afterwards.
+It keeps all samples, state changes and bytes of the line with their times.
 """
 
 import asyncio
@@ -36,7 +36,7 @@ def make_tag(
     name: str = "",
     **settings: Any,
 ) -> Tag:
-    """A tag as the file would make it: `D100`, `M12`, `D7.3`; `type="float32"`."""
+    """Makes a tag as the file would: `D100`, `M12`, `D7.3`; `type="float32"`."""
     driver = driver or Vigor(station=1)
     address = driver.address(text)
     unit = driver.areas[address.area].unit
@@ -61,7 +61,7 @@ def words(first: int, count: int, **settings: Any) -> list[Tag]:
 
 
 def clockwork(memory: Memory, numbers: Sequence[int]) -> None:
-    """Words of D that say what time it is: milliseconds, each by its own offset."""
+    """Makes words of D count the milliseconds, each with its own offset."""
     for n in numbers:
         memory.animate("D", n, partial(clock_word, n=n))
 
@@ -81,8 +81,8 @@ class Plant:
     stations: list[Unruly]
     bench: Bench
     wire: WireTiming = WIRE
-    told: list[tuple[float, Sample]] = field(default_factory=list)
-    lives: list[tuple[float, str, bool]] = field(default_factory=list)
+    reported: list[tuple[float, Sample]] = field(default_factory=list)
+    online_changes: list[tuple[float, str, bool]] = field(default_factory=list)
     now: dict[Tag, Sample] = field(default_factory=dict)
     echo_in_file: bool = True  # False: an adapter echoes, and the file does not mention it
     listeners: list[Callable[[Sequence[Sample]], None]] = field(default_factory=list)
@@ -102,31 +102,31 @@ class Plant:
         for listener in self.listeners:
             listener(samples)
         for sample in samples:
-            self.told.append((_now(), sample))
+            self.reported.append((_now(), sample))
             self.now[sample.tag] = sample
 
     def online(self, device: Device, online: bool) -> None:
-        self.lives.append((_now(), device.name, online))
+        self.online_changes.append((_now(), device.name, online))
 
-    # What tests ask
+    # For assertions
 
     def good(self, device: Device) -> bool:
         return all(tag in self.now and self.now[tag].quality is Quality.GOOD for tag in device.tags)
 
     def reads(self, device: Device, since: float = 0.0) -> list[float]:
-        """When the device's first tag was read well."""
+        """The times of good reads of the device's first tag."""
         tag = device.tags[0]
         return [
             at
-            for at, sample in self.told
+            for at, sample in self.reported
             if sample.tag is tag and sample.quality is Quality.GOOD and at >= since
         ]
 
     def turned(self, tag: Tag, quality: Quality, since: float) -> float:
-        """The first moment from `since` on when the tag was told to be so."""
+        """The first time from `since` on when the tag had this quality."""
         return next(
             at
-            for at, sample in self.told
+            for at, sample in self.reported
             if at >= since and sample.tag is tag and sample.quality is quality
         )
 
@@ -149,7 +149,7 @@ class Plant:
 
 @dataclass
 class Outcome:
-    """The outcome of a request, and when it came."""
+    """The outcome of a request, and its time."""
 
     asked: float
     outcomes: list[requests.Outcome] = field(default_factory=list)
@@ -201,7 +201,7 @@ def made_device(
     late_guard: float = 0.5,
     **settings: Any,
 ) -> Device:
-    """A device as the file would make it."""
+    """Makes a device as the file would."""
     known = DeviceSettings(
         name=name,
         driver=driver,
@@ -216,7 +216,7 @@ def made_device(
 def plant(
     devices: Sequence[Device], *, wire: WireTiming = WIRE, seed: int = 0, **bench: Any
 ) -> Plant:
-    """A station for every device; its knobs and the bench's can be turned at any time."""
+    """Makes a station for every device. The knobs of station and bench work at any time."""
     stations = [
         Unruly(VigorStation(d.driver.station), seed * 1000 + i, wire=wire)
         for i, d in enumerate(devices)
@@ -226,7 +226,7 @@ def plant(
 
 @asynccontextmanager
 async def running(plant: Plant) -> AsyncIterator["asyncio.Task[None]"]:
-    """The line's task, ended at the end. A task that ended by itself is an error."""
+    """Runs the line's task. Raises when the task ended by itself."""
     task = asyncio.create_task(plant.line.run())
     try:
         yield task

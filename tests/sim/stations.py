@@ -258,6 +258,7 @@ def set_holes(station: Station, missing: set[tuple[str, int]]) -> None:
         return
     if hasattr(station, "_store"):
         holes = tuple((area, number, number) for area, number in sorted(missing))
+        # Private: a Modbus station gets its holes at its creation.
         station._store._holes = holes
     else:
         station.holes = set(missing)  # type: ignore[attr-defined]  # Vigor and Computer Link

@@ -1,0 +1,81 @@
+"""A device server between line and PLC, which may stall."""
+
+import asyncio
+import random
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from gateway.engine.device import Device
+from gateway.planning.wire_timing import WireTiming
+from gateway.protocols.driver import AnyDriver
+from gateway.simulator.plant import station_for
+from gateway.tags import Tag
+from gateway.transport import Receiver
+from tests.sim.bench import WIRE, Bench
+from tests.sim.plant import Plant, made_device
+from tests.sim.virtual import now
+
+GUARD = 0.5
+
+
+@dataclass
+class DeviceServer(Bench):
+    """Passes requests to the PLC one by one, each after the reply to the one before.
+
+    While it is stalled it keeps them and loses none, as TCP does.
+    """
+
+    late: Callable[[random.Random], float] = lambda _: 0.0  # seconds on top, for each reply
+    deaf_to: Callable[[bytes], bool] = lambda _: False  # requests that are lost on the wire
+    latency: float = 0.0  # seconds, of what comes back
+    flows: asyncio.Event = field(default_factory=asyncio.Event)
+    _queue: "asyncio.Queue[bytes]" = field(default_factory=asyncio.Queue)
+    _task: "asyncio.Task[None] | None" = None
+
+    async def open(
+        self, stations: Sequence[Any], wire: WireTiming, ear: Receiver
+    ) -> "DeviceServer":
+        self.ear, (self._station,) = ear, stations
+        self.flows.set()
+        self._task = asyncio.create_task(self._serve())
+        return self
+
+    def write(self, data: bytes) -> None:
+        self.sent.append((now(), data))
+        self._queue.put_nowait(data)
+
+    async def close(self) -> None:
+        if self._task is not None:
+            self._task.cancel()
+
+    def received(self, data: bytes) -> None:
+        if self.ear is not None:
+            asyncio.get_running_loop().call_later(self.latency, self.ear.received, data)
+
+    async def _serve(self) -> None:
+        while True:
+            request = await self._queue.get()
+            await self.flows.wait()
+            await asyncio.sleep(len(request) * WIRE.character)
+            if self.echo:
+                self.received(request)
+            await asyncio.sleep(0.005)
+            answers = [] if self.deaf_to(request) else self._station.hear(request, now())
+            for answer in answers:
+                await asyncio.sleep(len(answer) * WIRE.character + self.late(self._random))
+                self.received(answer)
+
+
+def behind(
+    server: DeviceServer,
+    driver: AnyDriver,
+    *tags: Tag,
+    echo_in_file: bool = True,
+    **timing: Any,
+) -> tuple[Plant, Device, Any]:
+    """The line, its device, and the memory of its PLC."""
+    dev = made_device("plc", driver, WIRE, replace(driver.timing, **timing), tags, GUARD)
+    station = station_for(driver, [])
+    line = Plant([dev], [station], server, WIRE, echo_in_file=echo_in_file)  # type: ignore[list-item]
+    return line, dev, station.memory
