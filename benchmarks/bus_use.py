@@ -1,10 +1,10 @@
-"""How busy a line is when it is asked for more than it carries: `python -m benchmarks.bus_use`.
+"""The use of the wire on an overloaded line: `python -m benchmarks.bus_use`.
 
-The gateway's own line talks to a wire paced in another process, over a pty. `busy` is the time
-characters were on the wire, as a share of the time that the station's turnaround and the
-protocol's silences leave. `cycle` compares one round of all blocks with what `check` predicts.
-A second run writes a register three times a second meanwhile; `write` is the longest time from
-asking to the acknowledgement, beside the bound that `check` prints.
+A line of the gateway talks over a pty to a wire at a real baud rate in another process. `busy` is
+the time of characters on the wire, as a share of the time without turnarounds and silences.
+`cycle` compares one round of all blocks with the forecast of `check`. A second run writes a
+register three times a second; `write` is the longest time from the request to the
+acknowledgement, and the bound that `check` prints.
 """
 
 import argparse
@@ -66,7 +66,7 @@ SETTINGS = {
 
 
 class Counting:
-    """Upstairs that only counts."""
+    """A sample sink that only counts."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -89,14 +89,14 @@ class Result:
 
 
 def tags(area: str) -> tuple[Tag, ...]:
-    """Four full blocks of 64 words, asked for ten times faster than any line carries them."""
+    """Four full blocks of 64 words, with intervals ten times too short for any line."""
     # Too far apart to share a request.
     numbers = [number + (number // WORDS) * 200 for number in range(BLOCKS * WORDS)]
     return words(area, numbers, 0.01, writable=numbers[:1])
 
 
 async def writing(line: Line, device: Device, tag: Tag, took: list[float]) -> None:
-    """Three times a second, at moments that have nothing to do with the polls."""
+    """Writes three times a second, at times that are independent of the polls."""
     number = 0
     while True:
         await asyncio.sleep(0.29 + 0.13 * random.random())

@@ -1,4 +1,4 @@
-"""100 MB of noise through every kind of framing: megabytes a second, and the memory it leaves.
+"""Speed and memory of each framing with 100 MB of noise.
 
 .venv/bin/python benchmarks/frames_noise.py [megabytes]
 """

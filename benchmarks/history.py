@@ -1,7 +1,7 @@
-"""What the history file takes and gives: `python -m benchmarks.history`.
+"""Speed of recording and of queries of the history file: `python -m benchmarks.history`.
 
-Samples are recorded from an event loop, as the gateway does, at a fixed rate or as fast as it
-goes; beside it the loop's stalls are measured. Then questions are asked of the same file.
+An event loop records samples, as in the gateway, at a fixed rate or as fast as possible, and
+measures its own stalls. Then queries read the same file.
 """
 
 import argparse
@@ -47,7 +47,7 @@ async def stalls(late: list[float]) -> None:
 
 
 async def record(historian: Historian, some: list[Tag], rate: float, seconds: float) -> list[float]:
-    """Scans of 100 tags; as many as there is room for when `rate` is 0. Returns the stalls."""
+    """Records scans of 100 tags; `rate` 0: as fast as possible. Returns the stalls."""
     late: list[float] = []
     watch = asyncio.create_task(stalls(late))
     until = time.perf_counter() + seconds
@@ -85,11 +85,11 @@ def insert(folder: Path, count: int, rate: float, seconds: float) -> None:
     late = sorted(asyncio.run(record(historian, some, rate, seconds)))
     assert historian.close(60)
     took, used = time.perf_counter() - begun, cpu() - used
-    told = historian.document()
-    stored = told["stored"]
+    document = historian.document()
+    stored = document["stored"]
     assert isinstance(stored, int)
     print(
-        f"{count:7} {rate or 'all':>8} {stored / took:11,.0f} {told['lost']:6} "
+        f"{count:7} {rate or 'all':>8} {stored / took:11,.0f} {document['lost']:6} "
         f"{used / took:6.0%} {path.stat().st_size / stored:7.1f} "
         f"{late[len(late) // 2] * 1e3:6.2f} {late[len(late) * 99 // 100] * 1e3:6.2f} "
         f"{late[-1] * 1e3:6.1f}"

@@ -1,8 +1,8 @@
 """Many lines in one process, on virtual time: `python -m benchmarks.many_lines`.
 
-64 lines of 32 stations of 50 tags, each line paced at its baud rate, for a simulated minute; then
-200,000 tags in memory alone. Both again at a tenth of the size: growth should be linear. Memory is
-what the process grew by, processor time is per sample.
+It runs 64 lines of 32 stations of 50 tags, each line at its baud rate, for a simulated minute. Then
+it keeps 200,000 tags in memory only. It repeats both at a tenth of the size: growth should be
+linear. Memory is the growth of the process; processor time is per sample.
 """
 
 import argparse
@@ -35,7 +35,7 @@ TAGS = 50
 
 
 class Watching:
-    """Upstairs with a mirror, as the gateway has one."""
+    """A sample sink with a mirror, as in the gateway."""
 
     def __init__(self, mirror: Mirror) -> None:
         self._mirror = mirror
@@ -111,7 +111,7 @@ def memory_of(count: int) -> tuple[float, float]:
 
 
 def in_child(function: str, *arguments: float) -> None:
-    """A fresh process for each row, so that one does not live off another's memory."""
+    """Runs each row in a new process, so that no row uses the memory of another."""
     if (child := os.fork()) == 0:
         rows[function](*arguments)
         os._exit(0)

@@ -1,18 +1,18 @@
-"""How fast samples go from the mirror to a subscriber, beside a bare loop of puts.
+"""Speed of samples from the mirror to a subscriber, compared with a bare loop of puts.
 
     python -m benchmarks.northbound [--tags 50000] [--devices 100] [--seconds 5] [--flood 5]
 
-The subscriber is a process of its own on the same machine. Measured in one run:
+The subscriber is another process on the same machine. One run measures:
 
 * a bare loop of `session.put` with one fixed payload of the same size, in a session without a
   gateway: the best that Python can do here; and again with the declarations of a gateway;
-* the same number of samples through `Mirror.update` and `Northbound.publish`: decided, made
-  into JSON and put, all of them arrived, and how late the event loop was meanwhile;
-* the same of devices that say `blocks: only`: one put for all 500 tags of a device;
-* the time from a made configuration to being on Zenoh, and memory;
-* with `--flood`: for so many seconds questions as fast as three processes can ask them, then as
-  long questions, writes and junk on every key from two: how late the event loop was, what memory
-  grew by, and how the questions ended.
+* the same number of samples through `Mirror.update` and `Northbound.publish` until all have
+  arrived, and the delay of the event loop;
+* the same for devices with `blocks: only`: one put for all 500 tags of a device;
+* the time from the configuration to the first publishing, and memory;
+* with `--flood`: for so many seconds queries as fast as three processes can send them, then for
+  the same time queries, writes and junk on every key from two. It prints the delay of the event
+  loop, the growth of memory, and the ends of the queries.
 """
 
 import argparse
@@ -124,7 +124,7 @@ def plant(tags: int, devices: int, blocks: bool | Literal["only"] = False) -> Pl
 
 
 class Lag:
-    """How late the event loop was, probed every 2 ms."""
+    """The delay of the event loop, measured every 2 ms."""
 
     def __init__(self) -> None:
         self.late: list[float] = []
@@ -151,7 +151,7 @@ def memory() -> float:
 
 
 def count(endpoint: str) -> None:
-    """Counts the samples that arrive, alone or in blocks; tells how many at every line."""
+    """Counts the samples that arrive, alone or in blocks; prints the count for each input line."""
     arrived = 0
 
     def heard(_: zenoh.Sample) -> None:
@@ -173,7 +173,7 @@ def count(endpoint: str) -> None:
 
 
 def flood(endpoint: str, seconds: float) -> None:
-    """Everything a stranger might send, as fast as it goes."""
+    """Sends queries, writes and junk, as fast as possible."""
     junk = [
         b"[" * 60_000, b"9" * 60_000, b"NaN", b"", b"\xff" * 100, b'{"value":' * 5000,
         b'"' + b"A" * 60_000 + b'"', b"1e999", b"7",
@@ -207,7 +207,7 @@ def flood(endpoint: str, seconds: float) -> None:
 
 
 def ask(endpoint: str, seconds: float) -> None:
-    """Questions and nothing else, as fast as they go; tells how each of them ended."""
+    """Sends only queries, as fast as possible, and prints how they ended."""
     ended: CounterOf[str] = CounterOf()
     keys = (("plant/d1/t0", None), ("plant/d1/t0/@set", b"7"), ("plant/d1/t0/@meta", None))
 
@@ -232,7 +232,7 @@ def ask(endpoint: str, seconds: float) -> None:
 
 
 async def idle(seconds: float) -> None:
-    """Nothing at all; tells how late an event loop is on this machine as it is now."""
+    """Prints the delay of an idle event loop on this machine."""
     lag = Lag()
     with suppress(TimeoutError):
         await asyncio.wait_for(lag.run(), seconds)

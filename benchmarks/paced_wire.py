@@ -1,8 +1,8 @@
 """A wire on a pty at a real baud rate, in a process of its own: `python -m benchmarks.paced_wire`.
 
-Stations answer after their turnaround, each character of the reply arrives when it would have.
-The process prints the pty's path, serves until its standard input closes, and prints as JSON
-what passed: characters, turnarounds and elapsed time, as the wire saw them.
+Stations reply after their turnaround, and each character arrives at its time at this baud rate.
+The process prints the path of the pty, and serves until its standard input closes. Then it prints
+characters, turnarounds and elapsed time as JSON.
 """
 
 import ctypes
@@ -25,7 +25,7 @@ FIFO = 16  # characters a UART hands over at once
 class Passed:
     """Seconds and characters, from the second request to the end of the last reply.
 
-    The first exchange is the short question by which the line finds out who is there.
+    The first request is the short probe of the line.
     """
 
     exchanges: int = 0
@@ -66,7 +66,7 @@ def serve(stations: Sequence[Station], character: float, turnaround: float) -> N
 
 
 def _send(master: int, data: bytes, begin: float, character: float) -> float:
-    """Pieces of a FIFO's size, each when its last character is through; when the last one was."""
+    """Sends pieces of a FIFO's size, each when its last character ends. Returns the last end."""
     due = begin
     for start in range(0, len(data), FIFO):
         piece = data[start : start + FIFO]

@@ -1,8 +1,8 @@
-"""Requests and line time of one cycle, beside other ways: `python -m benchmarks.peers_requests`.
+"""Requests and line time of a cycle in several gateways: `python -m benchmarks.peers_requests`.
 
-The set is the one gateways are usually compared with: 100 registers in a row, 50 at every second
-and 50 at every tenth register, all wanted equally often. No wire is needed: every plan is priced
-by the same cost model, Modbus RTU with 10 ms turnaround. `--write` renews peers_requests.md.
+Gateways are usually compared with this set: 100 registers in a row, 50 at every second and 50 at
+every tenth register, all with one interval. No wire is needed: one cost model, Modbus RTU with
+10 ms turnaround, gives the time of every plan. `--write` writes peers_requests.md again.
 """
 
 import argparse
@@ -51,7 +51,7 @@ def seconds(wire: WireTiming, size: int) -> float:
 
 
 def fixed_gap(gap: int) -> list[int]:
-    """Sizes of the requests when registers are merged over at most `gap` unused ones."""
+    """Returns the sizes of the requests that include at most `gap` unused registers in a row."""
     sizes: list[int] = []
     start = last = addresses()[0]
     for address in addresses()[1:]:
@@ -63,7 +63,7 @@ def fixed_gap(gap: int) -> list[int]:
 
 
 def optimum(wire: WireTiming) -> float:
-    """The least time by plain dynamic programming, written again here to check the planner."""
+    """Returns the least time by dynamic programming, independent of the planner that it checks."""
     row = addresses()
     best = [0.0]
     for j in range(1, len(row) + 1):

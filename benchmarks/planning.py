@@ -1,10 +1,10 @@
-"""How long a plan takes: `python -m benchmarks.planning`.
+"""Processor time of planning: `python -m benchmarks.planning`.
 
-Registers of one Modbus device at 19200 baud in rows of several shapes, wanted at one interval or
-at several that were drawn at random for each register, which is the hardest case there is. The
-processor's time for ten thousand of them, and how many times that is of the time for a thousand.
-Then fewer, two of three at random, on a network, where characters cost next to nothing: every
-request may reach far, and there are many ways to choose from.
+It plans registers of one Modbus device at 19200 baud, in rows of several shapes. They have one
+interval, or a random one for each register, which is the hardest case. It prints the processor
+time for ten thousand registers, and its ratio to the time for a thousand. Then it plans fewer
+registers, two of three at random, on a network. Characters cost almost nothing there, so that the
+planner has many requests to choose from.
 """
 
 import random
@@ -60,7 +60,7 @@ def tags(shape: str, count: int, intervals: list[float]) -> list[Tag]:
 
 
 def took(shape: str, count: int, intervals: list[float], seconds: Seconds = SECONDS) -> float:
-    """Seconds of the processor."""
+    """Returns the seconds of processor time."""
     wanted = tags(shape, count, intervals)
     begun = time.process_time()
     plan(wanted, DRIVER, seconds)

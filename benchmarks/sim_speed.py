@@ -1,4 +1,4 @@
-"""How fast simulated time runs: one line of eight stations, as many exchanges as it carries.
+"""Speed of simulated time: one line of eight stations under full load.
 
 python -m benchmarks.sim_speed
 """

@@ -1,4 +1,4 @@
-"""The tags that benchmarks ask for: single words of one area."""
+"""Tags for benchmarks: single words of one area."""
 
 from collections.abc import Iterable
 
@@ -15,7 +15,7 @@ def words(
     kind: str = "int16",
     writable: Iterable[int] = (),
 ) -> tuple[Tag, ...]:
-    """One tag for each number of `area`, asked for every so many seconds."""
+    """Makes one tag for each number of `area`, with an interval in seconds."""
     may_write = set(writable)
     return tuple(
         Tag(

@@ -246,11 +246,11 @@ class DeviceSection(Section):
     silence: Duration | None = None
     """Pause on the line before each request."""
     retries: Annotated[int, Field(ge=0, le=10)] | None = None
-    """How often a failed read is repeated; writes are not."""
+    """Repetitions of a failed read; writes are not repeated."""
     verify_reads: Annotated[int, Field(ge=1, le=3)] = 1
     """The number of equal reads in a row before a value counts."""
     late_guard: Duration | None = None
-    """How long the line waits for a late reply before the next request."""
+    """The longest wait for a late reply after a time-out, before the next request."""
     blocks: Annotated[
         bool | Literal["only"],
         PlainValidator(parsers.blocks),

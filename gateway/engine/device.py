@@ -14,10 +14,10 @@ from gateway.planning.wire_timing import WireTiming
 from gateway.protocols.driver import AnyDriver, Cost, NoReplyCauses, Span, Timing, Windowed
 from gateway.tags import Tag
 
-LEARN_EVERY = 50  # exchanges between two looks at the measured turnaround
-MOST_PLANNED = 2000  # tags times intervals, while lines run: some tenths of a second
-WORTH_WHILE = 0.1  # of the wire's time, to plan again
-HALF_LIFE = 10.0  # seconds in which half of the use of the wire is forgotten
+LEARN_EVERY = 50  # requests between two comparisons with the measured turnaround
+MOST_PLANNED = 2000  # tags times intervals: planning them takes some tenths of a second
+WORTH_WHILE = 0.1  # share of the wire time that a new plan must save
+HALF_LIFE = 10.0  # seconds until past use of the wire counts half
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -26,10 +26,10 @@ class DeviceSettings:
 
     name: str
     driver: AnyDriver
-    timing: Timing  # the protocol's, with the file's own for this device
+    timing: Timing  # the defaults of the protocol, with the settings of the file
     turnaround: float | None = None  # None: measured
-    late_guard: float = 0.5  # how long the line waits for a late reply before it goes on
-    verify_reads: int = 1  # so many reads in a row must agree
+    late_guard: float = 0.5  # the longest wait for a late reply after a time-out
+    verify_reads: int = 1  # reads in a row that must agree
     blocks: bool | Literal["only"] = False  # one put per scan: also, or instead of one per tag
     control: bool = False  # run, stop, ... are allowed
     enabled: bool = True
@@ -38,12 +38,12 @@ class DeviceSettings:
 
 @dataclass(slots=True)
 class Turnaround:
-    """What a station takes for a reply, as far as plans and forecasts count on it. Seconds."""
+    """The turnaround of a station that plans and forecasts expect. Seconds."""
 
     configured: float | None
-    expected: float | None = field(init=False)  # None: the protocol's usual
-    look_at: float = LEARN_EVERY  # exchanges, until it is compared with the one measured
-    _planned: float = 0.0  # with which the device was planned last
+    expected: float | None = field(init=False)  # None: the default of the protocol
+    look_at: float = LEARN_EVERY  # number of requests at the next comparison with the measured one
+    _planned: float = 0.0  # the one in the last plan
 
     def __post_init__(self) -> None:
         self.expected = self.configured
@@ -51,7 +51,7 @@ class Turnaround:
             self.look_at = math.inf
 
     def learn(self, record: Record) -> bool:
-        """Expect the measured one from now on. True when it moved enough to plan again."""
+        """Expects the measured one from now on. Returns True if it differs enough to plan again."""
         if record.turnaround is None:
             return False
         self.look_at = record.exchanges + LEARN_EVERY
@@ -59,7 +59,7 @@ class Turnaround:
         return abs(record.turnaround - self._planned) >= WORTH_WHILE * self._planned
 
     def planned(self) -> None:
-        """The device is planned with the one expected now."""
+        """Notes that the device was planned with the expected one."""
         self._planned = self.expected or 0.0
 
 
@@ -75,11 +75,13 @@ class Device:
     turnaround: Turnaround = field(init=False)
     blocks: tuple[Block, ...] = ()
     registered: tuple[Span, ...] = ()  # the monitor list that the PLC holds, as far as known
-    broadcast: bool = field(init=False)  # written or listened to, but never asked
-    window: int = field(init=False)  # requests that may be open at once
+    broadcast: bool = field(
+        init=False
+    )  # it receives writes or sends unsolicited frames, and never replies
+    window: int = field(init=False)  # requests that may be outstanding at once
     silence: float = field(init=False)  # seconds before each request
-    _lists: bool = True  # it may be read by a monitor list
-    _use: tuple[float, float] = (0.0, 0.0)  # seconds of the wire, and when they were counted
+    _lists: bool = True  # reads by a monitor list are allowed
+    _use: tuple[float, float] = (0.0, 0.0)  # seconds of the wire, and the time of counting
 
     def __post_init__(self) -> None:
         driver = self.driver
@@ -114,39 +116,39 @@ class Device:
 
     @property
     def polled_tags(self) -> list[Tag]:
-        """The tags that requests read."""
+        """The tags that polls read."""
         return [tag for tag in self.tags if self.driver.areas[tag.span.area].readable]
 
     @property
     def longest_reply(self) -> float:
-        """Seconds after a request when its reply can no longer arrive."""
+        """Seconds after a request until its reply can no longer arrive."""
         return self.timing.reply_timeout + self.settings.late_guard
 
     def diagnosis(self) -> str:
-        """One sentence for people: why it does not answer as it should; empty when it does."""
+        """Returns the likely cause of its trouble as a sentence; empty when there is none."""
         driver = self.driver
         causes = driver.no_reply_causes if isinstance(driver, NoReplyCauses) else ""
         return diagnosis(self.health.trouble, causes)
 
     def restart(self, trouble: LineDown | None = None) -> None:
-        """The line was opened, or lost."""
+        """Starts again after the line was opened or lost."""
         self.health.restart(trouble)
         self.forget_list()
 
     # The plan
 
     def seconds(self, cost: Cost) -> float:
-        """One exchange on this line with this station."""
+        """Returns the seconds of one transaction with this station."""
         return self.wire.transaction(cost, self.timing, self.turnaround.expected)
 
     @property
     def load(self) -> float:
-        """The share of the line's time that its polls take."""
+        """The share of the wire time that its polls take."""
         once = sum(self.seconds(block.cost) / block.every for block in self.blocks)
         return once * self.settings.verify_reads
 
     def plan(self) -> None:
-        """Decide which requests read the tags, around the addresses that the device refuses."""
+        """Plans the blocks that read the tags, without the bad addresses."""
         bad = self.bad_addresses
         blocks = plan(self.tags, self.driver, self.seconds, bad.cuts)
         if self._lists:
@@ -154,13 +156,13 @@ class Device:
         self.blocks = blocks
 
     def poll_nothing(self) -> None:
-        """Leave out all polls: only requests are sent."""
+        """Removes all polls: only requests of clients are sent."""
         self.blocks = ()
 
     def learn_turnaround(self) -> bool:
-        """Plan again where the measured turnaround makes that worth while. True if it was done.
+        """Plans again if the measured turnaround makes the load smaller. Returns True if it did.
 
-        In either case the measured one is expected from now on.
+        In both cases the measured one is expected from now on.
         """
         if self.record.exchanges < self.turnaround.look_at:
             return False
@@ -176,38 +178,38 @@ class Device:
 
     @property
     def _planning_takes_long(self) -> bool:
-        """All lines wait while one is planned."""
+        """True if a new plan would hold up all lines for too long."""
         return len(self.tags) * len({tag.every for tag in self.tags}) > MOST_PLANNED
 
     def interval(self, block: Block) -> float:
-        """How often the block is polled: bad addresses only rarely."""
+        """Returns the interval of the block; bad addresses are polled only rarely."""
         bad = self.bad_addresses.bad.get(block.span)
         return block.every if bad is None else max(bad.retry, block.every)
 
     # The monitor list in the PLC
 
     def expect_list(self, spans: tuple[Span, ...]) -> None:
-        """The PLC is about to be given this list."""
+        """Notes the list that is registered in the PLC next."""
         self.registered = spans
 
     def forget_list(self) -> None:
-        """The PLC may have been switched off, or another master has spoken to it."""
+        """Forgets the list: the PLC may have restarted, or another master may have changed it."""
         self.registered = ()
 
     def allow_lists(self, allowed: bool) -> None:
-        """A PLC that refuses its list is read without one."""
+        """Allows or forbids a monitor list: a PLC that refuses its list is read without one."""
         self._lists = allowed
 
     # Its share of the wire
 
     def used(self, now: float, begun: float) -> None:
-        """It was polled or probed since `begun`.
+        """Adds the time since `begun` of a poll or a probe.
 
-        Writes do not count, nor reads on demand: they must not cost the device its polls.
+        Writes and reads on demand do not count: the device must not lose polls because of them.
         """
         self._use = (self.recent_use(now) + now - begun, now)
 
     def recent_use(self, now: float) -> float:
-        """Seconds of polls and probes in about the last ten seconds."""
+        """Returns the seconds of polls and probes in about the last ten seconds."""
         use, when = self._use
         return use * math.exp2((when - now) / HALF_LIFE)

@@ -1,9 +1,9 @@
-"""The engine of one line: what the line does next, and what each result means.
+"""The engine of one line: decides its next job, and applies the result of each job.
 
 Synchronous and pure: no asyncio, clock, port or log. Times are passed in: `now` in seconds of
 the line's clock, `time` in nanoseconds since 1970 for the samples. The line calls `expire` when
-`deadline` has come, then `next`, performs the job and passes the result to `conclude`. All other
-entries take what comes from outside. Each returns its effects as plain data.
+`deadline` is reached, then `next`, performs the job and passes the result to `conclude`. All
+other entries take requests, bytes and events of the port. Effects are returned as plain data.
 """
 
 from collections.abc import Sequence
@@ -57,7 +57,7 @@ GAP = 0.02  # seconds without a byte that end a run of noise
 
 
 class Engine:
-    """The rules of one line, and all that the line knows."""
+    """The rules of one line, and its state."""
 
     def __init__(
         self, name: str, devices: Sequence[Device], wire: WireTiming, seed: int = 0
@@ -80,7 +80,7 @@ class Engine:
     # The cycle of the line
 
     def next(self, now: float) -> Job:
-        """The next job. Every job but `Idle` must be concluded before the next call."""
+        """Returns the next job. Each job except `Idle` must be concluded before the next call."""
         in_flight = self._in_flight
         if in_flight.continuation is not None:
             return in_flight.resume(now)
@@ -186,7 +186,9 @@ class Engine:
     ) -> None:
         device = probe.device
         match result:
-            case Resynced() | Refused():  # "no" is a sign of life, perhaps for an older request
+            case (
+                Resynced() | Refused()
+            ):  # an error reply counts too, but may belong to an older request
                 told_from = result.told_from if isinstance(result, Resynced) else 0
                 if not probe.again and self._results.outstanding_requests(device) > told_from:
                     quiet = device.longest_reply
@@ -210,7 +212,7 @@ class Engine:
     def _unclear(
         self, job: Unfinished, error: DeviceError, traffic: Traffic, now: float, time: int
     ) -> None:
-        """The line settles next: the late reply must disturb no other transaction."""
+        """Lets the line settle next: the late reply must not disturb another transaction."""
         device = job.device
         before = self._results.unclear(device, error, span_of(job), now, time)
         self._in_flight.continuation = Settle(
@@ -241,13 +243,13 @@ class Engine:
 
     @property
     def is_idle(self) -> bool:
-        """No job is in flight: bytes that arrive now belong to no transaction."""
+        """True if no job is in flight. Then bytes that arrive belong to no transaction."""
         return self._in_flight.job is None
 
-    # What comes from outside
+    # Requests, bytes and events of the port
 
     def submit(self, request: Request, now: float) -> list[Effect]:
-        """Carries out the request as soon as the current transaction ends, or refuses it."""
+        """Queues the request, to be sent after the current transaction, or refuses it."""
         queue, device = self.schedule.requests, request.device
         if isinstance(request, Write):
             for older in queue.superseded(request):
@@ -263,7 +265,7 @@ class Engine:
         elif not self.schedule.reachable(device, now):
             self._effects.ended(request, offline(device))
         elif not queue.submit(request):
-            why = f"line {self.name}: too many orders are waiting; not sent"
+            why = f"line {self.name}: too many requests are waiting; not sent"
             self._effects.ended(request, Busy(why))
         self._set_deadline()
         return self._effects.take()
@@ -275,7 +277,7 @@ class Engine:
             self.schedule.expedite(poll)
 
     def received(self, data: bytes, now: float, time: int) -> list[Effect]:
-        """Bytes that arrived outside of a transaction."""
+        """Takes bytes that arrived outside of a transaction."""
         self.record.unasked += len(data)
         self._stray.received(data, now)
         self._unsolicited.received(data, now, time)
@@ -283,7 +285,7 @@ class Engine:
         return self._effects.take()
 
     def unmatched(self, device: Device, frame: Any, now: float, time: int) -> list[Effect]:
-        """A frame that arrived in a transaction with this device and is not its reply."""
+        """Takes a frame that arrived in a transaction with this device and is not its reply."""
         device.record.count_stray()
         self._stray.frames(device, [frame], now)
         self._unsolicited.unmatched(device, frame, now, time)
@@ -291,7 +293,7 @@ class Engine:
         return self._effects.take()
 
     def expire(self, now: float, time: int) -> list[Effect]:
-        """The deadline has come: requests that waited too long end, old values turn bad."""
+        """Ends requests that waited too long, and turns old values bad. Called at `deadline`."""
         for request in self.schedule.requests.expired(now):
             waited = f"waited {now - request.submitted:.1f} s for the line"
             refused = isinstance(request, Write) and request.alone
@@ -304,7 +306,7 @@ class Engine:
         return self._effects.take()
 
     def opened(self, now: float) -> list[Effect]:
-        """The port was opened: every device must answer again."""
+        """Starts all devices again, because the port was opened."""
         self.is_open = True
         self.record.opened += 1
         self.record.since, self.record.trouble = now, ""
@@ -317,7 +319,7 @@ class Engine:
         return self._effects.take()
 
     def lost(self, error: LineDown, now: float, time: int) -> list[Effect]:
-        """The port could not be opened, or was lost: every value is bad."""
+        """Turns every value bad, because the port was lost or could not be opened."""
         why = str(error)
         self._end_request_in_flight(error, now)
         if self.is_open:
@@ -330,7 +332,7 @@ class Engine:
         return self._close()
 
     def stopped(self, now: float) -> list[Effect]:
-        """The gateway stops: every request gets its outcome."""
+        """Ends every request, because the gateway stops."""
         self._end_request_in_flight(None, now)
         return self._close()
 

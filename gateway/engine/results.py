@@ -24,7 +24,7 @@ from gateway.protocols.driver import Span
 from gateway.tags import Reason, Sample
 from gateway.tags.unchanged import Unchanged
 
-BUSY_PAUSE = 0.2  # seconds left to a device that said it was busy, doubled each time
+BUSY_PAUSE = 0.2  # seconds of pause for a busy device, doubled each time
 
 
 class Results:
@@ -41,7 +41,7 @@ class Results:
     # Replies
 
     def answered(self, device: Device, now: float, time: int) -> None:
-        """The device replied to the request, with good or bad news."""
+        """Notes a reply of the device, also an error reply."""
         health = device.health
         if health.state is State.ONLINE and not health.needs_resync:
             return
@@ -53,7 +53,7 @@ class Results:
             self._staleness.look(now, time)
 
     def read(self, poll: Poll, units: Sequence[int], now: float, time: int) -> None:
-        """A block was read well."""
+        """Applies a good read of a block."""
         device, block = poll.device, poll.block
         health, last = device.health, poll.last
         if health.needs_resync or health.state is not State.ONLINE:
@@ -84,7 +84,7 @@ class Results:
             self._schedule.plan(device, now)
 
     def _samples(self, poll: Poll, units: Sequence[int], time: int) -> Sequence[Sample]:
-        """The samples of what was read. Equal units mean equal values: they are not decoded."""
+        """Returns the samples of the units. Equal units are not decoded again."""
         last = poll.last
         samples = last.samples
         if samples is None or units != last.units or poll.block.eager:
@@ -99,7 +99,7 @@ class Results:
         return samples
 
     def _count_garbled(self, device: Device, fields: Sequence[Any]) -> None:
-        """A good frame may hold a field that cannot be read."""
+        """Counts the garbled fields of a good frame."""
         for value in fields:
             if isinstance(value, Garbled):
                 device.record.count_failure(value)
@@ -107,15 +107,14 @@ class Results:
                 self._effects.info("field garbled", device=device.name, why=str(value), bytes=heard)
 
     def unsteady(self, poll: Poll, error: Unsteady, now: float, time: int) -> None:
-        """Two reads of the block differ: it is asked again in its turn, or its tags are bad."""
+        """Applies two different reads of a block: polls it again, or turns its tags bad."""
         if poll.tries < poll.device.timing.retries:
             self._schedule.again(poll)
             return
         self._end_badly(poll, Reason.GARBLED, error, now, time)
 
     def refused(self, poll: Poll, error: Refused, now: float, time: int) -> None:
-        """A poll was refused: it is asked again, halved to find the bad address, or its tags
-        are bad."""
+        """Applies the refusal of a poll: polls again, halves the block, or turns its tags bad."""
         device, block = poll.device, poll.block
         device.record.count_refusal(error)
         if block.listed:
@@ -130,7 +129,7 @@ class Results:
             self._list_refused(poll, error, now)
             return
         if error.refusal is Refusal.ADDRESS and poll.last.ever and not poll.tries:
-            self._schedule.again(poll)  # it was read before: noise can change a request
+            self._schedule.again(poll)  # the address was good before: noise can change a request
             return
         if error.refusal is Refusal.ADDRESS:
             known = block.span in device.bad_addresses.bad
@@ -144,7 +143,7 @@ class Results:
         self._end_search(device, now)
 
     def _list_refused(self, poll: Poll, error: Refused, now: float) -> None:
-        """The device forgot its monitor list, or one of its addresses is bad."""
+        """Registers the monitor list again, or plans without one: it may have a bad address."""
         if poll.tries < 1:
             self._schedule.again(poll)
             return
@@ -156,14 +155,14 @@ class Results:
     def _end_badly(
         self, poll: Poll, reason: Reason, error: GatewayError, now: float, time: int
     ) -> None:
-        """The device answered, but not with values."""
+        """Turns the tags of a block bad, after a reply without values."""
         poll.forget(now)
         self._effects.bad(poll.block.tags, reason, time, str(error))
         self._schedule.polled(poll, now)
 
     def _end_search(self, device: Device, now: float) -> None:
         if device.bad_addresses.settle():
-            device.allow_lists(True)  # the address for which a list was refused may be known now
+            device.allow_lists(True)  # the bad address in the list may be known now
             self._plan(device, now)
 
     def _plan(self, device: Device, now: float) -> None:
@@ -176,11 +175,11 @@ class Results:
     def unclear(
         self, device: Device, error: DeviceError, asked: Span | None, now: float, time: int
     ) -> State:
-        """A transaction ended unclear. Returns the state of the device before."""
+        """Applies an unclear transaction. Returns the state of the device before it."""
         before = device.health.state
         device.health.unclear(error, asked, now)
         device.record.count_failure(error)
-        device.forget_list()  # it may have been switched off
+        device.forget_list()  # the device may have restarted
         name, why = device.name, str(error)
         self._effects.info("transaction failed", line=self._line, device=name, why=why)
         self._staleness.look(now, time)
@@ -195,9 +194,9 @@ class Results:
         now: float,
         time: int,
     ) -> None:
-        """The line is quiet after an unclear transaction, which took `took` seconds in all.
+        """Applies an unclear transaction after the line has settled; it took `took` seconds.
 
-        `late`: seconds from the time-out to the right reply, if it came.
+        `late`: seconds from the time-out to the late reply, if it arrived.
         """
         health = device.health
         if late is not None:
@@ -210,7 +209,7 @@ class Results:
         unknown = before in (State.STARTING, State.OFFLINE)
         if not unknown and health.consecutive_failures <= device.timing.retries:
             return
-        if device.broadcast:  # no request could bring it back: only its own frames can
+        if device.broadcast:  # only its own frames can make it online again
             device.restart()
             if not unknown:
                 self._effects.online(device, False)
@@ -225,7 +224,7 @@ class Results:
             self._effects.ended(request, offline(device))
 
     def unread(self, poll: Poll, error: GatewayError, now: float, time: int) -> None:
-        """A poll ended unclear: it is asked again in its turn, or its tags are bad."""
+        """Applies an unclear poll: polls again, or turns its tags bad."""
         device = poll.device
         if device.health.state is State.OFFLINE:
             return
@@ -237,9 +236,9 @@ class Results:
         self._schedule.polled(poll, now, answered=False)
 
     def outstanding_requests(self, device: Device) -> int:
-        """How many requests to the device may still be answered.
+        """Counts the requests to the device whose reply may still arrive.
 
-        A read on this line shows that the requests before it went through.
+        A good read on this line shows that older requests are no longer delayed.
         """
         schedule = self._schedule
         polls = (poll for each in schedule.devices for poll in schedule.polls(each))
@@ -248,5 +247,5 @@ class Results:
 
 
 def offline(device: Device) -> Offline:
-    """The outcome of a request that is not sent."""
+    """Returns the outcome of a request that is not sent."""
     return Offline(f"{device.name} does not answer; nothing was sent")

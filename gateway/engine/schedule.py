@@ -13,8 +13,8 @@ from gateway.planning.planner import Block
 from gateway.tags import Tag
 
 NEVER = float("inf")
-GOLDEN = 0.6180339887498949  # its multiples spread evenly, however many there are
-OFFLINE_SHARE = 0.05  # of the wire's time, for all offline devices together
+GOLDEN = 0.6180339887498949  # any number of its multiples is spread evenly
+OFFLINE_SHARE = 0.05  # share of the wire time of all offline devices together
 
 
 class Schedule:
@@ -38,22 +38,24 @@ class Schedule:
         self.devices = devices
         self.requests = RequestQueue()
         self._random = random.Random(seed)  # noqa: S311  (jitter, not a secret)
-        # By how much of its period each poll begins early.
+        # The share of its period by which each poll begins early.
         self._phases = (n * GOLDEN % 1 / 2 for n in itertools.count())
         self._queue = PollQueue()
         self._polls: dict[Device, list[Poll]] = {}
-        self._readers: dict[Device, dict[Tag, Poll]] = {}  # made at the first question
+        self._readers: dict[Device, dict[Tag, Poll]] = {}  # made at the first call of `reader`
         self._wrote = False
         self._expedited = False
-        self._failing_lane = now  # when, with polls of others due, the next may fail
-        self._offline_lane = now  # when the next offline device may be probed
+        self._failing_lane = (
+            now  # the time of the next request that may fail, while others have due polls
+        )
+        self._offline_lane = now  # the time of the next probe of an offline device
         for device in devices:
             self.plan(device, now)
 
     # Changes
 
     def plan(self, device: Device, now: float) -> None:
-        """Takes over the device's blocks; a poll of the same span keeps its due time."""
+        """Makes polls of the blocks of the device. A poll of the same span keeps its due time."""
         before = self._polls.get(device, ())
         old = {poll.block.span: poll for poll in before}
         read = {tag: poll.last.at for poll in before for tag in poll.block.tags}
@@ -76,7 +78,7 @@ class Schedule:
         self._set_polls(device, polls, polls)
 
     def replace(self, poll: Poll, blocks: Iterable[Block], now: float) -> None:
-        """Polls these blocks instead of the one, at once."""
+        """Replaces one poll by polls of these blocks, due at once."""
         if not poll.live:
             return
         poll.live = False
@@ -91,7 +93,7 @@ class Schedule:
         self._queue.push_all(new)
 
     def expedite(self, poll: Poll) -> None:
-        """Poll this next, after requests: a client waits for it."""
+        """Polls this next, after requests, because a client waits for it."""
         if poll.device.health.state is State.OFFLINE:
             poll.device.health.probe_soon()
         elif poll.live and poll.device.health.online:
@@ -107,7 +109,7 @@ class Schedule:
         return self._polls[device]
 
     def reader(self, device: Device, tag: Tag) -> Poll | None:
-        """The poll that reads this tag of the device, if any."""
+        """Returns the poll that reads this tag of the device, if any."""
         readers = self._readers.get(device)
         if readers is None:
             readers = {tag: poll for poll in self._polls[device] for tag in poll.block.tags}
@@ -159,7 +161,7 @@ class Schedule:
         return self._hand_out(poll, now)
 
     def alongside(self, poll: Poll, most: int, now: float) -> list[Poll]:
-        """Other due polls of the same device, for one that takes several requests at once."""
+        """Returns more due polls of the device, if it accepts several requests at once."""
         others = [other for other in self._queue.valid() if other.device is poll.device]
         others.sort(key=lambda other: (other.deadline, other.ticket))
         return [self._hand_out(other, now) for other in others[:most]]
@@ -178,17 +180,17 @@ class Schedule:
         return poll
 
     def _fairest(self, now: float) -> Poll:
-        """Of the late polls the one whose device has recently used the wire least."""
+        """Returns the late poll whose device has recently used the wire least."""
         late = (poll for poll in self._queue.valid() if poll.deadline < now)
         return min(late, key=lambda poll: (poll.device.recent_use(now), poll.deadline))
 
     def _first_without_resync(self) -> Poll | None:
-        """The earliest due poll of a device that needs no resync."""
+        """Returns the due poll with the earliest deadline whose device needs no resync."""
         ready = (poll for poll in self._queue.valid() if not poll.device.health.needs_resync)
         return min(ready, key=lambda poll: poll.deadline, default=None)
 
     def _probes(self, others: Sequence[Device]) -> Iterator[tuple[Device, float]]:
-        """The next starting and the next offline device to probe, and from when on."""
+        """Yields the next starting and the next offline device to probe, with the earliest time."""
         for device in others:
             if device.health.state is State.STARTING and not device.broadcast:
                 yield device, self._failing_lane
@@ -201,7 +203,7 @@ class Schedule:
     # Results
 
     def polled(self, poll: Poll, now: float, *, answered: bool = True) -> None:
-        """The poll is done for this period, well or not."""
+        """Ends the poll for this period, after a good or a bad read."""
         poll.missed = 0 if answered else poll.missed + 1
         device, block = poll.device, poll.block
         plain = answered and not device.bad_addresses.bad
@@ -220,24 +222,24 @@ class Schedule:
         self._queue.push(poll)
 
     def again(self, poll: Poll, when: float | None = None) -> None:
-        """The poll is asked again in its turn, or from `when` on."""
+        """Polls again when the deadline is the earliest, or from `when` on."""
         poll.tries += 1
         if when is not None:
             poll.due = when
         self._queue.push(poll)
 
     def failed(self, now: float, took: float) -> None:
-        """A transaction with a device not offline ended unclear after `took` seconds."""
+        """Notes an unclear transaction of `took` seconds with a device that is not offline."""
         self._failing_lane = now + took
 
     def went_offline(self, device: Device, now: float, took: float) -> None:
-        """A probe or the last retry failed after `took` seconds on the wire."""
+        """Makes the device offline, after a failed probe or last retry of `took` seconds."""
         device.health.gave_up(now, self._random.uniform(0.9, 1.1))
         others = any(other.health.online for other in self.devices)
         self._offline_lane = now + took * (1 / OFFLINE_SHARE - 1) if others else now
 
     def came_online(self, device: Device, now: float) -> None:
-        """A starting or offline device answered: all its blocks are due at once."""
+        """Makes all blocks of a device due, because it came online."""
         for poll in self._polls[device]:
             poll.due = now
             poll.missed = 0
@@ -247,7 +249,7 @@ class Schedule:
             poll.phased = False
 
     def opened(self, now: float) -> None:
-        """The line was opened."""
+        """Starts again after the line was opened."""
         self._failing_lane = self._offline_lane = now
         self._wrote = self._expedited = False
 

@@ -1,4 +1,4 @@
-"""An open port with its clock: the one place where bytes of a line leave and arrive."""
+"""An open port with its clock, its echo and its wire log: sends all bytes of a line."""
 
 import asyncio
 from collections.abc import Callable
@@ -13,28 +13,28 @@ from gateway.transport import Port
 log = structlog.get_logger("gateway.line")
 NEVER = float("inf")
 FAST = 19200  # above this baud rate the millisecond of an event loop counts
-SPIN = 0.001  # seconds of a silence that are then waited for by looking at the clock
-LONGEST_WAIT = 1.0  # seconds for others to fall silent
+SPIN = 0.001  # seconds at the end of a silence in which the clock is polled
+LONGEST_WAIT = 1.0  # seconds for the wire to become silent
 SHORTEST_REPLY = 3  # characters; fewer are noise
 KEPT = 64  # bytes before an echo that are kept
 
 
 class Alarm:
-    """One timer for many time-outs, hardly any of which is reached.
+    """One timer for many time-outs, of which few are reached.
 
-    Arming and cancelling a timer for each request costs more than all else a request needs. So
-    one timer runs on, and `look` finds out who waits when it goes off.
+    A timer for each request costs more time than the rest of the request. So one timer keeps
+    running, and `look` finds the requests whose time-out ended.
     """
 
     __slots__ = ("_due", "_look", "_timer")
 
     def __init__(self) -> None:
-        self._due = NEVER  # when the timer goes off
+        self._due = NEVER  # the time of the timer
         self._look: Callable[[], float] = lambda: NEVER
         self._timer: asyncio.TimerHandle | None = None
 
     def by(self, when: float, look: Callable[[], float]) -> None:
-        """Calls `look` at `when` or before, and no older one. It returns when it is due again."""
+        """Calls `look` at `when` or earlier, instead of an older one. It returns its next time."""
         self._look = look
         if when < self._due:
             if self._timer is not None:
@@ -57,14 +57,14 @@ class Alarm:
 class Echo:
     """The echo of a two-wire adapter.
 
-    With `echo: true` in the file our own requests are dropped as they come back. Without a word
-    in the file the replies show whether the adapter echoes.
+    With `echo: true` in the file, the echo of each request is dropped. Without the setting, the
+    replies show if the adapter echoes.
     """
 
     __slots__ = ("_early", "_line", "_logged", "_pending", "_setting", "found", "strip")
 
     def __init__(self, line: str, setting: bool | None) -> None:
-        """`setting`: of the file; None: not said."""
+        """`setting`: of the file; None: not set."""
         self._line = line
         self._setting = setting
         self._logged = False  # once for each line, not at every opening
@@ -72,23 +72,23 @@ class Echo:
         self.opened()
 
     def opened(self) -> None:
-        """The port was opened, perhaps with another adapter."""
-        self.found = self._setting  # None: no reply has shown it yet
-        self._pending = b""  # what must still come back
-        self._early = b""  # what came instead, so far
+        """Starts again: the port was opened, perhaps with another adapter."""
+        self.found = self._setting  # None: not yet known
+        self._pending = b""  # the part of the echo that must still arrive
+        self._early = b""  # bytes that arrived before the echo
 
     def sent(self, data: bytes) -> None:
         self._pending, self._early = data, b""
 
     @property
     def early(self) -> bytes:
-        """What arrived while our own request did not come back."""
+        """Bytes that arrived while the echo did not."""
         return self._early
 
     def without(self, data: bytes) -> bytes:
-        """Drops our own request and everything before it.
+        """Drops the echo of our own request, and everything before it.
 
-        Until it has come back whole nothing is believed: some acknowledgements look like it.
+        Before the complete echo no reply is accepted: some acknowledgements look like the echo.
         """
         if not self._pending:
             return data
@@ -113,8 +113,8 @@ class Echo:
     def learn(self, request: bytes, heard: bytes, reply: int) -> None:
         """A reply of at most `reply` characters arrived; `heard` is all since the request.
 
-        Where it is the request once and nothing else, it may be an echo, or an acknowledgement
-        that repeats the request. A damaged echo proves nothing either.
+        If this is only the request once, it may be an echo, or an acknowledgement that repeats
+        the request. A damaged echo does not prove an echo either.
         """
         place = heard.find(request)
         if place < 0:
@@ -128,7 +128,7 @@ class Echo:
 
 
 class Channel:
-    """An open port, and when its wire was busy last."""
+    """An open port, and the last time when its wire was busy."""
 
     __slots__ = (
         "_port",
@@ -147,13 +147,13 @@ class Channel:
         self.echo = echo
         echo.opened()
         self.now = asyncio.get_running_loop().time
-        self.quiet_since = 0.0  # when the wire was busy last
+        self.quiet_since = 0.0  # the last time when the wire was busy
         self.alarm = Alarm()  # for the time-outs of its transactions
         self.lost_by: LineDown | None = None
         self._port = port
 
     def send(self, data: bytes) -> None:
-        """Raises `LineDown`."""
+        """Sends the bytes. Raises `LineDown`."""
         if self.lost_by is not None:
             raise self.lost_by
         if self.echo.strip:
@@ -164,13 +164,13 @@ class Channel:
         self._port.write(data)
 
     def pause(self, seconds: float) -> None:
-        """Keep quiet for so long: stations take in a broadcast."""
+        """Keeps the line silent for so long, while stations process a broadcast."""
         self.quiet_since += seconds
 
     async def quiet(self, silence: float) -> None:
-        """Waits for the silence before a request, by the clock: loops may wake early or late.
+        """Waits for the silence before a request. Checks the clock: a loop may wake too early.
 
-        Raises `Garbled` where others never fall silent.
+        Raises `Garbled` if the wire does not become silent.
         """
         # Event loops round sleeps up by about a millisecond.
         spin = SPIN if self.wire.baudrate > FAST else 0.0

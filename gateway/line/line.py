@@ -1,4 +1,4 @@
-"""A line: one port, the devices behind it, and the one task that drives it.
+"""A line: one port, its devices, and the task that serves them.
 
 The line decides nothing. It asks its engine for the next job, performs it, and passes the result
 back; the engine's effects go to the clients, the sample sink and the log.
@@ -51,7 +51,7 @@ class Line:
         wall: Callable[[], int] = time.time_ns,
         seed: int = 0,
     ) -> None:
-        """`echo`: the port hears what it sends; None: not known. `wall`: ns since 1970."""
+        """`echo`: the port receives its own bytes; None: not known. `wall`: ns since 1970."""
         self.engine = engine
         self._open_port = open_port
         self._sink = sink
@@ -77,7 +77,7 @@ class Line:
         return self._submit(Write(device, tag, units, _now()))
 
     def command(self, device: Device, name: str, argument: str) -> asyncio.Future[str]:
-        """Has the device run, stop, ...: one of its driver's controls. As `write`."""
+        """Sends a command of the driver, such as run or stop. As `write`."""
         return self._submit(Command(device, name, argument, _now()))
 
     def _submit(self, request: Request) -> asyncio.Future[Any]:
@@ -95,7 +95,7 @@ class Line:
 
     def received(self, data: bytes) -> None:
         channel, transaction = self._channel, self._transaction
-        if channel is None:  # still opening: no listener has begun
+        if channel is None:  # still opening
             return
         if transaction is not None and transaction.has_sent:
             transaction.received(data)
@@ -103,7 +103,7 @@ class Line:
         if channel.wire_log.active:
             channel.wire_log.heard(data)
         now = channel.now()
-        # No less quiet than is kept after a broadcast, whose echo this may be.
+        # The bytes may be the echo of a broadcast: its pause must not become shorter.
         channel.quiet_since = max(channel.quiet_since, now)
         if channel.echo.strip:
             data = channel.echo.without_rest(data)
@@ -125,7 +125,7 @@ class Line:
     # The task
 
     async def run(self) -> None:
-        """Serves the line until cancelled; its errors stay on it."""
+        """Serves the line until cancelled. Its errors do not end other lines."""
         pause = REOPEN_FIRST
         while True:
             served = 0.0
@@ -137,14 +137,14 @@ class Line:
                 self.tried.set()
             finally:
                 self._deliver(self.engine.stopped(_now()))
-                await self._close()  # last, as it may take a while
+                await self._close()  # last, because closing can be slow
             if served > REOPEN_LONGEST:
                 pause = REOPEN_FIRST
             await asyncio.sleep(pause * self._random.uniform(0.8, 1.2))
             pause = min(2 * pause, REOPEN_LONGEST)
 
     async def _open_and_serve(self) -> str:
-        """Returns why it ended."""
+        """Opens the port and serves it. Returns the reason of the end."""
         name, self._lost = self.engine.name, None
         try:
             port = await self._open_port(self)
@@ -157,7 +157,7 @@ class Line:
             known = str(error) == self.engine.record.trouble
             (log.debug if known else log.warning)("line down", line=name, why=str(error))
             return str(error)
-        except Exception as error:  # the bulkhead: an error ends one line, not all
+        except Exception as error:  # an error in one line must not end the others
             log.exception("line failed", line=name)
             return f"internal error: {error!r}"
 
@@ -189,7 +189,7 @@ class Line:
         raise self._lost
 
     async def _perform_together(self, polls: Sequence[Poll], channel: Channel) -> None:
-        """Several requests are open at once on one transaction."""
+        """Performs several polls at once in one transaction."""
         transaction = self._transaction
         if transaction is None:
             raise AssertionError("no transaction is open")
@@ -230,7 +230,7 @@ class Line:
 
     def _end(self, request: Request, outcome: Outcome) -> None:
         waiting = self._outcomes.pop(request)
-        if waiting.done():  # its client has gone
+        if waiting.done():  # the client no longer waits
             return
         if isinstance(outcome, GatewayError):
             waiting.set_exception(outcome)
@@ -238,7 +238,7 @@ class Line:
             waiting.set_result(outcome)
 
     def _expire(self) -> float:
-        """The engine's deadline has come. Returns the next."""
+        """Lets the engine expire what is due. Returns its next deadline."""
         self._deliver(self.engine.expire(_now(), self._wall()))
         self._wake.set()
         return self.engine.deadline

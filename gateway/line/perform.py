@@ -1,4 +1,4 @@
-"""Performs one job on an open transaction: the driver's calls, in their order, and no decision."""
+"""Performs one job on an open transaction: calls the driver, and decides nothing."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -28,7 +28,7 @@ DIFFER = "two readings in a row differ; verify_reads is for values that change s
 
 
 async def perform(job: Transacted, transaction: Transaction) -> Result:
-    """The result of the job. Every error of a device or the port is a result."""
+    """Returns the result of the job. Every error of a device or of the port is a result."""
     try:
         if isinstance(job, Poll):
             device, block = job.device, job.block
@@ -65,10 +65,10 @@ async def _perform(job: Transacted, transaction: Transaction) -> Result:
 async def read_with_care(
     talk: Talk[Any], device: Device, block: Block, *, register: bool = False
 ) -> Sequence[int]:
-    """The units of the block, read as often as `verify_reads` says.
+    """Returns the units of the block after `verify_reads` equal reads.
 
-    `register`: give the PLC its monitor list first. Raises `Unsteady` where two reads differ: a
-    check sum does not see everything.
+    `register`: registers the monitor list in the PLC first. Raises `Unsteady` if two reads differ:
+    a check sum does not find every error.
     """
     driver = device.driver
     if register and isinstance(driver, Monitor):
@@ -89,7 +89,7 @@ async def _read_once(talk: Talk[Any], device: Device, block: Block) -> Sequence[
 
 
 async def _write(write: Write, talk: Talk[Any]) -> Sent:
-    """One write, with all that its tag asks for. A bit is changed in the word as it is."""
+    """Writes one value, and reads it back if its tag has `verify`. A bit is changed in its word."""
     driver, tag = write.device.settings.driver, write.tag
     units = write.units
     if tag.address.bit is not None:
@@ -110,7 +110,7 @@ async def _confirm(job: Confirm, talk: Talk[Any]) -> Sent:
     try:
         await driver.resync(talk, job.outstanding, job.token)
     except Refused as error:
-        raise Unclear(f"nor what it says to a question about it: {error}") from error
+        raise Unclear(f"its resync was refused too: {error}") from error
     if tag.write is None or not tag.write.verify:
         return Sent()
     return Sent(held=await driver.read(talk, tag.span))

@@ -27,7 +27,7 @@ class _Request:
 
 @dataclass(slots=True, eq=False)
 class _LateReply:
-    """The reply to a request that timed out: it may still arrive."""
+    """A late reply: its request timed out, and it may still arrive."""
 
     answers: Callable[[Any], Any]
     arrived: bool = False
@@ -41,8 +41,8 @@ class _LateReply:
 class Transaction:
     """The `Talk` that a driver gets.
 
-    Bytes that arrive while it is open are passed to `received`. After a time-out it stays open:
-    `settle` waits for the late reply.
+    The line passes to `received` all bytes that arrive while it is open. After a time-out it
+    stays open: `settle` waits for the late reply.
     """
 
     __slots__ = (
@@ -69,7 +69,7 @@ class Transaction:
         on_unmatched_frame: Callable[[Device, Any], None] | None = None,
     ) -> None:
         """`on_unmatched_frame` gets each frame that is no reply, at once."""
-        self.has_sent = False  # before, no byte that arrives belongs to it
+        self.has_sent = False  # earlier bytes do not belong to it
         self.traffic = Traffic()
         self._channel = channel
         self._device = device
@@ -87,7 +87,7 @@ class Transaction:
 
     @property
     def may_echo(self) -> bool:
-        """As in `Talk`. With `echo: true` no driver sees our own requests."""
+        """As in `Talk`. With `echo: true` no driver gets our own requests."""
         echo = self._channel.echo
         return not echo.strip and echo.found is not False
 
@@ -123,7 +123,7 @@ class Transaction:
         finally:
             self._open.remove(request)
         busy = (len(data) + request.heard) * character
-        # Where several are open, each has its own part.
+        # Of several outstanding requests, each has its own part of the time.
         alone = max(started, self._answered)
         self._answered = channel.quiet_since
         traffic = self.traffic
@@ -134,7 +134,7 @@ class Transaction:
         return answer
 
     def _begin_hearing(self) -> None:
-        """No byte that arrived before the request may be read as its reply."""
+        """Drops earlier bytes: they must not become part of the reply."""
         if self._heard or self.traffic.heard or self._broken is not None:
             self._codec = self._device.settings.driver.codec()
             self._broken = None
@@ -143,7 +143,7 @@ class Transaction:
         self._heard = b""
 
     def received(self, data: bytes) -> None:
-        """Bytes that arrived at the port."""
+        """Takes bytes that arrived at the port."""
         channel = self._channel
         if channel.wire_log.active:
             channel.wire_log.heard(data)
@@ -176,7 +176,7 @@ class Transaction:
                 _fail(request, error)
 
     def lost(self, error: LineDown) -> None:
-        """The port is gone."""
+        """Ends all outstanding requests, because the port was lost."""
         self._channel.lost_by = error
         if self._late is not None:
             self._late.wake()
@@ -184,7 +184,7 @@ class Transaction:
             _fail(request, error)
 
     async def settle(self, guard: float, gap: float) -> float | None:
-        """Keeps quiet until nothing of this transaction can disturb the next.
+        """Sends nothing until this transaction can no longer disturb the next.
 
         After a time-out: until the late reply has arrived, or for `guard` seconds. After noise:
         until `gap` seconds have passed without a byte, at most `guard`. Returns how late the
@@ -208,7 +208,7 @@ class Transaction:
         return channel.now() - start if late.arrived else None
 
     async def _wait(self, late: _LateReply, end: float) -> None:
-        """Until the late reply has arrived, the port is lost, or it is `end`."""
+        """Waits until the late reply has arrived, the port is lost, or `end`."""
         loop = asyncio.get_running_loop()
         self._late, late.awaited = late, loop.create_future()
         timer = loop.call_at(end, late.wake)
@@ -249,10 +249,10 @@ class Transaction:
         try:
             return late.answers(frame) is not None
         except DeviceError:
-            return not self._needs_resync  # a refusal names no request
+            return not self._needs_resync  # an error reply names no request
 
     def _expire(self) -> float:
-        """Ends the requests whose time is over. Returns when to look again."""
+        """Ends the requests that timed out. Returns the next time-out."""
         now, again = self._channel.now(), NEVER
         for request in self._open:
             if request.future.done():

@@ -1,7 +1,7 @@
 """The wire log: every byte on a line with its time, for the log, for traces and for tests.
 
-A line of it reads `12.345678 > 02 30 30 ...` (sent) or `<` (heard); times are seconds of the
-line's clock.
+A line of the log is `12.345678 > 02 30 30 ...` (sent) or has `<` (received). Times are seconds
+of the line's clock.
 """
 
 import logging
@@ -19,10 +19,10 @@ class WireLog:
     def __init__(self, line: str) -> None:
         self.line = line
         self._listeners: list[Listener] = []
-        self.active = log.isEnabledFor(logging.DEBUG)  # else it costs nothing
+        self.active = log.isEnabledFor(logging.DEBUG)  # an inactive log costs no time
 
     def listen(self, listener: Listener) -> None:
-        """`listener` gets `>` or `<` and the bytes, from now on."""
+        """Adds a listener. It gets `>` or `<`, and the bytes."""
         self._listeners.append(listener)
         self.active = True
 

@@ -4,7 +4,7 @@ Each gateway declares a liveliness token in the role *claim* before it becomes a
 the role *active* while it is; the others see these tokens a moment later. A gateway that sees no
 other active token claims, waits for `CLAIM_TIME`, and only then becomes active. If two claim, the
 first by name continues. This holds as long as a token travels in less than half of `CLAIM_TIME`;
-docs/standby.md says what happens when the network is split.
+docs/standby.md explains a split network.
 
 Synchronous; does no I/O. All times are seconds of one monotonic clock.
 """

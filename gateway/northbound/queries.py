@@ -29,7 +29,7 @@ log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 StatusDocuments = Callable[[], dict[str, bytes]]  # by full key
 
 FRESH_LIMIT = 256  # tags that one query may have read from the devices
-_BUSY = Failure(Problem.BUSY, "too many questions are waiting; nothing was done")
+_BUSY = Failure(Problem.BUSY, "too many queries are waiting; nothing was done")
 _ENDING = Failure(Problem.UNCLEAR, "the gateway is ending")
 
 

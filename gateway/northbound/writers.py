@@ -59,7 +59,7 @@ class Writers:
         if len(token) < SHORTEST_TOKEN:
             raise NotAllowed(f"a token has at least {SHORTEST_TOKEN} characters")
         name = None
-        for writer in self._writers:  # always all: the time must not tell which one matched
+        for writer in self._writers:  # always all: the time must not show which one matched
             if hmac.compare_digest(hashlib.sha256(writer.salt + token).digest(), writer.digest):
                 name = writer.name
         if name is None:

@@ -72,7 +72,7 @@ class Timing:
 class Traits:
     """Properties of a protocol that the configuration needs; most can be set in the file."""
 
-    baudrate: int | None = 9600  # default of the line; None: spoken over TCP, without a serial line
+    baudrate: int | None = 9600  # default of the line; None: over TCP, without a serial line
     format: str = "8N1"  # default of the line
     binary: bool = False  # frames need 8 data bits
     word_type: Kind = Kind.INT16  # default type of a word
@@ -186,8 +186,8 @@ class Driver(Protocol[F]):
         It is also the cheapest way to see that the device is online. `probe_token` marks the
         request and grows by two with each resync; a second request in the same resync is marked
         with the number after it. So a reply to an earlier resync is not taken for the reply to
-        this one either, as far as the protocol can mark a request. Returns from how many
-        outstanding requests, `outstanding` included, this one can be told. Values are discarded.
+        this one either, as far as the protocol can mark a request. Values are discarded. Returns
+        the number of outstanding requests, with `outstanding`, whose replies differ from its own.
 
         Raises `Refused` where only error replies arrived that may belong to an older request.
         """
@@ -239,7 +239,7 @@ class Windowed(Protocol):
 
 @runtime_checkable
 class NoReplyCauses(Protocol):
-    """A driver that knows why its device may not reply at all."""
+    """A driver with causes why its device may not reply at all."""
 
     @property
     def no_reply_causes(self) -> str:

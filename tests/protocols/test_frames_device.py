@@ -343,7 +343,7 @@ def changed(name: str, *path: str, to: Any) -> dict[str, Any]:
         (
             changed("inverter", "write", "setpoint", "send", to="S={value:06.2f}"),
             ("write", "setpoint"),
-            "how it is written, its field says",
+            "write the format in its field",
         ),
         (
             changed("inverter", "write", "setpoint", "value", to={"type": "decimal"}),

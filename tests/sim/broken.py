@@ -299,7 +299,7 @@ MUTANTS = (
     Mutant(
         "a late error reply completes every resync",
         "line/transaction.py",
-        "            return not self._needs_resync  # a refusal names no request\n",
+        "            return not self._needs_resync  # an error reply names no request\n",
         "            return True\n",
         "tests/line/test_transaction.py",
     ),

@@ -16,7 +16,7 @@ def connection_failure(
 ) -> str:
     """Returns a sentence for each endpoint that accepts connections, or one if none does.
 
-    `hint` tells people without a user name (`user` is None) how to give one.
+    `hint` explains how to give a user name, for a client without one (`user` is None).
     """
     refused = f"refuses the user {user}: the name or password is wrong, or the gateway hangs"
     if user is None:

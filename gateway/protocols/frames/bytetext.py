@@ -64,7 +64,7 @@ def _piece(text: str, match: re.Match[str]) -> bytes | Hole:
         return _character(text, mark)
     if hole is not None:
         if not NAME.match(hole):
-            raise ConfigError(f"{text!r}: {{{hole}}} is no name; how it is written, its field says")
+            raise ConfigError(f"{text!r}: {{{hole}}} is no name; write the format in its field")
         return Hole(hole)
     if not plain.isascii():
         raise ConfigError(f"{text!r}: characters beyond ASCII are written in hex, <E4>")

@@ -103,7 +103,7 @@ class Field:
                     raise ConfigError(f"{self.type} has no {name}")
             if self.hex:
                 raise ConfigError(
-                    f"hex says how bytes are written: use it with uint16, not {self.type}"
+                    f"hex is a notation of bytes: use it with uint16, not {self.type}"
                 )
             return
         if self._octets > 1 and self.byte_order is None:
