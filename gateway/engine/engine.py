@@ -9,32 +9,23 @@ other entries take requests, bytes and events of the port. Effects are returned 
 from collections.abc import Sequence
 from typing import Any, cast
 
+from gateway.engine.conclusions import Conclusions
 from gateway.engine.device import Device
 from gateway.engine.effects import Effect, Effects
-from gateway.engine.health import State
 from gateway.engine.jobs import (
-    Answer,
-    Confirm,
     Idle,
     InFlight,
     Job,
     Poll,
     Probe,
-    Repeat,
-    RequestJob,
     Result,
-    Resynced,
-    Settle,
-    Settled,
     Traffic,
     Transacted,
-    Unfinished,
     WriteTogether,
-    span_of,
 )
 from gateway.engine.records import LineRecord
 from gateway.engine.request_results import RequestResults
-from gateway.engine.requests import Command, Request, Write, why_not_commanded
+from gateway.engine.requests import Request, Write, why_not_commanded
 from gateway.engine.results import Results, offline
 from gateway.engine.schedule import Schedule
 from gateway.engine.staleness import NEVER, Staleness
@@ -43,12 +34,7 @@ from gateway.engine.unsolicited import UnsolicitedFrames
 from gateway.errors import (
     BadValue,
     Busy,
-    DeviceError,
-    Garbled,
     LineDown,
-    Refused,
-    Unclear,
-    Unsteady,
 )
 from gateway.planning.wire_timing import WireTiming
 from gateway.tags import Reason, Tag
@@ -72,10 +58,14 @@ class Engine:
         self._effects = Effects()
         self._staleness = Staleness(self.schedule, self._effects)
         self._results = Results(name, self.schedule, self._staleness, self._effects)
-        self._requests = RequestResults(self.schedule, self._results, self._effects)
         self._unsolicited = UnsolicitedFrames(devices, self._results, self._effects)
         self._stray = Stray(name, devices, self._effects)
         self._in_flight = InFlight()
+        gap = max(GAP, 4 * wire.character)
+        requests = RequestResults(self.schedule, self._results, self._effects)
+        self._conclusions = Conclusions(
+            self._in_flight, self._results, requests, self._effects, gap
+        )
 
     # The cycle of the line
 
@@ -128,15 +118,15 @@ class Engine:
         if isinstance(job, Poll):
             in_flight.open_polls -= 1
             if isinstance(result, Exception):
-                self._conclude_failed_poll(job, result, now, time)
+                self._conclusions.poll_failed(job, result, now, time)
             else:  # units are the only good result of a poll
                 self._results.read(job, cast("Sequence[int]", result), now, time)
             if in_flight.open_polls:
                 return self._effects.take()
             if in_flight.failed:
-                self._unclear(*in_flight.failed[0], traffic, now, time)
+                self._conclusions.unclear(*in_flight.failed[0], traffic, now, time)
         else:
-            self._conclude_other(job, result, traffic, now, time)
+            self._conclusions.conclude(job, result, traffic, now, time)
         if in_flight.continuation is None:
             in_flight.job = None
             in_flight.failed.clear()
@@ -149,97 +139,6 @@ class Engine:
             self._set_deadline()
         effects, self._effects.collected = self._effects.collected, []
         return effects
-
-    def _conclude_failed_poll(self, poll: Poll, result: Exception, now: float, time: int) -> None:
-        device, results = poll.device, self._results
-        match result:
-            case Refused():
-                results.answered(device, now, time)
-                results.refused(poll, result, now, time)
-            case Unsteady():
-                results.answered(device, now, time)
-                results.unsteady(poll, result, now, time)
-            case DeviceError():
-                self._in_flight.failed.append((poll, result))
-            case LineDown():
-                device.health.left_outstanding(poll.block.span)
-            case _:
-                raise result
-
-    def _conclude_other(
-        self, job: Transacted, result: Result, traffic: Traffic, now: float, time: int
-    ) -> None:
-        match job:
-            case Settle():
-                self._conclude_settle(job, result, now, time)
-            case Probe():
-                self._conclude_probe(job, result, traffic, now, time)
-            case Answer():
-                if isinstance(result, Garbled):
-                    why = str(result)
-                    self._effects.warning("reply dropped", device=job.device.name, why=why)
-            case Write() | WriteTogether() | Command() | Confirm() | Repeat():
-                self._conclude_request(job, result, traffic, now, time)
-
-    def _conclude_probe(
-        self, probe: Probe, result: Result, traffic: Traffic, now: float, time: int
-    ) -> None:
-        device = probe.device
-        match result:
-            case (
-                Resynced() | Refused()
-            ):  # an error reply counts too, but may belong to an older request
-                told_from = result.told_from if isinstance(result, Resynced) else 0
-                if not probe.again and self._results.outstanding_requests(device) > told_from:
-                    quiet = device.longest_reply
-                    self._in_flight.continuation = Settle(device, quiet, quiet, probe)
-                else:
-                    self._results.answered(device, now, time)
-            case Unclear():
-                self._unclear(probe, result, traffic, now, time)
-            case BadValue():
-                raise result
-
-    def _conclude_request(
-        self, job: RequestJob, result: Result, traffic: Traffic, now: float, time: int
-    ) -> None:
-        match self._requests.conclude(job, result, traffic, now, time):
-            case Unclear() as error:
-                self._unclear(job, error, traffic, now, time)
-            case Repeat() as repeat:
-                self._in_flight.continuation = repeat
-
-    def _unclear(
-        self, job: Unfinished, error: DeviceError, traffic: Traffic, now: float, time: int
-    ) -> None:
-        """Lets the line settle next: the late reply must not disturb another transaction."""
-        device = job.device
-        before = self._results.unclear(device, error, span_of(job), now, time)
-        self._in_flight.continuation = Settle(
-            device,
-            0.0 if before is State.OFFLINE else device.settings.late_guard,
-            max(GAP, 4 * self.wire.character),
-            after=job,
-            error=error,
-            before=before,
-            sent=traffic.sent > 0,
-            failed=tuple(self._in_flight.failed),
-        )
-
-    def _conclude_settle(self, settle: Settle, result: Result, now: float, time: int) -> None:
-        device, after = settle.device, settle.after
-        if settle.error is None:
-            if isinstance(after, Probe):
-                again = Probe(device, after.outstanding, after.token + 1, again=True)
-                self._in_flight.continuation = again
-            return
-        late = result.late if isinstance(result, Settled) else None
-        took = now - self._in_flight.begun
-        self._results.settled(device, settle.before, took, late, now, time)
-        for poll, error in settle.failed:
-            self._results.unread(poll, error, now, time)
-        if not isinstance(after, Poll | Probe):
-            self._in_flight.continuation = self._requests.settled(settle, now)
 
     @property
     def is_idle(self) -> bool:
@@ -310,7 +209,7 @@ class Engine:
         self.is_open = True
         self.record.opened += 1
         self.record.since, self.record.trouble = now, ""
-        self._in_flight = InFlight()
+        self._in_flight.clear()
         for device in self.devices:
             device.restart()
         self.schedule.opened(now)
@@ -321,7 +220,7 @@ class Engine:
     def lost(self, error: LineDown, now: float, time: int) -> list[Effect]:
         """Turns every value bad, because the port was lost or could not be opened."""
         why = str(error)
-        self._end_request_in_flight(error, now)
+        self._conclusions.abandon(error, now)
         if self.is_open:
             self.record.open_before += now - self.record.since
         self.record.trouble = why
@@ -333,14 +232,8 @@ class Engine:
 
     def stopped(self, now: float) -> list[Effect]:
         """Ends every request, because the gateway stops."""
-        self._end_request_in_flight(None, now)
+        self._conclusions.abandon(None, now)
         return self._close()
-
-    def _end_request_in_flight(self, error: LineDown | None, now: float) -> None:
-        job = self._in_flight.continuation or self._in_flight.job
-        self._in_flight = InFlight()
-        if job is not None:
-            self._requests.abandon(job, error, now)
 
     def _close(self) -> list[Effect]:
         self.is_open = False

@@ -156,6 +156,12 @@ class InFlight:
     continuation: Transacted | None = None
     shared: "Traffic | None" = None  # of polls that share one transaction
 
+    def clear(self) -> None:
+        """No job is handed out any more."""
+        self.job = self.charged = self.continuation = self.shared = None
+        self.open_polls = 0
+        self.failed.clear()
+
     def traffic_of_all(self, shared: "Traffic", traffic: "Traffic") -> "Traffic":
         """Returns the traffic of all polls of a transaction when the last poll ends, else none."""
         shared.sent += traffic.sent

@@ -20,7 +20,7 @@ class Mutant:
 MUTANTS = (
     Mutant(
         "no late-reply guard",
-        "engine/engine.py",
+        "engine/conclusions.py",
         "            0.0 if before is State.OFFLINE else device.settings.late_guard,\n",
         "            0.0,\n",
         "tests/line/test_late_replies.py",
@@ -291,7 +291,7 @@ MUTANTS = (
     ),
     Mutant(
         "after a stall the first reply that fits is believed",
-        "engine/engine.py",
+        "engine/conclusions.py",
         "if not probe.again and self._results.outstanding_requests(device) > told_from:",
         "if False:",
         "tests/line/test_stalled_link.py",
@@ -370,7 +370,7 @@ MUTANTS = (
     ),
     Mutant(
         "the second probe after a stall is left out",
-        "engine/engine.py",
+        "engine/conclusions.py",
         "                self._in_flight.continuation = again\n",
         "                pass\n",
         "tests/engine tests/line/test_stalled_link.py",
@@ -378,7 +378,7 @@ MUTANTS = (
     Mutant(
         "a request in flight gets no outcome when the port is lost",
         "engine/engine.py",
-        "        why = str(error)\n        self._end_request_in_flight(error, now)\n",
+        "        why = str(error)\n        self._conclusions.abandon(error, now)\n",
         "        why = str(error)\n",
         "tests/engine tests/line/test_requests.py",
     ),

@@ -1,0 +1,149 @@
+"""Applies the result of a job that is no good read, and decides what follows it."""
+
+from gateway.engine.effects import Effects
+from gateway.engine.health import State
+from gateway.engine.jobs import (
+    Answer,
+    Confirm,
+    InFlight,
+    Poll,
+    Probe,
+    Repeat,
+    RequestJob,
+    Result,
+    Resynced,
+    Settle,
+    Settled,
+    Traffic,
+    Transacted,
+    Unfinished,
+    WriteTogether,
+    span_of,
+)
+from gateway.engine.request_results import RequestResults
+from gateway.engine.requests import Command, Write
+from gateway.engine.results import Results
+from gateway.errors import BadValue, DeviceError, Garbled, LineDown, Refused, Unclear, Unsteady
+
+
+class Conclusions:
+    """The rules that lead from one job to the next of the same transaction.
+
+    An unclear end is followed by `Settle`, a write whose tag says so by `Confirm` and `Repeat`, a
+    probe after many open requests by a second one.
+    """
+
+    def __init__(
+        self,
+        in_flight: InFlight,
+        results: Results,
+        requests: RequestResults,
+        effects: Effects,
+        gap: float,
+    ) -> None:
+        """`gap`: seconds without a byte that end a run of noise."""
+        self._in_flight = in_flight
+        self._results = results
+        self._requests = requests
+        self._effects = effects
+        self._gap = gap
+
+    def poll_failed(self, poll: Poll, result: Exception, now: float, time: int) -> None:
+        """The result of a poll without units."""
+        device, results = poll.device, self._results
+        match result:
+            case Refused():
+                results.answered(device, now, time)
+                results.refused(poll, result, now, time)
+            case Unsteady():
+                results.answered(device, now, time)
+                results.unsteady(poll, result, now, time)
+            case DeviceError():
+                self._in_flight.failed.append((poll, result))
+            case LineDown():
+                device.health.left_outstanding(poll.block.span)
+            case _:
+                raise result
+
+    def conclude(
+        self, job: Transacted, result: Result, traffic: Traffic, now: float, time: int
+    ) -> None:
+        """The result of any job but a poll."""
+        match job:
+            case Settle():
+                self._settled(job, result, now, time)
+            case Probe():
+                self._probed(job, result, traffic, now, time)
+            case Answer():
+                if isinstance(result, Garbled):
+                    why = str(result)
+                    self._effects.warning("reply dropped", device=job.device.name, why=why)
+            case Write() | WriteTogether() | Command() | Confirm() | Repeat():
+                self._requested(job, result, traffic, now, time)
+
+    def _probed(
+        self, probe: Probe, result: Result, traffic: Traffic, now: float, time: int
+    ) -> None:
+        device = probe.device
+        match result:
+            case (
+                Resynced() | Refused()
+            ):  # an error reply counts too, but may belong to an older request
+                told_from = result.told_from if isinstance(result, Resynced) else 0
+                if not probe.again and self._results.outstanding_requests(device) > told_from:
+                    quiet = device.longest_reply
+                    self._in_flight.continuation = Settle(device, quiet, quiet, probe)
+                else:
+                    self._results.answered(device, now, time)
+            case Unclear():
+                self.unclear(probe, result, traffic, now, time)
+            case BadValue():
+                raise result
+
+    def _requested(
+        self, job: RequestJob, result: Result, traffic: Traffic, now: float, time: int
+    ) -> None:
+        match self._requests.conclude(job, result, traffic, now, time):
+            case Unclear() as error:
+                self.unclear(job, error, traffic, now, time)
+            case Repeat() as repeat:
+                self._in_flight.continuation = repeat
+
+    def unclear(
+        self, job: Unfinished, error: DeviceError, traffic: Traffic, now: float, time: int
+    ) -> None:
+        """Lets the line settle next: the late reply must not disturb another transaction."""
+        device = job.device
+        before = self._results.unclear(device, error, span_of(job), now, time)
+        self._in_flight.continuation = Settle(
+            device,
+            0.0 if before is State.OFFLINE else device.settings.late_guard,
+            self._gap,
+            after=job,
+            error=error,
+            before=before,
+            sent=traffic.sent > 0,
+            failed=tuple(self._in_flight.failed),
+        )
+
+    def _settled(self, settle: Settle, result: Result, now: float, time: int) -> None:
+        device, after = settle.device, settle.after
+        if settle.error is None:
+            if isinstance(after, Probe):
+                again = Probe(device, after.outstanding, after.token + 1, again=True)
+                self._in_flight.continuation = again
+            return
+        late = result.late if isinstance(result, Settled) else None
+        took = now - self._in_flight.begun
+        self._results.settled(device, settle.before, took, late, now, time)
+        for poll, error in settle.failed:
+            self._results.unread(poll, error, now, time)
+        if not isinstance(after, Poll | Probe):
+            self._in_flight.continuation = self._requests.settled(settle, now)
+
+    def abandon(self, error: LineDown | None, now: float) -> None:
+        """The port was lost, or the gateway stops, in the middle of a job."""
+        job = self._in_flight.continuation or self._in_flight.job
+        self._in_flight.clear()
+        if job is not None:
+            self._requests.abandon(job, error, now)
