@@ -1,7 +1,7 @@
 """The byte-level Computer Link PLC of the protocol tests as a process at the end of a cable.
 
-`python -m tests.e2e.link_peer STATION FORMAT PORT`. It says `ready`, then obeys lines on its
-standard input and answers each with `ok …`:
+`python -m tests.e2e.link_peer STATION FORMAT PORT`. It prints `ready`, then executes
+commands from its standard input and prints `ok …` after each:
 
     set D0100 5    what its program would do     get D0500    mute / speak   its answers are lost
     forget         its registered lists          say 1E61     on-demand data, unasked
@@ -27,7 +27,7 @@ class Plc:
         self._request = b""
 
     def listen(self) -> None:
-        """Take what is there; answer when a request is whole."""
+        """Reads the available bytes and replies to each whole request."""
         self._request += os.read(self.port, 4096)
         while select.select([self.port], [], [], PAUSE)[0]:
             self._request += os.read(self.port, 4096)

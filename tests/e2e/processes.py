@@ -1,4 +1,4 @@
-"""Programs as processes of their own: started, listened to, ended by their ids."""
+"""Starts programs as processes, reads their output, and ends them by their ids."""
 
 import json
 import os
@@ -22,7 +22,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 
 class Done(NamedTuple):
-    """A program that came to its end by itself."""
+    """The result of a program that ended by itself."""
 
     code: int
     out: str
@@ -30,7 +30,7 @@ class Done(NamedTuple):
 
 
 def plc_gateway(*arguments: object, **how: Any) -> Done:
-    """Run the command to its end."""
+    """Runs a command to its end."""
     done = subprocess.run(
         [sys.executable, "-m", "gateway", *map(str, arguments)],
         stdin=subprocess.DEVNULL,
@@ -46,7 +46,7 @@ def plc_gateway(*arguments: object, **how: Any) -> Done:
 
 
 class Program:
-    """A running program. What it says is kept, and shown by pytest when the test fails."""
+    """A running program. Its output is kept; pytest shows it when the test fails."""
 
     def __init__(self, *command: object, merged: bool = True) -> None:
         """`merged`: its errors are among its lines; otherwise they are in `errors`."""
@@ -89,7 +89,7 @@ class Program:
         return self._process.poll() is None
 
     def says(self, *words: str, after: int = 0) -> str:
-        """Waits for a line that holds all the words, and returns the first after so many."""
+        """Returns the first line with all the words after so many lines; waits for it."""
         return self._wait(words, after)
 
     def _wait(self, words: tuple[str, ...], first: int, timeout: float = PATIENCE) -> str:
@@ -109,7 +109,7 @@ class Program:
         return any(all(word in line for word in words) for line in self.lines)
 
     def tell(self, command: str) -> str:
-        """One line to its standard input; returns what it answers after `ok`."""
+        """Writes a line to its standard input. Returns the text that it prints after `ok`."""
         first = len(self.lines)
         assert self._process.stdin is not None
         self._process.stdin.write(command + "\n")
@@ -117,12 +117,12 @@ class Program:
         return self._wait(("ok",), first).removeprefix("ok").strip()
 
     def end(self, by: signal.Signals = signal.SIGTERM, within: float = PATIENCE) -> int:
-        """Send a signal and wait; the exit code, negative where the signal itself ended it."""
+        """Sends a signal and waits. Returns the exit code, negative where the signal ended it."""
         self._process.send_signal(by)
         return self.ended(within)
 
     def ended(self, within: float = PATIENCE) -> int:
-        """Wait for its end."""
+        """Waits for its end."""
         code = self._process.wait(within)
         self._finish()
         return code
@@ -146,17 +146,17 @@ class Program:
 
 
 def gateway(*arguments: object, merged: bool = True) -> Program:
-    """`plc-gateway …` as a process; for `run` wait with `.says("Zenoh session ready")`."""
+    """Starts `plc-gateway …` as a process; for `run` wait with `.says("Zenoh session ready")`."""
     return Program(sys.executable, "-m", "gateway", *arguments, merged=merged)
 
 
 def started(config: Path) -> Program:
-    """A gateway that is on Zenoh."""
+    """Starts a gateway and waits for its Zenoh session."""
     return _ready(gateway("run", config), "Zenoh session ready")
 
 
 def station(*where: str, stations: tuple[int, ...] = (1,), by: tuple[str, ...] = ()) -> Program:
-    """Simulated Vigor PLCs that obey commands (tests/e2e/station.py), ready to be spoken to.
+    """Starts simulated Vigor PLCs that take commands (tests/e2e/station.py).
 
     `by`: the command that runs them, such as `ip netns exec plc`.
     """
@@ -165,13 +165,13 @@ def station(*where: str, stations: tuple[int, ...] = (1,), by: tuple[str, ...] =
 
 
 def cable(socat: str, link: Path, far_end: str) -> Program:
-    """A pty at `link` with a cable to `far_end`, as socat writes it. Killed, it is pulled out."""
+    """Starts socat as a cable from a pty at `link` to `far_end`. Killing it unplugs the cable."""
     ends = f"pty,raw,echo=0,link={link}", far_end
     return _ready(Program(socat, "-d", "-d", *ends), "starting data transfer loop")
 
 
 def _ready(program: Program, words: str) -> Program:
-    """The program once it has said so; ended if it never does."""
+    """Waits for the words and returns the program; ends it if they do not come."""
     try:
         program.says(words)
     except BaseException:
@@ -181,7 +181,7 @@ def _ready(program: Program, words: str) -> Program:
 
 
 def device_server(ser2net: str, folder: Path, tty: Path, number: int) -> Program:
-    """ser2net, telnet with RFC 2217, on this TCP port in front of a serial port."""
+    """Starts ser2net, telnet with RFC 2217, on a TCP port in front of a serial port."""
     config = folder / "ser2net.yaml"
     config.write_text(
         "connection: &a\n"
@@ -201,12 +201,12 @@ def free_port() -> int:
 
 
 def listens(number: int) -> bool:
-    """Whether anybody listens there: without connecting, as a port may serve one at a time."""
+    """A process listens there; found without a connection, as a port may serve one at a time."""
     return f"0100007F:{number:04X} 00000000:0000 0A" in Path("/proc/net/tcp").read_text()
 
 
 def until(happened: Callable[[], bool], what: str) -> None:
-    """For what only the system can be asked about, and which tells nobody."""
+    """Polls a condition of the system, which sends no notice."""
     end = time.monotonic() + PATIENCE
     while not happened():
         assert time.monotonic() < end, f"it did not happen that {what}"
@@ -214,7 +214,7 @@ def until(happened: Callable[[], bool], what: str) -> None:
 
 
 def write_config(path: Path, endpoint: str, lines: dict[str, Any], **sections: Any) -> Path:
-    """A configuration file (JSON is YAML)."""
+    """Writes a configuration file (JSON is YAML)."""
     document = {
         "gateway": {"name": "demo"},
         "zenoh": {"prefix": "plant", "listen": [endpoint]},
@@ -227,7 +227,7 @@ def write_config(path: Path, endpoint: str, lines: dict[str, Any], **sections: A
 
 
 def vigor_line(port: str, tags: dict[str, Any], **device: Any) -> dict[str, Any]:
-    """One line at 19200 7E1 with the PLC `mixer`, station 1, that answers within 200 ms."""
+    """Returns a line at 19200 7E1 with the PLC `mixer`, station 1, reply time-out 200 ms."""
     settings = {"protocol": "vigor", "station": 1, "reply_timeout": "200ms", **device}
     return {
         "port": port,

@@ -1,4 +1,4 @@
-"""The port goes away and comes back: by itself everything is as before."""
+"""A port is lost and comes back; the line recovers by itself."""
 
 import signal
 from collections.abc import Callable, Iterator
@@ -30,7 +30,7 @@ KEYS = {f"plant/mixer/{name}" for name in TAGS}
 
 
 class Link(NamedTuple):
-    """A way to the PLC that can be cut."""
+    """A connection to the PLC that can be cut."""
 
     port: str
     plc: Program
@@ -39,7 +39,7 @@ class Link(NamedTuple):
 
 
 def _cable(stack: ExitStack, folder: Path) -> Link:
-    """socat between two ptys is killed: ours is gone, and a new one is made at the same place."""
+    """Kills socat between two ptys: the pty is lost, and a new one appears at the same path."""
     socat = needs("socat")
     far, near = folder / "far", folder / "near"
     plc = stack.enter_context(station("pty", str(far)))

@@ -1,5 +1,7 @@
-"""A Computer Link PLC, byte by byte from the manual, at the end of a cable: PLC, cable, gateway
-and Zenoh client are processes of their own."""
+"""A Computer Link PLC, byte by byte from the manual, behind a cable.
+
+PLC, cable, gateway and Zenoh client are processes of their own.
+"""
 
 import sys
 from collections.abc import Iterator

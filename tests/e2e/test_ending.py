@@ -1,4 +1,4 @@
-"""How a gateway ends, and how the next one begins: signals, ports that are taken."""
+"""The end of a gateway and the start of the next: signals, ports in use."""
 
 import asyncio
 import signal
@@ -133,7 +133,7 @@ async def test_writes_in_flight_and_in_the_queue_get_a_reply(
 
 
 def test_a_client_without_its_router_ends_in_time(tmp_path: Path) -> None:
-    """It waits for the router, and polls; nobody has to wait for it."""
+    """It waits for the router and polls."""
     lines = {"hall": vigor_line("simulator", {"speed": {"address": "D10"}})}
     zenoh = {"mode": "client", "listen": [], "connect": [free_endpoint()]}
     path = write_config(tmp_path / "config.yaml", "", lines, zenoh=zenoh)

@@ -1,6 +1,6 @@
-"""The no-protocol examples as they stand, over a pty with a peer that knows nothing but bytes.
+"""The no-protocol examples, unchanged, over a pty with a peer of plain bytes.
 
-Gateway, Zenoh client and device are apart: two processes, and a thread on the far end of the pty.
+Gateway and Zenoh client are processes; the device is a thread on the far end of the pty.
 """
 
 import json
@@ -25,12 +25,12 @@ OVERLOAD = b"OL,+999999.9  g\r\n"
 
 
 class ByteDevice:
-    """The far end of a pty: hands what it hears to `hear`, says what that returns, and more."""
+    """The far end of a pty: passes its input to `hear` and sends the result."""
 
     def __init__(
         self, hear: Callable[[bytes], bytes] = lambda _: b"", streams: bytes = b""
     ) -> None:
-        """`streams`: said ten times a second."""
+        """`streams`: sent ten times a second."""
         self._hear = hear
         self._master, self._slave = os.openpty()
         tty.setraw(self._slave)
@@ -73,7 +73,7 @@ def endpoint() -> str:
 
 
 def configured(folder: Path, name: str, port: str, endpoint: str) -> Path:
-    """The example as it is, but for its port and its endpoint."""
+    """Writes the example with another port and endpoint."""
     text = (ROOT / "examples" / f"{name}.yaml").read_text()
     for old, new in (("/dev/ttyUSB0", port), ("tcp/127.0.0.1:7447", endpoint)):
         assert text.count(old) == 1
@@ -136,7 +136,7 @@ def _frame(text: bytes) -> bytes:
 
 
 class _Inverter:
-    """`F?` is answered with the speed that was set last."""
+    """Replies to `F?` with the speed that was set last."""
 
     def __init__(self) -> None:
         self._rest = b""

@@ -1,4 +1,4 @@
-"""Late replies in real time on a pty: the rule that other tests prove in virtual time."""
+"""Late replies in real time on a pty; other tests use virtual time."""
 
 import asyncio
 import random

@@ -1,4 +1,4 @@
-"""The first five minutes: the example runs, says what to type next, and that works."""
+"""The first five minutes: the example runs, and the commands that it proposes work."""
 
 import shlex
 import signal

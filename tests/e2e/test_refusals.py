@@ -1,4 +1,4 @@
-"""What a Zenoh client in another process is told when it asks for what cannot be done."""
+"""Error replies to a Zenoh client in another process."""
 
 from collections.abc import Iterator
 from typing import Any, NamedTuple
@@ -121,7 +121,7 @@ async def test_a_put_writes_and_its_outcome_is_published(plant: Plant) -> None:
 
 
 async def test_the_plc_holds_the_written_values(plant: Plant) -> None:
-    """The station's own memory is asked, not the gateway."""
+    """Reads the memory of the station, not the gateway."""
     async with ZenohPeer("client", connect=[plant.endpoint]) as client:
         for value in (7, 40, 1):
             [reply] = await client.get("plant/mixer/recipe/@set", str(value).encode())
@@ -134,6 +134,6 @@ async def test_the_plc_holds_the_written_values(plant: Plant) -> None:
 
 
 async def _writes(client: ZenohPeer) -> Any:
-    """How many writes went to the device; a status document is at most 0.2 s old."""
+    """Returns the number of writes to the device; a status document is at most 0.2 s old."""
     [device] = await client.get("plant/@gateway/demo/devices/mixer")
     return device.json["writes"]

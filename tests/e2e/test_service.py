@@ -1,4 +1,4 @@
-"""The files and the wire of a gateway: started twice, started again, with a broken part."""
+"""A gateway started twice, restarted, or with a failing part."""
 
 import asyncio
 import json
@@ -121,7 +121,7 @@ def _plant(folder: Path) -> tuple[Path, str, Path]:
 
 
 def _refused(state: Path) -> list[int]:
-    """Which addresses the file knows."""
+    """Returns the bad addresses in the file."""
     if not state.exists():
         return []
     known = json.loads(state.read_bytes())["devices"]["mixer"]["refused"]
@@ -187,7 +187,7 @@ async def test_a_failing_history_does_not_stop_publishing(tmp_path: Path) -> Non
 
 
 async def test_a_published_value_is_found_by_the_next_query(tmp_path: Path) -> None:
-    """In one turn of the loop a line has a sample, and then the inbox takes the queries."""
+    """In one pass of the loop a line has a sample, and then the inbox takes the queries."""
     lines = {"hall": vigor_line("simulator", {"speed": {"address": "D10", "history": True}})}
     path = write_config(tmp_path / "config.yaml", free_endpoint(), lines, history={"path": "h.db"})
     whole = Gateway(load(path))

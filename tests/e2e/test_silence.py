@@ -1,8 +1,8 @@
-"""A station that falls silent and comes back, as Zenoh clients in another process see it.
+"""A station falls silent and comes back; Zenoh clients in another process observe it.
 
 The configuration says `every: 1s`, `reply_timeout: 200ms` and `retries: 5`, and leaves
-`late_guard` as long as the reply time-out: a station is given up after 2.4 s, so that its values
-have to turn bad before. Silent, it is probed at most every 8 s, as its neighbour is served.
+`late_guard` as long as the reply time-out: the station is offline after 2.4 s, and its values
+must turn bad before. It is then probed at most every 8 s, as the other station is polled.
 """
 
 import signal
@@ -103,7 +103,7 @@ async def test_quality_goes_bad_within_two_intervals_and_good_again(plant: Plant
 
 
 async def test_a_write_with_a_lost_reply_is_unclear(plant: Plant) -> None:
-    """A mute station obeys: whoever says it was not done, or that it was, is guessing."""
+    """A mute station carries out requests, so the outcome of a write is unknown."""
     async with ZenohPeer("client", connect=[plant.endpoint]) as client:
         [good] = await client.get("plant/mixer/recipe/@set", b"3")
         assert good.ok

@@ -1,4 +1,4 @@
-"""The one rule for what a machine lacks: skipped with a reason, or failed if that is asked for."""
+"""A missing program skips its tests with a reason, or fails them with an option."""
 
 import pytest
 

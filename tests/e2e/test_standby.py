@@ -1,4 +1,4 @@
-"""Two gateways of one plant: never both on the wire, and one of them soon after a crash."""
+"""Two gateways of a group: one at most uses the wire, and one does soon after a crash."""
 
 import asyncio
 import json
@@ -24,7 +24,7 @@ SETTLE_TIME, CLAIM_TIME = 2.0, 1.5
 
 
 class Wire:
-    """A device server that nobody answers from: it counts who is connected."""
+    """A device server without a PLC that counts its connections."""
 
     def __init__(self) -> None:
         self.open = 0
@@ -44,7 +44,7 @@ class Wire:
         self.changed.set()
 
     async def until(self, count: int, within: float) -> None:
-        """Waits until so many are connected."""
+        """Waits until the number of connections is `count`."""
         async with asyncio.timeout(within):
             while self.open != count:
                 self.changed.clear()
@@ -73,8 +73,8 @@ def gateway(folder: Path, name: str, router: str, port: int) -> Program:
     return Program(sys.executable, "-c", RUN, "run", file)
 
 
-async def stand_so(client: ZenohPeer, stands: str) -> None:
-    """Waits until a and b say that they do: their documents are a moment old."""
+async def until_states(client: ZenohPeer, stands: str) -> None:
+    """Waits until a and b report these states; their documents lag a little."""
     async with asyncio.timeout(15):
         while True:
             replies = await client.get("plant/@gateway/*/standby")
@@ -92,7 +92,7 @@ async def test_two_gateways_of_a_group_share_one_wire(tmp_path: Path) -> None:
             async with ZenohPeer("client", connect=[router_at]) as client:
                 # Both start at once: the first by name goes.
                 await line.until(1, within=15)
-                await stand_so(client, "active waiting")
+                await until_states(client, "active waiting")
                 # One answers for the plant, and takes its writes; both say that they are there.
                 replies = await client.get("plant/mixer/speed", consolidation="NONE")
                 assert len(replies) == 1
@@ -102,7 +102,7 @@ async def test_two_gateways_of_a_group_share_one_wire(tmp_path: Path) -> None:
                 await router.kill()
                 async with ZenohPeer("router", listen=[router_at]):
                     await asyncio.sleep(SETTLE_TIME + CLAIM_TIME + 1)
-                    await stand_so(client, "active waiting")
+                    await until_states(client, "active waiting")
                     assert (line.open, line.most) == (1, 1)
                     # A crash.
                     await asyncio.to_thread(a.end, signal.SIGKILL)
@@ -110,9 +110,9 @@ async def test_two_gateways_of_a_group_share_one_wire(tmp_path: Path) -> None:
                     await line.until(1, within=3)
                     # Whoever comes back later stands by, until the other is ended in order.
                     a = programs.enter_context(gateway(tmp_path, "a", router_at, port))
-                    await stand_so(client, "waiting active")
+                    await until_states(client, "waiting active")
                     await asyncio.sleep(CLAIM_TIME + 1)
-                    await stand_so(client, "waiting active")
+                    await until_states(client, "waiting active")
                     assert await asyncio.to_thread(b.end) == 0
                     await line.until(1, within=3)
                     assert line.most == 1
@@ -120,7 +120,7 @@ async def test_two_gateways_of_a_group_share_one_wire(tmp_path: Path) -> None:
 
 
 async def says(program: Program, words: str, after: int = 0) -> int:
-    """How many lines there are up to the one that says so, after so many."""
+    """Returns the number of lines up to the one with the words, after so many."""
     line = await asyncio.to_thread(program.says, words, after=after)
     return program.lines.index(line, after) + 1
 
@@ -129,7 +129,7 @@ async def says(program: Program, words: str, after: int = 0) -> int:
 async def test_watch_continues_with_the_active_gateway_of_the_group(
     tmp_path: Path, watched: str
 ) -> None:
-    """By the file of either of them; and when nobody is left all is bad at once."""
+    """With the file of either of them. When both are gone all values are bad at once."""
     router_at, port, good, gone = free_endpoint(), free_port(), '"good"', '"no-gateway"'
     with ExitStack() as programs:
         programs.enter_context(station("tcp", str(port)))

@@ -1,1 +1,1 @@
-"""Real processes, real kills, real cables pulled out."""
+"""Faults with real processes, ports and cables."""

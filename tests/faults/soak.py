@@ -1,4 +1,4 @@
-"""A gateway at full load for a long time: what it holds in memory, and what it keeps open.
+"""Measures memory and open files of a gateway under full load for a long time.
 
     python -m tests.faults.soak --minutes 30
 
@@ -6,7 +6,7 @@ Four serial lines with more tags than they can carry and one Modbus TCP device, 
 `plc-gateway simulate` in a process of its own, and a scale that streams on a pty; every sample goes
 to history, whose file is full after a few minutes; a Zenoh client that takes every sample, asks for
 values, history, and writes. Every ten seconds the gateway's memory, file descriptors, threads and
-files are noted. Says at the end what is wrong, if anything is, and ends with exit code 1 then:
+files are noted. At the end it lists each fault, and ends with exit code 1 if there is one:
 memory that grows by more than a hundredth after the warm-up, a file descriptor or thread that
 stays, a file beyond its limit, a write that failed, a sample that history lost.
 """
@@ -51,7 +51,7 @@ class Look(NamedTuple):
 
 
 def plant() -> dict[str, Any]:
-    """Four wires that are never quiet and one network device."""
+    """Returns a plant of four overloaded lines and one network device."""
 
     def registers(area: str, **more: Any) -> dict[str, Any]:
         tags = {f"v{n}": {"address": f"{area}{n * 3}", **more} for n in range(40)}
@@ -79,7 +79,7 @@ def plant() -> dict[str, Any]:
 
 
 def scale(port: str) -> dict[str, Any]:
-    """A device without a protocol that streams its weight."""
+    """Streams weights as a device without a protocol."""
     weighing = {
         "match": r"(?P<state>ST|US),(?P<weight>[+-][0-9.]{8}) *g",
         "fields": {"weight": {"type": "decimal"}, "state": {"type": "text"}},
@@ -95,7 +95,7 @@ def scale(port: str) -> dict[str, Any]:
 
 
 class Customers:
-    """A Zenoh client that takes everything, asks, and writes all the time."""
+    """A Zenoh client that subscribes to all tags, queries and writes all the time."""
 
     def __init__(self, endpoint: str, tags: list[str]) -> None:
         settings = zenoh.Config()
@@ -130,7 +130,7 @@ class Customers:
                 self.remembered += sum(reply.ok is not None for reply in found)
 
     def history(self) -> dict[str, Any]:
-        """What the gateway says of it."""
+        """Returns the history status of the gateway."""
         [reply] = self._session.get("plant/@gateway/demo/history")
         assert reply.ok is not None
         document: dict[str, Any] = json.loads(bytes(reply.ok.payload))
@@ -169,7 +169,7 @@ def looks(service: Program, customers: Customers, folder: Path, minutes: float) 
 
 
 def measured(seen: list[Look]) -> dict[str, Any]:
-    """Medians of the minutes after the warm-up and of the last ones: single looks jump."""
+    """Returns medians of the minutes after the warm-up and of the last minutes."""
     first = [one for one in seen if one.seconds >= seen[-1].seconds * WARM_UP]
     part = max(1, len(first) // 4)
 
@@ -196,7 +196,7 @@ def measured(seen: list[Look]) -> dict[str, Any]:
 
 
 def complaints(result: dict[str, Any]) -> list[str]:
-    """What is not as it must be."""
+    """Returns a sentence for each fault."""
 
     def grew(what: str) -> bool:
         before, after = result[what]

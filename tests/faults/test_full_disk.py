@@ -1,4 +1,4 @@
-"""A disk that takes no more: history says so and waits, nothing else notices, nothing is lost."""
+"""A full disk: history reports it and waits, all else continues, no sample is lost."""
 
 import asyncio
 import os
@@ -29,7 +29,7 @@ def _config(folder: Path, endpoint: str, path: Path) -> Path:
     )
 
 
-async def test_a_file_that_may_not_grow_stops_the_history_and_nothing_else(tmp_path: Path) -> None:
+async def test_a_file_at_its_size_limit_stops_the_history_only(tmp_path: Path) -> None:
     """No file of this process may grow beyond 200 kB."""
     endpoint = free_endpoint()
     config = _config(tmp_path, endpoint, tmp_path / "history.db")
@@ -50,7 +50,7 @@ async def test_a_file_that_may_not_grow_stops_the_history_and_nothing_else(tmp_p
 
 @pytest.fixture
 def disk(tmp_path: Path) -> tuple[str, Path]:
-    """What mounts a small disk for the command behind it and for nobody else, and where."""
+    """Returns a command prefix that mounts a small disk for its command alone, and the folder."""
     needs("unshare")
     needs("mount")
     place = tmp_path / "disk"
@@ -63,7 +63,7 @@ def disk(tmp_path: Path) -> tuple[str, Path]:
     return f"exec unshare {who} --mount bash -c '{mount} && exec {{}}'", place
 
 
-async def test_a_disk_that_is_full_is_said_and_history_goes_on_when_there_is_room(
+async def test_a_full_disk_is_reported_and_history_continues_with_room(
     disk: tuple[str, Path], tmp_path: Path
 ) -> None:
     mounted, place = disk
@@ -102,7 +102,7 @@ async def test_a_disk_that_is_full_is_said_and_history_goes_on_when_there_is_roo
 
 
 def _fill(ballast: Path) -> None:
-    """Takes all the room there is, to the last byte."""
+    """Fills the disk to the last byte."""
     with ballast.open("ab", buffering=0) as file:
         for size in (65536, 4096, 1):
             try:
@@ -119,7 +119,7 @@ async def _history(client: ZenohPeer) -> dict[str, Any]:
 
 
 async def _is_remembered(client: ZenohPeer, heard: Subscription) -> None:
-    """Every sample that was heard live, once."""
+    """History holds every received sample once."""
     live = [sample.json["time"] for sample in heard.samples]
     kept = [reply.json["time"] for reply in await client.get(f"{KEY}?_time=[{live[0]}..]")]
     assert len(set(kept)) == len(kept)

@@ -1,4 +1,4 @@
-"""Router and gateway killed while everything goes on: history holds it, a consumer gets it once."""
+"""Router and gateway killed under load: a consumer gets every sample of the history once."""
 
 import asyncio
 import signal
@@ -21,7 +21,7 @@ Row = tuple[str, str, str]  # time, key and value, as the consumer prints them
 
 
 class Consumer:
-    """examples/catch_up.py, which wants everything."""
+    """examples/catch_up.py with all tags."""
 
     def __init__(self, program: Program) -> None:
         self._program = program
@@ -32,13 +32,13 @@ class Consumer:
         return [(when, key, value.removesuffix(" late")) for when, key, value in words]
 
     async def goes_on(self, rows: int) -> None:
-        """Waits for so many more."""
+        """Waits for more samples."""
         wanted = len(self.rows) + rows
         await asyncio.to_thread(until, lambda: len(self.rows) >= wanted, "the consumer goes on")
 
 
 def kept(path: Path) -> list[Row]:
-    """What is in the file, which is whole."""
+    """Returns the rows of the file, and checks that it is intact."""
     with closing(sqlite3.connect(f"file:{path}?mode=ro", uri=True)) as database:
         assert database.execute("PRAGMA integrity_check").fetchall() == [("ok",)]
         rows = database.execute("SELECT time, key, value FROM history ORDER BY time").fetchall()
@@ -46,7 +46,7 @@ def kept(path: Path) -> list[Row]:
 
 
 async def test_history_survives_router_and_gateway_killed_under_load(tmp_path: Path) -> None:
-    """A wire that is never quiet, and writes."""
+    """The line is overloaded, and a client writes."""
     endpoint, tty = free_endpoint(), str(tmp_path / "tty")
     history = tmp_path / "history.db"
     tags: dict[str, Any] = {f"v{n}": {"address": f"D{10 + n}"} for n in range(40)}

@@ -1,4 +1,4 @@
-"""Real stations killed, connections cut, gateways restarted: what stays true, what returns."""
+"""Stations killed, connections cut, gateways restarted, all as real processes."""
 
 import asyncio
 import os
@@ -30,7 +30,7 @@ TAGS: dict[str, dict[str, Any]] = {
 
 
 class Cuttable:
-    """A TCP proxy between gateway and PLC: cuts in the middle of a reply, or falls silent."""
+    """A TCP proxy between gateway and PLC that cuts in the middle of a reply, or falls silent."""
 
     def __init__(self, far: int) -> None:
         self._far = far
@@ -71,7 +71,7 @@ class Cuttable:
             await target.drain()
 
     def close(self) -> None:
-        """End every connection, as a device server does that is switched off and on."""
+        """Ends every connection, as a restart of a device server does."""
         for end in self._open:
             end.close()
         self._open.clear()
@@ -131,7 +131,7 @@ async def test_tcp_cut_in_the_middle_of_a_reply_and_half_open(tmp_path: Path) ->
                 assert not service.has_said("Traceback")
 
 
-async def test_the_station_killed_and_started_again(tmp_path: Path) -> None:
+async def test_a_killed_station_is_online_again_after_its_restart(tmp_path: Path) -> None:
     endpoint, number = free_endpoint(), free_port()
     line = vigor_line(f"tcp://127.0.0.1:{number}", TAGS)
     config = write_config(tmp_path / "config.yaml", endpoint, {"hall": line})
@@ -149,9 +149,9 @@ async def test_the_station_killed_and_started_again(tmp_path: Path) -> None:
 
 
 def test_restarts_leave_nothing_behind(tmp_path: Path) -> None:
-    """Ended kindly and killed by turns: no process, no file, no lock, no name on the port, and no
-    file descriptor in the PLC's process. What SQLite keeps beside a file after a kill goes with
-    the next; the file that is locked stays, and nobody holds it."""
+    """Ended and killed by turns, a gateway leaves no process, file, lock or port name, and no file
+    descriptor in the process of the PLC. The next start removes the files of SQLite after a kill.
+    The lock file stays and is not locked."""
     tty = str(tmp_path / "tty")
     tags = {**TAGS, "speed": {**TAGS["speed"], "history": True}}
     with station("pty", tty) as plc:
@@ -194,7 +194,7 @@ def _children(pid: int) -> list[int]:
 
 
 def _holders(tty: str) -> list[str]:
-    """Gateways that have the port open."""
+    """Returns the gateways that have the port open."""
     real, found = os.path.realpath(tty), []
     for command in Path("/proc").glob("[0-9]*/cmdline"):
         try:

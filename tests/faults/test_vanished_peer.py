@@ -1,7 +1,7 @@
-"""A TCP peer that loses its power says nothing: no FIN, no RST, only silence.
+"""A TCP peer that loses its power sends neither FIN nor RST.
 
-The PLC is in a network namespace of its own, behind a virtual cable that is pulled at its end. The
-gateway's long waits are shorter here, so that the suite is.
+The PLC runs in a network namespace behind a virtual cable, which the test unplugs. The long
+time-outs of the gateway are shorter here.
 """
 
 import asyncio
@@ -32,7 +32,7 @@ SPEED = "plant/mixer/speed"
 
 
 class Cable:
-    """Between this machine and a namespace of its own; pulled, what is sent is lost."""
+    """A cable to a network namespace; unplugged, it loses all packets."""
 
     def __init__(self, ip: str) -> None:
         number = os.getpid()
@@ -64,7 +64,7 @@ class Cable:
         self._run("-n", self.name, "link", "set", self._far, "down")
 
     def station(self) -> Program:
-        """A simulated PLC at the far end."""
+        """Runs a simulated PLC at the far end."""
         return station("tcp", f"{self.peer}:{PORT}", by=(self._ip, "netns", "exec", self.name))
 
     def remove(self) -> None:
@@ -82,7 +82,7 @@ def cable() -> Iterator[Cable]:
     cable.remove()
 
 
-async def test_a_peer_that_vanishes_without_a_word_is_noticed_and_comes_back(
+async def test_a_peer_without_power_is_detected_and_comes_back(
     cable: Cable, tmp_path: Path
 ) -> None:
     endpoint = free_endpoint()

@@ -1,11 +1,11 @@
-"""The rules of the gateway, each broken by hand: see `mutants.py`."""
+"""The mutants, each of which breaks one rule of the gateway: see `mutants.py`."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
 class Mutant:
-    """`old` becomes `new` in `file`; `tests` and `seeds` should mind."""
+    """`old` becomes `new` in `file`; `tests` or `seeds` should fail."""
 
     name: str
     file: str

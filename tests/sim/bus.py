@@ -1,4 +1,4 @@
-"""One line as the judge sees it: what passed on its wire, and what excuses whom."""
+"""One line of the simulation: its traffic, and the excuses for what the gateway reports."""
 
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
@@ -41,13 +41,13 @@ UNTIMELY = (
     "stall",
     "flicker",
 )
-SPOKE_LATELY = 1.0 + 0.7  # seconds: an answer to unasked words comes within one
-AFTER_ALL = 0.09  # seconds that stations need to take in what goes to all of them
+SPOKE_LATELY = 1.0 + 0.7  # seconds: the reply to an unsolicited frame comes within one
+AFTER_ALL = 0.09  # seconds that stations need after a broadcast
 
 
 @dataclass(eq=False)
 class Bus:
-    """The watch of a wire. Times by the loop's clock."""
+    """Observes a wire. Times by the loop's clock."""
 
     config: LineConfig
     stations: dict[str, Troubled]
@@ -60,22 +60,25 @@ class Bus:
     began: float
     wire: SimWire | SimNet = field(init=False)
     line: Line = field(init=False)  # built after its port
-    sent_at: float = 0.0  # when the gateway spoke last
+    sent_at: float = 0.0  # when the gateway sent last
     asked: Device | None = None
-    hurt_at: float = -1.0  # when something damaged arrived last
+    hurt_at: float = -1.0  # when damaged bytes arrived last
     hurt: dict[str, float] = field(default_factory=lambda: {"<": -1.0, ">": -1.0})
-    heard: bytes = b""  # since the gateway spoke last
+    heard: bytes = b""  # since the gateway sent last
     request: bytes = b""  # as it reached the stations
     writes: Counter[int] = field(default_factory=Counter)  # write frames by station number
     commands: Counter[int] = field(default_factory=Counter)
-    misled: set[Device] = field(default_factory=set)  # whose list was damaged, and agreed to
+    misled: set[Device] = field(default_factory=set)  # that accepted a damaged monitor list
     questions: deque[tuple[float, Asked]] = field(default_factory=lambda: deque(maxlen=64))
     open: dict[tuple[int, int], float] = field(default_factory=dict)  # Modbus TCP: since when
-    speaking: tuple[float, float] = (0.0, 0.0)  # an unasked frame that we could hear
+    speaking: tuple[float, float] = (
+        0.0,
+        0.0,
+    )  # the last unsolicited frame that the gateway could hear
     _to_all_until: float = -1.0
     _registering: Device | None = None
 
-    # The watch of the wire
+    # Traffic
 
     def sent(self, data: bytes, start: float, end: float) -> None:
         if self._registering is not None:
@@ -110,7 +113,7 @@ class Bus:
             self.broke(f"{self.config.name}: spoke into a frame that was coming in")
 
     def number_of(self, device: Device) -> int:
-        """What `station_in` says of what is sent to it."""
+        """Returns the number of the device in a request, as `station_in` finds it."""
         return (
             ord(device.name[-1])
             if isinstance(device.driver, FrameDriver)
@@ -128,7 +131,7 @@ class Bus:
         if device is None or self.excused(self.now() - self.began - 30.0):
             return
         if device.state in (State.OFFLINE, State.STARTING):
-            return  # nobody waits for late answers to a probe: that is the rule
+            return  # the line does not wait for late replies to a probe
         self.broke(f"{self.config.name}: spoke while {device.name} did")
 
     def damaged(self, way: str) -> None:
@@ -144,11 +147,11 @@ class Bus:
         else:
             self.request += data
 
-    # Who speaks unasked
+    # Unsolicited frames
 
     @property
     def collides(self) -> bool:
-        """Somebody on it speaks when he likes, though he or others are asked."""
+        """Some device of the line sends unsolicited frames and others are polled."""
         drivers = [device.driver for device in self.line.engine.devices]
         speakers = [d for d in drivers if isinstance(d, FrameDriver) and d.sends_unsolicited]
         return bool(speakers) and (len(drivers) > 1 or bool(speakers[0].settings.ask))
@@ -176,7 +179,7 @@ class Bus:
     # Modbus TCP
 
     def _questioned(self, question: Asked, device: Device) -> None:
-        """Never more are open than its window says, and no number is used again soon."""
+        """Checks that the open requests fit the window and that no number is reused soon."""
         now = self.now()
         since = max(now - device.timing.reply_timeout, self.line.engine.record.since)
         key = question.unit, question.number
@@ -191,7 +194,7 @@ class Bus:
         self.questions.append((now, question))
 
     def asked_at(self, tag: Tag) -> float:
-        """When the exchange began that fetched the tag's value, which has just come."""
+        """Returns the start of the transaction that has just read the tag."""
         if self.protocol != "modbus-tcp":
             return self.sent_at
         device = next(d for d in self.line.engine.devices if d.name == tag.device)
@@ -204,10 +207,10 @@ class Bus:
             default=self.now(),
         )
 
-    # What excuses it
+    # Excuses
 
     def excused(self, since: float) -> bool:
-        """Whether an answer may come at any time: later than any guard, or in another's name.
+        """A reply may arrive later than any guard, or with the number of another station.
 
         `since` in seconds from the start, as the episodes have it.
         """
@@ -217,7 +220,7 @@ class Bus:
         )
 
     def untimely(self, device: str) -> bool:
-        """Whether the device answers, or has of late, when nobody expects it any more."""
+        """The device replies, or replied recently, later than the line waits."""
         passed = self.now() - self.began
         return any(
             e.device == device and e.kind == "very-late" and e.start <= passed < e.end + 10.0
@@ -225,7 +228,7 @@ class Bus:
         )
 
     def blind(self, since: float) -> bool:
-        """Something was damaged since then, and its own check sum, if it has one, agrees."""
+        """A frame was damaged since then and still has a right check sum, or has none."""
         device = self.asked
         damaged = [
             heard
@@ -240,7 +243,7 @@ class Bus:
         return any(CHECKS[protocol](part) for part in damaged)
 
     def _registered(self, device: Device) -> None:
-        """A list of wrong addresses was taken for the right one: it is believed till the next."""
+        """Notes a device that took a damaged monitor list: its reads are wrong until the next."""
         self._registering = None
         if self.hurt_at >= self.sent_at and self.blind(self.sent_at):
             self.misled.add(device)
@@ -249,7 +252,7 @@ class Bus:
 
 
 def summed(device: Device) -> bool:
-    """Whether its frames have a check sum."""
+    """Its frames have a check sum."""
     match device.driver:
         case ComputerLink() as link:
             return link.sum_check

@@ -1,4 +1,4 @@
-"""Many seeds, many hours: `make sim SEEDS=0-499 HOURS=4 PACE=lean`, or one: `make sim SEEDS=17`.
+"""Runs many seeds: `make sim SEEDS=0-499 HOURS=4 PACE=lean`, or one: `make sim SEEDS=17`.
 
 Each seed that breaks a rule is printed with the command that replays it.
 """
@@ -17,11 +17,11 @@ from tests.sim.draw import PACES
 from tests.sim.story import Story
 from tests.sim.world import run
 
-MOST = ("most timers", "most open")  # of what is counted, the largest is told
+MOST = ("most timers", "most open")  # counts of which the largest is printed
 
 
 def seeds(text: str) -> list[int]:
-    """`0-499`, `17` or `3,5,17`."""
+    """Parses `0-499`, `17` or `3,5,17`."""
     found: list[int] = []
     for part in text.split(","):
         first, _, last = part.partition("-")

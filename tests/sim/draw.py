@@ -1,4 +1,4 @@
-"""A seed -> a plant: a configuration file, its wires, and what will go wrong with them when."""
+"""Draws a plant from a seed: its configuration file, its wires, its faults."""
 
 import json
 import random
@@ -13,23 +13,23 @@ PROTOCOLS = ("vigor", "computer-link", "modbus-rtu", "modbus-ascii")
 # How often tags are read: `busy` fills the wires, `lean` leaves time for many hours.
 PACES = {
     "busy": ("200ms", "500ms", "1s", "1s", "2s", "2s", "5s", "10s"),
-    "noisy": ("500ms", "1s"),  # storms of one kind only, below
+    "noisy": ("500ms", "1s"),  # storms of one kind only, see below
     "late": ("500ms", "1s"),
     "tardy": ("500ms", "1s"),
-    "storm": ("500ms", "1s", "2s"),  # ten times as much goes wrong
+    "storm": ("500ms", "1s", "2s"),  # ten times as many faults
     "lean": ("20s", "30s", "60s", "60s"),
 }
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """What the seed has chosen. Times in seconds from the start."""
+    """A plant drawn from a seed. Times in seconds from the start."""
 
     document: dict[str, Any]
     missing: dict[str, frozenset[int]]  # by device: addresses of its words that it refuses
     episodes: tuple[Episode, ...]
     jumps: tuple[tuple[float, float], ...]  # of the wall clock: when, by how many seconds
-    chunks: dict[str, int]  # by line: characters that a UART gathers
+    chunks: dict[str, int]  # by line: characters in a piece of a UART
     zeros: dict[str, bool]  # by line: a broken character is read as zero
 
     def write(self, folder: Path) -> Path:

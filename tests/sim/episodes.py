@@ -1,16 +1,16 @@
-"""What goes wrong on the lines of a seed, and when."""
+"""Draws the faults of a line, each with its time."""
 
 import random
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-CALM = 1000.0  # seconds at the end in which nothing goes wrong
+CALM = 1000.0  # seconds without faults at the end
 
 
 @dataclass(frozen=True)
 class Episode:
-    """One thing that goes wrong, for a while. Times in seconds from the start."""
+    """One fault and its duration. Times in seconds from the start."""
 
     start: float
     end: float
@@ -22,7 +22,7 @@ class Episode:
 
     @property
     def silent(self) -> bool:
-        """Nothing of the device is heard meanwhile."""
+        """The device does not reply meanwhile."""
         return self.kind in ("deaf", "mute", "vanish", "hang", "stall")
 
 
@@ -50,7 +50,7 @@ _LINE_KINDS = (
     "stall",
     "flicker",
 )
-# TCP loses and invents nothing, but its devices do what they like.
+# TCP neither loses nor invents bytes, but its devices have faults.
 _NET_STATION_KINDS = tuple(kind for kind in _STATION_KINDS if kind != "junk")
 _NET_LINE_KINDS = ("vanish", "hang", "flicker")
 
@@ -69,7 +69,7 @@ def line_episodes(
     haste: float,
     pace: str,
 ) -> list[Episode]:
-    """Of a line and of all that hangs on it; none of a device at which everybody is spoken to."""
+    """Draws the episodes of a line and its devices, except the devices for broadcasts."""
     stations: tuple[str, ...] = _STATION_KINDS
     wires: tuple[str, ...] = _LINE_KINDS
     if line["port"].startswith("tcp:"):
@@ -87,7 +87,7 @@ def line_episodes(
 def disappearances(
     line: str, name: str, device: dict[str, Any], chance: random.Random, seconds: float
 ) -> list[Episode]:
-    """Addresses that a PLC's program takes away, for a while or for good."""
+    """Draws addresses that a PLC's program removes, for a while or for good."""
     found = []
     never = device["tags"].get("missing", {"address": None})["address"]
     known = [
@@ -115,7 +115,7 @@ def _series(
     seconds: float,
     pause: float,
 ) -> list[Episode]:
-    """One after the other, never two at once."""
+    """Draws episodes that do not overlap."""
     found = []
     at = chance.expovariate(1 / pause)
     while kinds and at < seconds - CALM:

@@ -1,4 +1,4 @@
-"""What must follow: bad in time, good again in time, everybody served, nothing piled up."""
+"""Checks the deadlines: values bad and good in time, every device polled, bounded queues."""
 
 import asyncio
 import math
@@ -19,10 +19,10 @@ from tests.sim.judge import Judge
 from tests.sim.net import SimNet
 from tests.sim.wire import SimWire
 
-SPOKEN = 0.35  # seconds: the longest frames of a seed, there and back
+SPOKEN = 0.35  # seconds: the longest request and reply of a seed
 LONGEST_PAUSE = 66.0  # between two probes of a silent device
-DISTURBING = ("late", *UNTIMELY)  # late answers to probes are not waited for, and may hit others
-UNTRIED = RETRIES[-1] + 60.0  # seconds: an address that was refused is not asked for so long
+DISTURBING = ("late", *UNTIMELY)  # late replies to probes may hit other requests
+UNTRIED = RETRIES[-1] + 60.0  # seconds for which a refused address is not polled
 
 
 @dataclass(eq=False)
@@ -42,7 +42,7 @@ class Expectations:
         asyncio.get_running_loop().call_later(limit, getattr(self, must), *what)
 
     def times(self, line: Line) -> tuple[float, float]:
-        """The longest that one failed conversation takes, and the line's load."""
+        """Returns the longest duration of a failed transaction, and the line's load."""
         longest = (
             max(d.timing.reply_timeout + d.settings.late_guard for d in line.engine.devices)
             + SPOKEN
@@ -50,7 +50,7 @@ class Expectations:
         return longest, max(1.0, sum(d.load for d in line.engine.devices))
 
     def every(self, bus: Bus, device: Device, tag: Tag) -> float:
-        """How often it is to be heard of."""
+        """Returns the seconds between two samples of the tag."""
         if tag.span.area == LISTENED and isinstance(device.driver, FrameDriver):
             listened = device.driver.settings.listen.values()
             (stale,) = {one.stale_after for one in listened if one.stale_after is not None}
@@ -58,7 +58,7 @@ class Expectations:
         return tag.every
 
     def concerned(self, episode: Episode) -> list[tuple[Device, Tag]]:
-        """Whom it concerns, as far as they can be known at all."""
+        """Returns the tags that the episode concerns, without those that are never good."""
         return [
             (device, tag)
             for device in self.lines[episode.line].line.engine.devices
@@ -80,9 +80,9 @@ class Expectations:
             limit = 2 * load * every + 2 * (len(bus.line.engine.devices) + 2) * longest + 1.0
             if tag.span.area == LISTENED:
                 if episode.kind == "stall":
-                    continue  # what comes by itself goes on coming
+                    continue  # unsolicited frames continue
                 limit = 10 * every + 2 * longest + 1.0
-            if gone:  # asked twice, then searched for by halving
+            if gone:  # refused twice, then found by halving
                 limit += 3 * load * every + 8 * longest
                 if self._unwell(episode.line, device.name, episode.start - LONGEST_PAUSE, limit):
                     continue
@@ -90,7 +90,7 @@ class Expectations:
                 self.later(limit, "_must_be_bad", tag, episode)
 
     def _mixed(self, episode: Episode) -> bool:
-        """Whether the line itself has other trouble at that time."""
+        """The line has another fault at that time."""
         return any(
             other is not episode
             and not other.device
@@ -121,9 +121,9 @@ class Expectations:
                 LONGEST_PAUSE + 20 * longest * len(bus.line.engine.devices) + 2 * load * every + 5.0
             )
             if tag.span.area == LISTENED:
-                limit += 20 * every  # now and then it says what nobody understands
+                limit += 20 * every  # some of its frames cannot be parsed
             if episode.kind == "gone" or not summed(device):
-                limit += UNTRIED  # damage may have made another question of ours, refused twice
+                limit += UNTRIED  # damage may have changed a request, which was refused twice
             until = episode.end + limit
             troubled = any(
                 other is not episode
@@ -150,16 +150,16 @@ class Expectations:
         )
 
     def _passing(self, tag: Tag, reason: Reason | None) -> bool:
-        """Where somebody speaks when he likes, this or that is lost, and comes again."""
+        """Unsolicited frames collide with replies: some are lost and come again."""
         bus = self.judge.buses[tag.device]
         lately = self.judge.now - self.judge.read_at.get(tag, 0.0) < LONGEST_PAUSE
         said = tag.span.area == LISTENED
         return (bus.collides or said) and lately
 
-    # All the while
+    # During the run
 
     async def look_around(self) -> None:
-        """Now and then: nothing piles up, and who is well is served."""
+        """Checks every minute that queues are bounded and that sound devices are polled."""
         gateway, judge = self.judge.gateway, self.judge
         while True:
             for _ in range(6):
@@ -179,7 +179,7 @@ class Expectations:
                 self._look_at_shares(bus)
 
     def _look_at_queues(self, engine: Engine) -> None:
-        """A leak shows in no public figure: private attributes are read here."""
+        """Private attributes are read here: a leak shows in no public figure."""
         schedule, name, broke = engine.schedule, engine.name, self.judge.broke
         polls = sum(len(schedule.polls(device)) for device in engine.devices)
         queue = schedule._queue
@@ -193,7 +193,7 @@ class Expectations:
             broke(f"{name}: {replies} replies wait")
 
     def _look_at_ages(self) -> None:
-        """No good value is old, whatever goes on: a bound of our own, above the gateway's."""
+        """No good value is older than a bound, which is above that of the gateway."""
         judge = self.judge
         for bus in self.lines.values():
             devices = bus.line.engine.devices
@@ -214,7 +214,7 @@ class Expectations:
                         judge.broke(f"{tag.key} is still good after {age:.1f} s unread")
 
     def _look_at_shares(self, bus: Bus) -> None:
-        """A device that has been well for two minutes, on a line that was, is served."""
+        """A device without faults for two minutes, on such a line, is polled."""
         if not bus.line.engine.devices:
             return
         longest, load = self.times(bus.line)
@@ -257,7 +257,7 @@ class Expectations:
     # At the end
 
     def at_the_end(self) -> None:
-        """Nothing has gone wrong for a while."""
+        """Checks the end of the run, after a time without faults."""
         if self.seconds < 2 * CALM:
             return
         judge = self.judge
@@ -278,6 +278,6 @@ class Expectations:
 
 
 def _disturbs(bus: Bus, episode: Episode) -> bool:
-    """Whether it concerns others than the device it befalls."""
-    broken = episode.kind == "cut" and isinstance(bus.wire, SimNet)  # so is the connection
+    """The episode also concerns other devices of the line."""
+    broken = episode.kind == "cut" and isinstance(bus.wire, SimNet)  # it cuts the connection too
     return broken or episode.kind in DISTURBING

@@ -1,4 +1,4 @@
-"""What goes wrong, when its time has come."""
+"""Begins and ends each fault at its time."""
 
 import asyncio
 from collections.abc import Callable, Mapping
@@ -16,12 +16,12 @@ from tests.sim.judge import Judge
 from tests.sim.stations import Troubled
 from tests.sim.wire import Noise, SimWire
 
-DEFAULT_TIMES = 0.5  # seconds, of a device that is not served
+DEFAULT_TIMES = 0.5  # seconds, for a device without a poll
 
 
 @dataclass(eq=False)
 class Faults:
-    """Begins and ends what the seed has drawn."""
+    """Begins and ends the episodes of a seed."""
 
     drawn: Drawn
     lines: Mapping[str, Bus]
@@ -68,7 +68,7 @@ class Faults:
                 self.judge.stations[episode.device].vanish(tag)
             case kind:
                 station = self.judge.stations.get(episode.device)
-                if station is not None:  # nobody, where everybody is meant
+                if station is not None:  # None for a device of broadcasts
                     self._trouble(station, episode, kind)
         self.expect.bad(episode)
 

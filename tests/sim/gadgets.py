@@ -1,7 +1,7 @@
-"""Simulated devices without a protocol: one that is asked, one that speaks by itself.
+"""Simulated devices without a protocol: one replies, one sends by itself.
 
-What they say begins with a letter of their own, and numbers have five digits. Their framing is
-written a second time here, to judge the gateway's by.
+Their texts begin with a letter of their own, and numbers have five digits. The framing is
+written a second time here, as an oracle for that of the gateway.
 """
 
 import re
@@ -13,12 +13,12 @@ from gateway.stations.station import Memory
 
 _BYTES = {"<SOH>": b"\x01", "<ETX>": b"\x03", "": b""}
 _ENDINGS = {"CR LF": b"\r\n", "": b""}
-REFUSED = 7  # values that are multiples of it are not taken
+REFUSED = 7  # its multiples are refused as values
 
 
 @dataclass(frozen=True)
 class Wrapping:
-    """What stands around the data of a frame."""
+    """The header, terminator and sum around the data of a frame."""
 
     header: bytes = b""
     terminator: bytes = b""
@@ -31,7 +31,7 @@ class Wrapping:
         return self.header + body + self.terminator + total + self.ending
 
     def unwrap(self, data: bytes) -> bytes | None:
-        """The data of the first whole frame in it."""
+        """Returns the data of the first whole frame."""
         pattern = re.escape(self.header) + b"([ -~]*)" + re.escape(self.terminator)
         pattern += (b"([0-9A-F]{2})" if self.summed else b"()") + re.escape(self.ending)
         found = re.search(pattern, data) if self.header else re.fullmatch(pattern, data)
@@ -41,7 +41,7 @@ class Wrapping:
 
 
 def wrapping_of(framing: Any) -> Wrapping:
-    """Of a `framing` as the file has it."""
+    """Returns the wrapping of a `framing` in the file."""
     return Wrapping(
         _BYTES[framing.header],
         _BYTES[framing.terminator],
@@ -53,7 +53,7 @@ def wrapping_of(framing: Any) -> Wrapping:
 
 @dataclass(eq=False)
 class Gadget:
-    """Answers `aQ0?` and `aQ1?`, takes `aS=` with an acknowledgement and `aT=` without."""
+    """Replies to `aQ0?` and `aQ1?`, takes `aS=` with an acknowledgement and `aT=` without."""
 
     letter: str
     wrapping: Wrapping
@@ -87,7 +87,7 @@ class Gadget:
         return b""
 
     def speak(self, start: float, character: float, what: int) -> bytes:
-        """What it says at `start` by itself: mostly its weight, else something else."""
+        """Returns the frame that it sends at `start` by itself: mostly its weight."""
         if what < 2:
             return self.wrapping.wrap(self.letter.encode() + (b"N", b"OL?")[what])
         (weight,) = self.memory.read("listened", 0, 1, start)

@@ -1,4 +1,4 @@
-"""What the gateway says, held against what was in the PLCs."""
+"""Compares the samples of the gateway with the memory of the PLCs."""
 
 import asyncio
 from collections.abc import Sequence
@@ -14,24 +14,24 @@ from tests.sim.stations import Troubled
 from tests.sim.story import Story
 from tests.sim.wire import SimWire
 
-MOST_TROUBLES = 20  # noted in one run
+MOST_TROUBLES = 20  # recorded in one run
 
 
 @dataclass(eq=False)
 class Judge:
-    """Judges every sample on its way up. Times by the loop's clock."""
+    """Judges every sample before the gateway gets it. Times by the loop's clock."""
 
     gateway: Gateway
     buses: dict[str, Bus]  # by device
     stations: dict[str, Troubled]  # by device
     story: Story
     began: float
-    read_at: dict[Tag, float] = field(default_factory=dict)  # when it was good last
+    read_at: dict[Tag, float] = field(default_factory=dict)  # when it was last good
     online: dict[str, bool] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._plain = self.gateway.samples
-        self.gateway.samples = self.told  # type: ignore[method-assign]  # the lines call it
+        self.gateway.samples = self.samples  # type: ignore[method-assign]  # the lines call it
         self.known = {tag for device in self.gateway.config.devices for tag in device.tags}
         self.enabled = {device.name for device in self.gateway.enabled_devices}
 
@@ -43,9 +43,9 @@ class Judge:
     def now(self) -> float:
         return asyncio.get_running_loop().time()
 
-    # What the lines tell
+    # From the lines
 
-    def told(self, samples: Sequence[Sample]) -> None:
+    def samples(self, samples: Sequence[Sample]) -> None:
         for sample in samples:
             if sample.quality is Quality.GOOD:
                 self._judge(sample)
@@ -81,7 +81,7 @@ class Judge:
         if bus.blind(since):
             self._blind("blind reads", tag)
         elif tag.shape is not None and bus.untimely(tag.device):
-            self.story.counts["stale reads of frames"] += 1  # nothing says what they answer
+            self.story.counts["stale reads of frames"] += 1  # their frames name no request
         else:
             self.broke(
                 f"{tag.key} is told as good {value!r}, which was not in the PLC since "
@@ -89,7 +89,7 @@ class Judge:
             )
 
     def _judge_unasked(self, sample: Sample, bus: Bus) -> None:
-        """It was said just now, or while the device itself was asked."""
+        """The device sent the value just now, or while its own request was open."""
         station = self.stations[sample.tag.device].inner
         assert isinstance(station, Gadget)
         device = next(d for d in bus.line.engine.devices if d.name == sample.tag.device)
@@ -106,10 +106,10 @@ class Judge:
         device = next(d for d in bus.line.engine.devices if d.name == tag.device)
         self.story.counts[what if summed(device) else f"{what} without a sum"] += 1
 
-    # What devices say by themselves
+    # Unsolicited frames
 
     def said(self, name: str, station: Gadget) -> None:
-        """A weight has just begun to be said: on a line of its own, in good times, it is told."""
+        """A weight is being sent: alone on a line without faults, it must become a sample."""
         bus = self.buses[name]
         start, end, value = station.said[-1]
         passed = start - self.began
@@ -130,7 +130,7 @@ class Judge:
             self.broke(f"{name} said {value} at {start - self.began:.3f}, and it was not told")
 
     def readable(self, tag: Tag) -> bool:
-        """Whether it can ever be good: asked for, or said."""
+        """The tag can become good: it is polled, or sent by the device."""
         device = next(d for d in self.gateway.enabled_devices if d.name == tag.device)
         asked = device.driver.areas[tag.span.area].readable
         return asked or (isinstance(device.driver, FrameDriver) and tag.span.area == LISTENED)

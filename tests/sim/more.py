@@ -1,6 +1,6 @@
-"""More of a plant than its PLCs: devices without a protocol, Modbus TCP, everybody at once.
+"""Draws what a plant has beside its PLCs: no-protocol devices, Modbus TCP, broadcasts.
 
-Drawn by a `random.Random` of its own, so that a seed's PLCs stay what they are.
+It uses its own `random.Random`, so the PLCs of a seed stay as they are.
 """
 
 import random
@@ -10,7 +10,7 @@ SEPARATE = "<SOH>"  # no other protocol of ours begins with it
 
 
 def add_to(name: str, line: dict[str, Any], chance: random.Random) -> None:
-    """Settings that only some plants have, on a line that is drawn already."""
+    """Adds settings that only some plants have to a drawn line."""
     devices = line["devices"]
     protocols = {device["protocol"] for device in devices.values()}
     unsummed, told = chance.random() < 0.4, chance.random() < 0.6
@@ -35,7 +35,7 @@ def add_to(name: str, line: dict[str, Any], chance: random.Random) -> None:
 
 
 def net_line(name: str, chance: random.Random, intervals: tuple[str, ...]) -> dict[str, Any]:
-    """One Modbus TCP connection, with several units behind it or one that takes many questions."""
+    """Draws a Modbus TCP connection, with several units or with one that has a window."""
     window = chance.choice((1, 1, 2, 4, 16))
     every = chance.choice(intervals)
     devices = {}
@@ -82,7 +82,7 @@ _FRAMINGS: tuple[dict[str, Any], ...] = (
 
 
 def raw_line(name: str, chance: random.Random, intervals: tuple[str, ...]) -> dict[str, Any]:
-    """Devices without a protocol: one that speaks by itself, some that are asked, maybe a PLC."""
+    """Draws no-protocol devices: one that sends by itself, some that reply, maybe a PLC."""
     devices: dict[str, Any] = {}
     every = chance.choice(intervals)
     speaks = chance.random() < 0.7
@@ -156,9 +156,9 @@ def _asked(
 def _speaker(
     letter: str, framing: dict[str, Any], every: str, chance: random.Random, alone: bool
 ) -> dict[str, Any]:
-    """Says its weight again and again; now and then something else, known or unknown.
+    """Draws a device that sends its weight again and again, and other texts now and then.
 
-    Some such devices are asked and told something too.
+    Some of these devices are also polled and written to.
     """
     asked = chance.random() < 0.3
     period = chance.choice((0.4, 1.0, 5.0) if alone and not asked else (3.0, 8.0))
@@ -196,5 +196,5 @@ def _neighbour(every: str, chance: random.Random) -> dict[str, Any]:
 
 
 def rule(chance: random.Random) -> dict[str, Any]:
-    """What may follow a write that ended unclear."""
+    """Draws the rule for writes that end unclear."""
     return {"verify": chance.random() < 0.4, "repeat": chance.random() < 0.3}

@@ -1,8 +1,8 @@
-"""Break the gateway by hand, one rule at a time, and see who notices: `make mutants`.
+"""Breaks one rule of the gateway at a time and runs the tests: `make mutants`.
 
-Each mutant is one replacement in a copy of the tree. Two checks look at it, the tests of the
-module and a few stormy seeds of the simulation; who caught it, and in what time, is printed.
-Ends with exit code 1 when a mutant lives, or when a text to be replaced is not there any more.
+Each mutant is one replacement in a copy of the tree. Two checks run on it: the tests of the module
+and a few stormy seeds of the simulation. The program prints which check caught it, and its time.
+It ends with exit code 1 when a mutant lives, or when a text to be replaced is missing.
 """
 
 import argparse
@@ -26,7 +26,7 @@ PATIENCE = 60.0  # seconds for each check
 
 
 def check(tree: Path, command: list[str]) -> tuple[bool, float, str]:
-    """Whether it minded, after how many seconds, and what it said last."""
+    """Runs a check. Returns whether it failed, after how many seconds, and its message."""
     began = time.monotonic()
     try:
         done = subprocess.run(
@@ -62,7 +62,7 @@ def tests(files: str) -> list[str]:
 
 @contextmanager
 def put_in(tree: Path, mutant: Mutant) -> Iterator[bool]:
-    """False when the text is not there, or not once."""
+    """Applies the mutant. Yields False when its text is missing, or not unique."""
     path = tree / "gateway" / mutant.file
     text = path.read_text()
     path.write_text(text.replace(mutant.old, mutant.new))
@@ -73,7 +73,7 @@ def put_in(tree: Path, mutant: Mutant) -> Iterator[bool]:
 
 
 def stale() -> list[str]:
-    """The mutants whose text is not in the gateway, or not once: they would prove nothing."""
+    """The mutants whose text is missing in the gateway, or not unique."""
     return [
         mutant.name
         for mutant in MUTANTS

@@ -1,6 +1,6 @@
 """A TCP connection to Modbus TCP units: nothing is lost or damaged, but it may stall or break.
 
-Both ways at once, in order. What was on its way when the connection stalled arrives afterwards.
+Both directions work at once and keep the order. Bytes on their way in a stall arrive after it.
 """
 
 import asyncio
@@ -24,7 +24,7 @@ class SimNet:
     chance: random.Random
     watch: Watch
     split: bool = False  # answers arrive in two pieces
-    noise: Noise = field(default_factory=Noise)  # there is none
+    noise: Noise = field(default_factory=Noise)  # none by default
     gone: str = ""
     opened: int = 0
     closed: int = 0

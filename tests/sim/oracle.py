@@ -1,4 +1,4 @@
-"""Whether a frame's own check sum agrees: written a second time, to judge the gateway by."""
+"""Check sums of frames, written a second time: an oracle for the codecs of the gateway."""
 
 import re
 from collections.abc import Callable
@@ -26,8 +26,8 @@ def vigor(data: bytes) -> bool:
 def link(data: bytes) -> bool:
     """ENQ ... sum, or STX ... ETX sum, or ACK/NAK without any sum."""
     if re.search(rb"[\x06\x15][0-9A-F]{4}", data):
-        return True  # a bare acknowledgement or refusal: nothing protects it
-    # An answer in which a byte became NAK, or whose text begins later, is judged from there on.
+        return True  # a bare acknowledgement or refusal has no sum
+    # A reply in which a byte became NAK, or whose text begins later, is judged from there on.
     for match in re.finditer(rb"(?s)(?=\x02([^\x02]*?\x03)(..))", data):
         if _summed(match[1], match[2]):
             return True
@@ -47,7 +47,7 @@ def lrc(data: bytes) -> bool:
 
 
 def crc(data: bytes) -> bool:
-    """Any stretch of at least four bytes that ends with its CRC, bit by bit."""
+    """Any run of at least four bytes that ends with its CRC, bit by bit."""
     return any(_crc_ends_well(data[first:]) for first in range(max(0, len(data) - 3)))
 
 

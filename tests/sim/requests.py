@@ -1,14 +1,14 @@
-"""What the gateway says, read a second time: to whom, whether it writes, what it asks for."""
+"""Parses the requests of the gateway a second time: station, kind, address."""
 
 from typing import NamedTuple
 
-ALL = {"modbus-rtu": 0, "modbus-ascii": 0, "computer-link": 255}  # numbers that all obey
+ALL = {"modbus-rtu": 0, "modbus-ascii": 0, "computer-link": 255}  # the broadcast numbers
 _AREAS = {1: "coil", 2: "discrete", 3: "holding", 4: "input"}
 _LETTERS = b"abcdefghijklmnopqrstuvwxyz"
 
 
 class Asked(NamedTuple):
-    """A Modbus TCP question, or another frame with its number."""
+    """A Modbus TCP request, or another frame with its number."""
 
     unit: int
     number: int
@@ -23,7 +23,7 @@ class Asked(NamedTuple):
 
 
 def protocol_of(usual: str, data: bytes) -> str:
-    """Of a frame on a line most of whose devices speak `usual`."""
+    """Returns the protocol of a frame on a line whose devices mostly use `usual`."""
     if usual == "modbus-tcp":
         return usual
     if usual == "frames":
@@ -34,7 +34,7 @@ def protocol_of(usual: str, data: bytes) -> str:
 
 
 def station_in(protocol: str, data: bytes) -> int:
-    """The station number; of a device without a protocol, its letter."""
+    """Returns the station number, or the letter of a device without a protocol."""
     match protocol:
         case "modbus-rtu":
             return data[0]
@@ -65,18 +65,18 @@ def is_command(protocol: str, data: bytes) -> bool:
 
 
 def is_registration(protocol: str, data: bytes) -> bool:
-    """Of a list of addresses, which the PLC remembers."""
+    """The frame registers a monitor list."""
     return protocol == "computer-link" and data[5:7] in (b"BM", b"WM")
 
 
 def answer_in(data: bytes) -> int | None:
-    """The number that an answer to unasked words repeats."""
+    """Returns the number that the reply to an unsolicited frame repeats."""
     body = data.lstrip(b"\x01")
     return int(body[2:7]) if body[1:2] == b"!" else None
 
 
 def asked(data: bytes) -> Asked:
-    """Of a Modbus TCP frame."""
+    """Parses a Modbus TCP frame."""
     number = int.from_bytes(data[:2], "big")
     area = _AREAS.get(data[7], "")
     start, size = int.from_bytes(data[8:10], "big"), int.from_bytes(data[10:12], "big")

@@ -2,9 +2,9 @@
 
     python -m tests.sim.residual --seconds 20
 
-A block of eight words is read again and again through bit errors, both ways, by the driver and
-against the simulated station, without a line: what is measured is frames and check sums alone.
-What reading twice leaves of them: `tests/sim/twice.py`.
+The driver reads a block of eight words from the simulated station again and again, through bit
+errors in both directions and without a line. This measures frames and check sums alone.
+`tests/sim/twice.py` counts the wrong values that remain when each block is read twice.
 
 Theory: every pattern of the fewest errors that can pass is tried on the reply once, and counted;
 the share of wrong values is that number times the chance of one such pattern.
@@ -57,11 +57,11 @@ CASES = (
 )
 
 
-Way = Callable[[bytes], bytes]  # what the receiver makes of what was sent
+Way = Callable[[bytes], bytes]  # the sent bytes as they are received
 
 
 class Direct:
-    """A `Talk` without time: what is said is heard at once, through the noise."""
+    """A `Talk` without time: all bytes arrive at once, through the noise."""
 
     may_echo = False
 
@@ -82,7 +82,7 @@ class Direct:
 
 
 def finish(work: Awaitable[Sequence[int]]) -> Sequence[int]:
-    """Run a coroutine that never waits."""
+    """Runs a coroutine that never waits."""
     try:
         work.__await__().send(None)
     except StopIteration as end:
@@ -92,7 +92,7 @@ def finish(work: Awaitable[Sequence[int]]) -> Sequence[int]:
 
 
 class Bench:
-    """One device, one station, and what happens to the bytes between them."""
+    """One device, one station, and the bit errors between them."""
 
     def __init__(self, case: Case, hurt: Way) -> None:
         self.case, self.hurt = case, hurt
@@ -111,12 +111,12 @@ class Bench:
         assert self.devices[0].blocks[0].span == case.span
 
     def ask(self, data: bytes) -> bytes:
-        self.now += 10.0  # whatever it heard before is forgotten
+        self.now += 10.0  # the station drops a half request
         return b"".join(self.station.hear(data, self.now))
 
     def read(self, times: int = 1) -> list[int] | None:
-        """The words, as the gateway takes them after so many readings (`verify_reads`); None
-        where anything was noticed."""
+        """Returns the words after `times` equal reads (`verify_reads`), None after an
+        error."""
         device = self.devices[times - 1]
         talk = Direct(self.case, self.ask, self.hurt)
         try:
@@ -132,7 +132,7 @@ def noisy(case: Case, rate: float, chance: random.Random) -> Way:
 
 
 def measured(case: Case, rate: float, seconds: float) -> dict[str, int]:
-    """Counted over so many seconds."""
+    """Counts for so many seconds."""
     bench = Bench(case, noisy(case, rate, random.Random(f"{case.name} {rate}")))
     seen: Counter[str] = Counter()
     until = time.monotonic() + seconds
@@ -147,7 +147,7 @@ def measured(case: Case, rate: float, seconds: float) -> dict[str, int]:
 
 
 def theory(case: Case) -> tuple[int, int, int]:
-    """(fewest errors that can pass, patterns of so many that give a wrong value, bits).
+    """Returns the fewest errors that can pass, the wrong patterns of so many, and the bits.
 
     Both ways: in the reply and in the request. Where parity is checked, two bits of each of two
     characters; otherwise two bits of two characters in one place. For a CRC-16 no pattern of
@@ -164,7 +164,7 @@ def theory(case: Case) -> tuple[int, int, int]:
 
 
 def exchange(bench: Bench) -> tuple[bytes, bytes]:
-    """Request and reply as they are without noise."""
+    """Returns request and reply without noise."""
     passed: list[bytes] = []
     hurt = bench.hurt
 
@@ -187,7 +187,7 @@ def _choose(n: int, k: int) -> float:
 
 
 def _passing(case: Case, bench: Bench, request: bytes, reply: bytes) -> int:
-    """How many patterns on two characters pass: one bit of each, or with parity two of each."""
+    """Counts the patterns on two characters that pass: one bit of each, two with parity."""
     width = case.shape.data_bits + case.shape.parity
     hits = [
         sum(1 << bit for bit in bits)
@@ -212,14 +212,14 @@ def _passing(case: Case, bench: Bench, request: bytes, reply: bytes) -> int:
 def _same_sum(
     case: Case, a: int, b: int, hit: int, other: int, i: int, j: int, frame: bytes
 ) -> bool:
-    """A quick look, so that few patterns have to be tried in full."""
+    """Sorts out most patterns quickly, so that few are tried in full."""
     if case.driver.protocol == "modbus-ascii" or j >= len(frame) - 4:
         return True
     return ((a ^ hit) + (b ^ other) - a - b) % 256 == 0
 
 
 def _believed(bench: Bench, request: bytes, spoilt: bytes, of_request: bool) -> bool:
-    """Whether a wrong value comes of it."""
+    """The pattern results in a wrong value."""
     bench.hurt = lambda data: spoilt if (data == request) is of_request else data
     words = bench.read()
     return words is not None and words != bench.right

@@ -1,7 +1,7 @@
-"""Simulated PLCs with faults, and the truth about what was in them when.
+"""Simulated PLCs with faults, and a record of their memory over time.
 
-Every word that moves says what time it is, in milliseconds, by an offset of its own: a value
-that is too old, or from another address or another station, is not what it should be.
+Every moving word counts milliseconds from its own offset. So a value that is too old, or from
+another address or station, differs from the expected one.
 """
 
 import asyncio
@@ -17,12 +17,12 @@ from gateway.tags import Tag
 from gateway.values import Value
 from tests.sim.gadgets import Gadget, wrapping_of
 
-BLINK = 4096  # ms that a moving bit stays as it is
+BLINK = 4096  # ms between two changes of a moving bit
 SLACK = 2  # ms: moments are rounded to milliseconds on both sides
 
 
 def offset(station: int, area: str, number: int) -> int:
-    """In milliseconds, different for every address of every station."""
+    """Returns milliseconds, different for every address of every station."""
     return (number * 7919 + station * 27_644_437 + sum(area.encode()) * 104_729) % 2**32
 
 
@@ -33,7 +33,7 @@ def milliseconds(now: float) -> int:
 def moving(
     station: int, area: str, number: int, unit: Unit, part: int = 0, coarse: int = 0
 ) -> Callable[[float], int]:
-    """What the unit at `number + part` shows of the clock that begins at `number`."""
+    """Returns the unit at `number + part` of the clock that begins at `number`."""
     own = offset(station, area, number)
     if unit is Unit.BIT:
         return lambda now: (milliseconds(now) + own) // BLINK & 1
@@ -44,32 +44,32 @@ def moving(
 
 
 def _hashed(step: int, own: int, coarse: int) -> int:
-    """What the clock shows at this step: the step itself, or, where steps are long, any number."""
+    """Returns the value of the clock at a step: the step, or any number where it is coarse."""
     return (step * 2_654_435_761 + own) % 2**32 if coarse else step
 
 
 @dataclass(eq=False)
 class Troubled:
-    """One station on the wire and what is wrong with it just now."""
+    """One station on the wire, with its faults."""
 
     number: int
     inner: Station
     chance: random.Random
     character: float
     turnaround: float = 0.005
-    deaf: bool = False  # does not hear: switched off, or the cable is out
-    mute: bool = False  # obeys, but is not heard
-    lose: float = 0.0  # share of answers that are lost
-    cut: float = 0.0  # share of answers that break off
-    junk: float = 0.0  # share of answers with bytes before them that mean nothing
-    foreign: float = 0.0  # share of answers in whose place another station's last one is sent
+    deaf: bool = False  # receives nothing: switched off, or without its cable
+    mute: bool = False  # carries out requests; its replies are lost
+    lose: float = 0.0  # share of lost replies
+    cut: float = 0.0  # share of replies that break off
+    junk: float = 0.0  # share of replies after meaningless bytes
+    foreign: float = 0.0  # share of replies replaced by another station's last
     late: Callable[[random.Random], float] | None = None  # seconds more than usual
     last: bytes = b""
     others: list["Troubled"] = field(default_factory=list)
     written: dict[tuple[str, int], list[tuple[float, int]]] = field(default_factory=dict)
-    coarse: int = 0  # so many bits of its clocks are left out: values that change rarely
-    numbered: bool = False  # answers carry a number: a foreign one is its own, of a while ago
-    ordered: bool = True  # answers keep the order of the questions
+    coarse: int = 0  # bits left out of its clocks: values that change rarely
+    numbered: bool = False  # replies carry a number: a foreign one is an older one of its own
+    ordered: bool = True  # replies keep the order of the requests
     missing: set[tuple[str, int]] = field(default_factory=set)  # addresses it refuses
     absent: dict[tuple[str, int], list[list[float]]] = field(default_factory=dict)  # since, until
 
@@ -77,7 +77,7 @@ class Troubled:
         self._busy_until = 0.0
         self._now = 0.0
         self.broke_off = False  # the last answer
-        self.computed: set[tuple[str, int]] = set()  # by its own program: not to be written
+        self.computed: set[tuple[str, int]] = set()  # written by its own program
         self._remember_writes(self.inner.memory)
         for where in self.missing:
             self.absent[where] = [[0.0, float("inf")]]
@@ -88,12 +88,12 @@ class Troubled:
         def write(area: str, start: int, values: list[int]) -> None:
             values = list(values)
             if any((area, start + i) in self.computed for i in range(len(values))):
-                return  # its program has the last word
+                return  # its own program writes it
             for i, value in enumerate(values):
                 self.written.setdefault((area, start + i), []).append((self._now, value))
             plain(area, start, values)
 
-        memory.write = write  # type: ignore[method-assign,assignment]  # the only way to look in
+        memory.write = write  # type: ignore[method-assign,assignment]  # the only place to observe writes
 
     def hear(self, data: bytes, now: float) -> tuple[bytes, float] | None:
         if self.deaf:
@@ -122,7 +122,7 @@ class Troubled:
 
     @property
     def speaks(self) -> bool:
-        """It is about to answer, or does."""
+        """A reply is due, or is being sent."""
         return _now() < self._busy_until
 
     def well(self) -> None:
@@ -130,14 +130,14 @@ class Troubled:
         self.lose = self.cut = self.junk = self.foreign = 0.0
         self.late = None
 
-    # The truth
+    # The record
 
     def holds(self, tag: Tag) -> list[int]:
         area, start, size = tag.span
         return self.inner.memory.read(area, start, size, self._now)
 
     def vanish(self, tag: Tag) -> None:
-        """Its program has no such address any more."""
+        """Removes the addresses of the tag."""
         for where in _places(tag):
             self.missing.add(where)
             self.absent.setdefault(where, []).append([_now(), float("inf")])
@@ -153,7 +153,7 @@ class Troubled:
         return not self.missing.isdisjoint(_places(tag))
 
     def lacked(self, tag: Tag, since: float, until: float) -> bool:
-        """At no moment between the two was it there."""
+        """The tag was absent during the whole time."""
         return any(
             begin <= since and until <= end
             for where in _places(tag)
@@ -161,7 +161,7 @@ class Troubled:
         )
 
     def changed(self, tag: Tag, since: float) -> bool:
-        """It came or went since then."""
+        """The tag appeared or disappeared since then."""
         return any(
             since <= moment
             for where in _places(tag)
@@ -171,7 +171,7 @@ class Troubled:
         )
 
     def was(self, tag: Tag, value: Value, since: float, until: float) -> bool:
-        """Whether the tag had this value at some moment between the two."""
+        """The tag had this value at some time in between."""
         area, start, _ = tag.span
         if self.lacked(tag, since, until):
             return False
@@ -194,7 +194,7 @@ class Troubled:
         return (raw - own - first) % (1 << bits) <= last - first
 
     def _steps(self, tag: Tag, own: int, first: int, last: int) -> Iterator[list[int]]:
-        """What its clock showed from `first` to `last`, in milliseconds."""
+        """Yields the values of its clock from `first` to `last`, in milliseconds."""
         for step in range((first + own) >> self.coarse, ((last + own) >> self.coarse) + 1):
             number = _hashed(step, own, self.coarse)
             if tag.unit_kind is Unit.DWORD:
@@ -220,14 +220,14 @@ class Troubled:
 
 
 def station_of(driver: AnyDriver, device: str) -> Station:
-    """The one that the driver talks to, nothing in it yet."""
+    """Makes the station for a driver, with an empty memory."""
     if isinstance(driver, FrameDriver):
         return Gadget(device[-1], wrapping_of(driver.settings.framing))
     return station_for(driver, ())
 
 
 def set_going(station: Troubled, tags: tuple[Tag, ...]) -> None:
-    """Every tag moves, but those that can be written."""
+    """Makes every tag move, except those that can be written."""
     memory = station.inner.memory
     for tag in tags:
         area, start, size = tag.span
@@ -253,7 +253,7 @@ def _now() -> float:
 
 
 def set_holes(station: Station, missing: set[tuple[str, int]]) -> None:
-    """Addresses (area, number) that the station refuses from now on."""
+    """Sets the addresses (area, number) that the station refuses."""
     if isinstance(station, Gadget):
         return
     if hasattr(station, "_store"):

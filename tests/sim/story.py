@@ -1,4 +1,4 @@
-"""What came of one seed."""
+"""The result of one seed."""
 
 from collections import Counter
 from dataclasses import dataclass, field
@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 @dataclass
 class Story:
-    """`broken`: the rules that were broken, when and how; `trace`: a hash of all of it."""
+    """`broken`: the broken rules with their times; `trace`: a hash of all events."""
 
     seed: int
     hours: float

@@ -1,4 +1,4 @@
-"""Wrong values that pass every check, once and twice: a slice of what `twice.py` counts."""
+"""Wrong values that pass every check: a part of the counts of `twice.py`."""
 
 import pytest
 
@@ -17,17 +17,17 @@ STRONG = (
 
 
 @pytest.mark.parametrize("case", STRONG, ids=lambda case: case.name)
-def test_parity_with_a_sum_and_a_crc_notice_every_one_and_two_errors(case: Case) -> None:
+def test_parity_with_a_sum_and_a_crc_detect_all_one_and_two_bit_errors(case: Case) -> None:
     assert theory(case).ways == {}
 
 
 @pytest.mark.parametrize(
     ("case", "fewest", "rate", "readings"), [(SUM, 2, 1e-3, 12_000), (BARE, 1, 3e-3, 1200)]
 )
-def test_reading_twice_leaves_the_square_or_less(
+def test_reading_twice_leaves_at_most_the_square_of_the_share(
     case: Case, fewest: int, rate: float, readings: int
 ) -> None:
-    """Counted, and as theory says. The chance is seeded: it comes out alike every time."""
+    """The counted share is that of the theory. The chance is seeded, so every run is equal."""
     known = theory(case)
     assert known.fewest == fewest
     once, twice = known.shares(rate)

@@ -1,4 +1,4 @@
-"""Whole gateways among faults: a short slice of what `make sim` runs for hours."""
+"""Whole gateways with faults: a short part of `make sim`."""
 
 import os
 import subprocess
@@ -17,8 +17,8 @@ ROOT = Path(__file__).parents[2]
 LEAN, BUSY = range(6), range(100, 103)
 
 
-def test_the_slice_has_all_there_is() -> None:
-    """Every protocol, setting and trouble is in one of the plants below."""
+def test_the_seeds_contain_every_protocol_setting_and_fault() -> None:
+    """Each is in one of the plants of the tests below."""
     slice_of = [*(draw(n, 3600.0, "lean") for n in LEAN), *(draw(n, 300.0) for n in BUSY)]
     assert _there(slice_of) == _there(draw(n, 3600.0, "lean") for n in range(200))
 
@@ -49,8 +49,8 @@ def test_five_minutes_on_full_wires_break_no_rule(seed: int) -> None:
     assert not story.broken, "\n".join([story.replay(), *story.broken])
 
 
-def test_one_seed_gives_one_run_byte_for_byte() -> None:
-    """Also in another process, which hashes otherwise."""
+def test_the_runs_of_a_seed_are_equal_byte_for_byte() -> None:
+    """Also in another process, whose hashes differ."""
     ask = "from tests.sim.world import run; print(run(2, 0.02).trace)"
     environment = {**os.environ, "PYTHONHASHSEED": "7"}
     other = subprocess.run(
@@ -60,8 +60,8 @@ def test_one_seed_gives_one_run_byte_for_byte() -> None:
     assert run(3, 0.01).trace != run(2, 0.01).trace
 
 
-def test_the_judge_sees_a_value_that_is_too_old(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Stations that show what was in them a second ago are found out."""
+def test_the_judge_reports_a_value_that_is_too_old(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The stations return their values of a second ago."""
     moving = stations.moving
 
     def late(*where: Any) -> Callable[[float], int]:

@@ -1,8 +1,8 @@
-"""What `verify_reads: 2` leaves of the wrong values that pass every check: counted.
+"""Counts the wrong values that pass every check in spite of `verify_reads: 2`.
 
     python -m tests.sim.twice --readings 300000
 
-One word is read through bit errors by the gateway's own `read_block`. A wrong value passes twice
+One word is read through bit errors by `read_with_care` of the gateway. A wrong value passes twice
 only if the same wrong words come twice: with p(v) for each wrong value v, once is p = sum of p(v),
 twice is the sum of p(v)**2, which is at most p**2.
 
@@ -10,7 +10,7 @@ twice is the sum of p(v)**2, which is at most p**2.
   one was tried). Only exchanges with enough errors are drawn, as they come at this bit error rate,
   and what is counted is multiplied by how often such an exchange happens.
 * All pairs: two readings in a row are two independent draws. So are any two of all those that were
-  drawn: what every two wrong ones heard is put through `read_block` with `verify_reads` 2, and
+  drawn: what every two wrong ones heard is put through `read_with_care` with `verify_reads` 2, and
   the pairs that it believes are counted, of all pairs.
 * In a row: where it is frequent enough, readings with `verify_reads` 2 are simply counted.
 
@@ -50,12 +50,12 @@ CASES = (
     BARE,
 )
 RATES = (1e-4, 1e-3, 3e-3)
-MOST_PAIRED = 500  # wrong readings of which every two are put through the gateway
+MOST_PAIRED = 500  # wrong reads that are paired
 Words = tuple[int, ...]
 
 
 class Share(NamedTuple):
-    """A probability and its interval; `hits` were counted."""
+    """A probability with its interval, from `hits`."""
 
     value: float
     low: float
@@ -68,7 +68,7 @@ class Share(NamedTuple):
 
 @dataclass
 class Theory:
-    """How many patterns of one and of two errors end in each wrong value."""
+    """The number of patterns of one and two errors for each wrong value."""
 
     bits: int
     ways: dict[Words, Counter[int]]
@@ -78,7 +78,7 @@ class Theory:
         return min(errors for ways in self.ways.values() for errors in ways)
 
     def shares(self, rate: float) -> tuple[float, float]:
-        """(once, twice) at this bit error rate."""
+        """Returns the shares for one and for two reads at this bit error rate."""
         each = [
             sum(n * rate**k * (1 - rate) ** (self.bits - k) for k, n in ways.items())
             for ways in self.ways.values()
@@ -87,7 +87,7 @@ class Theory:
 
 
 class Struck:
-    """An exchange with chosen errors: bits of the request, then of the reply."""
+    """A transaction with chosen errors: bits of the request, then of the reply."""
 
     def __init__(self, case: Case, rate: float, chance: random.Random) -> None:
         self.bench = Bench(case, self._hurt)
@@ -99,7 +99,7 @@ class Struck:
         self.heard: list[bytes] = []
 
     def read(self, struck: Sequence[int]) -> Words | None:
-        """The wrong words that pass; None where nothing does, or what is right."""
+        """Returns the wrong words that pass; None for no words, or the right ones."""
         self._struck, self.heard = struck, []
         words = self.bench.read()
         return None if words is None or words == self.bench.right else tuple(words)
@@ -132,11 +132,11 @@ def theory(case: Case) -> Theory:
 class Counted(NamedTuple):
     once: Share
     twice: Share
-    weight: float  # how often an exchange has as many errors as were drawn at least
+    weight: float  # how often a transaction has at least so many errors
 
 
 def counted(case: Case, rate: float, fewest: int, readings: int, seed: str = "") -> Counted:
-    """Once and, of all pairs, twice. `fewest`: errors in every exchange that is drawn."""
+    """Counts one read, and two of all pairs. `fewest`: errors of each drawn transaction."""
     chance = random.Random(f"{case.name} {rate} {seed}")
     struck = Struck(case, rate, chance)
     numbers, weights = _at_least(fewest, struck.bits, rate)
@@ -147,14 +147,14 @@ def counted(case: Case, rate: float, fewest: int, readings: int, seed: str = "")
             wrong.append((words, struck.heard))
     weight = sum(weights)
     some = wrong[:MOST_PAIRED]
-    # As if the readings had ended with the last wrong one that was paired.
+    # As if the reads had ended with the last wrong one that was paired.
     drawn = readings * len(some) / len(wrong) if wrong else readings
     twice = _of_all_pairs(_believed_pairs(case, some), drawn)
     return Counted(_of(len(wrong), readings).times(weight), twice.times(weight**2), weight)
 
 
 def _of(hits: int, readings: int) -> Share:
-    """Wilson's interval."""
+    """Returns Wilson's interval."""
     z = 1.96
     share, more = hits / readings, z * z / readings
     middle = (share + more / 2) / (1 + more)
@@ -163,13 +163,13 @@ def _of(hits: int, readings: int) -> Share:
 
 
 def _at_least(fewest: int, bits: int, rate: float) -> tuple[list[int], list[float]]:
-    """Numbers of errors, and how often an exchange has so many."""
+    """Returns numbers of errors and the share of transactions with so many."""
     numbers = range(fewest, min(bits, fewest + 60) + 1)
     return list(numbers), [math.comb(bits, k) * rate**k * (1 - rate) ** (bits - k) for k in numbers]
 
 
 def _believed_pairs(case: Case, wrong: Sequence[tuple[Words, list[bytes]]]) -> list[int]:
-    """With how many others each is believed when the gateway reads twice."""
+    """Counts for each wrong read the others that are equal when the gateway reads twice."""
     again: Iterator[bytes] = iter(())
     bench = Bench(case, lambda _data: next(again))
     believed = [0] * len(wrong)
@@ -183,7 +183,7 @@ def _believed_pairs(case: Case, wrong: Sequence[tuple[Words, list[bytes]]]) -> l
 
 
 def _of_all_pairs(believed: Sequence[int], readings: float) -> Share:
-    """Of all pairs of so many readings: a U-statistic, by the spread of each reading's share."""
+    """Returns the share of all pairs: a U-statistic, by the spread of each read's share."""
     pairs = readings * (readings - 1) / 2
     hits = sum(believed) // 2
     mean = hits / pairs
@@ -195,7 +195,7 @@ def _of_all_pairs(believed: Sequence[int], readings: float) -> Share:
 
 
 def in_a_row(case: Case, rate: float, readings: int) -> Share:
-    """Nothing is weighted here: as the gateway reads with `verify_reads: 2`."""
+    """Counts reads with `verify_reads: 2`, without weights."""
     bench = Bench(case, noisy(case, rate, random.Random(f"row {case.name} {rate}")))
     return _of(
         sum(bench.read(times=2) not in (None, bench.right) for _ in range(readings)), readings

@@ -1,4 +1,4 @@
-"""An event loop whose clock jumps: nothing waits, everything happens in its order."""
+"""An event loop whose clock jumps to the next timer, so that no test waits."""
 
 import asyncio
 import functools
@@ -11,16 +11,16 @@ from structlog.testing import capture_logs
 P = ParamSpec("P")
 T = TypeVar("T")
 LOOKS_APART = 256  # passes between two looks at real file descriptors (signals, if anything)
-BUSY_PASSES = 50  # passes of the loop in one moment before somebody must be watching the clock
+BUSY_PASSES = 50  # passes of the loop without progress of the clock: some task polls it
 TICK = 1e-5
 
 
 class Deadlock(RuntimeError):
-    """Everybody waits for something that nobody will do."""
+    """All tasks wait, and no timer is set."""
 
 
 class _Selector(selectors.SelectSelector):
-    """Instead of waiting, move the clock on."""
+    """Moves the clock on instead of waiting."""
 
     loop: "VirtualLoop"
     _passes = 0
@@ -39,9 +39,9 @@ class _Selector(selectors.SelectSelector):
 
 
 class VirtualLoop(asyncio.SelectorEventLoop):
-    """Time stands still while code runs and jumps to the next timer when none does.
+    """Time stands still while code runs, and jumps to the next timer when all tasks wait.
 
-    A task that waits by looking at the clock again and again sees it move after a while.
+    The clock also moves on for a task that polls it.
     Threads are forbidden: a jump of the clock would overtake them.
     """
 
@@ -71,13 +71,13 @@ class VirtualLoop(asyncio.SelectorEventLoop):
 
 
 def run_virtual(coroutine: Coroutine[Any, Any, T]) -> T:
-    """Run to the end on a virtual clock of its own. Raises `Deadlock`."""
+    """Runs a coroutine on a virtual clock of its own. Raises `Deadlock`."""
     with asyncio.Runner(loop_factory=VirtualLoop) as runner:
         return runner.run(coroutine)
 
 
 def on_virtual_time(test: Callable[P, Awaitable[None]]) -> Callable[P, None]:
-    """A test that is a coroutine, run on a virtual clock. What is logged is kept off the screen."""
+    """Makes a test of a coroutine, on a virtual clock. The log is not shown."""
 
     @functools.wraps(test)
     def run(*args: P.args, **kwargs: P.kwargs) -> None:
@@ -91,5 +91,5 @@ def on_virtual_time(test: Callable[P, Awaitable[None]]) -> Callable[P, None]:
 
 
 def now() -> float:
-    """The time of the running loop."""
+    """Returns the time of the running loop."""
     return asyncio.get_running_loop().time()

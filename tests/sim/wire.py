@@ -1,7 +1,7 @@
-"""A half-duplex wire that is never quite well: collisions, bit errors, parity, lost ports.
+"""A half-duplex wire with faults: collisions, bit errors, parity, lost ports.
 
-Two ends: the gateway's port, and stations that speak when spoken to. All of it happens at exact
-moments of the loop's clock, and all chance comes from one `random.Random`.
+Its ends are the port of the gateway and the stations. Every event has an exact time of the loop's
+clock, and all chance comes from one `random.Random`.
 """
 
 import asyncio
@@ -17,34 +17,34 @@ from gateway.errors import LineDown
 from gateway.planning.wire_timing import WireTiming
 from gateway.transport import Receiver
 
-SERVER_WAITS = 0.25  # seconds between two requests that it has kept
+SERVER_WAITS = 0.25  # seconds between two kept requests
 
 
 class Speaker(Protocol):
-    """A station with its faults: what it says, and how long after the request."""
+    """A station with its faults: its replies, each with its delay after the request."""
 
     def hear(self, data: bytes, now: float) -> tuple[bytes, float] | None: ...
 
 
 class Watch(Protocol):
-    """Who looks at everything that passes."""
+    """Observes all traffic of a wire."""
 
     def sent(self, data: bytes, start: float, end: float) -> None:
-        """The gateway begins to speak."""
+        """The gateway begins to send."""
 
     def overlapped(self, station: Speaker | None) -> None:
-        """The gateway and this station speak at once."""
+        """The gateway and this station send at the same time."""
 
     def damaged(self, way: str) -> None:
-        """Not what was sent arrives at the stations (>) or at the gateway (<)."""
+        """Damaged bytes arrive at the stations (>) or at the gateway (<)."""
 
     def passed(self, way: str, data: bytes) -> None:
-        """Arrived."""
+        """Bytes arrived."""
 
 
 @dataclass
 class Noise:
-    """Bit errors. `before`: before the receiver looks at the parity; `after`: later on."""
+    """Bit errors. `before`: before the receiver checks the parity; `after`: after it."""
 
     before: float = 0.0
     after: float = 0.0
@@ -52,7 +52,7 @@ class Noise:
 
 @dataclass
 class Format:
-    """A character on the wire, as in `7E1`, and what its receiver makes of a broken one."""
+    """A character format such as `7E1`, and the receiver's reaction to a broken character."""
 
     data_bits: int = 8
     parity: bool = False
@@ -83,21 +83,23 @@ class SimWire:
     chance: random.Random
     watch: Watch
     echo: bool = False
-    chunk: int = 0  # characters told at once; 0: a whole reply
+    chunk: int = 0  # characters of one piece; 0: a whole reply
     noise: Noise = field(default_factory=Noise)
-    gone: str = ""  # why the port is not there
-    hanging: bool = False  # nothing passes, and nobody is told
-    stalled: bool = False  # the device server keeps what is said, and says it later, in order
+    gone: str = ""  # the reason why the port is lost
+    hanging: bool = False  # no byte passes, and no error is reported
+    stalled: bool = False  # the device server keeps the bytes and passes them on later, in order
     opened: int = 0
     closed: int = 0
-    addressed: Callable[[bytes], Sequence[Speaker]] | None = None  # whom a whole request is for
+    addressed: Callable[[bytes], Sequence[Speaker]] | None = (
+        None  # the stations that a whole request is for
+    )
 
     def __post_init__(self) -> None:
         self._ear: Receiver | None = None
         self._generation = 0
         self._sendings: list[_Sending] = []
         self._ours_until = 0.0
-        self._kept: deque[bytes] = deque()  # the first is being said
+        self._kept: deque[bytes] = deque()  # the first is being sent
         self._behind = -math.inf
 
     # The port
@@ -125,17 +127,17 @@ class SimWire:
 
     @property
     def behind(self) -> float:
-        """When the device server had something to say yet, last."""
+        """The last time at which the device server had kept bytes."""
         return _now() if self.stalled or self._kept else self._behind
 
     def flow(self) -> None:
-        """The stall is over."""
+        """Ends the stall."""
         self.stalled = False
         if self._kept:
             self._say_kept()
 
     def _say_kept(self) -> None:
-        """One after the other, and each answer is waited for a while."""
+        """Sends the kept requests one by one, and waits a while for each reply."""
         ends = self._say_ours(self._kept[0], _now())
         self._at(ends + SERVER_WAITS, self._next_kept)
 
@@ -195,7 +197,7 @@ class SimWire:
         if not data or self.hanging:
             return
         self.watch.passed(">", data)
-        # Where all is well the others would only look away: what they do with it takes long.
+        # Without damage the other stations ignore the request; this saves their time.
         well = self.addressed is not None and data is request.data
         for station in self.addressed(data) if well and self.addressed else self.stations:
             said = station.hear(data, request.end)
@@ -203,7 +205,7 @@ class SimWire:
                 self._say(said[0], request.end + said[1], station)
 
     def speak(self, data: bytes, station: Speaker) -> None:
-        """The station says this now, whether anybody asked or not."""
+        """The station sends this now, with or without a request."""
         if not self.hanging:
             self._say(data, _now(), station)
 
@@ -215,7 +217,7 @@ class SimWire:
             asyncio.get_running_loop().call_at(start, self._begin, sending)
 
     def _begin(self, sending: _Sending) -> None:
-        """Not before it begins is it known whom it collides with."""
+        """Finds the collisions at the beginning of the bytes: earlier they are unknown."""
         for other in self._collide(sending):
             if other.station is None:
                 self.watch.overlapped(sending.station)
@@ -234,7 +236,7 @@ class SimWire:
             self._ear.received(data)
 
     def _through(self, sending: _Sending, data: bytes, way: str) -> bytes:
-        """What arrives of it."""
+        """Returns the bytes that arrive."""
         heard = data
         if sending.spoilt:
             heard = bytes(self.chance.randrange(1 << self.shape.data_bits) for _ in data)
@@ -259,7 +261,7 @@ class SimWire:
 
 
 def spoil(data: bytes, noise: Noise, shape: Format, chance: random.Random) -> bytes:
-    """Bit errors of both kinds; start, parity and stop bits are hit as well."""
+    """Adds bit errors of both kinds, also in start, parity and stop bits."""
     if noise.before:
         data = strike(data, flips(len(data) * shape.bits, noise.before, chance), shape)
     out: list[int] = list(data)
@@ -270,7 +272,7 @@ def spoil(data: bytes, noise: Noise, shape: Format, chance: random.Random) -> by
 
 
 def strike(data: bytes, bits: Iterable[int], shape: Format) -> bytes:
-    """What the receiver makes of it when these bits turn, counted from the first start bit."""
+    """Returns the bytes received when these bits flip, counted from the first start bit."""
     masks: dict[int, int] = {}
     for bit in bits:
         masks[bit // shape.bits] = masks.get(bit // shape.bits, 0) | 1 << bit % shape.bits
@@ -281,7 +283,7 @@ def strike(data: bytes, bits: Iterable[int], shape: Format) -> bytes:
 
 
 def _break(out: list[int], place: int, mask: int, shape: Format) -> None:
-    """One character with these bits turned: bit 0 is the start bit, then data, parity, stop."""
+    """Returns one character with flipped bits: bit 0 is the start bit, then data, parity, stop."""
     framed = mask & 1 or mask >> (1 + shape.data_bits + shape.parity)
     data = mask >> 1 & ((1 << shape.data_bits) - 1)
     parity = mask >> (1 + shape.data_bits) & 1 if shape.parity else 0
@@ -295,7 +297,7 @@ def _break(out: list[int], place: int, mask: int, shape: Format) -> None:
 
 
 def flips(bits: int, rate: float, chance: random.Random) -> list[int]:
-    """The numbers of the bits that turn."""
+    """Returns the numbers of the bits that flip."""
     found = []
     scale = math.log1p(-rate)
     place = int(math.log(1.0 - chance.random()) / scale)

@@ -1,4 +1,4 @@
-"""A whole gateway on virtual time among faults, and everything it says held against the truth.
+"""A whole gateway on virtual time with faults; every report is compared with the simulated plant.
 
     broken = run(seed, hours=4).broken
 
@@ -24,13 +24,13 @@ from gateway.protocols.frames.driver import LISTENED
 from gateway.tags import Sample
 from gateway.transport import Receiver, TcpAddress
 from tests.sim.bus import Bus
+from tests.sim.clients import Client
 from tests.sim.draw import Drawn, draw
 from tests.sim.expect import Expectations
 from tests.sim.faults import Faults
 from tests.sim.gadgets import Gadget
 from tests.sim.judge import Judge
 from tests.sim.net import SimNet
-from tests.sim.people import Person
 from tests.sim.requests import ALL, protocol_of, station_in
 from tests.sim.stations import Troubled, set_going, station_of
 from tests.sim.story import Story
@@ -42,7 +42,7 @@ COARSE = 16  # bits: where each block is read twice, values change every 65.5 s
 
 
 class World:
-    """Gateway, stations, faults, people and judge."""
+    """Gateway, stations, faults, clients and judge."""
 
     def __init__(self, drawn: Drawn, story: Story, seconds: float) -> None:
         self.drawn, self.story, self.seconds = drawn, story, seconds
@@ -89,7 +89,7 @@ class World:
         self.judge.set_online(device, online)
 
     def _broke(self, what: str) -> None:
-        self.judge.broke(what)  # built last of all
+        self.judge.broke(what)  # the judge is built last
 
     # Building
 
@@ -162,14 +162,14 @@ class World:
     # The run
 
     def _tasks(self) -> list[asyncio.Task[None]]:
-        """All but the lines: people, devices that speak by themselves."""
+        """Starts all but the lines: clients, and devices that send by themselves."""
         tasks = []
         haste = 10.0 if self.story.pace == "lean" else 1.0
         for device in self.devices.values():
             bus = self._buses[device.name]
             for who in ("writer", "reader", "boss"):
                 chance = random.Random(f"{who} {self.story.seed} {device.name}")
-                person = Person(device, self.judge, bus, chance, haste)
+                person = Client(device, self.judge, bus, chance, haste)
                 if who == "writer":
                     tasks.append(asyncio.create_task(person.write_now_and_then()))
                 elif who == "reader":
@@ -181,7 +181,7 @@ class World:
         return tasks
 
     async def _speak(self, name: str, bus: Bus) -> None:
-        """A device that says its weight whenever it likes."""
+        """Runs a device that sends its weight by itself."""
         station, wire = self.stations[name], bus.wire
         gadget = station.inner
         assert isinstance(gadget, Gadget)
@@ -212,7 +212,7 @@ class World:
                 )
 
     def _begun(self, bus: Bus, until: float) -> None:
-        """The first of an unasked frame has arrived: was anybody speaking then?"""
+        """Notes the first byte of an unsolicited frame, if the line was idle then."""
         if bus.line.engine.is_open and bus.line.engine.is_idle:
             bus.speaking = self._loop.time(), until
 
@@ -243,7 +243,7 @@ class World:
 
 
 def run(seed: int, hours: float, pace: str = "busy") -> Story:
-    """One seed, from the drawing of its plant to the last look at it."""
+    """Runs one seed, from drawing its plant to the last check."""
     story = Story(seed, hours, pace)
     seconds = hours * 3600
 

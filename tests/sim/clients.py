@@ -1,4 +1,4 @@
-"""Who writes, asks for fresh values, and gives commands; and whether they are told the truth."""
+"""Clients that write, read fresh values and send commands, and check every outcome."""
 
 import asyncio
 import random
@@ -18,20 +18,20 @@ from tests.sim.judge import Judge
 from tests.sim.stations import Troubled
 from tests.sim.wire import SimWire
 
-SOON = 1.0  # seconds: what nobody acknowledges has arrived by then, or never will
+SOON = 1.0  # seconds within which an unacknowledged request arrives, if ever
 NOT_SENT = (Busy, Offline, LineDown)
 _QUIET = ("deaf", "reboot", "vanish", "flicker", "hang", "stall")
 
 
 @dataclass(eq=False)
-class Person:
-    """Has to do with one device. `haste`: how much more rarely than usual."""
+class Client:
+    """A client of one device. `rarity`: the factor by which its requests are rarer."""
 
     device: Device
     judge: Judge
     bus: Bus
     chance: random.Random
-    haste: float
+    rarity: float
 
     @property
     def number(self) -> int:
@@ -42,7 +42,7 @@ class Person:
         self.judge.story.counts[count] += 1
 
     def deaf(self, device: str, since: float, kinds: tuple[str, ...] = _QUIET) -> bool:
-        """Whether the device need not have heard what was sent after `since`."""
+        """The device may have missed what was sent after `since`."""
         begin = since - self.judge.began - 1.0
         now = self.judge.now - self.judge.began
         if isinstance(self.bus.wire, SimWire) and self.bus.wire.behind >= since - 1.0:
@@ -53,7 +53,7 @@ class Person:
         )
 
     async def _pause(self, mean: float) -> None:
-        await asyncio.sleep(self.chance.expovariate(1 / (mean * self.haste)))
+        await asyncio.sleep(self.chance.expovariate(1 / (mean * self.rarity)))
 
     # Writes
 
@@ -77,7 +77,7 @@ class Person:
             await self._write(writes)
 
     async def _write(self, writes: list[tuple[Tag, Value]]) -> None:
-        """Several at once may go out in one frame, and one by one if that is refused."""
+        """Writes several tags at once: in one frame, or one by one after a refusal."""
         frames, since = self.bus.writes[self.number], self.judge.now
         most = sum(2 if tag.write and tag.write.repeat else 1 for tag, _ in writes)
         most += len(writes) > 1
@@ -140,7 +140,7 @@ class Person:
             return error
 
     async def _must_arrive(self, tag: Tag, value: Value, station: Troubled, since: float) -> None:
-        """Nobody has said that it was done; where all is well, it is."""
+        """Checks a write without an acknowledgement: without faults it arrives."""
         await asyncio.sleep(SOON)
         if self.deaf(tag.device, since) or self.bus.hurt_at >= since:
             return
@@ -191,7 +191,7 @@ class Person:
         if judge.read_at[tag] >= asked:
             return  # it was read since, and judged then
         if tag.span.area == LISTENED:
-            return  # nobody can ask for it
+            return  # it cannot be polled
         since = asked - most - 1.5
         was = judge.stations[tag.device].was(tag, sample.value, since, judge.now)
         excused = self.bus.hurt_at >= since or self.bus.untimely(tag.device)
@@ -253,12 +253,12 @@ class Person:
             )
 
     async def _must_be_known(self, argument: str, since: float) -> None:
-        """To every PLC of the line that listens."""
+        """Checks a broadcast at every PLC of the line that hears it."""
         await asyncio.sleep(SOON)
         for name, station in self.bus.stations.items():
             device = next((d for d in self.bus.line.engine.devices if d.name == name), None)
             if device is None or not _alike(device, self.device):
-                continue  # another format: it does not understand
+                continue  # it has another format
             if self.deaf(name, since) or self.bus.hurt_at >= since:
                 continue
             self.judge.story.counts["told commands checked"] += 1
@@ -268,7 +268,7 @@ class Person:
 
 
 async def _said(ask: Callable[[], Awaitable[Any]]) -> Any:
-    """What was answered, or the error."""
+    """Returns the reply, or the error."""
     try:
         return (await ask()).answer
     except GatewayError as error:
@@ -276,7 +276,7 @@ async def _said(ask: Callable[[], Awaitable[Any]]) -> Any:
 
 
 def _alike(one: Device, other: Device) -> bool:
-    """Whether both are spoken to in the same way."""
+    """Both drivers use the same frames."""
     match one.driver, other.driver:
         case ComputerLink() as a, ComputerLink() as b:
             return (a.frame_format, a.sum_check) == (b.frame_format, b.sum_check)
@@ -284,10 +284,10 @@ def _alike(one: Device, other: Device) -> bool:
 
 
 def _times(station: Troubled, tag: Tag) -> int:
-    """At how many moments the tag was written to: some PLCs write it byte by byte."""
+    """Returns the number of times of writes to the tag: some PLCs write it byte by byte."""
     return len({at for at, _ in station.written.get((tag.span.area, tag.span.start), ())})
 
 
 def _switched(station: Troubled) -> int:
-    """How often the PLC was told to run or stop, and did."""
+    """Returns how often the PLC carried out run or stop."""
     return len(station.written.get(("M8", 8035), ()))
