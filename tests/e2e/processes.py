@@ -201,7 +201,7 @@ def free_port() -> int:
 
 
 def listens(number: int) -> bool:
-    """Whether anybody listens there: without connecting, as a port may serve one at a time."""
+    """True if a program listens there. Does not connect: a port may accept only one client."""
     return f"0100007F:{number:04X} 00000000:0000 0A" in Path("/proc/net/tcp").read_text()
 
 

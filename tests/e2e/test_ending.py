@@ -1,4 +1,4 @@
-"""How a gateway ends, and how the next one begins: signals, ports that are taken."""
+"""The end of a gateway and the start of the next: signals, ports in use."""
 
 import asyncio
 import signal

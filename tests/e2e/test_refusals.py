@@ -1,4 +1,4 @@
-"""What a Zenoh client in another process is told when it asks for what cannot be done."""
+"""Refusals that a Zenoh client in another process receives."""
 
 from collections.abc import Iterator
 from typing import Any, NamedTuple
@@ -134,6 +134,6 @@ async def test_the_plc_holds_the_written_values(plant: Plant) -> None:
 
 
 async def _writes(client: ZenohPeer) -> Any:
-    """How many writes went to the device; a status document is at most 0.2 s old."""
+    """Returns the number of writes to the device; a status document is at most 0.2 s old."""
     [device] = await client.get("plant/@gateway/demo/devices/mixer")
     return device.json["writes"]

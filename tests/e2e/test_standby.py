@@ -120,7 +120,7 @@ async def test_two_gateways_of_a_group_share_one_wire(tmp_path: Path) -> None:
 
 
 async def says(program: Program, words: str, after: int = 0) -> int:
-    """How many lines there are up to the one that says so, after so many."""
+    """Returns the number of lines up to the first with the text, after the given number."""
     line = await asyncio.to_thread(program.says, words, after=after)
     return program.lines.index(line, after) + 1
 

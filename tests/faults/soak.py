@@ -130,7 +130,7 @@ class Customers:
                 self.remembered += sum(reply.ok is not None for reply in found)
 
     def history(self) -> dict[str, Any]:
-        """What the gateway says of it."""
+        """Returns the history document of the gateway."""
         [reply] = self._session.get("plant/@gateway/demo/history")
         assert reply.ok is not None
         document: dict[str, Any] = json.loads(bytes(reply.ok.payload))
@@ -196,7 +196,7 @@ def measured(seen: list[Look]) -> dict[str, Any]:
 
 
 def complaints(result: dict[str, Any]) -> list[str]:
-    """What is not as it must be."""
+    """Returns the names of the broken limits."""
 
     def grew(what: str) -> bool:
         before, after = result[what]

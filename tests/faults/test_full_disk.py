@@ -50,7 +50,7 @@ async def test_a_file_that_may_not_grow_stops_the_history_and_nothing_else(tmp_p
 
 @pytest.fixture
 def disk(tmp_path: Path) -> tuple[str, Path]:
-    """What mounts a small disk for the command behind it and for nobody else, and where."""
+    """Returns the command that mounts a small disk for one other command, and its folder."""
     needs("unshare")
     needs("mount")
     place = tmp_path / "disk"

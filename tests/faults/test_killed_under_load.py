@@ -38,7 +38,7 @@ class Consumer:
 
 
 def kept(path: Path) -> list[Row]:
-    """What is in the file, which is whole."""
+    """Returns the content of the file, which must be intact."""
     with closing(sqlite3.connect(f"file:{path}?mode=ro", uri=True)) as database:
         assert database.execute("PRAGMA integrity_check").fetchall() == [("ok",)]
         rows = database.execute("SELECT time, key, value FROM history ORDER BY time").fetchall()

@@ -110,7 +110,7 @@ class Bus:
             self.broke(f"{self.config.name}: spoke into a frame that was coming in")
 
     def number_of(self, device: Device) -> int:
-        """What `station_in` says of what is sent to it."""
+        """Returns the name that `station_in` finds in requests to the device."""
         return (
             ord(device.name[-1])
             if isinstance(device.driver, FrameDriver)
@@ -191,7 +191,7 @@ class Bus:
         self.questions.append((now, question))
 
     def asked_at(self, tag: Tag) -> float:
-        """When the exchange began that fetched the tag's value, which has just come."""
+        """Returns the start of the transaction that read the latest value of the tag."""
         if self.protocol != "modbus-tcp":
             return self.sent_at
         device = next(d for d in self.line.engine.devices if d.name == tag.device)
@@ -207,7 +207,7 @@ class Bus:
     # What excuses it
 
     def excused(self, since: float) -> bool:
-        """Whether an answer may come at any time: later than any guard, or in another's name.
+        """True if a reply may arrive later than any guard, or in the name of another device.
 
         `since` in seconds from the start, as the episodes have it.
         """
@@ -217,7 +217,7 @@ class Bus:
         )
 
     def untimely(self, device: str) -> bool:
-        """Whether the device answers, or has of late, when nobody expects it any more."""
+        """True if the device replies, or recently replied, long after its time-out."""
         passed = self.now() - self.began
         return any(
             e.device == device and e.kind == "very-late" and e.start <= passed < e.end + 10.0
@@ -249,7 +249,7 @@ class Bus:
 
 
 def summed(device: Device) -> bool:
-    """Whether its frames have a check sum."""
+    """True if its frames have a check sum."""
     match device.driver:
         case ComputerLink() as link:
             return link.sum_check

@@ -23,7 +23,7 @@ PACES = {
 
 @dataclass(frozen=True)
 class Drawn:
-    """What the seed has chosen. Times in seconds from the start."""
+    """The choices of a seed. Times in seconds from the start."""
 
     document: dict[str, Any]
     missing: dict[str, frozenset[int]]  # by device: addresses of its words that it refuses

@@ -1,4 +1,4 @@
-"""What goes wrong on the lines of a seed, and when."""
+"""The faults on the lines of a seed, with their times."""
 
 import random
 from collections.abc import Callable

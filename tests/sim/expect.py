@@ -1,4 +1,4 @@
-"""What must follow: bad in time, good again in time, everybody served, nothing piled up."""
+"""Checks time limits: values turn bad, and good again, in time; requests end; nothing piles up."""
 
 import asyncio
 import math
@@ -50,7 +50,7 @@ class Expectations:
         return longest, max(1.0, sum(d.load for d in line.engine.devices))
 
     def every(self, bus: Bus, device: Device, tag: Tag) -> float:
-        """How often it is to be heard of."""
+        """Returns the interval in which a new value is expected."""
         if tag.span.area == LISTENED and isinstance(device.driver, FrameDriver):
             listened = device.driver.settings.listen.values()
             (stale,) = {one.stale_after for one in listened if one.stale_after is not None}
@@ -90,7 +90,7 @@ class Expectations:
                 self.later(limit, "_must_be_bad", tag, episode)
 
     def _mixed(self, episode: Episode) -> bool:
-        """Whether the line itself has other trouble at that time."""
+        """True if the line itself has another fault at that time."""
         return any(
             other is not episode
             and not other.device
@@ -150,7 +150,7 @@ class Expectations:
         )
 
     def _passing(self, tag: Tag, reason: Reason | None) -> bool:
-        """Where somebody speaks when he likes, this or that is lost, and comes again."""
+        """True if a bad value may pass: frames collide or are lost, and later ones arrive."""
         bus = self.judge.buses[tag.device]
         lately = self.judge.now - self.judge.read_at.get(tag, 0.0) < LONGEST_PAUSE
         said = tag.span.area == LISTENED
@@ -278,6 +278,6 @@ class Expectations:
 
 
 def _disturbs(bus: Bus, episode: Episode) -> bool:
-    """Whether it concerns others than the device it befalls."""
+    """True if the fault also affects other devices."""
     broken = episode.kind == "cut" and isinstance(bus.wire, SimNet)  # so is the connection
     return broken or episode.kind in DISTURBING

@@ -1,4 +1,4 @@
-"""What goes wrong, when its time has come."""
+"""Applies each fault at its time."""
 
 import asyncio
 from collections.abc import Callable, Mapping

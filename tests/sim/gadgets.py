@@ -18,7 +18,7 @@ REFUSED = 7  # values that are multiples of it are not taken
 
 @dataclass(frozen=True)
 class Wrapping:
-    """What stands around the data of a frame."""
+    """The bytes around the data of a frame."""
 
     header: bytes = b""
     terminator: bytes = b""
@@ -87,7 +87,7 @@ class Gadget:
         return b""
 
     def speak(self, start: float, character: float, what: int) -> bytes:
-        """What it says at `start` by itself: mostly its weight, else something else."""
+        """Returns the unsolicited frame at `start`: mostly the weight, sometimes another."""
         if what < 2:
             return self.wrapping.wrap(self.letter.encode() + (b"N", b"OL?")[what])
         (weight,) = self.memory.read("listened", 0, 1, start)

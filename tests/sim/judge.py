@@ -1,4 +1,4 @@
-"""What the gateway says, held against what was in the PLCs."""
+"""Compares the published values with the memory of the PLCs."""
 
 import asyncio
 from collections.abc import Sequence
@@ -130,7 +130,7 @@ class Judge:
             self.broke(f"{name} said {value} at {start - self.began:.3f}, and it was not told")
 
     def readable(self, tag: Tag) -> bool:
-        """Whether it can ever be good: asked for, or said."""
+        """True if the tag can become good: it is polled, or arrives unsolicited."""
         device = next(d for d in self.gateway.enabled_devices if d.name == tag.device)
         asked = device.driver.areas[tag.span.area].readable
         return asked or (isinstance(device.driver, FrameDriver) and tag.span.area == LISTENED)

@@ -196,5 +196,5 @@ def _neighbour(every: str, chance: random.Random) -> dict[str, Any]:
 
 
 def rule(chance: random.Random) -> dict[str, Any]:
-    """What may follow a write that ended unclear."""
+    """Draws the rule of a tag for unclear writes."""
     return {"verify": chance.random() < 0.4, "repeat": chance.random() < 0.3}

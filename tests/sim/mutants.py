@@ -26,7 +26,7 @@ PATIENCE = 60.0  # seconds for each check
 
 
 def check(tree: Path, command: list[str]) -> tuple[bool, float, str]:
-    """Whether it minded, after how many seconds, and what it said last."""
+    """Runs a check. Returns True if it failed, with its seconds and its first failure."""
     began = time.monotonic()
     try:
         done = subprocess.run(

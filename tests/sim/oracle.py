@@ -1,4 +1,4 @@
-"""Whether a frame's own check sum agrees: written a second time, to judge the gateway by."""
+"""Checks the check sum of a frame, independently of the gateway."""
 
 import re
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Who writes, asks for fresh values, and gives commands; and whether they are told the truth."""
+"""Clients that write, read and send commands, and check the outcomes."""
 
 import asyncio
 import random
@@ -42,7 +42,7 @@ class Person:
         self.judge.story.counts[count] += 1
 
     def deaf(self, device: str, since: float, kinds: tuple[str, ...] = _QUIET) -> bool:
-        """Whether the device need not have heard what was sent after `since`."""
+        """True if the device may have missed the bytes sent after `since`."""
         begin = since - self.judge.began - 1.0
         now = self.judge.now - self.judge.began
         if isinstance(self.bus.wire, SimWire) and self.bus.wire.behind >= since - 1.0:
@@ -268,7 +268,7 @@ class Person:
 
 
 async def _said(ask: Callable[[], Awaitable[Any]]) -> Any:
-    """What was answered, or the error."""
+    """Returns the reply, or the error."""
     try:
         return (await ask()).answer
     except GatewayError as error:
@@ -276,7 +276,7 @@ async def _said(ask: Callable[[], Awaitable[Any]]) -> Any:
 
 
 def _alike(one: Device, other: Device) -> bool:
-    """Whether both are spoken to in the same way."""
+    """True if both drivers use the same frames."""
     match one.driver, other.driver:
         case ComputerLink() as a, ComputerLink() as b:
             return (a.frame_format, a.sum_check) == (b.frame_format, b.sum_check)
@@ -289,5 +289,5 @@ def _times(station: Troubled, tag: Tag) -> int:
 
 
 def _switched(station: Troubled) -> int:
-    """How often the PLC was told to run or stop, and did."""
+    """Returns the number of run and stop commands that the PLC carried out."""
     return len(station.written.get(("M8", 8035), ()))

@@ -1,4 +1,4 @@
-"""What the gateway says, read a second time: to whom, whether it writes, what it asks for."""
+"""Decodes the requests of the gateway independently: station, kind, span."""
 
 from typing import NamedTuple
 

@@ -187,7 +187,7 @@ def _choose(n: int, k: int) -> float:
 
 
 def _passing(case: Case, bench: Bench, request: bytes, reply: bytes) -> int:
-    """How many patterns on two characters pass: one bit of each, or with parity two of each."""
+    """Counts the patterns on two characters that pass: one bit of each, or with parity two."""
     width = case.shape.data_bits + case.shape.parity
     hits = [
         sum(1 << bit for bit in bits)
@@ -219,7 +219,7 @@ def _same_sum(
 
 
 def _believed(bench: Bench, request: bytes, spoilt: bytes, of_request: bool) -> bool:
-    """Whether a wrong value comes of it."""
+    """True if a wrong value is accepted."""
     bench.hurt = lambda data: spoilt if (data == request) is of_request else data
     words = bench.read()
     return words is not None and words != bench.right

@@ -33,7 +33,7 @@ def milliseconds(now: float) -> int:
 def moving(
     station: int, area: str, number: int, unit: Unit, part: int = 0, coarse: int = 0
 ) -> Callable[[float], int]:
-    """What the unit at `number + part` shows of the clock that begins at `number`."""
+    """Returns the part of the clock at `number` that the unit at `number + part` holds."""
     own = offset(station, area, number)
     if unit is Unit.BIT:
         return lambda now: (milliseconds(now) + own) // BLINK & 1
@@ -44,7 +44,7 @@ def moving(
 
 
 def _hashed(step: int, own: int, coarse: int) -> int:
-    """What the clock shows at this step: the step itself, or, where steps are long, any number."""
+    """Returns the clock at this step: the step itself, or, if steps are long, any number."""
     return (step * 2_654_435_761 + own) % 2**32 if coarse else step
 
 
@@ -171,7 +171,7 @@ class Troubled:
         )
 
     def was(self, tag: Tag, value: Value, since: float, until: float) -> bool:
-        """Whether the tag had this value at some moment between the two."""
+        """True if the tag had this value at some time between the two."""
         area, start, _ = tag.span
         if self.lacked(tag, since, until):
             return False
@@ -194,7 +194,7 @@ class Troubled:
         return (raw - own - first) % (1 << bits) <= last - first
 
     def _steps(self, tag: Tag, own: int, first: int, last: int) -> Iterator[list[int]]:
-        """What its clock showed from `first` to `last`, in milliseconds."""
+        """Yields the values of its clock from `first` to `last`, in milliseconds."""
         for step in range((first + own) >> self.coarse, ((last + own) >> self.coarse) + 1):
             number = _hashed(step, own, self.coarse)
             if tag.unit_kind is Unit.DWORD:

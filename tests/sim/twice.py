@@ -1,4 +1,4 @@
-"""What `verify_reads: 2` leaves of the wrong values that pass every check: counted.
+"""Counts the wrong values that pass every check in spite of `verify_reads: 2`.
 
     python -m tests.sim.twice --readings 300000
 
@@ -68,7 +68,7 @@ class Share(NamedTuple):
 
 @dataclass
 class Theory:
-    """How many patterns of one and of two errors end in each wrong value."""
+    """Counts the patterns of one and of two errors that give each wrong value."""
 
     bits: int
     ways: dict[Words, Counter[int]]

@@ -27,7 +27,7 @@ class Speaker(Protocol):
 
 
 class Watch(Protocol):
-    """Who looks at everything that passes."""
+    """Observes all bytes on the wire."""
 
     def sent(self, data: bytes, start: float, end: float) -> None:
         """The gateway begins to speak."""
@@ -125,7 +125,7 @@ class SimWire:
 
     @property
     def behind(self) -> float:
-        """When the device server had something to say yet, last."""
+        """The last time at which the device server still had bytes to send."""
         return _now() if self.stalled or self._kept else self._behind
 
     def flow(self) -> None:
@@ -234,7 +234,7 @@ class SimWire:
             self._ear.received(data)
 
     def _through(self, sending: _Sending, data: bytes, way: str) -> bytes:
-        """What arrives of it."""
+        """Returns the bytes that arrive."""
         heard = data
         if sending.spoilt:
             heard = bytes(self.chance.randrange(1 << self.shape.data_bits) for _ in data)
@@ -270,7 +270,7 @@ def spoil(data: bytes, noise: Noise, shape: Format, chance: random.Random) -> by
 
 
 def strike(data: bytes, bits: Iterable[int], shape: Format) -> bytes:
-    """What the receiver makes of it when these bits turn, counted from the first start bit."""
+    """Returns the bytes received when these bits turn, counted from the first start bit."""
     masks: dict[int, int] = {}
     for bit in bits:
         masks[bit // shape.bits] = masks.get(bit // shape.bits, 0) | 1 << bit % shape.bits
