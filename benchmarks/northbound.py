@@ -460,11 +460,11 @@ async def flooded(
             northbound.publish(made.mirror.update(samples))
             most = max(most, memory())
             await asyncio.sleep(0.1)
-        told = [stranger.stdout.read().strip() for stranger in strangers if stranger.stdout]
+        reports = [stranger.stdout.read().strip() for stranger in strangers if stranger.stdout]
     probe.cancel()
     print(f"{seconds:g} s of {' + '.join(kinds)}: {lag.shown()}; "
           f"memory {before:.0f} MB, at most {most:.0f} MB")  # fmt: skip
-    print("they told:", *told)
+    print("the clients reported:", *reports)
     now = northbound.counters()
     print("counted:", {name: now[name] - earlier.get(name, 0) for name in now})
 

@@ -16,16 +16,16 @@ from tests.sim.virtual import run_virtual
 async def _line(seconds: float, every: float) -> int:
     devices = [device(words(100, 20, every=every), station=n) for n in range(1, 9)]
     hall = plant(devices)
-    told = 0
+    published = 0
 
     def count(_samples: object) -> None:
-        nonlocal told
-        told += 1
+        nonlocal published
+        published += 1
 
     hall.samples = count  # type: ignore[method-assign,assignment]  # keeping them all costs time
     async with running(hall):
         await asyncio.sleep(seconds)
-    return told
+    return published
 
 
 def main() -> None:

@@ -129,8 +129,8 @@ async def pymodbus(
 def libmodbus(master: Path, mode: str, where: str, count: int) -> float:
     """The C loop prints microseconds per read: wall clock and processor time."""
     command = [str(master), mode, where, "1", str(count)]
-    told = subprocess.run(command, check=True, capture_output=True, text=True).stdout
-    return float(told.split()[1]) / 1e6
+    output = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    return float(output.split()[1]) / 1e6
 
 
 @contextlib.contextmanager

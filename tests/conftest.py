@@ -17,7 +17,7 @@ def run_virtual() -> Callable[[Coroutine[Any, Any, Any]], Any]:
 
 
 def needs(program: str) -> str:
-    """Where a program is that a test cannot do without (see `lacking`)."""
+    """Returns the path of a program that a test needs (see `lacking`)."""
     places = f"{os.environ.get('PATH', '')}:/usr/sbin:/usr/local/sbin"
     return shutil.which(program, path=places) or lacking(f"{program} is not installed")
 

@@ -1,1 +1,1 @@
-"""What anybody may send: bytes to every codec, text to the configuration, payloads to writes."""
+"""Arbitrary input: bytes to every codec, text to the configuration, payloads to writes."""

@@ -32,7 +32,7 @@ async def running(*command: str | Path, ready: bytes) -> AsyncIterator[Process]:
 
 
 async def finished(*command: str | Path) -> str:
-    """What the program printed; it must end well."""
+    """Returns the output of the program, which must exit with code 0."""
     process = await asyncio.create_subprocess_exec(
         *map(str, command), stdout=PIPE, stderr=PIPE, cwd=HERE
     )

@@ -32,7 +32,7 @@ def hearing(driver: Driver, *heard: Sequence[bytes] | Callable[[bytes], Sequence
 
 
 def oracle_decodes(kind: type, data: bytes, station: int, *, requests: bool) -> ModbusPDU:
-    """What pymodbus reads out of one frame."""
+    """Returns the message that pymodbus decodes from one frame."""
     used, pdu = FRAMERS[kind](DecodePDU(requests)).handleFrame(data, station, 0)
     assert used == len(data)
     assert pdu is not None

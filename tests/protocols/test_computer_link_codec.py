@@ -186,7 +186,7 @@ def test_blocks_survive_noise_and_any_chopping(
 
 
 def outcome(procedure: Procedure, pieces: list[bytes]) -> tuple[list[Frame], str]:
-    """What a codec makes of a stream: the blocks, and the damage it ends with."""
+    """Returns the blocks that a codec finds in a stream, and the damage at its end."""
     reader = LinkCodec(*procedure)
     frames: list[Frame] = []
     reader.encode(Enquiry(5, "BR", "M001005", 10))

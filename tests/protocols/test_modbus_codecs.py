@@ -1,4 +1,4 @@
-"""What the Modbus codecs make of a line as it is: chopped, noisy, echoing, shared, late."""
+"""The Modbus codecs on real lines: chopped, noisy, echoing, shared, late."""
 
 from contextlib import suppress
 

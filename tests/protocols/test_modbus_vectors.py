@@ -42,7 +42,7 @@ def count_of(pdu: bytes) -> int:
 
 
 def units_of(pdu: bytes) -> list[int]:
-    """What a writing request carries."""
+    """Returns the values in a write request."""
     match pdu[0]:
         case 5:
             return [int(pdu[3] == 0xFF)]

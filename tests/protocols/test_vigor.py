@@ -648,7 +648,7 @@ async def test_a_refused_resync_asks_nothing_that_the_next_one_asks() -> None:
 
 
 async def test_a_plc_that_refuses_every_resync_raises_refused() -> None:
-    """Whoever asked decides what that is worth: the refusals may answer older questions."""
+    """The caller decides: the error replies may belong to older requests."""
     questions = Questions(refuse=9)
     with pytest.raises(Refused):
         await Vigor().resync(bus(questions.hear), None, 0)

@@ -20,7 +20,7 @@ C = WIRE.character
 
 
 def timed(pieces: list[tuple[float, bytes]], expected: list[tuple[float, bytes]]) -> bool:
-    """Whether the pieces came as expected, each at about its time."""
+    """True if the pieces arrived as expected, each at about its time."""
     times = [at for at, _ in pieces]
     return [data for _, data in pieces] == [data for _, data in expected] and times == (
         pytest.approx([at for at, _ in expected])

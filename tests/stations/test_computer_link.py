@@ -30,7 +30,7 @@ def station_of(vector: Vector) -> ComputerLinkStation:
 
 
 def answer(station: ComputerLinkStation, text: str, now: float = 0.0) -> list[Frame]:
-    """What the station says to a request of the text from station to area."""
+    """Returns the reply of the station to a request; the text is from station to area."""
     peer = Peer(station.station, station.frame_format, station.sum_check)
     reader = LinkCodec(station.frame_format, station.sum_check)
     return [frame for block in station.hear(peer.enq(text), now) for frame in reader.feed(block)]

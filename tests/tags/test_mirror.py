@@ -1,4 +1,4 @@
-"""What is worth telling the network: each rule of the mirror's docstring is a test."""
+"""The choice of samples to publish: one test for each rule in the mirror's docstring."""
 
 from typing import Any
 
