@@ -38,6 +38,10 @@ async def test_refused_addresses_are_found_and_the_others_turn_good() -> None:
         assert line.now[bad[1]].quality is Quality.GOOD
         assert [b.span.size for b in dev.blocks] == [59, 1]
         assert dev.record.refusals["28"] - refused <= 2 * len(bad) + 4
+        returned = now()
+        await asyncio.sleep(20)  # and they are read as often as all others
+        for tag in bad[:2]:
+            assert sum(s.tag is tag for at, s in line.reported if at > returned) >= 18
         assert len(line.reads(dev, settled)) >= 375
 
 
