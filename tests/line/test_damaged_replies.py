@@ -7,7 +7,7 @@ import pytest
 from gateway.errors import Evidence
 from gateway.tags import Quality, Reason
 from tests.line.clocks import clocks, wind_up
-from tests.sim.plant import device, plant, running, words
+from tests.sim.plant import device, make_tag, plant, running, words
 from tests.sim.virtual import now, on_virtual_time
 from tests.sim.witness import Witness
 
@@ -107,3 +107,19 @@ async def test_bytes_the_adapter_adds_before_an_echo_are_dropped() -> None:
         line.stations[0].mute = True
         await asyncio.sleep(20)
         assert dev.record.failures[Evidence.SILENCE] > 2
+
+
+@on_virtual_time
+async def test_an_address_of_its_own_request_that_returned_is_read_as_often_as_before() -> None:
+    dev = device([make_tag("D0"), make_tag("D1000")])
+    line = plant([dev])
+    station = line.stations[0].inner
+    station.holes = {("D", 1000)}
+    async with running(line):
+        await asyncio.sleep(400)  # by now it is tried every five minutes
+        station.holes = set()
+        await asyncio.sleep(320)
+        returned = now()
+        await asyncio.sleep(20)
+        tag = dev.tags[1]
+        assert sum(s.tag is tag for at, s in line.reported if at > returned) >= 18
