@@ -49,7 +49,7 @@ class Conclusions:
         self._gap = gap
 
     def poll_failed(self, poll: Poll, result: Exception, now: float, time: int) -> None:
-        """The result of a poll without units."""
+        """Applies the result of a poll without units."""
         device, results = poll.device, self._results
         match result:
             case Refused():
@@ -68,7 +68,7 @@ class Conclusions:
     def conclude(
         self, job: Transacted, result: Result, traffic: Traffic, now: float, time: int
     ) -> None:
-        """The result of any job but a poll."""
+        """Applies the result of a job that is no poll."""
         match job:
             case Settle():
                 self._settled(job, result, now, time)
@@ -142,7 +142,7 @@ class Conclusions:
             self._in_flight.continuation = self._requests.settled(settle, now)
 
     def abandon(self, error: LineDown | None, now: float) -> None:
-        """The port was lost, or the gateway stops, in the middle of a job."""
+        """Ends the job, because the port was lost or the gateway stops."""
         job = self._in_flight.continuation or self._in_flight.job
         self._in_flight.clear()
         if job is not None:
