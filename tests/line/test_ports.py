@@ -126,3 +126,18 @@ async def test_a_driver_bug_during_a_write_ends_it_unclear(monkeypatch: pytest.M
         await asyncio.sleep(5)
         assert isinstance(outcome.once, Unclear)
         assert line.good(line.devices[0])
+
+
+@on_virtual_time
+async def test_the_port_is_closed_at_its_loss_and_at_the_end_of_the_line() -> None:
+    line = plant([clocks(5)])
+    async with running(line):
+        await asyncio.sleep(2)
+        assert line.bench.inner is not None
+        line.bench.vanish()
+        await asyncio.sleep(0.001)
+        assert line.bench.inner is None
+        line.bench.come_back()
+        await asyncio.sleep(REOPEN_LONGEST * 2)
+        assert line.line.engine.is_open
+    assert line.bench.inner is None

@@ -185,7 +185,7 @@ MUTANTS = (
         "engine/results.py",
         "        if not unknown and health.consecutive_failures <= device.timing.retries:\n",
         "        if not unknown:\n",
-        "tests/line/test_mute_stations.py",
+        "tests/line/test_mute_stations.py tests/line/test_late_replies.py",
     ),
     Mutant(
         "values of an offline device stay good",
@@ -272,7 +272,7 @@ MUTANTS = (
         "a port is not closed",
         "line/channel.py",
         "        await self._port.close()\n",
-        "            pass\n",
+        "        pass\n",
         "tests/line/test_ports.py tests/test_app.py",
     ),
     Mutant(
