@@ -38,7 +38,7 @@ class Plc:
 
     def _answer(self, request: bytes) -> bytes:
         self.heard.append(request[5:7].decode())
-        if request[1:5] == b"FFFF":  # the global flag, which nobody answers
+        if request[1:5] == b"FFFF":  # the global flag, without a reply
             self.peer.devices["M8126"] = int(request[8:9])
             return b""
         if self.gone and self.gone in request.decode():

@@ -81,7 +81,7 @@ async def test_the_gateway_ends_in_time_under_load(busy_plant: Plant, by: signal
             assert took < WITHIN
             assert not gateway.has_said("Traceback")
 
-            # Every write was answered, and nobody was told anything untrue.
+            # Every write has an outcome, and no outcome is wrong.
             for i, replies in enumerate(await writing):
                 [reply] = replies
                 held = int(busy_plant.plc.tell(f"get 1 D {3000 + i}"))
@@ -126,7 +126,7 @@ async def test_writes_in_flight_and_in_the_queue_get_a_reply(
             told = time.monotonic()
             assert await asyncio.to_thread(gateway.end) == 0
             assert time.monotonic() - told < WITHIN
-            # The PLC obeyed one, the gateway did not hear it: nobody knows. The other never went.
+            # The PLC wrote one value and its reply was lost: unclear. The other was never sent.
             answers = zip(held(), await writing, strict=True)
             errors = {value: reply.json["error"] for value, [reply] in answers}
             assert errors == {"7": "unclear", "0": "line-down"}

@@ -98,7 +98,7 @@ async def test_two_gateways_of_a_group_share_one_wire(tmp_path: Path) -> None:
                 assert len(replies) == 1
                 assert len(await client.get("plant/mixer/run/@set", b"true", target="ALL")) == 1
                 await client.until_alive("plant/@gateway/*", [f"plant/@gateway/{n}" for n in "ab"])
-                # The network goes and comes: nobody moves.
+                # The network is lost and comes back: both keep their states.
                 await router.kill()
                 async with ZenohPeer("router", listen=[router_at]):
                     await asyncio.sleep(SETTLE_TIME + CLAIM_TIME + 1)
@@ -108,7 +108,7 @@ async def test_two_gateways_of_a_group_share_one_wire(tmp_path: Path) -> None:
                     await asyncio.to_thread(a.end, signal.SIGKILL)
                     await line.until(0, within=1)
                     await line.until(1, within=3)
-                    # Whoever comes back later stands by, until the other is ended in order.
+                    # The gateway that comes back is standby until the other one ends.
                     a = programs.enter_context(gateway(tmp_path, "a", router_at, port))
                     await until_states(client, "waiting active")
                     await asyncio.sleep(CLAIM_TIME + 1)

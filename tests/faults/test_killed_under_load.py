@@ -68,7 +68,7 @@ async def test_history_survives_router_and_gateway_killed_under_load(tmp_path: P
         consumer = Consumer(stack.enter_context(_catch_up(endpoint)))
         await consumer.goes_on(200)
 
-        # The router: what nobody hears is kept, and comes later.
+        # The router is down: history keeps the samples, and the consumer gets them later.
         await router.kill()
         await asyncio.to_thread(first.says, "Zenoh link down")
         there = len(kept(history))

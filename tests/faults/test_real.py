@@ -177,7 +177,7 @@ def test_restarts_leave_nothing_behind(tmp_path: Path) -> None:
             assert not _children(pid)
             beside = set() if kindly else {tmp_path / f"history.db-{what}" for what in _OF_SQLITE}
             assert set(tmp_path.rglob("*")) - beside == files
-        until(lambda: not _holders(tty), "nobody holds the port")
+        until(lambda: not _holders(tty), "no process holds the port")
         assert len(list(Path(f"/proc/{plc.pid}/fd").iterdir())) == kept_open
 
 

@@ -114,7 +114,7 @@ async def test_a_peer_without_power_is_detected_and_comes_back(
             await heard.next(_is(5))
             assert plc.tell("get 1 D 500") == "0" or unclear
 
-            # For good: nobody answers, so the line is down. Another station is there later.
+            # For good: no reply comes, so the line is down. Another station starts later.
             heard.forget()
             cable.pull()
             assert (await heard.next(_bad)).json["reason"] == "no-reply"

@@ -85,13 +85,13 @@ async def test_four_slaves_beside_a_silent_one_keep_95_percent_of_their_reads(
 async def test_a_broadcast_is_followed_by_the_turnaround_and_no_reply(
     kind: type[ModbusRtu | ModbusAscii],
 ) -> None:
-    everybody, ears = kind(station=0), [kind(station=n) for n in (1, 2)]
+    broadcast, slaves = kind(station=0), [kind(station=n) for n in (1, 2)]
     to_all = [
-        make_tag("holding:4", everybody, type="uint32", device="all", write=WriteRule()),
-        make_tag("coil:16", everybody, device="all", write=WriteRule()),
+        make_tag("holding:4", broadcast, type="uint32", device="all", write=WriteRule()),
+        make_tag("coil:16", broadcast, device="all", write=WriteRule()),
     ]
-    devices = [slave(d, registers(d, 20, every=0.02)) for d in ears]
-    devices.append(slave(everybody, to_all))
+    devices = [slave(d, registers(d, 20, every=0.02)) for d in slaves]
+    devices.append(slave(broadcast, to_all))
     line = plant(devices)
     async with running(line):
         await asyncio.sleep(2)

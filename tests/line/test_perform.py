@@ -239,15 +239,15 @@ def test_an_answer_is_sent_without_waiting_for_a_reply() -> None:
     class Recorder:
         """Keeps the frames of `tell`."""
 
-        told: list[bytes] = []  # noqa: RUF012  (one instance)
+        frames: list[bytes] = []  # noqa: RUF012  (one instance)
 
         async def tell(self, frame: bytes) -> None:
-            self.told.append(frame)
+            self.frames.append(frame)
 
     recorder = Recorder()
     job = Answer(Plc().device, b"ACK", 1.0)
     assert result_of(perform(job, cast(Any, recorder))) is None
-    assert recorder.told == [b"ACK"]
+    assert recorder.frames == [b"ACK"]
 
 
 @pytest.mark.parametrize("delay", [0.4, None])

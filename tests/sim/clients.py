@@ -156,7 +156,9 @@ class Client:
         bus.note("told all", tag.key, value, type(outcome).__name__, sent)
         judge.story.counts[f"broadcast {type(outcome).__name__}"] += 1
         if isinstance(outcome, WriteResult) and outcome.acknowledged:
-            judge.broke(f"{tag.key}: nobody acknowledges, but it is said to be done")
+            judge.broke(
+                f"{tag.key}: there is no acknowledgement, but the write is reported as done"
+            )
         if not isinstance(outcome, WriteResult):
             return
         await asyncio.sleep(SOON)
