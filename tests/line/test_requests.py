@@ -165,3 +165,19 @@ async def test_a_refused_write_reports_the_error_code() -> None:
         await asyncio.sleep(0.5)
         assert isinstance(outcome.once, Refused)
         assert outcome.once.code == "28"
+
+
+@on_virtual_time
+async def test_a_waiting_write_ends_in_time_while_one_transaction_takes_long() -> None:
+    """The engine's deadline wakes the line, though its transaction is still open."""
+    slow = device(words(0, 1, every=1.0), reply_timeout=12.0)
+    other = device([make_tag("D0", every=60.0, write=WriteRule())], station=2)
+    line = plant([slow, other])
+    async with running(line):
+        await asyncio.sleep(3)
+        line.stations[0].mute = True
+        await asyncio.sleep(2)  # its poll waits for a reply
+        outcome = line.submit(other, other.tags[0], 1)
+        await asyncio.sleep(WRITE_EXPIRY + 0.1)
+        assert isinstance(outcome.once, Busy)
+        assert outcome.at - outcome.asked == pytest.approx(WRITE_EXPIRY, abs=0.01)

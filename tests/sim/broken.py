@@ -394,7 +394,7 @@ MUTANTS = (
         "line/perform.py",
         "        await driver.resync(talk, job.outstanding, job.token)\n",
         "        pass\n",
-        "tests/line",
+        "tests/line/test_perform.py tests/line/test_writing.py",
     ),
     Mutant(
         "a write is repeated after its time",
@@ -422,6 +422,6 @@ MUTANTS = (
         "line/line.py",
         "        if transaction is not None and transaction.has_sent:\n",
         "        if transaction is not None:\n",
-        "tests/line tests/engine/test_unsolicited.py",
+        "tests/line/test_mixed_line.py tests/engine/test_unsolicited.py",
     ),
 )
