@@ -13,7 +13,7 @@ from gateway.line.line import REOPEN_LONGEST
 from gateway.protocols.vigor import Vigor
 from gateway.tags import Quality, Reason, WriteRule
 from tests.line.clocks import clocks, wind_up
-from tests.sim.plant import device, make_tag, plant, running
+from tests.sim.plant import device, make_tag, plant, running, words
 from tests.sim.virtual import now, on_virtual_time
 
 
@@ -141,3 +141,18 @@ async def test_the_port_is_closed_at_its_loss_and_at_the_end_of_the_line() -> No
         await asyncio.sleep(REOPEN_LONGEST * 2)
         assert line.line.engine.is_open
     assert line.bench.inner is None
+
+
+@on_virtual_time
+async def test_bytes_during_the_silence_before_a_request_belong_to_no_transaction() -> None:
+    dev = device(words(0, 1, every=0.001), silence=0.1)
+    line = plant([dev])
+    async with running(line):
+        await asyncio.sleep(3)
+        reads = len(line.reported)
+        while len(line.reported) == reads:
+            await asyncio.sleep(0.001)
+        await asyncio.sleep(0.05)  # the next poll waits for its silence
+        before = line.line.engine.record.unasked
+        line.bench.received(b"\x55\x55")
+        assert line.line.engine.record.unasked == before + 2

@@ -422,6 +422,6 @@ MUTANTS = (
         "line/line.py",
         "        if transaction is not None and transaction.has_sent:\n",
         "        if transaction is not None:\n",
-        "tests/line/test_mixed_line.py tests/engine/test_unsolicited.py",
+        "tests/line/test_ports.py tests/engine/test_unsolicited.py",
     ),
 )
