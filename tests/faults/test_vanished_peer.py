@@ -97,7 +97,7 @@ async def test_a_peer_without_power_is_detected_and_comes_back(
         Program(sys.executable, "-c", RUN, "run", config) as service,
     ):
         plc.tell("set 1 D 10 5")
-        await asyncio.to_thread(service.says, "on Zenoh")
+        await asyncio.to_thread(service.says, "Zenoh session ready")
         async with ZenohPeer("client", connect=[endpoint]) as client:
             heard = await client.subscribe("plant/mixer/*")
             await heard.next(_is(5))
