@@ -172,7 +172,7 @@ def _history(config: Config) -> Historian | None:
 class _Recording:
     """Records published samples in the history.
 
-    A client can query a sample as soon as it received it: recording comes first.
+    It does so before the event loop takes the query of a client that received them.
     """
 
     def __init__(self, history: Historian) -> None:

@@ -105,11 +105,6 @@ class Framing:
             return DEFAULT_GAP
         return self.gap
 
-    @property
-    def longest_on_line(self) -> int:
-        """The characters of the longest frame, everything included."""
-        return self.on_line(self.longest)
-
     def on_line(self, count: int) -> int:
         """Returns the characters of a frame with `count` data bytes, everything included."""
         data = count * (2 if self.conversion else 1)
