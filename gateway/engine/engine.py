@@ -99,18 +99,14 @@ class Engine:
         They share the transaction of `poll`; each is concluded by itself.
         """
         others = self.schedule.alongside(poll, poll.device.window - 1, now)
-        if others:
-            self._in_flight.open_polls += len(others)
-            self._in_flight.shared = Traffic()
+        self._in_flight.open_polls += len(others)
         return others
 
     def conclude(
         self, job: Transacted, result: Result, traffic: Traffic, now: float, time: int
     ) -> list[Effect]:
-        """Applies the result of a job."""
+        """Applies the result of a job. Polls of one transaction report its traffic once."""
         device, in_flight = job.device, self._in_flight
-        if in_flight.shared is not None:
-            traffic = in_flight.traffic_of_all(in_flight.shared, traffic)
         characters = (traffic.sent + traffic.heard) * self.wire.character
         self.record.busy += characters
         self.record.turnarounds += traffic.turnaround

@@ -154,24 +154,12 @@ class InFlight:
     open_polls: int = 0
     failed: list[tuple[Poll, DeviceError]] = field(default_factory=list)
     continuation: Transacted | None = None
-    shared: "Traffic | None" = None  # of polls that share one transaction
 
     def clear(self) -> None:
         """No job is handed out any more."""
-        self.job = self.charged = self.continuation = self.shared = None
+        self.job = self.charged = self.continuation = None
         self.open_polls = 0
         self.failed.clear()
-
-    def traffic_of_all(self, shared: "Traffic", traffic: "Traffic") -> "Traffic":
-        """Returns the traffic of all polls of a transaction when the last poll ends, else none."""
-        shared.sent += traffic.sent
-        shared.heard += traffic.heard
-        shared.exchanges += traffic.exchanges
-        shared.turnaround += traffic.turnaround
-        if self.open_polls > 1:
-            return Traffic()
-        self.shared = None
-        return shared
 
     def resume(self, now: float) -> Transacted:
         """Returns the continuation. `Confirm` and `Repeat` begin their own time."""

@@ -189,14 +189,18 @@ class Line:
         raise self._lost
 
     async def _perform_together(self, polls: Sequence[Poll], channel: Channel) -> None:
-        """Performs several polls at once in one transaction."""
-        transaction = self._transaction
+        """Performs several polls at once in one transaction. Its traffic counts with the last."""
+        transaction, left = self._transaction, len(polls)
         if transaction is None:
             raise AssertionError("no transaction is open")
 
         async def one(poll: Poll) -> None:
+            nonlocal left
             result = await perform(poll, transaction)
-            traffic, transaction.traffic = transaction.traffic, Traffic()
+            left -= 1
+            traffic = Traffic()
+            if not left:
+                traffic, transaction.traffic = transaction.traffic, traffic
             now, at = channel.now(), self._wall()
             self._deliver(self.engine.conclude(poll, result, traffic, now, at))
 
