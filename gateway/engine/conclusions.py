@@ -61,7 +61,7 @@ class Conclusions:
             case DeviceError():
                 self._in_flight.failed.append((poll, result))
             case LineDown():
-                device.health.left_outstanding(poll.block.span)
+                device.health.left_outstanding(poll.span, now)
             case _:
                 raise result
 
@@ -94,7 +94,7 @@ class Conclusions:
                     quiet = device.longest_reply
                     self._in_flight.continuation = Settle(device, quiet, quiet, probe)
                 else:
-                    self._results.answered(device, now, time)
+                    self._results.answered(device, now, time, resynced=True)
             case Unclear():
                 self.unclear(probe, result, traffic, now, time)
             case BadValue():

@@ -6,6 +6,7 @@ from typing import Literal
 
 from gateway.engine.health import Health, State, diagnosis
 from gateway.engine.records import Record
+from gateway.engine.reply_shapes import ReplyShapes, reply_shapes
 from gateway.errors import LineDown
 from gateway.planning.bad_addresses import BadAddresses
 from gateway.planning.monitor_lists import with_monitor_list
@@ -17,6 +18,10 @@ from gateway.tags import Tag
 LEARN_EVERY = 50  # requests between two comparisons with the measured turnaround
 MOST_PLANNED = 2000  # tags times intervals: planning them takes some tenths of a second
 WORTH_WHILE = 0.1  # share of the wire time that a new plan must save
+ANSWERS_TWICE = (
+    "Answers twice: a second master is on the line, two stations have the number {station}, or a "
+    "device server repeats replies"
+)
 HALF_LIFE = 10.0  # seconds until past use of the wire counts half
 
 
@@ -80,6 +85,7 @@ class Device:
     )  # it receives writes or sends unsolicited frames, and never replies
     window: int = field(init=False)  # requests that may be outstanding at once
     silence: float = field(init=False)  # seconds before each request
+    shapes: ReplyShapes | None = field(init=False)  # None: no reply, or each has a number
     _lists: bool = True  # reads by a monitor list are allowed
     _use: tuple[float, float] = (0.0, 0.0)  # seconds of the wire, and the time of counting
 
@@ -92,6 +98,7 @@ class Device:
         self.health = Health(answerable=not self.broadcast)
         self.window = driver.window if isinstance(driver, Windowed) else 1
         self.silence = self.wire.silence(self.timing)
+        self.shapes = None if self.broadcast else reply_shapes(driver, self.polled_tags)
         self.plan()
 
     @property
@@ -127,6 +134,8 @@ class Device:
     def diagnosis(self) -> str:
         """Returns the likely cause of its trouble as a sentence; empty when there is none."""
         driver = self.driver
+        if self.health.trouble is None and self.shapes is not None and self.shapes.answers_twice:
+            return ANSWERS_TWICE.format(station=driver.station)
         causes = driver.no_reply_causes if isinstance(driver, NoReplyCauses) else ""
         return diagnosis(self.health.trouble, causes)
 

@@ -22,6 +22,7 @@ from gateway.engine.jobs import (
     Traffic,
     Transacted,
     WriteTogether,
+    resync_around,
 )
 from gateway.engine.records import LineRecord
 from gateway.engine.request_results import RequestResults
@@ -29,7 +30,7 @@ from gateway.engine.requests import Request, Write, why_not_commanded
 from gateway.engine.results import Results, offline
 from gateway.engine.schedule import Schedule
 from gateway.engine.staleness import NEVER, Staleness
-from gateway.engine.stray import Stray
+from gateway.engine.stray import Stray, is_extra_reply
 from gateway.engine.unsolicited import UnsolicitedFrames
 from gateway.errors import (
     BadValue,
@@ -86,6 +87,8 @@ class Engine:
         if isinstance(job, Idle):
             return job
         in_flight.job, in_flight.begun = job, now
+        if job.device.shapes is not None and not isinstance(job, Poll):
+            resync_around(job, job.device.shapes, now)
         if isinstance(job, Poll):
             in_flight.open_polls = 1
             in_flight.charged = None if job.expedited else job.device
@@ -110,6 +113,8 @@ class Engine:
         characters = (traffic.sent + traffic.heard) * self.wire.character
         self.record.busy += characters
         self.record.turnarounds += traffic.turnaround
+        if device.shapes is not None:
+            device.shapes.at = now
         device.record.count_exchanges(traffic.exchanges, characters, traffic.turnaround)
         if isinstance(job, Poll):
             in_flight.open_polls -= 1
@@ -174,15 +179,24 @@ class Engine:
     def received(self, data: bytes, now: float, time: int) -> list[Effect]:
         """Takes bytes that arrived outside of a transaction."""
         self.record.unasked += len(data)
-        self._stray.received(data, now)
+        for device in self._stray.received(data, now):
+            self._results.answered_twice(device, now, time)
         self._unsolicited.received(data, now, time)
         self._set_deadline()
         return self._effects.take()
 
-    def unmatched(self, device: Device, frame: Any, now: float, time: int) -> list[Effect]:
-        """Takes a frame that arrived in a transaction with this device and is not its reply."""
+    def unmatched(
+        self, device: Device, frame: Any, now: float, time: int, *, echo: bool = False
+    ) -> list[Effect]:
+        """Takes a frame that arrived in a transaction with this device and is not its reply.
+
+        `echo`: it is equal to the request.
+        """
         device.record.count_stray()
         self._stray.frames(device, [frame], now)
+        for each in self.devices:
+            if not echo and is_extra_reply(each, frame):
+                self._results.answered_twice(each, now, time)
         self._unsolicited.unmatched(device, frame, now, time)
         self._set_deadline()
         return self._effects.take()

@@ -74,6 +74,7 @@ class Health:
     next_probe: float = 0.0
     _unanswered: deque[float] = field(default_factory=lambda: deque(maxlen=MOST_UNANSWERED))
     _probe_token: int = 0
+    _extra: bool = False  # an extra reply arrived since the last resync
 
     def __post_init__(self) -> None:
         self.needs_resync = self.answerable
@@ -85,15 +86,22 @@ class Health:
         self.consecutive_failures = 0
         self.needs_resync = self.answerable
 
-    def answered(self) -> bool:
-        """Notes a reply. Returns True if the device comes online."""
+    def answered(self, *, resynced: bool = False) -> bool:
+        """Notes a reply. Returns True if the device comes online.
+
+        `resynced`: it is the reply to a resync. After an extra reply only this one counts.
+        """
         came = not self.online
+        if resynced:
+            self._extra = False
         self._move(Event.ANSWERED)
         self.consecutive_failures = 0
-        self.needs_resync = False
-        self.outstanding = self.trouble = None
+        self.trouble = None
         self.pause = 0.0
-        self._unanswered.clear()
+        if not self._extra:
+            self.needs_resync = False
+            self.outstanding = None
+            self._unanswered.clear()
         return came
 
     def unclear(self, error: DeviceError, outstanding: Span | None, now: float) -> None:
@@ -110,9 +118,15 @@ class Health:
         if outstanding is not None:
             self.outstanding = outstanding
 
-    def left_outstanding(self, outstanding: Span | None) -> None:
-        """Notes that the port was lost during a transaction."""
+    def answered_twice(self, outstanding: Span | None, now: float) -> None:
+        """Notes an extra reply: the next reply may be another one. Only a resync ends this."""
+        self._extra = True
+        self.left_outstanding(outstanding, now)
+
+    def left_outstanding(self, outstanding: Span | None, now: float) -> None:
+        """Notes a request whose reply may still arrive, although nothing waits for it."""
         self.needs_resync = self.answerable
+        self._unanswered.append(now)
         if outstanding is not None:
             self.outstanding = outstanding
 
@@ -121,7 +135,7 @@ class Health:
 
         `last`: no other request is outstanding, so the next frame is no older reply.
         """
-        if last:
+        if last and not self._extra:
             self.needs_resync = False
             self._unanswered.clear()
         self.trouble = Garbled(

@@ -2,14 +2,16 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import cast
 
 from gateway.engine.device import Device
 from gateway.engine.health import PAUSE_FIRST, PAUSE_LONGEST, State
 from gateway.engine.records import PollRecord
-from gateway.engine.requests import Command, Request, Write
+from gateway.engine.reply_shapes import ReplyShapes
+from gateway.engine.requests import Command, Request, Resyncs, Write
 from gateway.errors import BadValue, DeviceError, LineDown
 from gateway.planning.planner import Block
-from gateway.protocols.driver import Span
+from gateway.protocols.driver import Span, UnnumberedReplies
 from gateway.tags import Sample
 
 EXPEDITED, NOT_QUEUED = -1, -2  # tickets of polls that are in no heap
@@ -32,6 +34,7 @@ class Poll:
     device: Device
     block: Block
     due: float
+    span: Span = field(init=False)  # to be read: that of the block, or a longer one around it
     tries: int = 0
     missed: int = 0  # rounds in a row without a reply, while the device replies to others
     asked: float = 0.0  # when it was handed out last
@@ -42,6 +45,9 @@ class Poll:
     register: bool = False  # its monitor list must be registered first
     last: LastRead = field(default_factory=LastRead)
     counts: PollRecord = field(default_factory=PollRecord)
+
+    def __post_init__(self) -> None:
+        self.span = self.block.span
 
     def forget(self, now: float) -> float:
         """Forgets the last read, because its values turn bad. Returns their age."""
@@ -190,7 +196,7 @@ def span_of(job: Unfinished) -> Span | None:
     """Returns the span that is outstanding if the job gets no reply; None: the older one stays."""
     match job:
         case Poll():
-            return job.block.span
+            return job.span
         case Write(tag=tag):
             return tag.span
         case WriteTogether(writes=[first, *_]):
@@ -198,6 +204,36 @@ def span_of(job: Unfinished) -> Span | None:
         case Confirm(write=write) | Repeat(write=write):
             return write.tag.span
     return None
+
+
+def resync_around(job: Transacted, shapes: ReplyShapes, now: float) -> None:
+    """Notes a request that is no poll.
+
+    A write whose acknowledgement may be an extra reply to an earlier one is followed by a resync.
+    If a request begins with a read whose reply may be an extra one, a resync precedes it.
+    """
+    device, last = job.device, None
+    driver = cast("UnnumberedReplies", device.driver)
+    match job:
+        case Probe(outstanding=outstanding, token=token):
+            last = driver.resync_shape(outstanding, token)
+        case Confirm(write=write):
+            last = driver.reply_shape(write.tag.span)
+        case Command():
+            again = shapes.may_be_extra(shapes.last, now)
+            job.resyncs = Resyncs(before=device.health.next_probe_token() if again else None)
+        case Write(tag=tag) | WriteTogether(writes=[Write(tag=tag), *_]):
+            first = job if isinstance(job, Write) else job.writes[0]
+            replies = driver.write_shapes(tag.span, first.units)
+            if tag.address.bit is not None:
+                replies = (driver.reply_shape(tag.span), None)
+            before = len(replies) > 1 and shapes.is_recent(replies[0], now)
+            last = replies[-1]
+            first.resyncs = Resyncs(
+                device.health.next_probe_token() if before else None,
+                device.health.next_probe_token() if shapes.may_be_extra(last, now) else None,
+            )
+    shapes.sent(last, now)
 
 
 # Results
@@ -211,6 +247,7 @@ class Traffic:
     heard: int = 0  # characters
     exchanges: int = 0  # requests with a reply
     turnaround: float = 0.0  # seconds of the station for them, without the characters
+    extra: int = 0  # frames of the station that answered no request
 
 
 @dataclass(frozen=True, slots=True)

@@ -85,7 +85,7 @@ class RequestResults:
             span, what = None, "the command"
             if isinstance(request, Write):
                 span, what = request.tag.span, "the write"
-            request.device.health.left_outstanding(span)
+            request.device.health.left_outstanding(span, now)
             unknown = STOPPED if why is None else f"{why}; it is unknown if {what} was done"
             self._end(request, Unclear(unknown), now)
 
@@ -99,6 +99,8 @@ class RequestResults:
                 self._pause(device)
                 return write.result(now, time, acknowledged=False)
             case Sent(held=held, refused_back=refused):
+                if device.shapes is not None:
+                    device.shapes.acknowledged(now)
                 if device.health.needs_resync or device.health.state is not State.ONLINE:
                     self._results.answered(device, now, time)
                 if refused is not None:
@@ -120,6 +122,8 @@ class RequestResults:
         if not isinstance(result, Sent):
             raise TypeError(f"{result!r} is no result of a write")
         self._results.answered(job.device, now, time)
+        if job.device.shapes is not None:
+            job.device.shapes.acknowledged(now)
         for write in job.writes:
             self._end(write, write.result(now, time), now)
 
@@ -132,7 +136,7 @@ class RequestResults:
         if isinstance(result, Refused):
             self._refused(job.device, result, now, time)
         elif result.held is not None and write.holds(result.held):
-            self._results.answered(job.device, now, time)
+            self._results.answered(job.device, now, time, resynced=True)
             outcome = write.result(now, time, verified=True)
         elif rule is not None and rule.repeat and now < write.expires:
             return Repeat(job.device, write, job.error)
@@ -157,6 +161,8 @@ class RequestResults:
     def _refused(self, device: Device, error: Refused, now: float, time: int) -> None:
         self._results.answered(device, now, time)
         device.record.count_refusal(error)
+        if device.shapes is not None:
+            device.shapes.refused(now)
 
     def _pause(self, device: Device) -> None:
         """Pauses after a broadcast: the stations need time for it, and none replies."""

@@ -26,6 +26,16 @@ class CommandResult(NamedTuple):
 Outcome = WriteResult | str | GatewayError
 
 
+class Resyncs(NamedTuple):
+    """Tokens of the resyncs around a request whose reply could be an extra reply; None: none."""
+
+    before: int | None = None
+    after: int | None = None
+
+
+NO_RESYNCS = Resyncs()
+
+
 @dataclass(slots=True, eq=False)
 class Write:
     """A value for a tag. Times in seconds of the line's clock."""
@@ -35,6 +45,7 @@ class Write:
     units: Sequence[int]
     submitted: float
     alone: bool = False  # refused together with others: it is now sent alone
+    resyncs: Resyncs = NO_RESYNCS
     value: Value = field(init=False)  # as the device will hold it, rounded to its steps
 
     def __post_init__(self) -> None:
@@ -82,6 +93,7 @@ class Command:
     name: str
     argument: str
     submitted: float
+    resyncs: Resyncs = NO_RESYNCS
 
     @property
     def expires(self) -> float:

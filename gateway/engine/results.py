@@ -4,10 +4,11 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from gateway.engine.device import Device
+from gateway.engine.device import ANSWERS_TWICE, Device
 from gateway.engine.effects import Effects, Samples
 from gateway.engine.health import State
 from gateway.engine.jobs import Poll
+from gateway.engine.reply_shapes import QUIET
 from gateway.engine.schedule import Schedule
 from gateway.engine.staleness import Staleness
 from gateway.errors import (
@@ -40,12 +41,16 @@ class Results:
 
     # Replies
 
-    def answered(self, device: Device, now: float, time: int) -> None:
-        """Notes a reply of the device, also an error reply."""
+    def answered(self, device: Device, now: float, time: int, *, resynced: bool = False) -> None:
+        """Notes a reply of the device, also an error reply. `resynced`: to a resync."""
         health = device.health
+        if resynced and device.shapes is not None:
+            device.shapes.marked(now)
         if health.state is State.ONLINE and not health.needs_resync:
             return
-        if health.answered():
+        if health.answered(resynced=resynced):
+            if device.shapes is not None:
+                device.shapes.restart()
             self._effects.online(device, True)
             self._effects.info("device online", line=self._line, device=device.name)
             device.bad_addresses.abandon()
@@ -58,6 +63,8 @@ class Results:
         health, last = device.health, poll.last
         if health.needs_resync or health.state is not State.ONLINE:
             self.answered(device, now, time)
+        if poll.span is not block.span and device.shapes is not None:
+            device.shapes.read_longer(block.span, replied=True)
         counts = poll.counts
         if last.at is not None:
             gap = now - last.at
@@ -119,6 +126,12 @@ class Results:
         device.record.count_refusal(error)
         if block.listed:
             device.forget_list()
+        if device.shapes is not None:
+            device.shapes.refused(now)
+            if poll.span is not block.span and error.refusal not in (Refusal.DAMAGED, Refusal.BUSY):
+                device.shapes.refused_longer(block.span)
+                self._schedule.again(poll, counted=False)
+                return
         if error.refusal is Refusal.DAMAGED and poll.tries < device.timing.retries:
             self._schedule.again(poll)
             return
@@ -226,6 +239,8 @@ class Results:
     def unread(self, poll: Poll, error: GatewayError, now: float, time: int) -> None:
         """Applies an unclear poll: polls again, or turns its tags bad."""
         device = poll.device
+        if poll.span is not poll.block.span and device.shapes is not None:
+            device.shapes.read_longer(poll.block.span, replied=False)
         if device.health.state is State.OFFLINE:
             return
         if poll.tries < device.timing.retries and not poll.missed:
@@ -235,13 +250,34 @@ class Results:
         self._effects.bad(poll.block.tags, device.health.reason, time, str(error))
         self._schedule.polled(poll, now, answered=False)
 
+    def answered_twice(self, device: Device, now: float, time: int) -> None:
+        """Applies a reply to no request: values read just before may be those of other tags.
+
+        They turn bad and are read again after a resync. Values that were read before the wire was
+        quiet stay good: an extra reply would have arrived then.
+        """
+        health, shapes = device.health, device.shapes
+        if shapes is None or health.needs_resync or not health.online:
+            return  # the reply to an older request, which the resync expects
+        known, why = shapes.answers_twice, ANSWERS_TWICE.format(station=device.driver.station)
+        shapes.extra_arrived(now)
+        health.answered_twice(shapes.span, now)
+        log = self._effects.debug if known else self._effects.warning
+        log("device answers twice", line=self._line, device=device.name, why=why)
+        for poll in self._schedule.polls(device):
+            at = poll.last.at
+            if at is not None and at >= shapes.proven and now - shapes.at < QUIET:
+                poll.forget(now)
+                self._effects.bad(poll.block.tags, Reason.GARBLED, time, why)
+                self._schedule.expedite(poll)
+
     def outstanding_requests(self, device: Device) -> int:
         """Counts the requests to the device whose reply may still arrive.
 
-        A good read on this line shows that older requests are no longer delayed.
+        A good read of this device shows that older requests are no longer delayed. Reads of other
+        devices do not: each may have a link of its own behind one port.
         """
-        schedule = self._schedule
-        polls = (poll for each in schedule.devices for poll in schedule.polls(each))
+        polls = self._schedule.polls(device)
         flowed = max((at for poll in polls if (at := poll.last.at) is not None), default=-math.inf)
         return device.health.outstanding_requests(flowed - device.longest_reply)
 

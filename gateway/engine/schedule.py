@@ -151,6 +151,9 @@ class Schedule:
         poll = queue.expedited[0] if expedited else queue.due[0][2]
         if not expedited and len(self.devices) > 1 and poll.deadline < now:
             poll = self._fairest(now)
+        shapes = poll.device.shapes
+        if shapes is not None and shapes.needs_mark(now):
+            poll.device.health.left_outstanding(shapes.span, now)
         if poll.device.health.needs_resync:
             other = self._first_without_resync() if now < self._failing_lane else None
             if other is None:
@@ -173,7 +176,9 @@ class Schedule:
         if poll.due > now:
             poll.due = now
         poll.asked = now
-        listed = poll.block.listed
+        listed, shapes = poll.block.listed, poll.device.shapes
+        if shapes is not None:
+            poll.span = shapes.polled(poll.block, now)
         if listed:
             poll.register = poll.device.registered != listed
             poll.device.expect_list(listed)
@@ -221,9 +226,9 @@ class Schedule:
         poll.tries = 0
         self._queue.push(poll)
 
-    def again(self, poll: Poll, when: float | None = None) -> None:
+    def again(self, poll: Poll, when: float | None = None, *, counted: bool = True) -> None:
         """Polls again when the deadline is the earliest, or from `when` on."""
-        poll.tries += 1
+        poll.tries += counted
         if when is not None:
             poll.due = when
         self._queue.push(poll)

@@ -1,15 +1,21 @@
 """Stray frames: counted, and explained in the log by the driver."""
 
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import Any, cast
 
 from gateway.engine.device import Device
 from gateway.engine.effects import Effects
 from gateway.errors import Garbled
-from gateway.protocols.driver import Codec, StrayFrames
+from gateway.protocols.driver import Codec, StrayFrames, UnnumberedReplies
 
 LOG_EVERY = 10.0  # seconds for each device; other frames are logged at level debug
 PAUSE = 0.1  # seconds without a byte after which a frame begins
+
+
+def is_extra_reply(device: Device, frame: Any) -> bool:
+    """Returns True for a reply of the device, where replies have no number."""
+    driver = device.driver
+    return device.shapes is not None and cast("UnnumberedReplies", driver).is_reply(frame)
 
 
 class Stray:
@@ -27,18 +33,25 @@ class Stray:
         self._last = float("-inf")
         self._logged: dict[Device, float] = {}
 
-    def received(self, data: bytes, now: float) -> None:
-        """Takes bytes that arrived outside of a transaction."""
+    def received(self, data: bytes, now: float) -> list[Device]:
+        """Takes bytes that arrived outside of a transaction. Returns devices that replied."""
+        replied = []
         if now - self._last > PAUSE:
             self._codecs.clear()
         self._last = now
         for device in self._devices:
             device.forget_list()
-            if isinstance(device.driver, StrayFrames):
-                found = self._feed(device, data)
-                own = [frame for frame in found if device.driver.from_this_station(frame)]
-                device.record.count_stray(len(own))
-                self.frames(device, own, now)
+            driver = device.driver
+            explained = isinstance(driver, StrayFrames)
+            if device.shapes is None and not explained:
+                continue
+            found = self._feed(device, data)
+            own = [frame for frame in found if frame.station == driver.station]
+            device.record.count_stray(len(own))
+            self.frames(device, own, now)
+            if any(is_extra_reply(device, frame) for frame in own):
+                replied.append(device)
+        return replied
 
     def frames(self, device: Device, frames: Iterable[Any], now: float) -> None:
         """Logs complete frames that are already counted."""

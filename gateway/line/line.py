@@ -119,8 +119,8 @@ class Line:
             self._transaction.lost(self._lost)
         self._wake.set()
 
-    def _unmatched(self, device: Device, frame: Any) -> None:
-        self._deliver(self.engine.unmatched(device, frame, _now(), self._wall()))
+    def _unmatched(self, device: Device, frame: Any, echo: bool) -> None:
+        self._deliver(self.engine.unmatched(device, frame, _now(), self._wall(), echo=echo))
 
     # The task
 

@@ -1,6 +1,6 @@
 """Performs one job on an open transaction: calls the driver, and decides nothing."""
 
-from collections.abc import Sequence
+from collections.abc import Awaitable, Sequence
 from typing import Any
 
 from gateway.engine.device import Device
@@ -22,8 +22,9 @@ from gateway.engine.requests import Command, Write
 from gateway.errors import BadValue, DeviceError, Evidence, LineDown, Refused, Unclear, Unsteady
 from gateway.line.transaction import Transaction
 from gateway.planning.planner import Block
-from gateway.protocols.driver import Controllable, Monitor, ScatteredWriter, Talk
+from gateway.protocols.driver import Controllable, Monitor, ScatteredWriter, Span, Talk
 
+TWO_REPLIES = "two replies arrived, and the first may be that to an earlier write"
 DIFFER = "two readings in a row differ; verify_reads is for values that change slowly"
 
 
@@ -33,7 +34,11 @@ async def perform(job: Transacted, transaction: Transaction) -> Result:
         if isinstance(job, Poll):
             device, block = job.device, job.block
             if block.listed or device.settings.verify_reads > 1:
-                return await read_with_care(transaction, device, block, register=job.register)
+                return await read_with_care(
+                    transaction, device, block, span=job.span, register=job.register
+                )
+            if job.span is not block.span:
+                return await _read_longer(transaction, device, job.span, block.span)
             return await device.settings.driver.read(transaction, block.span)
         return await _perform(job, transaction)
     except (DeviceError, BadValue, LineDown) as error:
@@ -51,10 +56,13 @@ async def _perform(job: Transacted, transaction: Transaction) -> Result:
             return await _write(job.write if isinstance(job, Repeat) else job, transaction)
         case WriteTogether(writes=writes) if isinstance(driver, ScatteredWriter):
             parts = [(write.tag.span, write.units) for write in writes]
-            return Sent(await driver.write_scattered(transaction, parts))
+            sending = driver.write_scattered(transaction, parts)
+            return Sent(await _only_reply(sending, writes[0], transaction))
         case Confirm():
             return await _confirm(job, transaction)
         case Command(name=name, argument=argument) if isinstance(driver, Controllable):
+            if job.resyncs.before is not None:
+                await job.device.driver.resync(transaction, None, job.resyncs.before)
             return await driver.control(transaction, name, argument)
         case Answer(frame=frame):
             await transaction.tell(frame)
@@ -62,47 +70,77 @@ async def _perform(job: Transacted, transaction: Transaction) -> Result:
     raise TypeError(f"{job.device.name} cannot perform {job!r}")
 
 
+async def _read_longer(
+    talk: Talk[Any], device: Device, longer: Span, wanted: Span
+) -> Sequence[int]:
+    """Reads the longer span around the wanted one. Returns the wanted units."""
+    units = await device.settings.driver.read(talk, longer)
+    begin = wanted.start - longer.start
+    return units[begin : begin + wanted.size]
+
+
 async def read_with_care(
-    talk: Talk[Any], device: Device, block: Block, *, register: bool = False
+    talk: Talk[Any], device: Device, block: Block, *, span: Span, register: bool = False
 ) -> Sequence[int]:
     """Returns the units of the block after `verify_reads` equal reads.
 
-    `register`: registers the monitor list in the PLC first. Raises `Unsteady` if two reads differ:
-    a check sum does not find every error.
+    `span`: that of the block, or a longer one around it. `register`: registers the monitor list
+    in the PLC first. Raises `Unsteady` if two reads differ: a check sum does not find every error.
     """
     driver = device.driver
     if register and isinstance(driver, Monitor):
         await driver.register(talk, block.listed)
-    units = await _read_once(talk, device, block)
+    units = await _read_once(talk, device, block, span)
     for _ in range(1, device.settings.verify_reads):
-        if list(await _read_once(talk, device, block)) != list(units):
+        if list(await _read_once(talk, device, block, span)) != list(units):
             raise Unsteady(DIFFER, evidence=Evidence.CHECKSUM)
     return units
 
 
-async def _read_once(talk: Talk[Any], device: Device, block: Block) -> Sequence[int]:
+async def _read_once(talk: Talk[Any], device: Device, block: Block, span: Span) -> Sequence[int]:
     driver = device.driver
     if not block.listed or not isinstance(driver, Monitor):
-        return await driver.read(talk, block.span)
+        return await _read_longer(talk, device, span, block.span)
     parts = await driver.read_registered(talk, block.listed)
     return [unit for part in parts for unit in part]
 
 
-async def _write(write: Write, talk: Talk[Any]) -> Sent:
+async def _write(write: Write, talk: Transaction) -> Sent:
     """Writes one value, and reads it back if its tag has `verify`. A bit is changed in its word."""
     driver, tag = write.device.settings.driver, write.tag
     units = write.units
+    if write.resyncs.before is not None:
+        await driver.resync(talk, tag.span, write.resyncs.before)
     if tag.address.bit is not None:
         (word,) = await driver.read(talk, tag.span)
         bit = 1 << tag.address.bit
         units = [word | bit if write.units[0] else word & ~bit]
-    acknowledged = await driver.write(talk, tag.span, units)
+    acknowledged = await _only_reply(driver.write(talk, tag.span, units), write, talk)
     if not acknowledged or tag.write is None or not tag.write.verify:
         return Sent(acknowledged)
     try:
         return Sent(held=await driver.read(talk, tag.span))
     except Refused as error:
         return Sent(refused_back=error)
+
+
+async def _only_reply(sending: Awaitable[bool], write: Write, talk: Transaction) -> bool:
+    """Sends a write, then the resync that it needs. Raises `Unclear` if two replies arrived."""
+    refused: Refused | None = None
+    try:
+        acknowledged = await sending
+    except Refused as error:
+        refused, acknowledged = error, False
+    if write.resyncs.after is not None:
+        try:
+            await write.device.driver.resync(talk, write.tag.span, write.resyncs.after)
+        except Refused as error:
+            raise Unclear(TWO_REPLIES) from error
+        if talk.traffic.extra:
+            raise Unclear(TWO_REPLIES)
+    if refused is not None:
+        raise refused
+    return acknowledged
 
 
 async def _confirm(job: Confirm, talk: Talk[Any]) -> Sent:

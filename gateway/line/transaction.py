@@ -18,6 +18,7 @@ MOST_REMEMBERED = 4096  # bytes of one reply
 @dataclass(slots=True, eq=False)
 class _Request:
     data: bytes
+    frame: Any
     answers: Callable[[Any], Any]
     until: float  # by the line's clock
     reply: int  # characters of the longest reply
@@ -66,9 +67,9 @@ class Transaction:
         self,
         channel: Channel,
         device: Device,
-        on_unmatched_frame: Callable[[Device, Any], None] | None = None,
+        on_unmatched_frame: Callable[[Device, Any, bool], None] | None = None,
     ) -> None:
-        """`on_unmatched_frame` gets each frame that is no reply, at once."""
+        """`on_unmatched_frame` gets each frame that is no reply, at once; True for an echo."""
         self.has_sent = False  # earlier bytes do not belong to it
         self.traffic = Traffic()
         self._channel = channel
@@ -116,7 +117,7 @@ class Transaction:
         channel.send(data)
         self.traffic.sent += len(data)
         future: asyncio.Future[T] = asyncio.get_running_loop().create_future()
-        request = _Request(data, answers, until, reply, future)
+        request = _Request(data, frame, answers, until, reply, future)
         self._open.append(request)
         try:
             answer = await future
@@ -238,12 +239,15 @@ class Transaction:
             late.arrived = True
             late.wake()
             return
+        is_echo = self.may_echo and any(frame == request.frame for request in self._open)
         station = self._device.settings.driver.station
         foreign = getattr(frame, "station", station) != station
         if self._stray is not Evidence.STATION:
             self._stray = Evidence.STATION if foreign else Evidence.SHAPE
+        if not is_echo and not foreign:
+            self.traffic.extra += 1
         if self._on_unmatched_frame is not None:
-            self._on_unmatched_frame(self._device, frame)
+            self._on_unmatched_frame(self._device, frame, is_echo)
 
     def _is_late_reply(self, late: _LateReply, frame: Any) -> bool:
         try:

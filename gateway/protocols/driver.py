@@ -5,7 +5,7 @@ synchronously. A `Driver` turns frames into words with `async def`; it can only 
 receive frames of the transaction it is given.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar, runtime_checkable
@@ -255,6 +255,33 @@ class StrayFrames(Protocol):
 
     def describe_stray(self, frame: Any) -> str | None:
         """Returns a phrase for the log; None for a frame that needs no explanation."""
+
+
+@runtime_checkable
+class UnnumberedReplies(Protocol):
+    """A driver whose replies name no request: they differ by shape only, kind and length."""
+
+    @property
+    def unnumbered(self) -> bool:
+        """False where the settings give each reply a number."""
+
+    def cost(self, span: Span) -> Cost | None:
+        """As in `Driver`."""
+
+    def reply_shape(self, span: Span) -> Hashable:
+        """Returns the shape of the reply to a read of `span`.
+
+        Replies of different shapes are never taken for each other.
+        """
+
+    def write_shapes(self, span: Span, units: Sequence[int]) -> Sequence[Hashable]:
+        """Returns the shapes of all replies to a write of `span`, in their order."""
+
+    def resync_shape(self, outstanding: Span | None, probe_token: int) -> Hashable:
+        """Returns the shape of the reply to `resync`; None where no other reply can have it."""
+
+    def is_reply(self, frame: Any) -> bool:
+        """Returns True for a reply of this station: for no request and no unsolicited frame."""
 
 
 @runtime_checkable

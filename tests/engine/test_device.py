@@ -68,7 +68,7 @@ def test_a_failed_probe_keeps_the_older_outstanding_request(dev: Device) -> None
 
 def test_a_reopened_line_keeps_the_outstanding_request(dev: Device) -> None:
     dev.health.answered()
-    dev.health.left_outstanding(Span("D", 0, 10))
+    dev.health.left_outstanding(Span("D", 0, 10), 0.0)
     dev.restart()
     assert dev.state is State.STARTING
     assert dev.health.needs_resync

@@ -6,10 +6,11 @@ log events, "-" for none; the next job. After "lost" the line closes instead.
 States: "failing" is a device whose last transaction failed; before polls, writes and commands its
 late reply has arrived, so it needs no resync. `retries` is 1: the second failure is the last.
 
-Jobs: "PollAgain" is the last retry, "PollReadBefore" a block that was read well before. A settling
-line is named by the job before it: "Last..." if that was the last failure, "NotSent" if nothing was
-sent, "Ambiguous" if the reply to a probe may answer an older request. "...Verify" is the same job
-for a tag with `verify`, "ConfirmBoth" for one with `verify` and `repeat`.
+Jobs: "PollAgain" is the last retry, of a longer span, "PollReadBefore" a block that was read well
+before. A settling line is named by the job before it: "Last..." if that was the last failure,
+"NotSent" if nothing was sent, "Ambiguous" if the reply to a probe may answer an older request.
+"...Verify" is the same job for a tag with `verify`, "ConfirmBoth" for one with `verify` and
+`repeat`.
 
 Results: "any-refusal" and "any-unclear" are several results with one row. "to-all" had no reply by
 design, "held" is read back as written, "differs" is not, "not-sent" failed before the first byte.
@@ -295,7 +296,7 @@ online   PollAgain             unsteady      online    bad:garbled              
 online   PollAgain             address       online    -                                    Poll
 online   PollAgain             damaged       online    bad:refused                          Idle
 online   PollAgain             busy          online    bad:refused                          Idle
-online   PollAgain             refused       online    bad:refused                          Idle
+online   PollAgain             refused       online    -                                    Poll
 online   PollAgain             any-unclear   failing   -                                    Settle
 online   PollAgain             lost          online    -                                    -
 online   PollReadBefore        units         online    good                                 Idle
@@ -338,7 +339,7 @@ failing  Poll                  unsteady      online    bad:garbled              
 failing  Poll                  address       online    -                                    Poll
 failing  Poll                  damaged       online    bad:refused                          Idle
 failing  Poll                  busy          online    bad:refused                          Idle
-failing  Poll                  refused       online    bad:refused                          Idle
+failing  Poll                  refused       online    -                                    Poll
 failing  Poll                  any-unclear   failing   -                                    Settle
 failing  Poll                  lost          failing   -                                    -
 failing  Write                 sent          online    written                              Poll

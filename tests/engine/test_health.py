@@ -158,9 +158,9 @@ def test_a_restart_keeps_the_pause_of_an_offline_device() -> None:
 
 def test_a_transaction_cut_off_by_the_loss_of_the_port_leaves_its_request_outstanding() -> None:
     found = health()
-    found.left_outstanding(SPAN)
+    found.left_outstanding(SPAN, 0.0)
     assert (found.state, found.needs_resync, found.outstanding) == (S.ONLINE, True, SPAN)
-    found.left_outstanding(None)
+    found.left_outstanding(None, 0.0)
     assert found.outstanding == SPAN
 
 
@@ -221,7 +221,7 @@ def test_a_device_that_cannot_answer_never_needs_a_resync(event: Event) -> None:
     found = health(S.STARTING, answerable=False)
     assert not found.needs_resync
     happen(found, event)
-    found.left_outstanding(SPAN)
+    found.left_outstanding(SPAN, 0.0)
     assert not found.needs_resync
 
 

@@ -5,6 +5,7 @@ import pytest
 from gateway.engine.device import LEARN_EVERY
 from gateway.engine.health import State
 from gateway.engine.jobs import Idle, Poll, Resynced, Settle, Settled, Traffic
+from gateway.engine.reply_shapes import QUIET
 from gateway.engine.results import BUSY_PAUSE
 from gateway.errors import DeviceError, Garbled, Refusal, Refused, Unsteady
 from gateway.tags import Quality, Reason
@@ -153,6 +154,7 @@ def test_a_block_that_was_read_before_is_asked_once_more_before_it_is_halved() -
     rig.conclude(poll, UNITS)
     assert polled(rig) is poll
     rig.conclude(poll, ADDRESS, REPLIED)
+    rig.now += QUIET
     assert rig.next() is poll
     rig.conclude(poll, ADDRESS, REPLIED)
     assert polled(rig).block.span.size < poll.block.span.size

@@ -66,7 +66,7 @@ def opened(
     channel = Channel(port, wire, WireLog("test"), Echo("test", echo))
     channel.quiet_since = quiet_since
     frames = [] if unmatched is None else unmatched
-    port.talk = Transaction(channel, device, lambda _, frame: frames.append(frame))
+    port.talk = Transaction(channel, device, lambda _, frame, echo: frames.append(frame))
     return port.talk
 
 

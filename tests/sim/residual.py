@@ -118,9 +118,10 @@ class Bench:
         """Returns the words after `times` equal reads (`verify_reads`), None after an
         error."""
         device = self.devices[times - 1]
+        block = device.blocks[0]
         talk = Direct(self.case, self.ask, self.hurt)
         try:
-            return list(finish(read_with_care(talk, device, device.blocks[0])))
+            return list(finish(read_with_care(talk, device, block, span=block.span)))
         except DeviceError:
             self.station.hear(b"\x00" * 300, self.now + 10.0)
             return None

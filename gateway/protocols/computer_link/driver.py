@@ -3,7 +3,7 @@
 Liyan Computer Link manual (Lylink-edoc0307), section numbers below are its own.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Literal, TypeVar
 
@@ -11,11 +11,13 @@ from gateway.errors import BadValue, ConfigError
 from gateway.protocols.computer_link.access import Access, possible, read_access, write_access
 from gateway.protocols.computer_link.codec import (
     ALL_STATIONS,
+    PC_ON_DEMAND,
     Ack,
     Enquiry,
     Frame,
     FrameFormat,
     LinkCodec,
+    Text,
 )
 from gateway.protocols.computer_link.devices import DEVICE, PROFILES, Profile, ProfileName
 from gateway.protocols.computer_link.replies import (
@@ -41,6 +43,7 @@ T = TypeVar("T")
 
 _TRAITS = Traits(baudrate=9600, format="7E1")
 _COUNT, _CODE = 2, 2  # characters of a count, of an error code
+_ACK = "ack"
 _SWITCH = {"1": "1", "on": "1", "true": "1", "0": "0", "off": "0", "false": "0"}
 
 
@@ -226,6 +229,30 @@ class ComputerLink:
         """Sends a loopback. No data reply has its letter Z; the rest is the `probe_token`."""
         await self._loopback(talk, f"Z{probe_token & 0xFFFF:04X}")
         return 0xFFFF
+
+    # The shapes of replies
+
+    @property
+    def unnumbered(self) -> bool:
+        return True
+
+    def reply_shape(self, span: Span) -> Hashable:
+        """The number of characters: data names no command and no device."""
+        cost = self.cost(span)
+        return None if cost is None else cost.reply
+
+    def write_shapes(self, span: Span, units: Sequence[int]) -> Sequence[Hashable]:
+        """Every write has the same acknowledgement."""
+        return (_ACK,)
+
+    def resync_shape(self, outstanding: Span | None, probe_token: int) -> Hashable:
+        """None: the letter Z and the token are no data of any other reply."""
+        return None
+
+    def is_reply(self, frame: Frame) -> bool:
+        """False for an enquiry, and for on-demand data."""
+        own = frame.station == self.station and not isinstance(frame, Enquiry)
+        return own and not (isinstance(frame, Text) and frame.pc == PC_ON_DEMAND)
 
     def from_this_station(self, frame: Frame) -> bool:
         return frame.station == self.station

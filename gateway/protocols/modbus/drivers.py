@@ -1,6 +1,6 @@
 """The Modbus drivers: RTU, ASCII and TCP, each a list of settings over the same master."""
 
-from collections.abc import Coroutine, Mapping, Sequence
+from collections.abc import Coroutine, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Literal
 
@@ -95,6 +95,22 @@ class _Modbus:
         self, talk: Talk[Frame], outstanding: Span | None, probe_token: int
     ) -> Coroutine[Any, Any, int]:
         return self._master.resync(talk, outstanding, probe_token)
+
+    @property
+    def unnumbered(self) -> bool:
+        return not self._master.numbered
+
+    def reply_shape(self, span: Span) -> Hashable:
+        return self._master.reply_shape(span)
+
+    def write_shapes(self, span: Span, units: Sequence[int]) -> Sequence[Hashable]:
+        return self._master.write_shapes(span, units)
+
+    def resync_shape(self, outstanding: Span | None, probe_token: int) -> Hashable:
+        return self._master.resync_shape(outstanding, probe_token)
+
+    def is_reply(self, frame: Frame) -> bool:
+        return isinstance(frame, Frame) and frame.station == self.station
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,6 +1,6 @@
 """The master's side of Modbus: requests to one device and their replies, without framing."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import count, repeat
 from typing import NamedTuple
@@ -212,6 +212,34 @@ class Master:
             other = next(p for p in places.values() if p.function != place.function).area
             return [Span(other.name, other.first, 1)]
         return [Span(area.name, min(near.start, area.last + 1 - n), n) for n in sizes]
+
+    # The shapes of replies
+
+    def reply_shape(self, span: Span) -> Hashable:
+        """Function and byte count: a reply to a read names no address."""
+        place = self._place(span)
+        if place is None:
+            return None
+        registers = span.size * place.registers
+        count = (registers + 7) // 8 if _is_bits(place) else 2 * registers
+        return bytes((place.function, count & 0xFF))
+
+    def write_shapes(self, span: Span, units: Sequence[int]) -> Sequence[Hashable]:
+        """The whole reply: it repeats the address, and the value or the count."""
+        try:
+            request = self._write_request(span, units)
+        except BadValue:
+            return (None,)
+        if self.dialect.forgets_address and request[0] == 6:
+            return (request[:1] + bytes(2) + request[3:],)
+        return (request[:5],)
+
+    def resync_shape(self, outstanding: Span | None, probe_token: int) -> Hashable:
+        """None for function 08 with its token."""
+        if self.diagnostics:
+            return None
+        harmless = self._harmless(outstanding)
+        return self.reply_shape(harmless[probe_token % len(harmless)])
 
     async def _loopback(self, talk: Talk[Frame], token: int) -> None:
         request = pdu.loopback_request(token)

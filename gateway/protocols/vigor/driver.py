@@ -1,7 +1,7 @@
 """Reads and writes the devices of Vigor M, VB and VH PLCs over the computer link (manual B-5)."""
 
 import struct
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import ClassVar, Literal
@@ -155,13 +155,38 @@ class Vigor:
         An error reply names no request: it may be the late reply to the `outstanding` read, so
         one more read with another number of bytes follows it.
         """
-        late = cover(outstanding) if outstanding is not None else None
-        sizes = [size for size in _PROBE_SIZES if late is None or size != late.size]
+        sizes = _probe_sizes(outstanding)
         try:
             await self._read_bytes(talk, 0x0080, sizes[probe_token % len(sizes)])
         except Refused:
             await self._read_bytes(talk, 0x0080, sizes[(probe_token + 1) % len(sizes)])
         return len(sizes) // 2
+
+    # The shapes of replies
+
+    @property
+    def unnumbered(self) -> bool:
+        return True
+
+    def reply_shape(self, span: Span) -> Hashable:
+        """The number of bytes: a reply names station and command, but no address."""
+        covered = cover(span)
+        return None if covered is None else covered.size
+
+    def write_shapes(self, span: Span, units: Sequence[int]) -> Sequence[Hashable]:
+        """The command. Bits that do not fill their bytes are read just before."""
+        if _forced(span):
+            return (FORCE_ON if units[0] else FORCE_OFF,)
+        covered = cover(span)
+        neighbours = covered is not None and (covered.ahead or covered.behind)
+        return (self.reply_shape(span), WRITE) if neighbours else (WRITE,)
+
+    def resync_shape(self, outstanding: Span | None, probe_token: int) -> Hashable:
+        sizes = _probe_sizes(outstanding)
+        return sizes[probe_token % len(sizes)]
+
+    def is_reply(self, frame: Frame) -> bool:
+        return isinstance(frame, Reply) and frame.station == self.station
 
     async def _read_bytes(self, talk: Talk[Frame], address: int, count: int) -> bytes:
         request = _read_request(self.station, address, count)
@@ -180,6 +205,11 @@ class Vigor:
         bits = bits_from_bytes(await self._read_bytes(talk, covered.address, covered.size))
         bits[covered.ahead : len(bits) - covered.behind] = units
         return bits
+
+
+def _probe_sizes(outstanding: Span | None) -> Sequence[int]:
+    late = cover(outstanding) if outstanding is not None else None
+    return [size for size in _PROBE_SIZES if late is None or size != late.size]
 
 
 def _forced(span: Span) -> bool:

@@ -1,0 +1,173 @@
+"""Alternates the shapes of a device's replies, so that an extra reply matches no request.
+
+Replies without a number are told apart by shape: kind and length. If a station or a device server
+repeats one reply, every later reply answers the request before its own. So requests in quick
+succession to one device do not expect replies of one shape: where they would, one reads some
+addresses more. An extra reply then arrives as a stray frame.
+"""
+
+from collections.abc import Hashable, Iterator, Mapping
+
+from gateway.planning.planner import Block
+from gateway.protocols.driver import AnyDriver, Span, UnnumberedReplies
+from gateway.tags import Tag
+
+QUIET = 0.25  # seconds after a reply in which an extra reply would have arrived
+MARK_FIRST, MARK_LONGEST = 60.0, 600.0  # seconds between two resyncs on a wire that is never quiet
+SHOWN = 60.0  # seconds for which an extra reply explains the state of the device
+LONGEST_STEP = 16  # addresses by which a read may grow, to reach the next byte of bits
+MOST_CHOICES = 3  # shapes of one block: an extra reply that is late by two requests is noticed
+MOST_FAILED = 3  # reads in a row of the longer span without a reply
+NEVER = float("inf")
+
+
+Choice = tuple[Span, Hashable]  # a span to read, and the shape of its reply
+
+
+class ReplyShapes:
+    """The last replies of one device. Times in seconds of the line's clock."""
+
+    __slots__ = (
+        "_acked",
+        "_choices",
+        "_driver",
+        "_failed",
+        "_hull",
+        "_mark",
+        "_refused",
+        "_used",
+        "at",
+        "extra_at",
+        "last",
+        "proven",
+        "span",
+    )
+
+    def __init__(self, driver: UnnumberedReplies, tags: Mapping[str, tuple[int, int]]) -> None:
+        """`tags`: the first and last address of the tags, by area."""
+        self.last: Hashable = None  # shape of the reply to the last request
+        self._used: dict[Hashable, float] = {}  # when a reply of each shape was expected last
+        self.span: Span | None = None  # of the last read
+        self.at = -NEVER  # when the last transaction ended
+        self.proven = 0.0  # values read before are no extra replies
+        self.extra_at = -NEVER  # when an extra reply arrived
+        self._refused = -NEVER  # when the last error reply arrived
+        self._acked: tuple[Hashable, float] = (None, -NEVER)  # the last acknowledgement, and when
+        self._mark = MARK_FIRST
+        self._driver = driver
+        self._hull = tags
+        self._choices: dict[Span, list[Choice]] = {}
+        self._failed: dict[Span, int] = {}
+
+    def polled(self, block: Block, now: float) -> Span:
+        """Returns the span to read for the block: its own, or a longer one around it."""
+        span = block.span
+        if block.listed:
+            self.sent(block.cost.reply, now)
+            return span
+        choices = self._choices.get(span) or self._choose(span)
+        used = self._used
+        read, shape = choices[0]
+        if now - self.at >= QUIET:
+            self.proven = now
+        elif now - used.get(shape, -NEVER) < QUIET:
+            read, shape = min(choices, key=lambda choice: used.get(choice[1], -NEVER))
+        used[shape] = now
+        self.last, self.span = shape, read
+        return read
+
+    def sent(self, shape: Hashable, now: float) -> None:
+        """Notes a request that is no poll, and the shape of its last reply."""
+        if now - self.at >= QUIET:
+            self.proven = now
+        self.last = shape
+        self._used[shape] = now
+
+    def is_recent(self, shape: Hashable, now: float) -> bool:
+        """Returns True if a second reply of this shape may still arrive."""
+        return now - self._used.get(shape, -NEVER) < QUIET
+
+    def may_be_extra(self, shape: Hashable, now: float) -> bool:
+        """Returns True if an earlier reply to a write, or a refusal, may arrive once more."""
+        acked, at = self._acked
+        return (shape == acked and now - at < QUIET) or now - self._refused < QUIET
+
+    def acknowledged(self, now: float) -> None:
+        """Notes that the last request, a write, was acknowledged."""
+        self._acked = (self.last, now)
+
+    def refused(self, now: float) -> None:
+        """Notes an error reply."""
+        self._refused = now
+
+    def marked(self, now: float) -> None:
+        """Notes a resync: its reply shows that no extra reply is waiting."""
+        self.proven = now
+        self._mark = min(2 * self._mark, MARK_LONGEST)
+
+    def needs_mark(self, now: float) -> bool:
+        """Returns True if the wire was not quiet for so long that a resync must show the order."""
+        return now - self.proven >= self._mark and now - self.at < QUIET
+
+    def extra_arrived(self, now: float) -> None:
+        """Notes an extra reply."""
+        self.extra_at = now
+        self._mark = MARK_FIRST
+
+    @property
+    def answers_twice(self) -> bool:
+        """True if an extra reply arrived recently."""
+        return self.at - self.extra_at < SHOWN
+
+    # The longer span
+
+    def refused_longer(self, span: Span) -> None:
+        """Reads the span alone from now on: the addresses beside it do not exist."""
+        self._choices[span] = self._choices[span][:1]
+
+    def read_longer(self, span: Span, *, replied: bool) -> None:
+        """Counts reads of the longer span without a reply. Some stations refuse by silence."""
+        failed = 0 if replied else self._failed.get(span, 0) + 1
+        self._failed[span] = failed
+        if failed >= MOST_FAILED:
+            self.refused_longer(span)
+
+    def restart(self) -> None:
+        """Starts again after the device came online: it may have other addresses now."""
+        self._choices.clear()
+        self._failed.clear()
+
+    def _choose(self, span: Span) -> list[Choice]:
+        """Returns the span, and longer ones whose replies have other shapes."""
+        found: dict[Hashable, Span] = {self._driver.reply_shape(span): span}
+        for longer in self._longer(span):
+            found.setdefault(self._driver.reply_shape(longer), longer)
+            if len(found) == MOST_CHOICES:
+                break
+        choices = [(read, shape) for shape, read in found.items()]
+        self._choices[span] = choices
+        return choices
+
+    def _longer(self, span: Span) -> Iterator[Span]:
+        """Yields spans around `span` that one request reads, those among the tags first."""
+        area, start, size = span
+        first, last = self._hull.get(area, (start, start))
+        steps = range(1, LONGEST_STEP + 1)
+        both = [Span(area, start, size + n) for n in steps]
+        both += [Span(area, start - n, size + n) for n in steps if start >= n]
+        among = [s for s in both if first <= s.start and s.start + s.size - 1 <= last]
+        for longer in [*among, *both]:
+            if self._driver.cost(longer) is not None:
+                yield longer
+
+
+def reply_shapes(driver: AnyDriver, tags: list[Tag]) -> ReplyShapes | None:
+    """Returns the shapes of a device's replies; None where replies carry a number."""
+    if not isinstance(driver, UnnumberedReplies) or not driver.unnumbered:
+        return None
+    hull: dict[str, tuple[int, int]] = {}
+    for tag in tags:
+        area, start, size = tag.span
+        first, last = hull.get(area, (start, start))
+        hull[area] = (min(first, start), max(last, start + size - 1))
+    return ReplyShapes(driver, hull)

@@ -1,0 +1,188 @@
+"""Device servers that repeat a reply, a second master, and stations that are held up."""
+
+import asyncio
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import pytest
+
+from gateway.engine.health import State
+from gateway.errors import Refused, Unclear
+from gateway.protocols.computer_link import ComputerLink
+from gateway.protocols.driver import AnyDriver
+from gateway.protocols.modbus import ModbusAscii, ModbusRtu
+from gateway.protocols.vigor import Vigor
+from gateway.simulator.plant import station_for
+from gateway.stations.modbus import ModbusStation
+from gateway.tags import Quality, Tag, WriteRule
+from tests.line.device_server import GUARD, DeviceServer, behind
+from tests.sim.bench import WIRE
+from tests.sim.plant import Plant, made_device, make_tag, running
+from tests.sim.virtual import now, on_virtual_time
+
+DRIVERS = [
+    ModbusRtu(station=1),
+    ModbusAscii(station=1),
+    Vigor(station=1),
+    ComputerLink(station=1, monitor=False),
+]
+by_protocol = pytest.mark.parametrize("driver", DRIVERS, ids=lambda driver: driver.protocol)
+
+
+@dataclass
+class Repeater(DeviceServer):
+    """Sends the replies in `twice` (by number) a second time, `after` seconds later."""
+
+    twice: set[int] = field(default_factory=set)
+    after: float = 0.0
+    replies: int = 0
+
+    def lacks(self, *places: tuple[str, int]) -> None:
+        """The addresses that the station lacks from now on."""
+        if isinstance(self._station, ModbusStation):
+            store: Any = self._station._store
+            store._holes = [(area, number, number) for area, number in places]
+        else:
+            self._station.holes = set(places)
+
+    def received(self, data: bytes) -> None:
+        super().received(data)
+        self.replies += 1
+        if self.replies in self.twice:
+            loop = asyncio.get_running_loop()
+            loop.call_later(self.latency + self.after, super().received, data)
+
+
+def area_of(driver: AnyDriver) -> str:
+    return "holding:" if driver.protocol.startswith("modbus") else "D"
+
+
+def numbered(driver: AnyDriver, *numbers: int, every: float = 0.01, **settings: Any) -> list[Tag]:
+    """Words far apart, each a block of its own; each holds its own number."""
+    return [
+        make_tag(f"{area_of(driver)}{n}", driver, type="uint16", every=every, **settings)
+        for n in numbers
+    ]
+
+
+def wrong_values(line: Plant) -> list[tuple[float, str, object]]:
+    good = [(at, sample) for at, sample in line.reported if sample.quality is Quality.GOOD]
+    return [
+        (at, sample.tag.text, sample.value)
+        for at, sample in good
+        if sample.value != sample.tag.address.number
+    ]
+
+
+@by_protocol
+@pytest.mark.parametrize("after", [0.0, 0.01, 0.03])
+@on_virtual_time
+async def test_no_value_moves_to_the_next_tag_after_a_repeated_reply(
+    driver: AnyDriver, after: float
+) -> None:
+    server = Repeater(twice={50, 99, 231}, after=after)
+    tags = numbered(driver, 100, 200, 300, 400, 500)
+    line, dev, memory = behind(server, driver, *tags)
+    for number in range(1000):
+        memory.write(area_of(driver).strip(":"), number, [number])
+    async with running(line):
+        await asyncio.sleep(12)
+        assert server.replies > 240
+        assert dev.state is State.ONLINE
+        assert line.good(dev)
+    assert wrong_values(line) == []
+
+
+@by_protocol
+@on_virtual_time
+async def test_the_diagnosis_says_that_the_station_answers_twice(driver: AnyDriver) -> None:
+    server = Repeater(twice={50})
+    line, dev, _ = behind(server, driver, *numbered(driver, 100, 200, 300))
+    async with running(line):
+        while server.replies < 50:
+            await asyncio.sleep(0.01)
+        await asyncio.sleep(1)
+        assert "Answers twice: a second master" in dev.diagnosis()
+        await asyncio.sleep(120)
+        assert dev.diagnosis() == ""
+
+
+@by_protocol
+@pytest.mark.parametrize("after", [0.0, 0.005, 0.02, 0.05, 0.07])
+@on_virtual_time
+async def test_a_repeated_acknowledgement_confirms_no_other_write(
+    driver: AnyDriver, after: float
+) -> None:
+    """The second write is refused: the PLC no longer has the address."""
+    target = make_tag(f"{area_of(driver)}100", driver, name="target", write=WriteRule())
+    place = (area_of(driver).strip(":"), 100)
+    server = Repeater(after=after)
+    line, dev, memory = behind(server, driver, *numbered(driver, 200, 300, 400), target)
+    async with running(line):
+        for value in range(12):
+            await asyncio.sleep(1.0 + 0.013 * value)
+            server.twice = {server.replies + n for n in (1, 2, 3)}
+            await line.line.write(dev, target, [value])
+            server.lacks(place)
+            second = line.submit(dev, target, 1000 + value)
+            await asyncio.sleep(3)
+            server.lacks()
+            assert isinstance(second.once, Refused | Unclear)
+            assert memory.read(*place) == [value]
+
+
+@dataclass
+class TwoLinks(DeviceServer):
+    """A port with two radio links behind it: the replies of station 2 are held up at times."""
+
+    stations: list[Any] = field(default_factory=list)
+    held: list[bytes] | None = None  # replies of station 2 that wait
+
+    async def open(self, stations: Any, wire: Any, ear: Any) -> "TwoLinks":
+        self.ear, self.stations = ear, list(stations)
+        self.flows.set()
+        self._task = asyncio.create_task(self._serve())
+        return self
+
+    async def _serve(self) -> None:
+        while True:
+            request = await self._queue.get()
+            await asyncio.sleep(len(request) * WIRE.character + 0.005)
+            for number, station in enumerate(self.stations, 1):
+                for answer in station.hear(request, now()):
+                    await asyncio.sleep(len(answer) * WIRE.character)
+                    if number == 2 and self.held is not None:
+                        self.held.append(answer)
+                    else:
+                        self.received(answer)
+
+    def release(self) -> None:
+        held, self.held = self.held or [], None
+        for answer in held:
+            self.received(answer)
+
+
+@pytest.mark.parametrize("kind", [ModbusRtu, ModbusAscii, Vigor])
+@on_virtual_time
+async def test_other_stations_prove_nothing_for_one_that_is_held_up(kind: Any) -> None:
+    devices = []
+    server = TwoLinks()
+    for number in (1, 2):
+        driver = kind(station=number)
+        tags = numbered(driver, 100, 101, 200, 300, 301, 302, every=0.5)
+        timing = replace(driver.timing, retries=6, reply_timeout=0.3)
+        devices.append(made_device(f"plc{number}", driver, WIRE, timing, tags, GUARD))
+    stations = [station_for(device.driver, []) for device in devices]
+    for station in stations:
+        for n in range(1000):
+            station.memory.write(area_of(devices[0].driver).strip(":"), n, [n])
+    line = Plant(devices, stations, server, WIRE)  # type: ignore[arg-type]
+    async with running(line):
+        for phase in range(15):
+            await asyncio.sleep(10 + 0.13 * phase)
+            server.held = []
+            await asyncio.sleep(2.0 + 0.8 * phase)
+            server.release()
+        await asyncio.sleep(20)
+        assert all(line.good(device) for device in devices)
+    assert wrong_values(line) == []
