@@ -3,6 +3,7 @@
 import math
 from collections import defaultdict
 from collections.abc import Sequence
+from statistics import fmean
 from typing import NamedTuple
 
 from gateway.engine.device import Device
@@ -23,8 +24,9 @@ def polled_blocks(devices: Sequence[Device]) -> list[PolledBlock]:
 
 
 def polled_block(device: Device, block: Block) -> PolledBlock:
-    """Returns the block with the time of one poll, which reads it `verify_reads` times."""
-    return PolledBlock(device, block, device.settings.verify_reads * device.seconds(block.cost))
+    """Returns the block with the mean time of one poll, which reads it `verify_reads` times."""
+    seconds = fmean(device.poll_seconds(block))
+    return PolledBlock(device, block, device.settings.verify_reads * seconds)
 
 
 def load_of(blocks: Sequence[PolledBlock]) -> float:

@@ -1,6 +1,7 @@
 """One device on a line: its settings, its plan, its health and its record."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -163,6 +164,14 @@ class Device:
         if self._lists:
             blocks = with_monitor_list(blocks, self.driver, self.seconds, bad.bad.keys())
         self.blocks = blocks
+        if self.shapes is not None:
+            self.shapes.planned(blocks)
+
+    def poll_seconds(self, block: Block) -> Sequence[float]:
+        """Returns the seconds of one poll of the block: of each span that may be read for it."""
+        if self.shapes is None:
+            return [self.seconds(block.cost)]
+        return [self.seconds(cost) for cost in self.shapes.costs(block)]
 
     def poll_nothing(self) -> None:
         """Removes all polls: only requests of clients are sent."""

@@ -58,7 +58,7 @@ def forecast(name: str, devices: Sequence[Device], wire: WireTiming) -> LineFore
     """Calculates the forecast of a line from the plans of its devices."""
     blocks = polled_blocks(devices)
     load = load_of(blocks)
-    longest = max((one.seconds for one in blocks), default=0.0)
+    longest = max((_longest(device, block) for device, block, _ in blocks), default=0.0)
     write = max((_longest_write(device) for device in devices), default=0.0)
     silence = max((device.longest_reply for device in devices), default=0.0)
     cycle = sum(one.seconds for one in blocks)
@@ -78,6 +78,11 @@ def forecast(name: str, devices: Sequence[Device], wire: WireTiming) -> LineFore
         shortest=sum(_round(device) for device in devices) if load > 1 else cycle,
         unsolicited=tuple((device, tags) for device, tags in unsolicited if tags),
     )
+
+
+def _longest(device: Device, block: Block) -> float:
+    """Returns the seconds of the longest poll of the block."""
+    return device.settings.verify_reads * max(device.poll_seconds(block))
 
 
 def _unsolicited_tags(device: Device) -> int:

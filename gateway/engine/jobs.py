@@ -220,7 +220,7 @@ def resync_around(job: Transacted, shapes: ReplyShapes, now: float) -> None:
         case Confirm(write=write):
             last = driver.reply_shape(write.tag.span)
         case Command():
-            again = shapes.may_be_extra(shapes.last, now)
+            again = shapes.may_be_extra(None, now)
             job.resyncs = Resyncs(before=device.health.next_probe_token() if again else None)
         case Write(tag=tag) | WriteTogether(writes=[Write(tag=tag), *_]):
             first = job if isinstance(job, Write) else job.writes[0]

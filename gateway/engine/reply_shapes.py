@@ -6,10 +6,11 @@ succession to one device do not expect replies of one shape: where they would, o
 addresses more. An extra reply then arrives as a stray frame.
 """
 
-from collections.abc import Hashable, Iterator, Mapping
+from collections import Counter
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 
 from gateway.planning.planner import Block
-from gateway.protocols.driver import AnyDriver, Span, UnnumberedReplies
+from gateway.protocols.driver import AnyDriver, Cost, Span, UnnumberedReplies
 from gateway.tags import Tag
 
 QUIET = 0.25  # seconds after a reply in which an extra reply would have arrived
@@ -35,6 +36,7 @@ class ReplyShapes:
         "_hull",
         "_mark",
         "_refused",
+        "_shapes",
         "_used",
         "at",
         "extra_at",
@@ -57,6 +59,7 @@ class ReplyShapes:
         self._driver = driver
         self._hull = tags
         self._choices: dict[Span, list[Choice]] = {}
+        self._shapes: Counter[Hashable] = Counter()  # of the planned blocks
         self._failed: dict[Span, int] = {}
 
     def polled(self, block: Block, now: float) -> Span:
@@ -65,13 +68,17 @@ class ReplyShapes:
         if block.listed:
             self.sent(block.cost.reply, now)
             return span
-        choices = self._choices.get(span) or self._choose(span)
+        choices = self._choices.get(span)
+        if choices is None:
+            choices = self._choices[span] = self._choose(span)
         used = self._used
-        read, shape = choices[0]
+        shape, read = choices[0][1], span  # the caller tells the block's own span by identity
         if now - self.at >= QUIET:
             self.proven = now
         elif now - used.get(shape, -NEVER) < QUIET:
-            read, shape = min(choices, key=lambda choice: used.get(choice[1], -NEVER))
+            best = min(choices, key=lambda choice: used.get(choice[1], -NEVER))
+            if best is not choices[0]:
+                read, shape = best
         used[shape] = now
         self.last, self.span = shape, read
         return read
@@ -88,12 +95,16 @@ class ReplyShapes:
         return now - self._used.get(shape, -NEVER) < QUIET
 
     def may_be_extra(self, shape: Hashable, now: float) -> bool:
-        """Returns True if an earlier reply to a write, or a refusal, may arrive once more."""
+        """Returns True if an earlier reply to a write, or a refusal, may arrive once more.
+
+        `shape` of the expected reply; None: unknown.
+        """
         acked, at = self._acked
-        return (shape == acked and now - at < QUIET) or now - self._refused < QUIET
+        alike = shape == acked or shape is None or acked is None
+        return (alike and now - at < QUIET) or now - self._refused < QUIET
 
     def acknowledged(self, now: float) -> None:
-        """Notes that the last request, a write, was acknowledged."""
+        """Notes that the last request, a write or command, was acknowledged."""
         self._acked = (self.last, now)
 
     def refused(self, now: float) -> None:
@@ -118,6 +129,18 @@ class ReplyShapes:
     def answers_twice(self) -> bool:
         """True if an extra reply arrived recently."""
         return self.at - self.extra_at < SHOWN
+
+    # Forecast
+
+    def planned(self, blocks: Sequence[Block]) -> None:
+        """Notes the blocks of a new plan."""
+        self._shapes = Counter(self._driver.reply_shape(block.span) for block in blocks)
+
+    def costs(self, block: Block) -> list[Cost]:
+        """Returns the costs of the spans that are read for the block."""
+        alone = block.listed or self._shapes[self._driver.reply_shape(block.span)] < 2
+        spans = [] if alone else [span for span, _ in self._choose(block.span)]
+        return [cost for span in spans if (cost := self._driver.cost(span))] or [block.cost]
 
     # The longer span
 
@@ -144,9 +167,7 @@ class ReplyShapes:
             found.setdefault(self._driver.reply_shape(longer), longer)
             if len(found) == MOST_CHOICES:
                 break
-        choices = [(read, shape) for shape, read in found.items()]
-        self._choices[span] = choices
-        return choices
+        return [(read, shape) for shape, read in found.items()]
 
     def _longer(self, span: Span) -> Iterator[Span]:
         """Yields spans around `span` that one request reads, those among the tags first."""

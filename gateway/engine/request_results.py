@@ -152,6 +152,8 @@ class RequestResults:
         elif isinstance(result, str):
             if traffic.exchanges:
                 self._results.answered(device, now, time)
+                if device.shapes is not None:
+                    device.shapes.acknowledged(now)
             else:
                 self._pause(device)
         if not isinstance(result, str | Exception):
