@@ -207,32 +207,23 @@ def span_of(job: Unfinished) -> Span | None:
 
 
 def resync_around(job: Transacted, shapes: ReplyShapes, now: float) -> None:
-    """Notes a request that is no poll.
-
-    A write whose acknowledgement may be an extra reply to an earlier one is followed by a resync.
-    If a request begins with a read whose reply may be an extra one, a resync precedes it.
-    """
+    """Notes a request that is no poll, and adds the resyncs that it needs."""
     device, last = job.device, None
     driver = cast("UnnumberedReplies", device.driver)
+    token = device.health.next_probe_token
     match job:
-        case Probe(outstanding=outstanding, token=token):
-            last = driver.resync_shape(outstanding, token)
+        case Write() | WriteTogether():
+            write = job if isinstance(job, Write) else job.writes[0]
+            before, after = shapes.written(write.tag, write.units, now)
+            write.resyncs = Resyncs(token() if before else None, token() if after else None)
+            return
+        case Command():
+            before = shapes.may_be_extra(None, now)
+            job.resyncs = Resyncs(before=token() if before else None)
+        case Probe(outstanding=outstanding, token=marked):
+            last = driver.resync_shape(outstanding, marked)
         case Confirm(write=write):
             last = driver.reply_shape(write.tag.span)
-        case Command():
-            again = shapes.may_be_extra(None, now)
-            job.resyncs = Resyncs(before=device.health.next_probe_token() if again else None)
-        case Write(tag=tag) | WriteTogether(writes=[Write(tag=tag), *_]):
-            first = job if isinstance(job, Write) else job.writes[0]
-            replies = driver.write_shapes(tag.span, first.units)
-            if tag.address.bit is not None:
-                replies = (driver.reply_shape(tag.span), None)
-            before = len(replies) > 1 and shapes.is_recent(replies[0], now)
-            last = replies[-1]
-            first.resyncs = Resyncs(
-                device.health.next_probe_token() if before else None,
-                device.health.next_probe_token() if shapes.may_be_extra(last, now) else None,
-            )
     shapes.sent(last, now)
 
 

@@ -32,7 +32,6 @@ class ReplyShapes:
         "_acked",
         "_choices",
         "_driver",
-        "_failed",
         "_hull",
         "_mark",
         "_refused",
@@ -40,7 +39,9 @@ class ReplyShapes:
         "_used",
         "at",
         "extra_at",
+        "failed",
         "last",
+        "mark_due",
         "proven",
         "span",
     )
@@ -52,6 +53,7 @@ class ReplyShapes:
         self.span: Span | None = None  # of the last read
         self.at = -NEVER  # when the last transaction ended
         self.proven = 0.0  # values read before are no extra replies
+        self.mark_due = 0.0  # when a resync must show the order, if the wire is not quiet before
         self.extra_at = -NEVER  # when an extra reply arrived
         self._refused = -NEVER  # when the last error reply arrived
         self._acked: tuple[Hashable, float] = (None, -NEVER)  # the last acknowledgement, and when
@@ -60,7 +62,7 @@ class ReplyShapes:
         self._hull = tags
         self._choices: dict[Span, list[Choice]] = {}
         self._shapes: Counter[Hashable] = Counter()  # of the planned blocks
-        self._failed: dict[Span, int] = {}
+        self.failed: dict[Span, int] = {}  # reads of longer spans in a row without a reply
 
     def polled(self, block: Block, now: float) -> Span:
         """Returns the span to read for the block: its own, or a longer one around it."""
@@ -74,7 +76,7 @@ class ReplyShapes:
         used = self._used
         shape, read = choices[0][1], span  # the caller tells the block's own span by identity
         if now - self.at >= QUIET:
-            self.proven = now
+            self._prove(now)
         elif now - used.get(shape, -NEVER) < QUIET:
             best = min(choices, key=lambda choice: used.get(choice[1], -NEVER))
             if best is not choices[0]:
@@ -86,13 +88,23 @@ class ReplyShapes:
     def sent(self, shape: Hashable, now: float) -> None:
         """Notes a request that is no poll, and the shape of its last reply."""
         if now - self.at >= QUIET:
-            self.proven = now
+            self._prove(now)
         self.last = shape
         self._used[shape] = now
 
-    def is_recent(self, shape: Hashable, now: float) -> bool:
-        """Returns True if a second reply of this shape may still arrive."""
-        return now - self._used.get(shape, -NEVER) < QUIET
+    def written(self, tag: Tag, units: Sequence[int], now: float) -> tuple[bool, bool]:
+        """Notes a write. Returns True where a resync must precede it, and follow it.
+
+        It precedes where the write begins with a read whose reply may be an extra one. It follows
+        where the acknowledgement may be an extra one.
+        """
+        replies = self._driver.write_shapes(tag.span, units)
+        if tag.address.bit is not None:  # the word is read first
+            replies = (self._driver.reply_shape(tag.span), None)
+        used = self._used.get(replies[0], -NEVER)
+        before, after = now - used < QUIET, self.may_be_extra(replies[-1], now)
+        self.sent(replies[-1], now)
+        return before and len(replies) > 1, after
 
     def may_be_extra(self, shape: Hashable, now: float) -> bool:
         """Returns True if an earlier reply to a write, or a refusal, may arrive once more.
@@ -113,12 +125,11 @@ class ReplyShapes:
 
     def marked(self, now: float) -> None:
         """Notes a resync: its reply shows that no extra reply is waiting."""
-        self.proven = now
         self._mark = min(2 * self._mark, MARK_LONGEST)
+        self._prove(now)
 
-    def needs_mark(self, now: float) -> bool:
-        """Returns True if the wire was not quiet for so long that a resync must show the order."""
-        return now - self.proven >= self._mark and now - self.at < QUIET
+    def _prove(self, now: float) -> None:
+        self.proven, self.mark_due = now, now + self._mark
 
     def extra_arrived(self, now: float) -> None:
         """Notes an extra reply."""
@@ -150,15 +161,16 @@ class ReplyShapes:
 
     def read_longer(self, span: Span, *, replied: bool) -> None:
         """Counts reads of the longer span without a reply. Some stations refuse by silence."""
-        failed = 0 if replied else self._failed.get(span, 0) + 1
-        self._failed[span] = failed
-        if failed >= MOST_FAILED:
-            self.refused_longer(span)
+        failed = self.failed.pop(span, 0) + 1
+        if not replied:
+            self.failed[span] = failed
+            if failed >= MOST_FAILED:
+                self.refused_longer(span)
 
     def restart(self) -> None:
         """Starts again after the device came online: it may have other addresses now."""
         self._choices.clear()
-        self._failed.clear()
+        self.failed.clear()
 
     def _choose(self, span: Span) -> list[Choice]:
         """Returns the span, and longer ones whose replies have other shapes."""

@@ -63,8 +63,9 @@ class Results:
         health, last = device.health, poll.last
         if health.needs_resync or health.state is not State.ONLINE:
             self.answered(device, now, time)
-        if poll.span is not block.span and device.shapes is not None:
-            device.shapes.read_longer(block.span, replied=True)
+        shapes = device.shapes
+        if poll.span is not block.span and shapes is not None and shapes.failed:
+            shapes.read_longer(block.span, replied=True)
         counts = poll.counts
         if last.at is not None:
             gap = now - last.at

@@ -8,6 +8,7 @@ from gateway.engine.device import Device
 from gateway.engine.health import PAUSE_LONGEST, State
 from gateway.engine.jobs import EXPEDITED, NOT_QUEUED, Idle, LastRead, Poll, Probe
 from gateway.engine.poll_queue import PollQueue
+from gateway.engine.reply_shapes import QUIET
 from gateway.engine.requests import Request, RequestQueue
 from gateway.planning.planner import Block
 from gateway.tags import Tag
@@ -152,7 +153,7 @@ class Schedule:
         if not expedited and len(self.devices) > 1 and poll.deadline < now:
             poll = self._fairest(now)
         shapes = poll.device.shapes
-        if shapes is not None and shapes.needs_mark(now):
+        if shapes is not None and shapes.mark_due <= now < shapes.at + QUIET:
             poll.device.health.left_outstanding(shapes.span, now)
         if poll.device.health.needs_resync:
             other = self._first_without_resync() if now < self._failing_lane else None
