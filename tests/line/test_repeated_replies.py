@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from gateway.engine.health import State
-from gateway.errors import Refused, Unclear
+from gateway.errors import LineDown, Refused, Unclear
 from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.driver import AnyDriver
 from gateway.protocols.modbus import ModbusAscii, ModbusRtu
@@ -156,15 +156,22 @@ class TwoLinks(DeviceServer):
                     else:
                         self.received(answer)
 
-    def release(self) -> None:
+    async def release(self, pause: float) -> None:
+        """Delivers them in order, with a pause after each of the first; the rest at once."""
+        for _ in range(len(self.held or [])):
+            self.received(self.held.pop(0))  # type: ignore[union-attr]
+            await asyncio.sleep(pause)
         held, self.held = self.held or [], None
         for answer in held:
             self.received(answer)
 
 
+@pytest.mark.parametrize("pause", [0.0, 0.05, 0.35])
 @pytest.mark.parametrize("kind", [ModbusRtu, ModbusAscii, Vigor])
 @on_virtual_time
-async def test_other_stations_prove_nothing_for_one_that_is_held_up(kind: Any) -> None:
+async def test_other_stations_prove_nothing_for_one_that_is_held_up(
+    kind: Any, pause: float
+) -> None:
     devices = []
     server = TwoLinks()
     for number in (1, 2):
@@ -181,8 +188,51 @@ async def test_other_stations_prove_nothing_for_one_that_is_held_up(kind: Any) -
         for phase in range(15):
             await asyncio.sleep(10 + 0.13 * phase)
             server.held = []
-            await asyncio.sleep(2.0 + 0.8 * phase)
-            server.release()
+            await asyncio.sleep(2.0 + 2.3 * phase)
+            await server.release(pause)
         await asyncio.sleep(20)
         assert all(line.good(device) for device in devices)
+    assert wrong_values(line) == []
+
+
+@dataclass
+class Serial(DeviceServer):
+    """A device server whose serial side goes on while the connection is reset."""
+
+    async def open(self, stations: Any, wire: Any, ear: Any) -> "Serial":
+        self.ear, (self._station,) = ear, stations
+        if self._task is None:
+            self.flows.set()
+            self._task = asyncio.create_task(self._serve())
+        return self
+
+    async def close(self) -> None:
+        self.ear = None
+
+    def reset(self) -> None:
+        ear, self.ear = self.ear, None
+        if ear is not None:
+            ear.lost(LineDown("connection reset"))
+
+
+@pytest.mark.parametrize("kind", [ModbusRtu, ModbusAscii, Vigor])
+@on_virtual_time
+async def test_a_request_that_a_reset_cut_off_is_still_outstanding(kind: Any) -> None:
+    """The serial side stalls, and its old replies arrive on the new connection."""
+    driver = kind(station=1)
+    server = Serial()
+    line, dev, memory = behind(server, driver, *numbered(driver, 100, 200, 300, 301, every=0.2))
+    for number in range(1000):
+        memory.write(area_of(driver).strip(":"), number, [number])
+    async with running(line):
+        for phase in range(12):
+            await asyncio.sleep(8 + 0.031 * phase)
+            server.flows.clear()
+            for _ in range(3 + phase % 4):
+                await asyncio.sleep(0.7)
+                server.reset()
+            await asyncio.sleep(0.5)
+            server.flows.set()
+        await asyncio.sleep(20)
+        assert line.good(dev)
     assert wrong_values(line) == []

@@ -1,0 +1,233 @@
+"""Requests in quick succession expect replies of different shapes."""
+
+import pytest
+
+from gateway.engine.device import Device
+from gateway.engine.health import State
+from gateway.engine.jobs import Poll, Probe, Resynced, Sent
+from gateway.engine.reply_shapes import (
+    MARK_FIRST,
+    MARK_LONGEST,
+    MOST_FAILED,
+    QUIET,
+    ReplyShapes,
+    reply_shapes,
+)
+from gateway.engine.requests import Write
+from gateway.errors import Refusal, Refused
+from gateway.protocols.computer_link import ComputerLink
+from gateway.protocols.computer_link.codec import Ack, Enquiry, Text
+from gateway.protocols.driver import AnyDriver, Span
+from gateway.protocols.modbus import ModbusAscii, ModbusRtu, ModbusTcp
+from gateway.protocols.modbus.frame import Frame
+from gateway.protocols.vigor import Vigor
+from gateway.protocols.vigor.codec import READ, Reply, Request
+from gateway.tags import Quality, Reason
+from tests.engine.rig import REPLIED, Rig, link_device, tcp_device
+from tests.sim.plant import device, words
+
+SERIAL = [ModbusRtu(station=1), ModbusAscii(station=1), Vigor(station=1), ComputerLink(station=1)]
+
+
+def single(**settings: object) -> Device:
+    return device(words(100, 10), **settings)  # type: ignore[arg-type]
+
+
+def shapes_of(dev: Device) -> ReplyShapes:
+    assert dev.shapes is not None
+    return dev.shapes
+
+
+def read(shapes: ReplyShapes, dev: Device, now: float) -> Span:
+    """One poll of the first block, which ends at once."""
+    span = shapes.polled(dev.blocks[0], now)
+    shapes.at = now
+    return span
+
+
+def test_reads_in_quick_succession_differ_in_length() -> None:
+    dev = single()
+    sizes = [read(shapes_of(dev), dev, 0.02 * n).size for n in range(6)]
+    assert sizes == [10, 11, 12, 10, 11, 12]
+
+
+def test_after_a_quiet_time_the_block_is_read_alone() -> None:
+    dev = single()
+    assert [read(shapes_of(dev), dev, QUIET * n).size for n in range(4)] == [10] * 4
+
+
+def test_the_longer_span_lies_among_the_tags_where_there_are_some() -> None:
+    dev = device([*words(100, 10), *words(500, 10)])
+    second = next(block for block in dev.blocks if block.span.start == 500)
+    shapes = shapes_of(dev)
+    spans = []
+    for n in range(3):
+        spans.append(shapes.polled(second, 0.02 * n))
+        shapes.at = 0.02 * n
+    assert spans == [Span("D", 500, 10), Span("D", 499, 11), Span("D", 498, 12)]
+
+
+def test_a_longer_span_that_was_refused_is_not_read_again() -> None:
+    dev = single()
+    shapes = shapes_of(dev)
+    read(shapes, dev, 0.0)
+    shapes.refused_longer(dev.blocks[0].span)
+    assert read(shapes, dev, 0.02).size == 10
+
+
+def test_a_longer_span_without_replies_is_given_up() -> None:
+    dev = single()
+    shapes, span = shapes_of(dev), dev.blocks[0].span
+    read(shapes, dev, 0.0)
+    for _ in range(MOST_FAILED - 1):
+        shapes.read_longer(span, replied=False)
+    shapes.read_longer(span, replied=True)
+    for _ in range(MOST_FAILED - 1):
+        shapes.read_longer(span, replied=False)
+    assert read(shapes, dev, 0.02).size == 11
+    shapes.read_longer(span, replied=False)
+    assert read(shapes, dev, 0.04).size == 10
+    shapes.restart()
+    assert read(shapes, dev, 0.06).size != 10
+
+
+@pytest.mark.parametrize("driver", SERIAL, ids=lambda driver: driver.protocol)
+def test_reads_of_the_same_shape_have_the_same_reply_length(driver: AnyDriver) -> None:
+    area = "holding" if driver.protocol.startswith("modbus") else "D"
+    found = {driver.reply_shape(Span(area, 0, size)): size for size in range(1, 20)}  # type: ignore[attr-defined]
+    assert len(found) == 19
+    assert driver.reply_shape(Span(area, 7, 3)) == driver.reply_shape(Span(area, 0, 3))  # type: ignore[attr-defined]
+
+
+def test_numbered_replies_need_no_shapes() -> None:
+    assert reply_shapes(ModbusTcp(station=1), []) is None
+    assert tcp_device().shapes is None
+
+
+def test_only_a_reply_of_the_station_is_an_extra_reply() -> None:
+    vigor, link, modbus = Vigor(station=1), ComputerLink(station=1), ModbusRtu(station=1)
+    assert vigor.is_reply(Reply(1, READ, "00", b"12"))
+    assert not vigor.is_reply(Reply(2, READ, "00", b"12"))
+    assert not vigor.is_reply(Request(1, READ, b""))
+    assert link.is_reply(Text(1, "0007"))
+    assert link.is_reply(Ack(1))
+    assert not link.is_reply(Text(1, "0007", "FE"))  # on-demand data
+    assert not link.is_reply(Enquiry(1, "WR", "D000001"))
+    assert modbus.is_reply(Frame(1, b"\x03\x02\x00\x07"))
+    assert not modbus.is_reply(Frame(2, b"\x03\x02\x00\x07"))
+
+
+# In the engine
+
+
+def polling(*devices: Device) -> tuple[Rig, Poll]:
+    """An engine that has just read the first block."""
+    rig = Rig(*devices)
+    rig.bring(State.ONLINE)
+    poll = rig.transacted()
+    assert isinstance(poll, Poll)
+    return rig, poll
+
+
+def test_an_extra_reply_asks_for_a_resync_and_takes_back_the_last_values() -> None:
+    rig, poll = polling(link_device())
+    rig.conclude(poll, [0] * 6)
+    assert rig.samples[-1].quality is Quality.GOOD
+    rig.now += 0.01
+    rig.note(rig.engine.unmatched(rig.device, Ack(1), rig.now, rig.time))
+    assert rig.samples[-1].reason is Reason.GARBLED
+    assert "Answers twice" in rig.device.diagnosis()
+    assert [event.event for event in rig.logged][-1] == "device answers twice"
+    probe = rig.next()
+    assert isinstance(probe, Probe)
+    rig.conclude(probe, Resynced(0xFFFF))
+    assert rig.next() is poll  # read again at once
+
+
+def test_values_before_a_quiet_time_stay_good_after_an_extra_reply() -> None:
+    rig, poll = polling(link_device())
+    rig.conclude(poll, [0] * 6)
+    rig.now += 1.1 * QUIET
+    rig.note(rig.engine.unmatched(rig.device, Ack(1), rig.now, rig.time))
+    assert rig.samples[-1].quality is Quality.GOOD
+    assert isinstance(rig.transacted(), Probe)
+
+
+def test_a_reply_to_the_request_in_flight_does_not_end_the_need_of_a_resync() -> None:
+    rig, poll = polling(link_device())
+    rig.note(rig.engine.unmatched(rig.device, Ack(1), rig.now, rig.time))
+    rig.conclude(poll, [0] * 6)
+    assert isinstance(rig.transacted(), Probe)
+
+
+def test_the_echo_of_the_request_is_no_extra_reply() -> None:
+    rig, poll = polling(link_device())
+    rig.note(rig.engine.unmatched(rig.device, Ack(1), rig.now, rig.time, echo=True))
+    assert rig.device.diagnosis() == ""
+    assert not rig.device.health.needs_resync
+    rig.conclude(poll, [0] * 6)
+
+
+def test_a_reply_to_an_older_request_is_no_extra_reply() -> None:
+    rig = Rig(link_device())
+    rig.note(rig.engine.unmatched(rig.device, Ack(1), rig.now, rig.time))
+    assert rig.device.diagnosis() == ""
+
+
+def test_a_refused_longer_read_is_repeated_without_it() -> None:
+    rig, poll = polling(link_device())
+    rig.conclude(poll, [0] * 6)
+    poll = rig.transacted()  # type: ignore[assignment]
+    rig.device.shapes.at = rig.now  # type: ignore[union-attr]
+    rig.conclude(poll, [0] * 6)
+    again = rig.transacted()
+    assert isinstance(again, Poll)
+
+
+def test_the_second_of_two_writes_is_followed_by_a_resync() -> None:
+    rig, poll = polling(link_device())
+    rig.conclude(poll, [0] * 6)
+    first, tokens = rig.write("D0"), []
+    assert rig.next() is first
+    tokens.append(first.resyncs)
+    rig.conclude(first, Sent(), REPLIED)
+    second = rig.write("D0", 8)
+    job = rig.next()
+    if isinstance(job, Poll):
+        rig.conclude(job, [0] * 6)
+        job = rig.next()
+    assert job is second
+    assert (first.resyncs.before, first.resyncs.after) == (None, None)
+    assert second.resyncs.before is None
+    assert second.resyncs.after is not None
+
+
+def test_a_write_after_a_refusal_is_followed_by_a_resync() -> None:
+    rig, poll = polling(link_device())
+    rig.conclude(poll, Refused("NAK 06", code="06", refusal=Refusal.OTHER), REPLIED)
+    write = rig.write("D0")
+    job = rig.next()
+    assert isinstance(job, Write)
+    assert write.resyncs.after is not None
+
+
+def test_on_a_wire_that_is_never_quiet_a_resync_shows_the_order_from_time_to_time() -> None:
+    rig, poll = polling(link_device())
+    rig.conclude(poll, [0] * 6)
+    marks = []
+    last = rig.now
+    while rig.now < 3 * MARK_LONGEST:
+        job = rig.next()
+        if isinstance(job, Probe):
+            marks.append(rig.now - last)
+            last = rig.now
+            rig.conclude(job, Resynced(0xFFFF))
+            continue
+        if not isinstance(job, Poll):
+            rig.now += 0.9 * QUIET
+            poll.device.shapes.at = rig.now  # type: ignore[union-attr]  # another transaction
+            continue
+        rig.conclude(job, [0] * 6, took=0.1)
+    assert marks[0] >= MARK_FIRST
+    assert marks[-1] >= MARK_LONGEST
+    assert marks == sorted(marks)
