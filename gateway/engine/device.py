@@ -1,21 +1,24 @@
 """One device on a line: its settings, its plan, its health and its record."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
 from gateway.engine.health import Health, State, diagnosis
 from gateway.engine.records import Record
 from gateway.errors import LineDown
-from gateway.planning.bad_addresses import BadAddresses
+from gateway.planning.bad_addresses import RETRIES, BadAddresses
 from gateway.planning.monitor_lists import with_monitor_list
-from gateway.planning.planner import Block, plan
+from gateway.planning.planner import Block, plan, runs_of
 from gateway.planning.wire_timing import WireTiming
 from gateway.protocols.driver import AnyDriver, Cost, NoReplyCauses, Span, Timing, Windowed
 from gateway.tags import Tag
 
 LEARN_EVERY = 50  # requests between two comparisons with the measured turnaround
 MOST_PLANNED = 2000  # tags times intervals: planning them takes some tenths of a second
+SILENT_SHARE = 0.01  # share of the time for new tries of silent addresses
+MOST_PROBED = 8  # places among which the resyncs change
 WORTH_WHILE = 0.1  # share of the wire time that a new plan must save
 HALF_LIFE = 10.0  # seconds until past use of the wire counts half
 
@@ -74,6 +77,7 @@ class Device:
     bad_addresses: BadAddresses = field(init=False)
     turnaround: Turnaround = field(init=False)
     blocks: tuple[Block, ...] = ()
+    last_read: Span | None = None  # the last block that was read
     registered: tuple[Span, ...] = ()  # the monitor list that the PLC holds, as far as known
     broadcast: bool = field(
         init=False
@@ -182,9 +186,37 @@ class Device:
         return len(self.tags) * len({tag.every for tag in self.tags}) > MOST_PLANNED
 
     def interval(self, block: Block) -> float:
-        """Returns the interval of the block; bad addresses are polled only rarely."""
-        bad = self.bad_addresses.bad.get(block.span)
-        return block.every if bad is None else max(bad.retry, block.every)
+        """Returns the interval of the block; bad addresses are polled only rarely.
+
+        The time-outs of silent addresses hold up the others: all of them together take about
+        `SILENT_SHARE` of the time, unless one returned a short time ago.
+        """
+        known = self.bad_addresses.bad
+        bad = known.get(block.span)
+        if bad is None:
+            return block.every
+        pause = bad.retry
+        if bad.silent and pause == RETRIES[-1]:
+            silent = sum(other.silent for other in known.values())
+            pause = max(pause, silent * self.longest_reply / SILENT_SHARE)
+        return max(pause, block.every)
+
+    def was_read(self, block: Block) -> None:
+        """Notes a good read: the device has these addresses."""
+        if not block.listed:
+            self.last_read = block.span
+
+    @property
+    def probe_spans(self) -> Sequence[Span]:
+        """Configured addresses for a resync, those of the last good read first.
+
+        They stay the same from one good read to the next, as `Driver.resync` needs it.
+        """
+        tags = self.polled_tags
+        bad = {tag for one in self.bad_addresses.bad.values() for tag in one.tags}
+        runs = runs_of([tag for tag in tags if tag not in bad] or tags)
+        some = runs[:: 1 + len(runs) // MOST_PROBED]
+        return some if self.last_read is None else (self.last_read, *some)
 
     # The monitor list in the PLC
 

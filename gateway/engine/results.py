@@ -19,7 +19,8 @@ from gateway.errors import (
     Refused,
     Unsteady,
 )
-from gateway.planning.planner import describe
+from gateway.planning.bad_addresses import SILENT
+from gateway.planning.planner import Block, describe
 from gateway.protocols.driver import Span
 from gateway.tags import Reason, Sample
 from gateway.tags.unchanged import Unchanged
@@ -66,22 +67,29 @@ class Results:
             counts.mean_gap += (gap - counts.mean_gap) / max(1, min(10, counts.reads))
         counts.reads += 1
         last.at, last.ever = now, True
+        device.was_read(block)
         self._effects.collected.append(Samples(self._samples(poll, units, time)))
         if block.of_fields:
             self._count_garbled(device, units)
         self._schedule.polled(poll, now)
-        bad = device.bad_addresses
-        if bad.bad or bad.searches:
-            if bad.read(block):
-                self._effects.info("address returned", device=device.name, block=describe(block))
-                self._plan(device, now)
-            self._end_search(device, now)
-        if device.record.exchanges < device.turnaround.look_at or bad.searching:
+        if not device.bad_addresses.clear:
+            self._read_beside_bad(device, block, now)
+        if device.record.exchanges < device.turnaround.look_at or device.bad_addresses.searching:
             return
         if device.learn_turnaround():
             expected = device.turnaround.expected
             self._effects.info("plan updated", device=device.name, turnaround=expected)
             self._schedule.plan(device, now)
+
+    def _read_beside_bad(self, device: Device, block: Block, now: float) -> None:
+        """Applies a good read of a device that has bad addresses or split blocks."""
+        bad = device.bad_addresses
+        returned = bad.read(block)
+        if returned:
+            self._effects.info("address returned", device=device.name, block=describe(block))
+        if returned or bad.rejoin(now):
+            self._plan(device, now)
+        self._end_search(device, now)
 
     def _samples(self, poll: Poll, units: Sequence[int], time: int) -> Sequence[Sample]:
         """Returns the samples of the units. Equal units are not decoded again."""
@@ -128,19 +136,33 @@ class Results:
         if block.listed:
             self._list_refused(poll, error, now)
             return
-        if error.refusal is Refusal.ADDRESS and poll.last.ever and not poll.tries:
-            self._schedule.again(poll)  # the address was good before: noise can change a request
-            return
-        if error.refusal is Refusal.ADDRESS:
-            known = block.span in device.bad_addresses.bad
-            halves = device.bad_addresses.refused(block, time, error.code)
-            if halves:
-                self._schedule.replace(poll, halves, now)
+        lasting = error.refusal in (Refusal.ADDRESS, Refusal.OTHER)
+        if lasting and block.span not in device.bad_addresses.bad:
+            # The address may exist: noise can change a request, or the device may have restarted.
+            if error.refusal is Refusal.ADDRESS and poll.last.ever and not poll.tries:
+                self._schedule.again(poll)
                 return
-            log = self._effects.debug if known else self._effects.warning
-            log("address refused", device=device.name, block=describe(block), why=str(error))
+            if error.refusal is Refusal.OTHER and poll.tries < device.timing.retries:
+                self._schedule.again(poll, now + BUSY_PAUSE * 2**poll.tries)
+                return
+        if lasting and self._halved(poll, error, error.code, now, time):
+            return
         self._end_badly(poll, Reason.REFUSED, error, now, time)
         self._end_search(device, now)
+
+    def _halved(self, poll: Poll, error: DeviceError, code: str, now: float, time: int) -> bool:
+        """Polls the halves of a block that failed for good. False: it is a bad address."""
+        device, block = poll.device, poll.block
+        if block.of_fields or block.listed:  # any part of it is read by the same request
+            return False
+        known = block.span in device.bad_addresses.bad
+        halves = device.bad_addresses.refused(block, time, code)
+        if halves:
+            self._schedule.replace(poll, halves, now)
+            return True
+        log = self._effects.debug if known else self._effects.warning
+        log("address refused", device=device.name, block=describe(block), why=str(error))
+        return False
 
     def _list_refused(self, poll: Poll, error: Refused, now: float) -> None:
         """Registers the monitor list again, or plans without one: it may have a bad address."""
@@ -153,15 +175,22 @@ class Results:
         self._plan(device, now)
 
     def _end_badly(
-        self, poll: Poll, reason: Reason, error: GatewayError, now: float, time: int
+        self,
+        poll: Poll,
+        reason: Reason,
+        error: GatewayError,
+        now: float,
+        time: int,
+        *,
+        answered: bool = True,
     ) -> None:
-        """Turns the tags of a block bad, after a reply without values."""
+        """Turns the tags of a block bad, after a reply without values or no reply."""
         poll.forget(now)
         self._effects.bad(poll.block.tags, reason, time, str(error))
-        self._schedule.polled(poll, now)
+        self._schedule.polled(poll, now, answered=answered)
 
     def _end_search(self, device: Device, now: float) -> None:
-        if device.bad_addresses.settle():
+        if device.bad_addresses.settle(now):
             device.allow_lists(True)  # the bad address in the list may be known now
             self._plan(device, now)
 
@@ -223,17 +252,26 @@ class Results:
         for request in self._schedule.requests.withdraw(device):
             self._effects.ended(request, offline(device))
 
-    def unread(self, poll: Poll, error: GatewayError, now: float, time: int) -> None:
-        """Applies an unclear poll: polls again, or turns its tags bad."""
-        device = poll.device
-        if device.health.state is State.OFFLINE:
+    def unread(self, poll: Poll, error: DeviceError, now: float, time: int) -> None:
+        """Applies an unclear poll: polls again, halves the block, or turns its tags bad.
+
+        A block that stays without a reply while the device replies to other requests may hold an
+        address about which the device is silent, or be too long for it.
+        """
+        device, bad = poll.device, poll.device.bad_addresses
+        health, retries = device.health, device.timing.retries
+        if health.state is State.OFFLINE:
             return
-        if poll.tries < device.timing.retries and not poll.missed:
+        known, half = poll.block.span in bad.bad, bad.is_half(poll.block)
+        if not known and not poll.missed and poll.tries < (min(1, retries) if half else retries):
             self._schedule.again(poll)
             return
-        poll.forget(now)
-        self._effects.bad(poll.block.tags, device.health.reason, time, str(error))
-        self._schedule.polled(poll, now, answered=False)
+        others_answered = health.consecutive_failures <= 1
+        lasting = others_answered and (known or half or poll.missed > 0)
+        if lasting and self._halved(poll, error, SILENT, now, time):
+            return
+        self._end_badly(poll, health.reason, error, now, time, answered=False)
+        self._end_search(device, now)
 
     def outstanding_requests(self, device: Device) -> int:
         """Counts the requests to the device whose reply may still arrive.

@@ -46,7 +46,8 @@ async def _perform(job: Transacted, transaction: Transaction) -> Result:
         case Settle(guard=guard, gap=gap):
             return Settled(await transaction.settle(guard, gap))
         case Probe(outstanding=outstanding, token=token):
-            return Resynced(await driver.resync(transaction, outstanding, token))
+            spans = job.device.probe_spans
+            return Resynced(await driver.resync(transaction, outstanding, token, spans))
         case Write() | Repeat():
             return await _write(job.write if isinstance(job, Repeat) else job, transaction)
         case WriteTogether(writes=writes) if isinstance(driver, ScatteredWriter):
@@ -108,7 +109,7 @@ async def _write(write: Write, talk: Talk[Any]) -> Sent:
 async def _confirm(job: Confirm, talk: Talk[Any]) -> Sent:
     driver, tag = job.device.driver, job.write.tag
     try:
-        await driver.resync(talk, job.outstanding, job.token)
+        await driver.resync(talk, job.outstanding, job.token, job.device.probe_spans)
     except Refused as error:
         raise Unclear(f"its resync was refused too: {error}") from error
     if tag.write is None or not tag.write.verify:

@@ -165,6 +165,18 @@ def items_of(tags: Iterable[Tag]) -> list[Item]:
     return items
 
 
+def runs_of(tags: Iterable[Tag]) -> list[Span]:
+    """Returns the spans of the tags; spans without a gap between them are one."""
+    runs: list[Span] = []
+    for area, start, size in sorted(tag.span for tag in tags):
+        if runs and runs[-1].area == area and start <= runs[-1].start + runs[-1].size:
+            end = max(start + size, runs[-1].start + runs[-1].size)
+            runs[-1] = runs[-1]._replace(size=end - runs[-1].start)
+        else:
+            runs.append(Span(area, start, size))
+    return runs
+
+
 def describe(block: Block) -> str:
     """Returns the first and last address of a block as the file writes them: `D7.3..D10`."""
     first = min(block.tags, key=lambda tag: tag.span)

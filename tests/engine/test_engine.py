@@ -287,7 +287,7 @@ online   Poll                  unsteady      online    -                        
 online   Poll                  address       online    -                                    Poll
 online   Poll                  damaged       online    -                                    Poll
 online   Poll                  busy          online    -                                    Idle
-online   Poll                  refused       online    bad:refused                          Idle
+online   Poll                  refused       online    -                                    Idle
 online   Poll                  any-unclear   failing   -                                    Settle
 online   Poll                  lost          online    -                                    -
 online   PollAgain             units         online    good                                 Idle
@@ -295,7 +295,7 @@ online   PollAgain             unsteady      online    bad:garbled              
 online   PollAgain             address       online    -                                    Poll
 online   PollAgain             damaged       online    bad:refused                          Idle
 online   PollAgain             busy          online    bad:refused                          Idle
-online   PollAgain             refused       online    bad:refused                          Idle
+online   PollAgain             refused       online    -                                    Poll
 online   PollAgain             any-unclear   failing   -                                    Settle
 online   PollAgain             lost          online    -                                    -
 online   PollReadBefore        units         online    good                                 Idle
@@ -303,7 +303,7 @@ online   PollReadBefore        unsteady      online    -                        
 online   PollReadBefore        address       online    -                                    Poll
 online   PollReadBefore        damaged       online    -                                    Poll
 online   PollReadBefore        busy          online    -                                    Idle
-online   PollReadBefore        refused       online    bad:refused                          Idle
+online   PollReadBefore        refused       online    -                                    Idle
 online   PollReadBefore        any-unclear   failing   -                                    Settle
 online   PollReadBefore        lost          online    -                                    -
 online   Write                 sent          online    written                              Poll
@@ -338,7 +338,7 @@ failing  Poll                  unsteady      online    bad:garbled              
 failing  Poll                  address       online    -                                    Poll
 failing  Poll                  damaged       online    bad:refused                          Idle
 failing  Poll                  busy          online    bad:refused                          Idle
-failing  Poll                  refused       online    bad:refused                          Idle
+failing  Poll                  refused       online    -                                    Poll
 failing  Poll                  any-unclear   failing   -                                    Settle
 failing  Poll                  lost          failing   -                                    -
 failing  Write                 sent          online    written                              Poll

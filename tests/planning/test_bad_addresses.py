@@ -32,14 +32,14 @@ class Asker:
             again = refusals.read(block)
             if again:
                 refusals.abandon()
-            if again or refusals.settle():
+            if again or refusals.settle(0.0):
                 self.device.plan()
                 return True
             return False
         halves = refusals.refused(block, 7, "28")
         if any(self.ask(half) for half in halves):
             return True
-        if not halves and refusals.settle():
+        if not halves and refusals.settle(0.0):
             self.device.plan()
             return True
         return False

@@ -92,9 +92,13 @@ class _Modbus:
         return self._master.write(talk, span, units)
 
     def resync(
-        self, talk: Talk[Frame], outstanding: Span | None, probe_token: int
+        self,
+        talk: Talk[Frame],
+        outstanding: Span | None,
+        probe_token: int,
+        spans: Sequence[Span] = (),
     ) -> Coroutine[Any, Any, int]:
-        return self._master.resync(talk, outstanding, probe_token)
+        return self._master.resync(talk, outstanding, probe_token, spans)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
