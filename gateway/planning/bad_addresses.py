@@ -95,6 +95,7 @@ class BadAddresses:
     bad: dict[Span, BadRange] = field(default_factory=dict)
     splits: set[Cut] = field(default_factory=set)
     searches: list[_Node] = field(default_factory=list)  # failed blocks, not yet settled
+    clear: bool = True  # no address is bad, no block is split: a good read changes nothing
     _leaves: dict[Span, _Node] = field(default_factory=dict)
     _suspected: set[Cut] = field(default_factory=set)  # splits unless the whole block is read
     _rejoin_at: float | None = None
@@ -109,17 +110,13 @@ class BadAddresses:
     def searching(self) -> bool:
         return bool(self.searches)
 
-    @property
-    def clear(self) -> bool:
-        """True if no address is bad and no block was split: a good read changes nothing."""
-        return not (self.bad or self.searches or self.splits or self._suspected)
-
     def is_half(self, block: Block) -> bool:
         """Returns True while a search waits for this block."""
         return block.span in self._leaves
 
     def refused(self, block: Block, now: int, code: str) -> tuple[Block, ...]:
         """Returns the two halves to read instead of `block`; empty when it is the bad address."""
+        self.clear = False
         node = self._leaves.pop(block.span, None)
         if (known := self.bad.get(block.span)) is not None:
             self.bad[block.span] = replace(known, refusals=known.refusals + 1, code=code)
@@ -147,7 +144,9 @@ class BadAddresses:
         if self._suspected:  # the whole block is read: its halves were no cure
             area, start, size = block.span
             self._suspected -= {(area, n) for n in range(start + 1, start + size)}
-        if self.bad.pop(block.span, None) is None:
+        returned = self.bad.pop(block.span, None) is not None
+        self._look()
+        if not returned:
             return False
         for span, other in self.bad.items():
             if other.refusals:
@@ -187,6 +186,10 @@ class BadAddresses:
         """Drops the searches: the device gets other blocks, and a bad address is found again."""
         self.searches.clear()
         self._leaves.clear()
+        self._look()
+
+    def _look(self) -> None:
+        self.clear = not (self.bad or self.searches or self.splits or self._suspected)
 
     def known(self) -> KnownBad:
         refused = tuple((bad.span, bad.since, bad.code) for bad in self.bad.values())
@@ -203,6 +206,7 @@ class BadAddresses:
                 (span.start, span.start + span.size)
             ]:
                 self.bad[span] = BadRange(span, since, code, inside, refusals=len(RETRIES))
+        self._look()
 
     def _halves(self, block: Block, node: _Node) -> tuple[Block, ...]:
         items = items_of(block.tags)
