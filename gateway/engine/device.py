@@ -10,13 +10,15 @@ from gateway.engine.records import Record
 from gateway.errors import LineDown
 from gateway.planning.bad_addresses import RETRIES, BadAddresses
 from gateway.planning.monitor_lists import with_monitor_list
-from gateway.planning.planner import Block, plan, runs_of
+from gateway.planning.planner import Block, around, plan, runs_of
 from gateway.planning.wire_timing import WireTiming
-from gateway.protocols.driver import AnyDriver, Cost, NoReplyCauses, Span, Timing, Windowed
+from gateway.protocols.driver import AnyDriver, Cost, Monitor, NoReplyCauses, Span, Timing, Windowed
 from gateway.tags import Tag
 
 LEARN_EVERY = 50  # requests between two comparisons with the measured turnaround
-MOST_PLANNED = 2000  # tags times intervals: planning them takes some tenths of a second
+MOST_PATIENCE = 128  # times LEARN_EVERY, between two plans that change nothing
+MOST_PLANNED = 1000  # tags times intervals: planning them takes some tenths of a second
+PLANNING = 2e-4  # seconds for each tag and interval, estimated
 SILENT_SHARE = 0.01  # share of the time for new tries of silent addresses
 MOST_PROBED = 8  # places among which the resyncs change
 WORTH_WHILE = 0.1  # share of the wire time that a new plan must save
@@ -46,7 +48,9 @@ class Turnaround:
     configured: float | None
     expected: float | None = field(init=False)  # None: the default of the protocol
     look_at: float = LEARN_EVERY  # number of requests at the next comparison with the measured one
-    _planned: float = 0.0  # the one in the last plan
+    plan_from: int = 0  # number of requests from which on it may be planned again
+    _planned: float | None = None  # the one in the last plan; None: the default of the protocol
+    _patience: int = 1
 
     def __post_init__(self) -> None:
         self.expected = self.configured
@@ -54,16 +58,23 @@ class Turnaround:
             self.look_at = math.inf
 
     def learn(self, record: Record) -> bool:
-        """Expects the measured one from now on. Returns True if it differs enough to plan again."""
+        """Expects the measured one from now on. Returns True if the device may be planned again."""
         if record.turnaround is None:
             return False
         self.look_at = record.exchanges + LEARN_EVERY
         self.expected = record.turnaround
-        return abs(record.turnaround - self._planned) >= WORTH_WHILE * self._planned
+        return record.exchanges >= self.plan_from
 
-    def planned(self) -> None:
-        """Notes that the device was planned with the expected one."""
-        self._planned = self.expected or 0.0
+    def change(self, default: float) -> float:
+        """Returns the difference to the one in the last plan. `default`: of the protocol."""
+        planned = default if self._planned is None else self._planned
+        return (default if self.expected is None else self.expected) - planned
+
+    def planned(self, record: Record, *, useful: bool) -> None:
+        """Notes a plan with the expected one. The next waits longer if this one was not useful."""
+        self._planned = self.expected
+        self._patience = 1 if useful else min(2 * self._patience, MOST_PATIENCE)
+        self.plan_from = record.exchanges + LEARN_EVERY * self._patience
 
 
 @dataclass(slots=True, eq=False)
@@ -158,27 +169,81 @@ class Device:
         if self._lists:
             blocks = with_monitor_list(blocks, self.driver, self.seconds, bad.bad.keys())
         self.blocks = blocks
+        bad.changed.clear()
+
+    def plan_changes(self) -> float:
+        """Plans again around the addresses that turned bad, returned or are split no longer.
+
+        Plans only the blocks that hold them and their neighbours, a limited number at a time: other
+        lines wait meanwhile. `bad_addresses.changed` keeps the rest. Returns the estimated seconds.
+        """
+        bad = self.bad_addresses
+        if self._lists and self._monitored:  # the list may take tags of any block
+            self.plan()
+            return self.planning_seconds(self.tags)
+        rates = len({tag.every for tag in self.tags})
+        blocks = sorted(self.blocks, key=lambda block: block.span)
+        near: set[int] = set()
+        tags: list[Tag] = []
+        for span in sorted(bad.changed):
+            for place in set(around(blocks, span)) - near:
+                near.add(place)
+                tags += blocks[place].tags
+            bad.changed.discard(span)
+            if len(tags) * rates >= MOST_PLANNED:
+                break
+        kept = [block for place, block in enumerate(blocks) if place not in near]
+        found = plan(tags, self.driver, self.seconds, bad.cuts)
+        self.blocks = tuple(sorted((*kept, *found), key=lambda block: block.span))
+        return self.planning_seconds(tags)
+
+    @property
+    def _monitored(self) -> bool:
+        driver = self.driver
+        return isinstance(driver, Monitor) and any(
+            driver.monitor_cost([tag.span]) is not None for tag in self.tags
+        )
+
+    def planning_seconds(self, tags: Sequence[Tag]) -> float:
+        """Estimates the duration of a plan of these tags, the same on every computer."""
+        return PLANNING * len(tags) * len({tag.every for tag in tags})
 
     def poll_nothing(self) -> None:
         """Removes all polls: only requests of clients are sent."""
         self.blocks = ()
 
-    def learn_turnaround(self) -> bool:
-        """Plans again if the measured turnaround makes the load smaller. Returns True if it did.
+    def learn_turnaround(self) -> bool | None:
+        """Plans again if the measured turnaround can make the load smaller.
 
-        In both cases the measured one is expected from now on.
+        Returns True if the plan is another one now, None if nothing was planned. In every case the
+        measured one is expected from now on.
         """
         if self.record.exchanges < self.turnaround.look_at:
-            return False
+            return None
         if not self.turnaround.learn(self.record) or self._planning_takes_long:
-            return False
-        self.turnaround.planned()
+            return None
         load, blocks = self.load, self.blocks
+        if self._most_gain() < WORTH_WHILE * load:
+            return None
         self.plan()
-        if self.load < (1 - WORTH_WHILE) * load:
-            return True
-        self.blocks = blocks
-        return False
+        useful = self.load < (1 - WORTH_WHILE) * load
+        self.turnaround.planned(self.record, useful=useful)
+        if not useful:
+            self.blocks = blocks
+        return useful
+
+    def _most_gain(self) -> float:
+        """Returns the load that a new plan can save at most.
+
+        The present plan was the cheapest at its turnaround. A longer one costs it no more than the
+        difference for each of its requests. After a shorter one, a plan with more requests is
+        cheaper by no more than the difference for each additional one.
+        """
+        change = self.turnaround.change(self.timing.turnaround)
+        requests = sum(1 / block.every for block in self.blocks)
+        if change < 0:
+            requests -= sum(1 / tag.every for tag in self.polled_tags)
+        return requests * change * self.settings.verify_reads
 
     @property
     def _planning_takes_long(self) -> bool:

@@ -19,12 +19,14 @@ from gateway.errors import (
     Refused,
     Unsteady,
 )
-from gateway.planning.bad_addresses import SILENT
+from gateway.planning.bad_addresses import RETRIES, SILENT
 from gateway.planning.planner import Block, describe
 from gateway.protocols.driver import Span
 from gateway.tags import Reason, Sample
 from gateway.tags.unchanged import Unchanged
 
+PLANNING_SHARE = 0.01  # of the time, for all devices of a line together
+TOGETHER = RETRIES[0] + 1.0  # seconds in which all addresses that return are tried
 BUSY_PAUSE = 0.2  # seconds of pause for a busy device, doubled each time
 
 
@@ -38,6 +40,9 @@ class Results:
         self._schedule = schedule
         self._staleness = staleness
         self._effects = effects
+        self._to_plan: dict[Device, float] = {}  # waiting for a plan, from this time on
+        self._plan_at = math.inf  # when the next of them is planned
+        self._planned_until = -math.inf  # when the share of planning permits another plan
 
     # Replies
 
@@ -74,9 +79,17 @@ class Results:
         self._schedule.polled(poll, now)
         if not device.bad_addresses.clear:
             self._read_beside_bad(device, block, now)
-        if device.record.exchanges < device.turnaround.look_at or device.bad_addresses.searching:
+        if now >= self._plan_at:
+            self._look_at_plans(now)
+        if device.record.exchanges >= device.turnaround.look_at and now >= self._planned_until:
+            self._learn(device, now)
+
+    def _learn(self, device: Device, now: float) -> None:
+        """Compares the plan with the measured turnaround."""
+        if device.bad_addresses.searching or (found := device.learn_turnaround()) is None:
             return
-        if device.learn_turnaround():
+        self._planned(device.planning_seconds(device.tags), now)
+        if found:
             expected = device.turnaround.expected
             self._effects.info("plan updated", device=device.name, turnaround=expected)
             self._schedule.plan(device, now)
@@ -87,6 +100,11 @@ class Results:
         returned = bad.read(block)
         if returned:
             self._effects.info("address returned", device=device.name, block=describe(block))
+            self._schedule.try_soon(device, now + RETRIES[0])
+            if bad.bad:  # they may return as well: one plan for all
+                self._to_plan.setdefault(device, now + TOGETHER)
+            else:
+                self._to_plan[device] = now
         if returned or bad.rejoin(now):
             self._plan(device, now)
         self._end_search(device, now)
@@ -172,7 +190,9 @@ class Results:
         device = poll.device
         self._effects.warning("monitor list refused", device=device.name, why=str(error))
         device.allow_lists(False)
-        self._plan(device, now)
+        device.bad_addresses.abandon()
+        device.plan()
+        self._schedule.plan(device, now)
 
     def _end_badly(
         self,
@@ -195,9 +215,30 @@ class Results:
             self._plan(device, now)
 
     def _plan(self, device: Device, now: float) -> None:
+        """Plans the device when the earlier plans allow it, in pieces if much has changed."""
+        self._to_plan.setdefault(device, now)
+        self._look_at_plans(now)
+
+    def _look_at_plans(self, now: float) -> None:
+        """Plans the first waiting device, if there is one and the share of planning permits it."""
+        self._plan_at = math.inf
+        if not self._to_plan:
+            return
+        device = min(self._to_plan, key=self._to_plan.__getitem__)
+        due = max(self._to_plan[device], self._planned_until)
+        if now < due:
+            self._plan_at = due
+            return
         device.bad_addresses.abandon()
-        device.plan()
+        self._planned(device.plan_changes(), now)
         self._schedule.plan(device, now)
+        if not device.bad_addresses.changed:
+            del self._to_plan[device]
+        self._look_at_plans(now)
+
+    def _planned(self, seconds: float, now: float) -> None:
+        """Allows the next plan so late that all plans of the line keep to their share."""
+        self._planned_until = now + seconds / PLANNING_SHARE
 
     # Unclear ends
 

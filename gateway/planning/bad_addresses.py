@@ -95,6 +95,7 @@ class BadAddresses:
     bad: dict[Span, BadRange] = field(default_factory=dict)
     splits: set[Cut] = field(default_factory=set)
     searches: list[_Node] = field(default_factory=list)  # failed blocks, not yet settled
+    changed: set[Span] = field(default_factory=set)  # to be planned again
     clear: bool = True  # no address is bad, no block is split: a good read changes nothing
     _leaves: dict[Span, _Node] = field(default_factory=dict)
     _suspected: set[Cut] = field(default_factory=set)  # splits unless the whole block is read
@@ -148,6 +149,7 @@ class BadAddresses:
         self._look()
         if not returned:
             return False
+        self.changed.add(block.span)
         for span, other in self.bad.items():
             if other.refusals:
                 self.bad[span] = replace(other, refusals=0)
@@ -161,6 +163,7 @@ class BadAddresses:
         if not self.searches or not all(root.settled() for root in self.searches):
             return False
         for root in self.searches:
+            self.changed.add(root.span)
             splits = root.splits()
             if proven := splits & self._suspected:
                 self.splits |= proven
@@ -178,6 +181,7 @@ class BadAddresses:
         if now < self._rejoin_at:
             return False
         self._rejoin_pause = min(2 * self._rejoin_pause, SPLIT_LONGEST)
+        self.changed |= {Span(area, n - 1, 2) for area, n in self.splits}
         self._suspected |= self.splits  # one search is enough to find them again
         self.splits.clear()
         return True

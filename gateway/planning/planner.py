@@ -6,7 +6,7 @@ turnaround; no fixed gap is right at every baud rate. A slower tag joins a faste
 costs less than a request of its own.
 """
 
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -163,6 +163,17 @@ def items_of(tags: Iterable[Tag]) -> list[Item]:
         else:
             items.append(Item(tag.span.start, end, tag.every, [tag]))
     return items
+
+
+def around(blocks: Sequence[Block], span: Span) -> range:
+    """Returns the places of the blocks that begin in the span, and of their neighbours.
+
+    `blocks` are in the order of areas and addresses.
+    """
+    end = Span(span.area, span.start + span.size, 0)
+    first = bisect_right(blocks, span, key=lambda block: block.span)
+    last = bisect_left(blocks, end, key=lambda block: block.span)
+    return range(max(0, min(first, last) - 2), min(len(blocks), last + 1))
 
 
 def runs_of(tags: Iterable[Tag]) -> list[Span]:

@@ -1,9 +1,13 @@
 """A slave that lacks an address refuses it with any code, or is silent about it."""
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from gateway.engine import device as engine_device
+from gateway.planning.planner import Block, plan
 from tests.attacks.slave import Slave, polled
 
 NUMBERS = range(100, 120)
@@ -66,3 +70,23 @@ async def test_a_slave_without_its_first_register_is_found_at_another(tmp_path: 
     slave = Slave(lambda n: 101 <= n < 120)
     async with polled(slave, tmp_path, NUMBERS) as (_, watch):
         await watch.until(lambda: watch.good == set(NUMBERS) - {100})
+
+
+async def test_many_addresses_that_return_at_once_are_planned_together(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    planned = list[int]()
+
+    def counted(tags: Sequence[Any], *rest: Any) -> tuple[Block, ...]:
+        planned.append(len(tags))
+        return plan(tags, *rest)
+
+    numbers, missing = range(100, 350), set(range(100, 350))
+    slave = Slave(lambda n: n not in missing, exception=2)
+    async with polled(slave, tmp_path, numbers) as (line, watch):
+        [device] = line.engine.devices
+        await watch.until(lambda: len(device.bad_addresses.bad) == 250)
+        monkeypatch.setattr(engine_device, "plan", counted)
+        missing.clear()
+        await watch.until(lambda: len(device.blocks) == 2 and watch.good == set(numbers))
+    assert len(planned) <= 6
