@@ -9,15 +9,19 @@ from gateway.engine.health import Health, State, diagnosis
 from gateway.engine.records import Record
 from gateway.engine.reply_shapes import ReplyShapes, reply_shapes
 from gateway.errors import LineDown
-from gateway.planning.bad_addresses import BadAddresses
+from gateway.planning.bad_addresses import RETRIES, BadAddresses
 from gateway.planning.monitor_lists import with_monitor_list
-from gateway.planning.planner import Block, plan
+from gateway.planning.planner import Block, around, plan, runs_of
 from gateway.planning.wire_timing import WireTiming
-from gateway.protocols.driver import AnyDriver, Cost, NoReplyCauses, Span, Timing, Windowed
+from gateway.protocols.driver import AnyDriver, Cost, Monitor, NoReplyCauses, Span, Timing, Windowed
 from gateway.tags import Tag
 
 LEARN_EVERY = 50  # requests between two comparisons with the measured turnaround
-MOST_PLANNED = 2000  # tags times intervals: planning them takes some tenths of a second
+MOST_PATIENCE = 128  # times LEARN_EVERY, between two plans that change nothing
+MOST_PLANNED = 1000  # tags times intervals: planning them takes some tenths of a second
+PLANNING = 2e-4  # seconds for each tag and interval, estimated
+SILENT_SHARE = 0.01  # share of the time for new tries of silent addresses
+MOST_PROBED = 8  # places among which the resyncs change
 WORTH_WHILE = 0.1  # share of the wire time that a new plan must save
 ANSWERS_TWICE = (
     "Answers twice: a second master is on the line, two stations have the number {station}, or a "
@@ -49,7 +53,9 @@ class Turnaround:
     configured: float | None
     expected: float | None = field(init=False)  # None: the default of the protocol
     look_at: float = LEARN_EVERY  # number of requests at the next comparison with the measured one
-    _planned: float = 0.0  # the one in the last plan
+    plan_from: int = 0  # number of requests from which on it may be planned again
+    _planned: float | None = None  # the one in the last plan; None: the default of the protocol
+    _patience: int = 1
 
     def __post_init__(self) -> None:
         self.expected = self.configured
@@ -57,16 +63,23 @@ class Turnaround:
             self.look_at = math.inf
 
     def learn(self, record: Record) -> bool:
-        """Expects the measured one from now on. Returns True if it differs enough to plan again."""
+        """Expects the measured one from now on. Returns True if the device may be planned again."""
         if record.turnaround is None:
             return False
         self.look_at = record.exchanges + LEARN_EVERY
         self.expected = record.turnaround
-        return abs(record.turnaround - self._planned) >= WORTH_WHILE * self._planned
+        return record.exchanges >= self.plan_from
 
-    def planned(self) -> None:
-        """Notes that the device was planned with the expected one."""
-        self._planned = self.expected or 0.0
+    def change(self, default: float) -> float:
+        """Returns the difference to the one in the last plan. `default`: of the protocol."""
+        planned = default if self._planned is None else self._planned
+        return (default if self.expected is None else self.expected) - planned
+
+    def planned(self, record: Record, *, useful: bool) -> None:
+        """Notes a plan with the expected one. The next waits longer if this one was not useful."""
+        self._planned = self.expected
+        self._patience = 1 if useful else min(2 * self._patience, MOST_PATIENCE)
+        self.plan_from = record.exchanges + LEARN_EVERY * self._patience
 
 
 @dataclass(slots=True, eq=False)
@@ -80,6 +93,7 @@ class Device:
     bad_addresses: BadAddresses = field(init=False)
     turnaround: Turnaround = field(init=False)
     blocks: tuple[Block, ...] = ()
+    last_read: Span | None = None  # the last block that was read
     registered: tuple[Span, ...] = ()  # the monitor list that the PLC holds, as far as known
     broadcast: bool = field(
         init=False
@@ -164,6 +178,7 @@ class Device:
         if self._lists:
             blocks = with_monitor_list(blocks, self.driver, self.seconds, bad.bad.keys())
         self.blocks = blocks
+        bad.changed.clear()
         if self.shapes is not None:
             self.shapes.planned(blocks)
 
@@ -173,26 +188,81 @@ class Device:
             return [self.seconds(block.cost)]
         return [self.seconds(cost) for cost in self.shapes.costs(block)]
 
+    def plan_changes(self) -> float:
+        """Plans again around the addresses that turned bad, returned or are split no longer.
+
+        Plans only the blocks that hold them and their neighbours, a limited number at a time: other
+        lines wait meanwhile. `bad_addresses.changed` keeps the rest. Returns the estimated seconds.
+        """
+        bad = self.bad_addresses
+        if self._lists and self._monitored:  # the list may take tags of any block
+            self.plan()
+            return self.planning_seconds(self.tags)
+        rates = len({tag.every for tag in self.tags})
+        blocks = sorted(self.blocks, key=lambda block: block.span)
+        near: set[int] = set()
+        tags: list[Tag] = []
+        for span in sorted(bad.changed):
+            for place in set(around(blocks, span)) - near:
+                near.add(place)
+                tags += blocks[place].tags
+            bad.changed.discard(span)
+            if len(tags) * rates >= MOST_PLANNED:
+                break
+        kept = [block for place, block in enumerate(blocks) if place not in near]
+        found = plan(tags, self.driver, self.seconds, bad.cuts)
+        self.blocks = tuple(sorted((*kept, *found), key=lambda block: block.span))
+        if self.shapes is not None:
+            self.shapes.planned(self.blocks)
+        return self.planning_seconds(tags)
+
+    @property
+    def _monitored(self) -> bool:
+        driver = self.driver
+        return isinstance(driver, Monitor) and any(
+            driver.monitor_cost([tag.span]) is not None for tag in self.tags
+        )
+
+    def planning_seconds(self, tags: Sequence[Tag]) -> float:
+        """Estimates the duration of a plan of these tags, the same on every computer."""
+        return PLANNING * len(tags) * len({tag.every for tag in tags})
+
     def poll_nothing(self) -> None:
         """Removes all polls: only requests of clients are sent."""
         self.blocks = ()
 
-    def learn_turnaround(self) -> bool:
-        """Plans again if the measured turnaround makes the load smaller. Returns True if it did.
+    def learn_turnaround(self) -> bool | None:
+        """Plans again if the measured turnaround can make the load smaller.
 
-        In both cases the measured one is expected from now on.
+        Returns True if the plan is another one now, None if nothing was planned. In every case the
+        measured one is expected from now on.
         """
         if self.record.exchanges < self.turnaround.look_at:
-            return False
+            return None
         if not self.turnaround.learn(self.record) or self._planning_takes_long:
-            return False
-        self.turnaround.planned()
+            return None
         load, blocks = self.load, self.blocks
+        if self._most_gain() < WORTH_WHILE * load:
+            return None
         self.plan()
-        if self.load < (1 - WORTH_WHILE) * load:
-            return True
-        self.blocks = blocks
-        return False
+        useful = self.load < (1 - WORTH_WHILE) * load
+        self.turnaround.planned(self.record, useful=useful)
+        if not useful:
+            self.blocks = blocks
+        return useful
+
+    def _most_gain(self) -> float:
+        """Returns the load that a new plan can save at most.
+
+        The present plan was the cheapest at its turnaround. A longer one costs it no more than the
+        difference for each of its requests. After a shorter one, a plan with more requests is
+        cheaper by no more than the difference for each additional one.
+        """
+        change = self.turnaround.change(self.timing.turnaround)
+        requests = sum(1 / block.every for block in self.blocks)
+        if change < 0:
+            requests -= sum(1 / tag.every for tag in self.polled_tags)
+        return requests * change * self.settings.verify_reads
 
     @property
     def _planning_takes_long(self) -> bool:
@@ -200,9 +270,37 @@ class Device:
         return len(self.tags) * len({tag.every for tag in self.tags}) > MOST_PLANNED
 
     def interval(self, block: Block) -> float:
-        """Returns the interval of the block; bad addresses are polled only rarely."""
-        bad = self.bad_addresses.bad.get(block.span)
-        return block.every if bad is None else max(bad.retry, block.every)
+        """Returns the interval of the block; bad addresses are polled only rarely.
+
+        The time-outs of silent addresses hold up the others: all of them together take about
+        `SILENT_SHARE` of the time, unless one returned a short time ago.
+        """
+        known = self.bad_addresses.bad
+        bad = known.get(block.span)
+        if bad is None:
+            return block.every
+        pause = bad.retry
+        if bad.silent and pause == RETRIES[-1]:
+            silent = sum(other.silent for other in known.values())
+            pause = max(pause, silent * self.longest_reply / SILENT_SHARE)
+        return max(pause, block.every)
+
+    def was_read(self, block: Block) -> None:
+        """Notes a good read: the device has these addresses."""
+        if not block.listed:
+            self.last_read = block.span
+
+    @property
+    def probe_spans(self) -> Sequence[Span]:
+        """Configured addresses for a resync, those of the last good read first.
+
+        They stay the same from one good read to the next, as `Driver.resync` needs it.
+        """
+        tags = self.polled_tags
+        bad = {tag for one in self.bad_addresses.bad.values() for tag in one.tags}
+        runs = runs_of([tag for tag in tags if tag not in bad] or tags)
+        some = runs[:: 1 + len(runs) // MOST_PROBED]
+        return some if self.last_read is None else (self.last_read, *some)
 
     # The monitor list in the PLC
 

@@ -221,7 +221,7 @@ def resync_around(job: Transacted, shapes: ReplyShapes, now: float) -> None:
             before = shapes.may_be_extra(None, now)
             job.resyncs = Resyncs(before=token() if before else None)
         case Probe(outstanding=outstanding, token=marked):
-            last = driver.resync_shape(outstanding, marked)
+            last = driver.resync_shape(outstanding, marked, device.probe_spans)
         case Confirm(write=write):
             last = driver.reply_shape(write.tag.span)
     shapes.sent(last, now)

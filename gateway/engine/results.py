@@ -20,11 +20,14 @@ from gateway.errors import (
     Refused,
     Unsteady,
 )
-from gateway.planning.planner import describe
+from gateway.planning.bad_addresses import RETRIES, SILENT
+from gateway.planning.planner import Block, describe
 from gateway.protocols.driver import Span
 from gateway.tags import Reason, Sample
 from gateway.tags.unchanged import Unchanged
 
+PLANNING_SHARE = 0.01  # of the time, for all devices of a line together
+TOGETHER = RETRIES[0] + 1.0  # seconds in which all addresses that return are tried
 BUSY_PAUSE = 0.2  # seconds of pause for a busy device, doubled each time
 
 
@@ -38,6 +41,9 @@ class Results:
         self._schedule = schedule
         self._staleness = staleness
         self._effects = effects
+        self._to_plan: dict[Device, float] = {}  # waiting for a plan, from this time on
+        self._plan_at = math.inf  # when the next of them is planned
+        self._planned_until = -math.inf  # when the share of planning permits another plan
 
     # Replies
 
@@ -74,22 +80,42 @@ class Results:
             counts.mean_gap += (gap - counts.mean_gap) / max(1, min(10, counts.reads))
         counts.reads += 1
         last.at, last.ever = now, True
+        device.was_read(block)
         self._effects.collected.append(Samples(self._samples(poll, units, time)))
         if block.of_fields:
             self._count_garbled(device, units)
         self._schedule.polled(poll, now)
-        bad = device.bad_addresses
-        if bad.bad or bad.searches:
-            if bad.read(block):
-                self._effects.info("address returned", device=device.name, block=describe(block))
-                self._plan(device, now)
-            self._end_search(device, now)
-        if device.record.exchanges < device.turnaround.look_at or bad.searching:
+        if not device.bad_addresses.clear:
+            self._read_beside_bad(device, block, now)
+        if now >= self._plan_at:
+            self._look_at_plans(now)
+        if device.record.exchanges >= device.turnaround.look_at and now >= self._planned_until:
+            self._learn(device, now)
+
+    def _learn(self, device: Device, now: float) -> None:
+        """Compares the plan with the measured turnaround."""
+        if device.bad_addresses.searching or (found := device.learn_turnaround()) is None:
             return
-        if device.learn_turnaround():
+        self._planned(device.planning_seconds(device.tags), now)
+        if found:
             expected = device.turnaround.expected
             self._effects.info("plan updated", device=device.name, turnaround=expected)
             self._schedule.plan(device, now)
+
+    def _read_beside_bad(self, device: Device, block: Block, now: float) -> None:
+        """Applies a good read of a device that has bad addresses or split blocks."""
+        bad = device.bad_addresses
+        returned = bad.read(block)
+        if returned:
+            self._effects.info("address returned", device=device.name, block=describe(block))
+            self._schedule.try_soon(device, now + RETRIES[0])
+            if bad.bad:  # they may return as well: one plan for all
+                self._to_plan.setdefault(device, now + TOGETHER)
+            else:
+                self._to_plan[device] = now
+        if returned or bad.rejoin(now):
+            self._plan(device, now)
+        self._end_search(device, now)
 
     def _samples(self, poll: Poll, units: Sequence[int], time: int) -> Sequence[Sample]:
         """Returns the samples of the units. Equal units are not decoded again."""
@@ -142,19 +168,33 @@ class Results:
         if block.listed:
             self._list_refused(poll, error, now)
             return
-        if error.refusal is Refusal.ADDRESS and poll.last.ever and not poll.tries:
-            self._schedule.again(poll)  # the address was good before: noise can change a request
-            return
-        if error.refusal is Refusal.ADDRESS:
-            known = block.span in device.bad_addresses.bad
-            halves = device.bad_addresses.refused(block, time, error.code)
-            if halves:
-                self._schedule.replace(poll, halves, now)
+        lasting = error.refusal in (Refusal.ADDRESS, Refusal.OTHER)
+        if lasting and block.span not in device.bad_addresses.bad:
+            # The address may exist: noise can change a request, or the device may have restarted.
+            if error.refusal is Refusal.ADDRESS and poll.last.ever and not poll.tries:
+                self._schedule.again(poll)
                 return
-            log = self._effects.debug if known else self._effects.warning
-            log("address refused", device=device.name, block=describe(block), why=str(error))
+            if error.refusal is Refusal.OTHER and poll.tries < device.timing.retries:
+                self._schedule.again(poll, now + BUSY_PAUSE * 2**poll.tries)
+                return
+        if lasting and self._halved(poll, error, error.code, now, time):
+            return
         self._end_badly(poll, Reason.REFUSED, error, now, time)
         self._end_search(device, now)
+
+    def _halved(self, poll: Poll, error: DeviceError, code: str, now: float, time: int) -> bool:
+        """Polls the halves of a block that failed for good. False: it is a bad address."""
+        device, block = poll.device, poll.block
+        if block.of_fields or block.listed:  # any part of it is read by the same request
+            return False
+        known = block.span in device.bad_addresses.bad
+        halves = device.bad_addresses.refused(block, time, code)
+        if halves:
+            self._schedule.replace(poll, halves, now)
+            return True
+        log = self._effects.debug if known else self._effects.warning
+        log("address refused", device=device.name, block=describe(block), why=str(error))
+        return False
 
     def _list_refused(self, poll: Poll, error: Refused, now: float) -> None:
         """Registers the monitor list again, or plans without one: it may have a bad address."""
@@ -164,25 +204,55 @@ class Results:
         device = poll.device
         self._effects.warning("monitor list refused", device=device.name, why=str(error))
         device.allow_lists(False)
-        self._plan(device, now)
+        device.bad_addresses.abandon()
+        device.plan()
+        self._schedule.plan(device, now)
 
     def _end_badly(
-        self, poll: Poll, reason: Reason, error: GatewayError, now: float, time: int
+        self,
+        poll: Poll,
+        reason: Reason,
+        error: GatewayError,
+        now: float,
+        time: int,
+        *,
+        answered: bool = True,
     ) -> None:
-        """Turns the tags of a block bad, after a reply without values."""
+        """Turns the tags of a block bad, after a reply without values or no reply."""
         poll.forget(now)
         self._effects.bad(poll.block.tags, reason, time, str(error))
-        self._schedule.polled(poll, now)
+        self._schedule.polled(poll, now, answered=answered)
 
     def _end_search(self, device: Device, now: float) -> None:
-        if device.bad_addresses.settle():
+        if device.bad_addresses.settle(now):
             device.allow_lists(True)  # the bad address in the list may be known now
             self._plan(device, now)
 
     def _plan(self, device: Device, now: float) -> None:
+        """Plans the device when the earlier plans allow it, in pieces if much has changed."""
+        self._to_plan.setdefault(device, now)
+        self._look_at_plans(now)
+
+    def _look_at_plans(self, now: float) -> None:
+        """Plans the first waiting device, if there is one and the share of planning permits it."""
+        self._plan_at = math.inf
+        if not self._to_plan:
+            return
+        device = min(self._to_plan, key=self._to_plan.__getitem__)
+        due = max(self._to_plan[device], self._planned_until)
+        if now < due:
+            self._plan_at = due
+            return
         device.bad_addresses.abandon()
-        device.plan()
+        self._planned(device.plan_changes(), now)
         self._schedule.plan(device, now)
+        if not device.bad_addresses.changed:
+            del self._to_plan[device]
+        self._look_at_plans(now)
+
+    def _planned(self, seconds: float, now: float) -> None:
+        """Allows the next plan so late that all plans of the line keep to their share."""
+        self._planned_until = now + seconds / PLANNING_SHARE
 
     # Unclear ends
 
@@ -237,19 +307,28 @@ class Results:
         for request in self._schedule.requests.withdraw(device):
             self._effects.ended(request, offline(device))
 
-    def unread(self, poll: Poll, error: GatewayError, now: float, time: int) -> None:
-        """Applies an unclear poll: polls again, or turns its tags bad."""
-        device = poll.device
+    def unread(self, poll: Poll, error: DeviceError, now: float, time: int) -> None:
+        """Applies an unclear poll: polls again, halves the block, or turns its tags bad.
+
+        A block that stays without a reply while the device replies to other requests may hold an
+        address about which the device is silent, or be too long for it.
+        """
+        device, bad = poll.device, poll.device.bad_addresses
+        health, retries = device.health, device.timing.retries
         if poll.span is not poll.block.span and device.shapes is not None:
             device.shapes.read_longer(poll.block.span, replied=False)
-        if device.health.state is State.OFFLINE:
+        if health.state is State.OFFLINE:
             return
-        if poll.tries < device.timing.retries and not poll.missed:
+        known, half = poll.block.span in bad.bad, bad.is_half(poll.block)
+        if not known and not poll.missed and poll.tries < (min(1, retries) if half else retries):
             self._schedule.again(poll)
             return
-        poll.forget(now)
-        self._effects.bad(poll.block.tags, device.health.reason, time, str(error))
-        self._schedule.polled(poll, now, answered=False)
+        others_answered = health.consecutive_failures <= 1
+        lasting = others_answered and (known or half or poll.missed > 0)
+        if lasting and self._halved(poll, error, SILENT, now, time):
+            return
+        self._end_badly(poll, health.reason, error, now, time, answered=False)
+        self._end_search(device, now)
 
     def answered_twice(self, device: Device, now: float, time: int) -> None:
         """Applies a reply to no request: values read just before may be those of other tags.

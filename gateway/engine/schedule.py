@@ -88,6 +88,14 @@ class Schedule:
         kept = [other for other in self._polls[poll.device] if other is not poll]
         self._set_polls(poll.device, kept + new, new)
 
+    def try_soon(self, device: Device, when: float) -> None:
+        """Polls all bad addresses of the device before `when`, because one has returned."""
+        bad = device.bad_addresses.bad
+        later = [p for p in self._polls[device] if p.due > when and p.block.span in bad]
+        for poll in later:
+            poll.due = when
+        self._queue.push_all(later)
+
     def _set_polls(self, device: Device, polls: list[Poll], new: list[Poll]) -> None:
         self._polls[device] = polls
         self._readers.pop(device, None)

@@ -51,7 +51,8 @@ async def _perform(job: Transacted, transaction: Transaction) -> Result:
         case Settle(guard=guard, gap=gap):
             return Settled(await transaction.settle(guard, gap))
         case Probe(outstanding=outstanding, token=token):
-            return Resynced(await driver.resync(transaction, outstanding, token))
+            spans = job.device.probe_spans
+            return Resynced(await driver.resync(transaction, outstanding, token, spans))
         case Write() | Repeat():
             return await _write(job.write if isinstance(job, Repeat) else job, transaction)
         case WriteTogether(writes=writes) if isinstance(driver, ScatteredWriter):
@@ -62,7 +63,8 @@ async def _perform(job: Transacted, transaction: Transaction) -> Result:
             return await _confirm(job, transaction)
         case Command(name=name, argument=argument) if isinstance(driver, Controllable):
             if job.resyncs.before is not None:
-                await job.device.driver.resync(transaction, None, job.resyncs.before)
+                spans = job.device.probe_spans
+                await job.device.driver.resync(transaction, None, job.resyncs.before, spans)
             return await driver.control(transaction, name, argument)
         case Answer(frame=frame):
             await transaction.tell(frame)
@@ -110,7 +112,7 @@ async def _write(write: Write, talk: Transaction) -> Sent:
     driver, tag = write.device.settings.driver, write.tag
     units = write.units
     if write.resyncs.before is not None:
-        await driver.resync(talk, tag.span, write.resyncs.before)
+        await driver.resync(talk, tag.span, write.resyncs.before, write.device.probe_spans)
     if tag.address.bit is not None:
         (word,) = await driver.read(talk, tag.span)
         bit = 1 << tag.address.bit
@@ -133,7 +135,10 @@ async def _only_reply(sending: Awaitable[bool], write: Write, talk: Transaction)
         refused, acknowledged = error, False
     if write.resyncs.after is not None:
         try:
-            await write.device.driver.resync(talk, write.tag.span, write.resyncs.after)
+            device = write.device
+            await device.driver.resync(
+                talk, write.tag.span, write.resyncs.after, device.probe_spans
+            )
         except Refused as error:
             raise Unclear(TWO_REPLIES) from error
         if talk.traffic.extra:
@@ -146,7 +151,7 @@ async def _only_reply(sending: Awaitable[bool], write: Write, talk: Transaction)
 async def _confirm(job: Confirm, talk: Talk[Any]) -> Sent:
     driver, tag = job.device.driver, job.write.tag
     try:
-        await driver.resync(talk, job.outstanding, job.token)
+        await driver.resync(talk, job.outstanding, job.token, job.device.probe_spans)
     except Refused as error:
         raise Unclear(f"its resync was refused too: {error}") from error
     if tag.write is None or not tag.write.verify:

@@ -1,8 +1,12 @@
 """Finds the addresses a device refuses by halving their block, and remembers them.
 
-A device refuses a whole request when one of its addresses does not exist. The block is halved,
-then the refused half, until the bad address stands alone. Then the planner covers all other
-addresses again, with cuts around the bad ones.
+A device refuses a whole request, or does not reply to it, when one of its addresses does not
+exist. The block is halved, then the failed half, until the bad address stands alone. Then the
+planner covers all other addresses again, with cuts around the bad ones.
+
+If both halves are read although their block failed, the block may be too long for the device, or
+noise hit it. So the block is tried once more as a whole. It is split if it fails again, and tried
+as a whole again after growing pauses.
 """
 
 from collections.abc import Callable, Iterable
@@ -15,6 +19,9 @@ from gateway.tags import Tag
 
 # Seconds between two tries of a bad address: a short refusal costs little, a missing one as well.
 RETRIES = (2.0, 10.0, 60.0, 300.0)
+SPLIT_FIRST, SPLIT_LONGEST = 600.0, 86_400.0  # seconds until a split block is tried as a whole
+SILENT = "no reply"  # the code of addresses about which the device is silent
+Cut = tuple[str, int]  # (area, n): a boundary between n - 1 and n
 CostOf = Callable[[Span], Cost | None]
 
 
@@ -33,12 +40,17 @@ class BadRange:
         """Seconds until it is tried again."""
         return RETRIES[min(self.refusals, len(RETRIES) - 1)]
 
+    @property
+    def silent(self) -> bool:
+        """True if the device does not reply at all: each try costs a time-out."""
+        return self.code == SILENT
+
 
 class KnownBad(NamedTuple):
     """Bad addresses and cuts, as the state file keeps them across a restart."""
 
     refused: tuple[tuple[Span, int, str], ...]  # span, since (ns since 1970), the maker's code
-    cuts: tuple[tuple[str, int], ...]
+    cuts: tuple[Cut, ...]
 
 
 @dataclass(slots=True)
@@ -52,15 +64,13 @@ class _Node:
     def settled(self) -> bool:
         return all(half.settled() for half in self.halves) if self.halves else self.good is not None
 
-    def cuts(self) -> set[tuple[str, int]]:
-        """The boundaries that the completed search requires."""
+    def splits(self) -> set[Cut]:
+        """Returns the boundaries between two good halves of a failed block."""
         if not self.halves:
-            if self.good:
-                return set()
-            return _bounds(self.span)
-        if all(half.good for half in self.halves):  # the device refuses only both in one request
+            return set()
+        if all(half.good for half in self.halves):
             return {(self.span.area, self.halves[1].span.start)}
-        return set().union(*(half.cuts() for half in self.halves))
+        return set().union(*(half.splits() for half in self.halves))
 
 
 def _within(inner: Span, outer: Span) -> bool:
@@ -69,38 +79,48 @@ def _within(inner: Span, outer: Span) -> bool:
     )
 
 
-def _bounds(span: Span) -> set[tuple[str, int]]:
+def _bounds(span: Span) -> set[Cut]:
     return {(span.area, span.start), (span.area, span.start + span.size)}
 
 
 @dataclass(slots=True)
 class BadAddresses:
-    """The bad addresses of one device. The caller reports each block the device refuses or reads.
+    """The bad addresses of one device. The caller reports each block that fails or is read.
 
-    `bad` holds the ranges found so far. While `searching`, halves of refused blocks are still
-    to be read.
+    `bad` holds the ranges found so far. While `searching`, halves of failed blocks are still
+    to be read. `splits` are boundaries inside blocks that can be read only in parts.
     """
 
     cost: CostOf
     bad: dict[Span, BadRange] = field(default_factory=dict)
-    _cuts: set[tuple[str, int]] = field(default_factory=set)
-    searches: list[_Node] = field(default_factory=list)  # refused blocks, not yet settled
+    splits: set[Cut] = field(default_factory=set)
+    searches: list[_Node] = field(default_factory=list)  # failed blocks, not yet settled
+    changed: set[Span] = field(default_factory=set)  # to be planned again
+    clear: bool = True  # no address is bad, no block is split: a good read changes nothing
     _leaves: dict[Span, _Node] = field(default_factory=dict)
+    _suspected: set[Cut] = field(default_factory=set)  # splits unless the whole block is read
+    _rejoin_at: float | None = None
+    _rejoin_pause: float = SPLIT_FIRST
 
     @property
     def cuts(self) -> Cuts:
         """Boundaries that no planned block may cross."""
-        return frozenset(self._cuts)
+        return frozenset(self.splits.union(*map(_bounds, self.bad)))
 
     @property
     def searching(self) -> bool:
         return bool(self.searches)
 
+    def is_half(self, block: Block) -> bool:
+        """Returns True while a search waits for this block."""
+        return block.span in self._leaves
+
     def refused(self, block: Block, now: int, code: str) -> tuple[Block, ...]:
         """Returns the two halves to read instead of `block`; empty when it is the bad address."""
+        self.clear = False
         node = self._leaves.pop(block.span, None)
         if (known := self.bad.get(block.span)) is not None:
-            self.bad[block.span] = replace(known, refusals=known.refusals + 1)
+            self.bad[block.span] = replace(known, refusals=known.refusals + 1, code=code)
             if node is not None:
                 node.good = False
             return ()
@@ -122,38 +142,66 @@ class BadAddresses:
         node = self._leaves.pop(block.span, None)
         if node is not None:
             node.good = True
-        if self.bad.pop(block.span, None) is None:
+        if self._suspected:  # the whole block is read: its halves were no cure
+            area, start, size = block.span
+            self._suspected -= {(area, n) for n in range(start + 1, start + size)}
+        returned = self.bad.pop(block.span, None) is not None
+        self._look()
+        if not returned:
             return False
-        self._cuts -= _bounds(block.span)
-        for span, other in self.bad.items():  # a neighbour may share a boundary
-            self._cuts |= _bounds(span)
-            self.bad[span] = replace(other, refusals=0)
+        self.changed.add(block.span)
+        for span, other in self.bad.items():
+            if other.refusals:
+                self.bad[span] = replace(other, refusals=0)
         return True
 
-    def settle(self) -> bool:
-        """Adopts the cuts once all searches are complete.
+    def settle(self, now: float) -> bool:
+        """Ends the searches once all are complete. `now`: seconds, by the line's clock.
 
         Returns True then: the device is to be planned again.
         """
         if not self.searches or not all(root.settled() for root in self.searches):
             return False
         for root in self.searches:
-            self._cuts |= root.cuts()
+            self.changed.add(root.span)
+            splits = root.splits()
+            if proven := splits & self._suspected:
+                self.splits |= proven
+                self._rejoin_at = now + self._rejoin_pause
+            self._suspected ^= splits
         self.abandon()
+        return True
+
+    def rejoin(self, now: float) -> bool:
+        """Drops the splits after a pause. Returns True if the device is to be planned again."""
+        if not self.splits:
+            return False
+        if self._rejoin_at is None:
+            self._rejoin_at = now + self._rejoin_pause
+        if now < self._rejoin_at:
+            return False
+        self._rejoin_pause = min(2 * self._rejoin_pause, SPLIT_LONGEST)
+        self.changed |= {Span(area, n - 1, 2) for area, n in self.splits}
+        self._suspected |= self.splits  # one search is enough to find them again
+        self.splits.clear()
         return True
 
     def abandon(self) -> None:
         """Drops the searches: the device gets other blocks, and a bad address is found again."""
         self.searches.clear()
         self._leaves.clear()
+        self._look()
+
+    def _look(self) -> None:
+        self.clear = not (self.bad or self.searches or self.splits or self._suspected)
 
     def known(self) -> KnownBad:
         refused = tuple((bad.span, bad.since, bad.code) for bad in self.bad.values())
-        return KnownBad(tuple(sorted(refused)), tuple(sorted(self._cuts)))
+        return KnownBad(tuple(sorted(refused)), tuple(sorted(self.cuts)))
 
     def restore(self, known: KnownBad, tags: Iterable[Tag]) -> None:
         """Takes over the result of an earlier run. Skips ranges that the tags no longer fill."""
-        self._cuts |= set(known.cuts)
+        self.splits = set(known.cuts).difference(*(_bounds(span) for span, _, _ in known.refused))
         areas = {span.area for span, _, _ in known.refused}
         candidates = [tag for tag in tags if tag.span.area in areas]
         for span, since, code in known.refused:
@@ -162,7 +210,7 @@ class BadAddresses:
                 (span.start, span.start + span.size)
             ]:
                 self.bad[span] = BadRange(span, since, code, inside, refusals=len(RETRIES))
-                self._cuts |= _bounds(span)
+        self._look()
 
     def _halves(self, block: Block, node: _Node) -> tuple[Block, ...]:
         items = items_of(block.tags)

@@ -6,7 +6,7 @@ turnaround; no fixed gap is right at every baud rate. A slower tag joins a faste
 costs less than a request of its own.
 """
 
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -163,6 +163,29 @@ def items_of(tags: Iterable[Tag]) -> list[Item]:
         else:
             items.append(Item(tag.span.start, end, tag.every, [tag]))
     return items
+
+
+def around(blocks: Sequence[Block], span: Span) -> range:
+    """Returns the places of the blocks that begin in the span, and of their neighbours.
+
+    `blocks` are in the order of areas and addresses.
+    """
+    end = Span(span.area, span.start + span.size, 0)
+    first = bisect_right(blocks, span, key=lambda block: block.span)
+    last = bisect_left(blocks, end, key=lambda block: block.span)
+    return range(max(0, min(first, last) - 2), min(len(blocks), last + 1))
+
+
+def runs_of(tags: Iterable[Tag]) -> list[Span]:
+    """Returns the spans of the tags; spans without a gap between them are one."""
+    runs: list[Span] = []
+    for area, start, size in sorted(tag.span for tag in tags):
+        if runs and runs[-1].area == area and start <= runs[-1].start + runs[-1].size:
+            end = max(start + size, runs[-1].start + runs[-1].size)
+            runs[-1] = runs[-1]._replace(size=end - runs[-1].start)
+        else:
+            runs.append(Span(area, start, size))
+    return runs
 
 
 def describe(block: Block) -> str:

@@ -180,9 +180,18 @@ class Driver(Protocol[F]):
         """Returns True when the device acknowledged the write, False where it never does
         (a broadcast). Raises in every other case."""
 
-    async def resync(self, talk: Talk[F], outstanding: Span | None, probe_token: int) -> int:
+    async def resync(
+        self,
+        talk: Talk[F],
+        outstanding: Span | None,
+        probe_token: int,
+        spans: Sequence[Span] = (),
+    ) -> int:
         """Sends a harmless request whose reply cannot be the reply to the `outstanding` read.
 
+        `spans`: readable addresses of the file, the likeliest first. A device may be silent about
+        all others, so a resync by a read stays inside one of them. Where no read inside them
+        differs from the outstanding one, the resync may send that read again, and returns 0.
         It is also the cheapest way to see that the device is online. `probe_token` marks the
         request and grows by two with each resync; a second request in the same resync is marked
         with the number after it. So a reply to an earlier resync is not taken for the reply to
@@ -277,7 +286,9 @@ class UnnumberedReplies(Protocol):
     def write_shapes(self, span: Span, units: Sequence[int]) -> Sequence[Hashable]:
         """Returns the shapes of all replies to a write of `span`, in their order."""
 
-    def resync_shape(self, outstanding: Span | None, probe_token: int) -> Hashable:
+    def resync_shape(
+        self, outstanding: Span | None, probe_token: int, spans: Sequence[Span] = ()
+    ) -> Hashable:
         """Returns the shape of the reply to `resync`; None where no other reply can have it."""
 
     def is_reply(self, frame: Any) -> bool:

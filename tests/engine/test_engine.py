@@ -288,7 +288,7 @@ online   Poll                  unsteady      online    -                        
 online   Poll                  address       online    -                                    Poll
 online   Poll                  damaged       online    -                                    Poll
 online   Poll                  busy          online    -                                    Idle
-online   Poll                  refused       online    bad:refused                          Idle
+online   Poll                  refused       online    -                                    Idle
 online   Poll                  any-unclear   failing   -                                    Settle
 online   Poll                  lost          online    -                                    -
 online   PollAgain             units         online    good                                 Idle
@@ -304,7 +304,7 @@ online   PollReadBefore        unsteady      online    -                        
 online   PollReadBefore        address       online    -                                    Poll
 online   PollReadBefore        damaged       online    -                                    Poll
 online   PollReadBefore        busy          online    -                                    Idle
-online   PollReadBefore        refused       online    bad:refused                          Idle
+online   PollReadBefore        refused       online    -                                    Idle
 online   PollReadBefore        any-unclear   failing   -                                    Settle
 online   PollReadBefore        lost          online    -                                    -
 online   Write                 sent          online    written                              Poll

@@ -1,13 +1,18 @@
 """Results of polls and probes: what follows for the values, the plan, the log and the record."""
 
+from collections.abc import Callable
+
 import pytest
 
-from gateway.engine.device import LEARN_EVERY
+from gateway.engine.device import LEARN_EVERY, SILENT_SHARE
 from gateway.engine.health import State
-from gateway.engine.jobs import Idle, Poll, Resynced, Settle, Settled, Traffic
+from gateway.engine.jobs import Idle, Poll, Probe, Resynced, Settle, Settled, Traffic
 from gateway.engine.reply_shapes import QUIET
 from gateway.engine.results import BUSY_PAUSE
 from gateway.errors import DeviceError, Garbled, Refusal, Refused, Unsteady
+from gateway.planning.bad_addresses import RETRIES, SILENT, SPLIT_FIRST
+from gateway.planning.planner import plan
+from gateway.protocols.driver import Span
 from gateway.tags import Quality, Reason
 from tests.engine.rig import REPLIED, SILENCE, Rig, link_device, tcp_device
 from tests.sim.plant import device, make_tag
@@ -113,11 +118,105 @@ def test_a_request_that_arrived_damaged_is_sent_again_at_once() -> None:
     assert {sample.reason for sample in rig.samples} == {Reason.REFUSED}
 
 
-def test_any_other_refusal_makes_the_tags_bad_at_once() -> None:
-    rig = online()
-    rig.conclude(polled(rig), OTHER, REPLIED)
-    assert [(s.reason, s.detail) for s in rig.samples] == [(Reason.REFUSED, "not allowed")] * 6
-    assert isinstance(rig.next(), Idle)
+def test_any_other_refusal_that_comes_again_halves_the_block() -> None:
+    rig = online(retries=2)
+    poll = polled(rig)
+    for _ in range(2):
+        rig.conclude(poll, OTHER, REPLIED)
+        assert polled(rig) is poll
+    rig.conclude(poll, OTHER, REPLIED)
+    assert polled(rig).block.span.size == 3
+    assert rig.samples == []
+
+
+@pytest.mark.parametrize("refusal", [BUSY, DAMAGED])
+def test_a_busy_device_and_damaged_requests_start_no_search(refusal: Refused) -> None:
+    rig = online(retries=1)
+    for _ in range(12):
+        poll = polled(rig)
+        assert poll.block.span.size == 6
+        rig.conclude(poll, refusal, REPLIED)
+    assert rig.device.bad_addresses.clear
+
+
+def serve(rig: Rig, until: float, silent: Callable[[Span], bool] = lambda _: False) -> None:
+    """Serves the device, which replies to all requests but those for silent spans."""
+    while rig.now < until:
+        job = rig.next()
+        match job:
+            case Idle():
+                rig.now = min(until, job.until)
+            case Probe():
+                rig.conclude(job, Resynced(9))
+            case Poll(block=block) if silent(block.span):
+                rig.fail(job)
+            case Poll(block=block):
+                start, size = block.span.start, block.span.size
+                rig.conclude(job, UNITS[start : start + size])
+
+
+def good_now(rig: Rig) -> set[str]:
+    last = {sample.tag.text: sample.quality for sample in rig.samples}
+    return {text for text, quality in last.items() if quality is Quality.GOOD}
+
+
+def test_an_address_about_which_the_device_is_silent_is_found_by_halves() -> None:
+    rig = online(retries=2)
+    serve(rig, 30.0, lambda span: span.start <= 2 < span.start + span.size)
+    [bad] = rig.device.bad_addresses.bad.values()
+    assert (bad.span.start, bad.span.size, bad.code) == (2, 1, SILENT)
+    assert good_now(rig) == {"D0", "D1", "D3", "D4", "D5"}
+    assert "device offline" not in events(rig)
+    serve(rig, 400.0)
+    assert rig.device.bad_addresses.clear
+    assert [block.span.size for block in rig.device.blocks] == [6]
+
+
+@pytest.mark.parametrize("outage", [2.0, 8.0, 20.0])
+def test_an_outage_of_one_block_leaves_no_bad_address_and_no_split(outage: float) -> None:
+    rig = online(retries=2)
+    serve(rig, outage, lambda _: True)
+    serve(rig, 400.0)
+    assert rig.device.bad_addresses.clear
+    assert [block.span.size for block in rig.device.blocks] == [6]
+    assert len(good_now(rig)) == 6
+
+
+def test_a_device_that_goes_offline_starts_no_search() -> None:
+    rig = online(retries=2)
+    while rig.device.state is not State.OFFLINE:
+        job = rig.transacted()
+        assert isinstance(job, Poll | Probe)
+        rig.fail(job)
+    for _ in range(20):
+        job = rig.transacted()
+        assert isinstance(job, Probe)
+        rig.fail(job)
+    assert rig.device.bad_addresses.clear
+
+
+def test_a_block_too_long_for_the_device_is_split_and_tried_whole_again_much_later() -> None:
+    rig = online(retries=1)
+    serve(rig, 30.0, lambda span: span.size > 3)
+    assert [block.span.size for block in rig.device.blocks] == [3, 3]
+    assert len(good_now(rig)) == 6
+    assert not rig.device.bad_addresses.bad
+    serve(rig, SPLIT_FIRST)
+    assert len(rig.device.blocks) == 2
+    serve(rig, SPLIT_FIRST + 60.0)
+    assert [block.span.size for block in rig.device.blocks] == [6]
+    assert rig.device.bad_addresses.clear
+
+
+def test_many_silent_addresses_are_tried_in_a_hundredth_of_the_time() -> None:
+    dev = link_device()
+    for n in range(6):
+        block = plan([dev.tags[n]], dev.driver, dev.seconds)[0]
+        for _ in range(4):
+            dev.bad_addresses.refused(block, 0, SILENT)
+    assert dev.interval(block) == pytest.approx(6 * dev.longest_reply / SILENT_SHARE)
+    dev.bad_addresses.refused(block, 0, "06")
+    assert dev.interval(block) == RETRIES[-1]
 
 
 def test_a_bad_address_is_found_by_halves_and_the_others_are_planned_again() -> None:

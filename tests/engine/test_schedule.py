@@ -440,7 +440,7 @@ class AnyOrder(RuleBasedStateMachine):
                 schedule.replace(poll, halves, self.now)
             else:
                 schedule.polled(poll, self.now)
-            if found.bad_addresses.settle():
+            if found.bad_addresses.settle(0.0):
                 found.plan()
                 schedule.plan(found, self.now)
         else:

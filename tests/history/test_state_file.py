@@ -29,7 +29,7 @@ def searched(numbers: range, culprit: int) -> Device:
             found.bad_addresses.read(block)
             continue
         refused += found.bad_addresses.refused(block, 1_000, "28")
-    assert found.bad_addresses.settle()
+    assert found.bad_addresses.settle(0.0)
     found.plan()
     return found
 

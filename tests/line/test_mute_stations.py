@@ -6,6 +6,7 @@ import pytest
 
 from gateway.engine.requests import WRITE_EXPIRY
 from gateway.errors import Offline
+from gateway.planning.bad_addresses import SPLIT_FIRST
 from gateway.tags import Quality, Reason, WriteRule
 from tests.line.clocks import clocks, wind_up
 from tests.sim.bench import WIRE
@@ -146,8 +147,8 @@ async def test_writes_to_a_silent_station_do_not_occupy_the_line() -> None:
 
 
 @on_virtual_time
-async def test_a_block_without_replies_does_not_occupy_the_line() -> None:
-    """The station replies to other requests, so it stays online: only this block is polled less."""
+async def test_a_block_without_replies_is_read_in_parts_and_does_not_occupy_the_line() -> None:
+    """The station replies to other requests, so it stays online. It is silent for 40 words."""
     odd, other = clocks(3, 40, station=1, every=0.5), clocks(10, station=2, every=0.2)
     line = plant([odd, other])
     wind_up(line)
@@ -159,9 +160,10 @@ async def test_a_block_without_replies_does_not_occupy_the_line() -> None:
         await asyncio.sleep(60)
         start = now()
         await asyncio.sleep(600)
-        assert line.now[odd.tags[3]].reason is Reason.NO_REPLY
-        assert line.now[odd.tags[0]].quality is Quality.GOOD
+        assert line.good(odd)
+        assert sorted(block.span.size for block in odd.blocks) == [3, 20, 20]
         assert len(line.reads(other, start)) >= 0.95 * 600 / 0.2
         station.answer = None
-        await asyncio.sleep(65)
+        await asyncio.sleep(2 * SPLIT_FIRST)
         assert line.good(odd)
+        assert sorted(block.span.size for block in odd.blocks) == [3, 40]

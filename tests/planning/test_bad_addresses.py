@@ -24,6 +24,10 @@ class Asker:
         start, size = block.span.start, block.span.size
         return not any(start <= n < start + size for n in self.missing)
 
+    def plan(self) -> None:
+        self.device.plan_changes()
+        assert not self.device.bad_addresses.changed
+
     def ask(self, block: Block) -> bool:
         """True when the device was planned again."""
         refusals = self.device.bad_addresses
@@ -32,15 +36,15 @@ class Asker:
             again = refusals.read(block)
             if again:
                 refusals.abandon()
-            if again or refusals.settle():
-                self.device.plan()
+            if again or refusals.settle(0.0):
+                self.plan()
                 return True
             return False
         halves = refusals.refused(block, 7, "28")
         if any(self.ask(half) for half in halves):
             return True
-        if not halves and refusals.settle():
-            self.device.plan()
+        if not halves and refusals.settle(0.0):
+            self.plan()
             return True
         return False
 

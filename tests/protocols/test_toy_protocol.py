@@ -110,7 +110,13 @@ class Toy:
         await self._ask(talk, "W", f"N{span.start} {units[0]}")
         return True
 
-    async def resync(self, talk: Talk[str], outstanding: Span | None, probe_token: int) -> int:
+    async def resync(
+        self,
+        talk: Talk[str],
+        outstanding: Span | None,
+        probe_token: int,
+        spans: Sequence[Span] = (),
+    ) -> int:
         number = probe_token % 100
         if outstanding is not None and number == outstanding.start:
             number = (number + 1) % 100

@@ -225,7 +225,13 @@ class ComputerLink:
         await talk.tell(self._enquiry("GW", _SWITCH[argument.lower()], ALL_STATIONS))
         return "sent to all stations, none answers"
 
-    async def resync(self, talk: LinkTalk, outstanding: Span | None, probe_token: int) -> int:
+    async def resync(
+        self,
+        talk: LinkTalk,
+        outstanding: Span | None,
+        probe_token: int,
+        spans: Sequence[Span] = (),
+    ) -> int:
         """Sends a loopback. No data reply has its letter Z; the rest is the `probe_token`."""
         await self._loopback(talk, f"Z{probe_token & 0xFFFF:04X}")
         return 0xFFFF
@@ -245,7 +251,9 @@ class ComputerLink:
         """Every write has the same acknowledgement."""
         return (_ACK,)
 
-    def resync_shape(self, outstanding: Span | None, probe_token: int) -> Hashable:
+    def resync_shape(
+        self, outstanding: Span | None, probe_token: int, spans: Sequence[Span] = ()
+    ) -> Hashable:
         """None: the letter Z and the token are no data of any other reply."""
         return None
 

@@ -148,7 +148,13 @@ class FrameDriver:
         name = self.spell(Address(span.area, span.start))
         return await self.settings.tell(talk, name, bytes(units))
 
-    async def resync(self, talk: Talk[bytes], outstanding: Span | None, probe_token: int) -> int:
+    async def resync(
+        self,
+        talk: Talk[bytes],
+        outstanding: Span | None,
+        probe_token: int,
+        spans: Sequence[Span] = (),
+    ) -> int:
         """Sends another request than the outstanding one; the same where there is no other.
 
         These replies do not name their request: a late reply to the same request is taken for

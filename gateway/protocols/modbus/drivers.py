@@ -92,9 +92,13 @@ class _Modbus:
         return self._master.write(talk, span, units)
 
     def resync(
-        self, talk: Talk[Frame], outstanding: Span | None, probe_token: int
+        self,
+        talk: Talk[Frame],
+        outstanding: Span | None,
+        probe_token: int,
+        spans: Sequence[Span] = (),
     ) -> Coroutine[Any, Any, int]:
-        return self._master.resync(talk, outstanding, probe_token)
+        return self._master.resync(talk, outstanding, probe_token, spans)
 
     @property
     def unnumbered(self) -> bool:
@@ -106,8 +110,10 @@ class _Modbus:
     def write_shapes(self, span: Span, units: Sequence[int]) -> Sequence[Hashable]:
         return self._master.write_shapes(span, units)
 
-    def resync_shape(self, outstanding: Span | None, probe_token: int) -> Hashable:
-        return self._master.resync_shape(outstanding, probe_token)
+    def resync_shape(
+        self, outstanding: Span | None, probe_token: int, spans: Sequence[Span] = ()
+    ) -> Hashable:
+        return self._master.resync_shape(outstanding, probe_token, spans)
 
     def is_reply(self, frame: Frame) -> bool:
         return isinstance(frame, Frame) and frame.station == self.station

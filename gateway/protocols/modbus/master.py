@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 from gateway.errors import BadValue, Refused
 from gateway.protocols.driver import Area, Cost, Span, Talk, Unit
+from gateway.protocols.harmless import HarmlessReads, told_from
 from gateway.protocols.modbus import pdu
 from gateway.protocols.modbus.addressing import Dialect, Limits, Place
 from gateway.protocols.modbus.frame import READ_BITS, Frame, answer_length
@@ -171,28 +172,60 @@ class Master:
             units = pdu.words_of(units, low_first=self.low_first)
         return pdu.write_words_request(wire, units, single=single)
 
-    async def resync(self, talk: Talk[Frame], outstanding: Span | None, probe_token: int) -> int:
+    async def resync(
+        self,
+        talk: Talk[Frame],
+        outstanding: Span | None,
+        probe_token: int,
+        spans: Sequence[Span] = (),
+    ) -> int:
         """Reads another byte count than the `outstanding` read, or sends a token by function 08.
 
         Function 08 is not used while its reply may be an echo: a dead device would seem online.
         An exception names no address: it may be the late reply to the `outstanding` read. So one
         more read with another byte count follows it, unless requests carry a number.
+
+        Reads stay inside the `spans`. If they hold no read of another byte count, every second
+        resync repeats the outstanding read, and the others read beyond the spans.
         """
         loopback = self.diagnostics and (self.numbered or not talk.may_echo)
-        harmless = self._harmless(outstanding)
-        count = len(harmless)
+        pick = self._harmless_pick(outstanding, spans)
+        first, second = pick(probe_token), pick(probe_token + 1)
         try:
             if loopback:
                 await self._loopback(talk, probe_token & 0xFFFF)
             else:
-                await self.read(talk, harmless[probe_token % count])
+                await self.read(talk, first)
         except Refused:
             if self.numbered:
                 return _NUMBERS
-            if loopback:
+            if loopback or self._form(first) == self._form(second):
                 raise
-            await self.read(talk, harmless[(probe_token + 1) % count])
-        return _NUMBERS if self.numbered or loopback else max(1, count // 2)
+            await self.read(talk, second)
+            first = second
+        if self.numbered or loopback:
+            return _NUMBERS
+        return told_from(first, probe_token, outstanding, pick, self._form)
+
+    def _harmless_pick(
+        self, outstanding: Span | None, spans: Sequence[Span]
+    ) -> Callable[[int], Span]:
+        """Returns the read of each probe token."""
+        if inside := HarmlessReads(spans, outstanding, self._form):
+            return inside.pick
+        beyond = self._harmless(outstanding)
+
+        def pick(token: int) -> Span:
+            if spans and outstanding is not None and token // 2 % 2:
+                return outstanding
+            return beyond[token % len(beyond)]
+
+        return pick
+
+    def _form(self, span: Span) -> tuple[int, int] | None:
+        """Returns the function and the length of the reply to a read."""
+        cost, place = self.cost(span), self._place(span)
+        return None if cost is None or place is None else (place.function, cost.reply)
 
     def _harmless(self, outstanding: Span | None) -> Sequence[Span]:
         """Short reads near the `outstanding` one, of different byte counts, none equal to its."""
@@ -216,13 +249,8 @@ class Master:
     # The shapes of replies
 
     def reply_shape(self, span: Span) -> Hashable:
-        """Function and byte count: a reply to a read names no address."""
-        place = self._place(span)
-        if place is None:
-            return None
-        registers = span.size * place.registers
-        count = (registers + 7) // 8 if _is_bits(place) else 2 * registers
-        return bytes((place.function, count & 0xFF))
+        """Function and length: a reply to a read names no address."""
+        return self._form(span)
 
     def write_shapes(self, span: Span, units: Sequence[int]) -> Sequence[Hashable]:
         """The whole reply: it repeats the address, and the value or the count."""
@@ -234,12 +262,13 @@ class Master:
             return (request[:1] + bytes(2) + request[3:],)
         return (request[:5],)
 
-    def resync_shape(self, outstanding: Span | None, probe_token: int) -> Hashable:
+    def resync_shape(
+        self, outstanding: Span | None, probe_token: int, spans: Sequence[Span]
+    ) -> Hashable:
         """None for function 08 with its token."""
         if self.diagnostics:
             return None
-        harmless = self._harmless(outstanding)
-        return self.reply_shape(harmless[probe_token % len(harmless)])
+        return self._form(self._harmless_pick(outstanding, spans)(probe_token))
 
     async def _loopback(self, talk: Talk[Frame], token: int) -> None:
         request = pdu.loopback_request(token)

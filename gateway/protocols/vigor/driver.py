@@ -19,6 +19,7 @@ from gateway.protocols.driver import (
     Traits,
     Unit,
 )
+from gateway.protocols.harmless import HarmlessReads, told_from
 from gateway.protocols.vigor.codec import (
     FORCE_OFF,
     FORCE_ON,
@@ -149,18 +150,35 @@ class Vigor:
         await self._write_body(talk, WRITE, body)
         return True
 
-    async def resync(self, talk: Talk[Frame], outstanding: Span | None, probe_token: int) -> int:
+    async def resync(
+        self,
+        talk: Talk[Frame],
+        outstanding: Span | None,
+        probe_token: int,
+        spans: Sequence[Span] = (),
+    ) -> int:
         """Reads M0 and up, in a number of bytes that no outstanding request reads.
 
-        An error reply names no request: it may be the late reply to the `outstanding` read, so
-        one more read with another number of bytes follows it.
+        Every second resync reads inside the `spans`, if they allow it: a device that only speaks
+        this protocol may lack M0 and be silent about it. An error reply names no request: it may
+        be the late reply to the `outstanding` read, so one more read with another number of bytes
+        follows it.
         """
-        sizes = _probe_sizes(outstanding)
+        pick = _pick(outstanding, spans)
+        first, second = pick(probe_token), pick(probe_token + 1)
         try:
-            await self._read_bytes(talk, 0x0080, sizes[probe_token % len(sizes)])
+            await self._read_cover(talk, first)
         except Refused:
-            await self._read_bytes(talk, 0x0080, sizes[(probe_token + 1) % len(sizes)])
-        return len(sizes) // 2
+            if _bytes(first) == _bytes(second):
+                raise
+            await self._read_cover(talk, second)
+            first = second
+        return told_from(first, probe_token, outstanding, pick, _bytes)
+
+    async def _read_cover(self, talk: Talk[Frame], span: Span) -> None:
+        covered = cover(span)
+        if covered is not None:
+            await self._read_bytes(talk, covered.address, covered.size)
 
     # The shapes of replies
 
@@ -181,9 +199,10 @@ class Vigor:
         neighbours = covered is not None and (covered.ahead or covered.behind)
         return (self.reply_shape(span), WRITE) if neighbours else (WRITE,)
 
-    def resync_shape(self, outstanding: Span | None, probe_token: int) -> Hashable:
-        sizes = _probe_sizes(outstanding)
-        return sizes[probe_token % len(sizes)]
+    def resync_shape(
+        self, outstanding: Span | None, probe_token: int, spans: Sequence[Span] = ()
+    ) -> Hashable:
+        return _bytes(_pick(outstanding, spans)(probe_token))
 
     def is_reply(self, frame: Frame) -> bool:
         return isinstance(frame, Reply) and frame.station == self.station
@@ -207,9 +226,25 @@ class Vigor:
         return bits
 
 
-def _probe_sizes(outstanding: Span | None) -> Sequence[int]:
-    late = cover(outstanding) if outstanding is not None else None
-    return [size for size in _PROBE_SIZES if late is None or size != late.size]
+def _pick(outstanding: Span | None, spans: Sequence[Span]) -> Callable[[int], Span]:
+    """Returns the read of each probe token."""
+    late = None if outstanding is None else _bytes(outstanding)
+    sizes = [size for size in _PROBE_SIZES if size != late]
+    inside = HarmlessReads(spans, outstanding, _bytes)
+
+    def pick(token: int) -> Span:
+        if inside:
+            token, in_turn = token // 4 * 2 + token % 2, token // 2 % 2
+            if in_turn:
+                return inside.pick(token)
+        return Span("M", 0, 8 * sizes[token % len(sizes)])
+
+    return pick
+
+
+def _bytes(span: Span) -> int | None:
+    covered = cover(span)
+    return None if covered is None else covered.size
 
 
 def _forced(span: Span) -> bool:

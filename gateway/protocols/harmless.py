@@ -1,0 +1,80 @@
+"""Reads for a resync: short ones, of addresses that the device has by its configuration.
+
+A device may be silent about addresses that it lacks. So a resync reads inside the spans that the
+caller names, and each resync in another place and with another form of its reply.
+"""
+
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass, field
+
+from gateway.protocols.driver import Span
+
+MOST_UNITS, MOST_FORMS = 64, 6  # of one read; of the reads in one place
+MOST_EARLIER = 16  # resyncs before this one
+# The form of the reply to a read, such as its number of bytes; None: it cannot be read.
+FormOf = Callable[[Span], Hashable | None]
+
+
+def told_from(
+    read: Span, token: int, outstanding: Span | None, pick: Callable[[int], Span], form: FormOf
+) -> int:
+    """Returns the number of outstanding requests whose replies differ from that to `read`.
+
+    `pick` returns the read of a token. These are the `outstanding` read and the resyncs before.
+    """
+    own = form(read)
+    if outstanding is not None and form(outstanding) == own:
+        return 0
+    found = int(outstanding is not None)
+    for earlier in range(token - 2, max(0, token - 2 * MOST_EARLIER), -2):
+        if own in (form(pick(earlier)), form(pick(earlier + 1))):
+            break
+        found += 1
+    return found
+
+
+@dataclass(slots=True)
+class HarmlessReads:
+    """The reads inside `spans` with another form than the `outstanding` read."""
+
+    spans: Sequence[Span]
+    outstanding: Span | None
+    form: FormOf
+    _places: list[tuple[Sequence[Span], Sequence[Span]]] = field(init=False)
+
+    def __post_init__(self) -> None:
+        late = None if self.outstanding is None else self.form(self.outstanding)
+        places = (self._place(span, late) for span in self.spans)
+        self._places = [place for place in places if place[0]]
+
+    def __bool__(self) -> bool:
+        return bool(self._places)
+
+    def pick(self, token: int) -> Span:
+        """Returns the read of a token, which grows by two from one resync to the next.
+
+        Every second one is in the first span. The reads begin where their span begins, or end
+        where it ends: a bad address must not hide the device for long.
+        """
+        (first, *others), (step, second) = self._places, divmod(token, 2)
+        turn = step // 2 if others else step
+        if step % 2 and others:
+            turn, place = divmod(turn, len(others))
+            first = others[place]
+        reads = first[turn % 2]
+        return reads[(2 * step + second) % len(reads)]
+
+    def _place(self, span: Span, late: Hashable) -> tuple[Sequence[Span], Sequence[Span]]:
+        """Returns the reads at the begin of the span, and those at its end."""
+        area, start, size = span
+        begin: dict[Hashable, Span] = {}
+        end: dict[Hashable, Span] = {}
+        for units in range(1, min(size, MOST_UNITS) + 1):
+            for found, at in ((begin, start), (end, start + size - units)):
+                read = Span(area, at, units)
+                shape = self.form(read)
+                if shape is not None and shape != late:
+                    found.setdefault(shape, read)
+            if len(begin) == MOST_FORMS:
+                break
+        return list(begin.values()), list((end or begin).values())

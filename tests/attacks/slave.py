@@ -1,0 +1,128 @@
+"""A Modbus RTU slave on a TCP port, and the line that polls it over a real connection.
+
+It shares no code with the gateway. Each register holds its own number. A request for a register
+that it lacks, or for too many, gets the reply that the attack chose: an exception, or silence.
+"""
+
+import asyncio
+from collections.abc import AsyncIterator, Callable, Sequence
+from contextlib import asynccontextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from gateway.app import line_of
+from gateway.config import load
+from gateway.engine.device import Device
+from gateway.line.line import Line
+from gateway.tags import Quality, Sample
+from tests.e2e.processes import write_config
+
+PATIENCE = 20.0  # seconds; never waited for when all is well
+
+
+def crc(data: bytes) -> bytes:
+    left = 0xFFFF
+    for byte in data:
+        left ^= byte
+        for _ in range(8):
+            left = left >> 1 ^ (0xA001 if left & 1 else 0)
+    return left.to_bytes(2, "little")
+
+
+@dataclass
+class Slave:
+    """Station 1. `exception`: its reply to a request that it cannot serve; None: silence."""
+
+    has: Callable[[int], bool]
+    exception: int | None = None
+    longest: int = 125  # registers of one reply
+    mute: bool = False  # every reply is lost
+    requests: list[tuple[int, int]] = field(default_factory=list)  # first register, and number
+    _heard: bytes = b""
+
+    async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        with suppress(ConnectionError):
+            while data := await reader.read(4096):
+                self._heard += data
+                while len(self._heard) >= 8:
+                    request, self._heard = self._heard[:8], self._heard[8:]
+                    reply = self._reply(request)
+                    writer.write(b"" if self.mute else reply)
+        writer.close()
+
+    def _reply(self, request: bytes) -> bytes:
+        assert crc(request[:6]) == request[6:], request
+        function = request[1]
+        first, count = int.from_bytes(request[2:4]), int.from_bytes(request[4:6])
+        self.requests.append((first, count))
+        numbers = range(first, first + count)
+        if function == 3 and count <= self.longest and all(map(self.has, numbers)):
+            data = b"".join(number.to_bytes(2) for number in numbers)
+            reply = bytes((1, function, len(data))) + data
+        elif self.exception is not None:
+            reply = bytes((1, function | 0x80, self.exception))
+        else:
+            return b""
+        return reply + crc(reply)
+
+
+@dataclass
+class Watch:
+    """The sink of the line. `good` and `wrong`: register numbers, by their last sample."""
+
+    last: dict[int, Sample] = field(default_factory=dict)
+    wrong: list[Sample] = field(default_factory=list)
+    news: asyncio.Event = field(default_factory=asyncio.Event)
+
+    def samples(self, samples: Sequence[Sample]) -> None:
+        for sample in samples:
+            number = sample.tag.address.number
+            self.last[number] = sample
+            if sample.quality is Quality.GOOD and sample.value != number:
+                self.wrong.append(sample)
+        self.news.set()
+
+    def online(self, device: Device, online: bool) -> None: ...
+
+    @property
+    def good(self) -> set[int]:
+        return {n for n, sample in self.last.items() if sample.quality is Quality.GOOD}
+
+    async def until(self, happened: Callable[[], bool]) -> None:
+        async with asyncio.timeout(PATIENCE):
+            while not happened():
+                self.news.clear()
+                await self.news.wait()
+
+
+@asynccontextmanager
+async def polled(
+    slave: Slave, folder: Path, numbers: Sequence[int], **settings: Any
+) -> AsyncIterator[tuple[Line, Watch]]:
+    """Runs a line that polls these registers of the slave."""
+    server = await asyncio.start_server(slave.serve, "127.0.0.1", 0)
+    port = server.sockets[0].getsockname()[1]
+    tags = {f"r{n}": {"address": f"holding:{n}", "type": "uint16"} for n in numbers}
+    device = {
+        "protocol": "modbus-rtu",
+        "station": 1,
+        "reply_timeout": "100ms",
+        "late_guard": "50ms",
+        **settings,
+        "tags": tags,
+    }
+    line = {"port": f"tcp://127.0.0.1:{port}", "baudrate": 115200, "devices": {"slave": device}}
+    file = write_config(folder / "config.yaml", "tcp/127.0.0.1:0", {"hall": line})
+    [config] = load(file).lines
+    watch = Watch()
+    served = line_of(config, config.devices, watch)
+    task = asyncio.create_task(served.run())
+    try:
+        yield served, watch
+    finally:
+        task.cancel()
+        with suppress(asyncio.CancelledError):
+            await task
+        server.close()
+    assert watch.wrong == []
