@@ -8,6 +8,7 @@ from gateway.engine.device import ANSWERS_TWICE, Device
 from gateway.engine.effects import Effects, Samples
 from gateway.engine.health import State
 from gateway.engine.jobs import Poll
+from gateway.engine.plans import Plans
 from gateway.engine.reply_shapes import QUIET
 from gateway.engine.schedule import Schedule
 from gateway.engine.staleness import Staleness
@@ -26,7 +27,6 @@ from gateway.protocols.driver import Span
 from gateway.tags import Reason, Sample
 from gateway.tags.unchanged import Unchanged
 
-PLANNING_SHARE = 0.01  # of the time, for all devices of a line together
 TOGETHER = RETRIES[0] + 1.0  # seconds in which all addresses that return are tried
 BUSY_PAUSE = 0.2  # seconds of pause for a busy device, doubled each time
 
@@ -41,9 +41,7 @@ class Results:
         self._schedule = schedule
         self._staleness = staleness
         self._effects = effects
-        self._to_plan: dict[Device, float] = {}  # waiting for a plan, from this time on
-        self._plan_at = math.inf  # when the next of them is planned
-        self._planned_until = -math.inf  # when the share of planning permits another plan
+        self._plans = Plans(schedule)
 
     # Replies
 
@@ -87,16 +85,17 @@ class Results:
         self._schedule.polled(poll, now)
         if not device.bad_addresses.clear:
             self._read_beside_bad(device, block, now)
-        if now >= self._plan_at:
-            self._look_at_plans(now)
-        if device.record.exchanges >= device.turnaround.look_at and now >= self._planned_until:
+        plans = self._plans
+        if now >= plans.next_at:
+            plans.look(now)
+        if device.record.exchanges >= device.turnaround.look_at and now >= plans.allowed_from:
             self._learn(device, now)
 
     def _learn(self, device: Device, now: float) -> None:
         """Compares the plan with the measured turnaround."""
         if device.bad_addresses.searching or (found := device.learn_turnaround()) is None:
             return
-        self._planned(device.planning_seconds(device.tags), now)
+        self._plans.spent(device.planning_seconds(device.tags), now)
         if found:
             expected = device.turnaround.expected
             self._effects.info("plan updated", device=device.name, turnaround=expected)
@@ -109,12 +108,10 @@ class Results:
         if returned:
             self._effects.info("address returned", device=device.name, block=describe(block))
             self._schedule.try_soon(device, now + RETRIES[0])
-            if bad.bad:  # they may return as well: one plan for all
-                self._to_plan.setdefault(device, now + TOGETHER)
-            else:
-                self._to_plan[device] = now
-        if returned or bad.rejoin(now):
-            self._plan(device, now)
+            # The others may return as well: one plan for all.
+            self._plans.want(device, now, TOGETHER if bad.bad else 0.0)
+        elif bad.rejoin(now):
+            self._plans.want(device, now)
         self._end_search(device, now)
 
     def _samples(self, poll: Poll, units: Sequence[int], time: int) -> Sequence[Sample]:
@@ -153,12 +150,8 @@ class Results:
         device.record.count_refusal(error)
         if block.listed:
             device.forget_list()
-        if device.shapes is not None:
-            device.shapes.refused(now)
-            if poll.span is not block.span and error.refusal not in (Refusal.DAMAGED, Refusal.BUSY):
-                device.shapes.refused_longer(block.span)
-                self._schedule.again(poll, counted=False)
-                return
+        if self._refused_longer(poll, error, now):
+            return
         if error.refusal is Refusal.DAMAGED and poll.tries < device.timing.retries:
             self._schedule.again(poll)
             return
@@ -181,6 +174,18 @@ class Results:
             return
         self._end_badly(poll, Reason.REFUSED, error, now, time)
         self._end_search(device, now)
+
+    def _refused_longer(self, poll: Poll, error: Refused, now: float) -> bool:
+        """Polls the block alone if the refused read was longer than the block."""
+        shapes = poll.device.shapes
+        if shapes is None:
+            return False
+        shapes.refused(now)
+        if poll.span is poll.block.span or error.refusal in (Refusal.DAMAGED, Refusal.BUSY):
+            return False
+        shapes.refused_longer(poll.block.span)
+        self._schedule.again(poll, counted=False)
+        return True
 
     def _halved(self, poll: Poll, error: DeviceError, code: str, now: float, time: int) -> bool:
         """Polls the halves of a block that failed for good. False: it is a bad address."""
@@ -226,33 +231,7 @@ class Results:
     def _end_search(self, device: Device, now: float) -> None:
         if device.bad_addresses.settle(now):
             device.allow_lists(True)  # the bad address in the list may be known now
-            self._plan(device, now)
-
-    def _plan(self, device: Device, now: float) -> None:
-        """Plans the device when the earlier plans allow it, in pieces if much has changed."""
-        self._to_plan.setdefault(device, now)
-        self._look_at_plans(now)
-
-    def _look_at_plans(self, now: float) -> None:
-        """Plans the first waiting device, if there is one and the share of planning permits it."""
-        self._plan_at = math.inf
-        if not self._to_plan:
-            return
-        device = min(self._to_plan, key=self._to_plan.__getitem__)
-        due = max(self._to_plan[device], self._planned_until)
-        if now < due:
-            self._plan_at = due
-            return
-        device.bad_addresses.abandon()
-        self._planned(device.plan_changes(), now)
-        self._schedule.plan(device, now)
-        if not device.bad_addresses.changed:
-            del self._to_plan[device]
-        self._look_at_plans(now)
-
-    def _planned(self, seconds: float, now: float) -> None:
-        """Allows the next plan so late that all plans of the line keep to their share."""
-        self._planned_until = now + seconds / PLANNING_SHARE
+            self._plans.want(device, now)
 
     # Unclear ends
 

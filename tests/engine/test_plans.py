@@ -11,7 +11,7 @@ from gateway.engine import device as engine_device
 from gateway.engine.device import LEARN_EVERY, MOST_PLANNED, PLANNING, Device
 from gateway.engine.health import State
 from gateway.engine.jobs import Idle, Poll, Probe, Resynced, Traffic
-from gateway.engine.results import PLANNING_SHARE
+from gateway.engine.plans import PLANNING_SHARE
 from gateway.errors import Refusal, Refused
 from gateway.planning.planner import Block, plan
 from gateway.protocols.modbus import ModbusTcp

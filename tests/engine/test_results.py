@@ -123,6 +123,7 @@ def test_any_other_refusal_that_comes_again_halves_the_block() -> None:
     poll = polled(rig)
     for _ in range(2):
         rig.conclude(poll, OTHER, REPLIED)
+        rig.now += QUIET
         assert polled(rig) is poll
     rig.conclude(poll, OTHER, REPLIED)
     assert polled(rig).block.span.size == 3

@@ -518,13 +518,13 @@ MUTANTS = (
     Mutant(
         "each address that returns is planned at once",
         "engine/results.py",
-        "                self._to_plan.setdefault(device, now + TOGETHER)\n",
-        "                self._to_plan[device] = now\n",
+        "self._plans.want(device, now, TOGETHER if bad.bad else 0.0)",
+        "self._plans.want(device, now)",
         "tests/engine/test_plans.py",
     ),
     Mutant(
         "plans take more than their share of the time",
-        "engine/results.py",
+        "engine/plans.py",
         "now + seconds / PLANNING_SHARE",
         "now + seconds",
         "tests/engine/test_plans.py",
