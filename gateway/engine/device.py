@@ -81,7 +81,9 @@ class Device:
     window: int = field(init=False)  # requests that may be outstanding at once
     silence: float = field(init=False)  # seconds before each request
     _lists: bool = True  # reads by a monitor list are allowed
-    _use: tuple[float, float] = (0.0, 0.0)  # seconds of the wire, and the time of counting
+    # Its recent use of the wire, to compare with that of other devices: the binary logarithm of
+    # the seconds, plus the half-lives until the time of counting. It grows, and never decays.
+    use: float = -math.inf
 
     def __post_init__(self) -> None:
         driver = self.driver
@@ -203,13 +205,11 @@ class Device:
     # Its share of the wire
 
     def used(self, now: float, begun: float) -> None:
-        """Adds the time since `begun` of a poll or a probe.
+        """Adds the time since `begun` of a poll or a probe. Past use counts half after `HALF_LIFE`.
 
         Writes and reads on demand do not count: the device must not lose polls because of them.
         """
-        self._use = (self.recent_use(now) + now - begun, now)
-
-    def recent_use(self, now: float) -> float:
-        """Returns the seconds of polls and probes in about the last ten seconds."""
-        use, when = self._use
-        return use * math.exp2((when - now) / HALF_LIFE)
+        if now > begun:
+            more = math.log2(now - begun) + now / HALF_LIFE
+            least, most = sorted((self.use, more))
+            self.use = most + math.log2(1.0 + math.exp2(least - most))

@@ -40,7 +40,7 @@ class Schedule:
         self._random = random.Random(seed)  # noqa: S311  (jitter, not a secret)
         # The share of its period by which each poll begins early.
         self._phases = (n * GOLDEN % 1 / 2 for n in itertools.count())
-        self._queue = PollQueue()
+        self._queue = PollQueue(shared=len(devices) > 1)
         self._polls: dict[Device, list[Poll]] = {}
         self._readers: dict[Device, dict[Tag, Poll]] = {}  # made at the first call of `reader`
         self._wrote = False
@@ -147,10 +147,10 @@ class Schedule:
 
     def _next_poll(self, now: float) -> Poll | Probe:
         queue = self._queue
-        expedited = bool(queue.expedited) and not (self._expedited and queue.due)
-        poll = queue.expedited[0] if expedited else queue.due[0][2]
-        if not expedited and len(self.devices) > 1 and poll.deadline < now:
-            poll = self._fairest(now)
+        poll = queue.due
+        expedited = bool(queue.expedited) and not (self._expedited and poll is not None)
+        if expedited or poll is None:
+            poll = queue.expedited[0]
         if poll.device.health.needs_resync:
             other = self._first_without_resync() if now < self._failing_lane else None
             if other is None:
@@ -162,9 +162,7 @@ class Schedule:
 
     def alongside(self, poll: Poll, most: int, now: float) -> list[Poll]:
         """Returns more due polls of the device, if it accepts several requests at once."""
-        others = [other for other in self._queue.valid() if other.device is poll.device]
-        others.sort(key=lambda other: (other.deadline, other.ticket))
-        return [self._hand_out(other, now) for other in others[:most]]
+        return [self._hand_out(other, now) for other in self._queue.more(poll.device, most)]
 
     def _hand_out(self, poll: Poll, now: float) -> Poll:
         if poll.ticket == EXPEDITED:
@@ -178,11 +176,6 @@ class Schedule:
             poll.register = poll.device.registered != listed
             poll.device.expect_list(listed)
         return poll
-
-    def _fairest(self, now: float) -> Poll:
-        """Returns the late poll whose device has recently used the wire least."""
-        late = (poll for poll in self._queue.valid() if poll.deadline < now)
-        return min(late, key=lambda poll: (poll.device.recent_use(now), poll.deadline))
 
     def _first_without_resync(self) -> Poll | None:
         """Returns the due poll with the earliest deadline whose device needs no resync."""

@@ -480,8 +480,8 @@ class AnyOrder(RuleBasedStateMachine):
 
     def _queues(self, poll: Poll) -> int:
         queue = self.schedule._queue  # private: a lost poll shows only after its whole period
-        heaps = [*queue.waiting, *queue.due]
-        valid = [one for _, ticket, one in heaps if one is poll and ticket == poll.ticket]
+        entries = [*queue.waiting, *(e for own in queue.by_device.values() for e in own.heap)]
+        valid = [one for _, ticket, one in entries if one is poll and ticket == poll.ticket]
         return len(valid) + sum(one is poll for one in queue.expedited)
 
     def _due(self) -> list[Poll]:
