@@ -424,4 +424,18 @@ MUTANTS = (
         "        if transaction is not None:\n",
         "tests/line/test_ports.py tests/engine/test_unsolicited.py",
     ),
+    Mutant(
+        "a late device keeps its place, however much of the wire it uses",
+        "engine/poll_queue.py",
+        "            elif use < own.device.use:  # it has used the wire since\n",
+        "            elif False:\n",
+        "tests/engine/test_poll_queue.py tests/line/test_load.py",
+    ),
+    Mutant(
+        "more requests at once are taken in any order",
+        "engine/poll_queue.py",
+        "            heapq.heappop(own.heap)\n            taken.append(poll)\n",
+        "            taken.append(own.heap.pop()[2])\n",
+        "tests/engine/test_poll_queue.py",
+    ),
 )
