@@ -8,10 +8,7 @@ another version: both are then measured in turn.
 import argparse
 import asyncio
 import logging
-import os
 import struct
-import subprocess
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -99,14 +96,6 @@ async def measure(count: int, window: int, reads: int) -> float:
     return reads / spent
 
 
-def in_checkout(path: Path, arguments: Sequence[str]) -> list[float]:
-    """Returns the figures of one round in another process, with the gateway of that folder."""
-    known = {**os.environ, "PYTHONPATH": str(path)}
-    command = [sys.executable, __file__, "--once", *arguments]
-    done = subprocess.run(command, cwd=path, env=known, check=True, capture_output=True, text=True)
-    return [float(word) for word in done.stdout.split()]
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--reads", type=int, default=3000)
@@ -121,13 +110,15 @@ def main() -> None:
             print(asyncio.run(measure(count, chosen.window, chosen.reads)))
         return
     arguments = ["--reads", str(chosen.reads), "--window", str(chosen.window)]
+    from benchmarks.checkouts import run_in
+
     trees = {"now": Path(__file__).parent.parent}
     if chosen.before is not None:
         trees = {"before": chosen.before.resolve(), **trees}
     best = {name: [0.0] * len(COUNTS) for name in trees}
     for _ in range(chosen.rounds):
         for name, tree in trees.items():
-            found = in_checkout(tree, arguments)
+            found = [float(word) for [word] in run_in(tree, __file__, arguments)]
             best[name] = [max(pair) for pair in zip(best[name], found, strict=True)]
     print(f"devices of {BLOCKS} blocks, window {chosen.window}: reads per second of CPU")
     for name, figures in best.items():

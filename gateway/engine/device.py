@@ -126,6 +126,12 @@ class Device:
         """Seconds after a request until its reply can no longer arrive."""
         return self.timing.reply_timeout + self.settings.late_guard
 
+    @property
+    def usual_turnaround(self) -> float | None:
+        """Seconds of the station for a reply, measured or from the file; None: not known yet."""
+        measured, given = self.record.turnaround, self.turnaround.configured
+        return given if measured is None else max(measured, given or 0.0)
+
     def diagnosis(self) -> str:
         """Returns the likely cause of its trouble as a sentence; empty when there is none."""
         driver = self.driver
@@ -142,6 +148,12 @@ class Device:
     def seconds(self, cost: Cost) -> float:
         """Returns the seconds of one transaction with this station."""
         return self.wire.transaction(cost, self.timing, self.turnaround.expected)
+
+    @property
+    def longest_poll(self) -> float:
+        """Seconds of its longest poll."""
+        longest = max((self.seconds(block.cost) for block in self.blocks), default=0.0)
+        return longest * self.settings.verify_reads
 
     @property
     def load(self) -> float:

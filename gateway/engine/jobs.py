@@ -72,6 +72,7 @@ class Probe:
     outstanding: Span | None  # a late reply to it must not look like the reply to the probe
     token: int
     again: bool = False  # the line has settled: any reply belongs to this probe
+    timeout: float | None = None  # of a short probe; None: `reply_timeout` of the device
 
 
 @dataclass(frozen=True, slots=True, eq=False)

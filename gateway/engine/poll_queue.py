@@ -118,6 +118,11 @@ class PollQueue:
         return (entry[2] for heap in heaps for entry in heap if _is_valid(entry))
 
     @property
+    def is_late(self) -> bool:
+        """True if a deadline has passed. Not known on the line of a single device."""
+        return bool(self._late)
+
+    @property
     def entries(self) -> int:
         """The number of all entries, also of stale ones."""
         due = sum(len(own.heap) for own in self.by_device.values())

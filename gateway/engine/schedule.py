@@ -2,19 +2,19 @@
 
 import itertools
 import random
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 
 from gateway.engine.device import Device
-from gateway.engine.health import PAUSE_LONGEST, State
+from gateway.engine.health import PAUSE_LONGEST, PROBE_SPREAD, State
 from gateway.engine.jobs import EXPEDITED, NOT_QUEUED, Idle, LastRead, Poll, Probe
 from gateway.engine.poll_queue import PollQueue
+from gateway.engine.probes import OFFLINE_SHARE, PATIENT_AFTER, probe_seconds, short_timeout
 from gateway.engine.requests import Request, RequestQueue
 from gateway.planning.planner import Block
 from gateway.tags import Tag
 
 NEVER = float("inf")
 GOLDEN = 0.6180339887498949  # any number of its multiples is spread evenly
-OFFLINE_SHARE = 0.05  # share of the wire time of all offline devices together
 
 
 class Schedule:
@@ -28,10 +28,13 @@ class Schedule:
     * A late poll is done once, not once per missed period.
     * After their first round the polls are spread over their periods.
     * A device that needs a resync is probed before anything else is sent to it.
-    * A starting device is probed at once. While polls of others are due, its probes and those of
-      devices that have just failed get half of the wire's time.
-    * An offline device is probed at growing pauses. All offline devices together get a twentieth
-      of the wire's time while others are online.
+    * A starting device is probed at once, first by a short probe. Devices that have replied last
+      time go first. While polls of others are due, these probes and those of devices that have
+      just failed get half of the wire's time.
+    * An offline device is probed at growing pauses, mostly by short probes. A probe uses idle time
+      of the wire if it ends before the next poll is due, or takes no longer than the longest poll.
+      Otherwise all offline devices together get a twentieth of the wire's time.
+    * A request to an offline device has it probed at once, when no poll is due.
     """
 
     def __init__(self, devices: Sequence[Device], now: float, seed: int = 0) -> None:
@@ -48,7 +51,8 @@ class Schedule:
         self._failing_lane = (
             now  # the time of the next request that may fail, while others have due polls
         )
-        self._offline_lane = now  # the time of the next probe of an offline device
+        self._offline_lane = now  # the time of the next probe of an offline device beside idle time
+        self._in_idle_time = False  # the current probe uses idle time of the wire
         for device in devices:
             self.plan(device, now)
 
@@ -102,8 +106,16 @@ class Schedule:
     # Questions
 
     def reachable(self, device: Device, now: float) -> bool:
-        """False for an offline device whose next probe is not allowed yet."""
-        return device.health.state is not State.OFFLINE or self._offline_lane <= now
+        """False for an offline device that is not probed at once for a request."""
+        health = device.health
+        if health.state is not State.OFFLINE or not self._any_online:
+            return True
+        idle = not (device.driver.traits.over_network or self._queue.is_late)
+        return health.may_be_probed(now) and (idle or self._offline_lane <= now)
+
+    @property
+    def _any_online(self) -> bool:
+        return any(device.health.online for device in self.devices)
 
     def polls(self, device: Device) -> Sequence[Poll]:
         return self._polls[device]
@@ -120,6 +132,7 @@ class Schedule:
 
     def next(self, now: float) -> Request | Probe | Poll | Idle:
         due = self._queue.ripen(now)
+        self._in_idle_time = False
         if self.requests.waiting and not (self._wrote and due):
             job = self._next_request(now, due)
             if job is not None:
@@ -128,22 +141,25 @@ class Schedule:
         waiting = self._queue.waiting
         until = waiting[0][0] if waiting else NEVER
         others = [device for device in self.devices if not device.health.online]
-        for device, allowed in self._probes(others) if others else ():
-            starting = device.health.state is State.STARTING
-            if allowed <= now or (starting and not due):
-                return _probe(device)
-            until = min(until, allowed)
+        if others:
+            probe = self._next_probe(others, now, now if due else until)
+            if isinstance(probe, Probe):
+                return probe
+            until = min(until, probe)
         return self._next_poll(now) if due else Idle(until)
 
     def _next_request(self, now: float, due: bool) -> Request | Probe | None:
         first = self.requests.first.device
-        if first.health.needs_resync and self._failing_lane <= now:
-            return _probe(first)
+        offline = first.health.state is State.OFFLINE
+        lane = self._offline_lane if offline else self._failing_lane
+        if first.health.needs_resync and (lane <= now or (offline and not due)):
+            self._in_idle_time = not due
+            return self._probe(first)
         request = self.requests.take()
         if request is not None:
             self._wrote = True
             return request
-        return None if due else _probe(first)
+        return None if due else self._probe(first)
 
     def _next_poll(self, now: float) -> Poll | Probe:
         queue = self._queue
@@ -154,7 +170,7 @@ class Schedule:
         if poll.device.health.needs_resync:
             other = self._first_without_resync() if now < self._failing_lane else None
             if other is None:
-                return _probe(poll.device)
+                return self._probe(poll.device)
             poll = other
             expedited = False
         self._expedited = poll.expedited = expedited
@@ -182,16 +198,57 @@ class Schedule:
         ready = (poll for poll in self._queue.valid() if not poll.device.health.needs_resync)
         return min(ready, key=lambda poll: poll.deadline, default=None)
 
-    def _probes(self, others: Sequence[Device]) -> Iterator[tuple[Device, float]]:
-        """Yields the next starting and the next offline device to probe, with the earliest time."""
-        for device in others:
-            if device.health.state is State.STARTING and not device.broadcast:
-                yield device, self._failing_lane
-                break
+    # Probes
+
+    def _next_probe(self, others: Sequence[Device], now: float, idle_until: float) -> Probe | float:
+        """Returns the probe of a starting or an offline device, or the time of the next one.
+
+        `idle_until`: when the next poll is due; `now` while one is due.
+        """
+        until, idle = NEVER, idle_until > now
+        starting = [
+            device
+            for device in others
+            if device.health.state is State.STARTING and not device.broadcast
+        ]
+        if starting:
+            if idle or self._failing_lane <= now:
+                return self._probe(min(starting, key=_order_of_start))
+            until = self._failing_lane
         offline = [device for device in others if device.health.state is State.OFFLINE]
-        if offline:
-            device = min(offline, key=lambda device: device.health.next_probe)
-            yield device, max(device.health.next_probe, self._offline_lane)
+        if not offline:
+            return until
+        device = min(offline, key=lambda device: device.health.next_probe)
+        if device.health.next_probe > now:
+            return min(until, device.health.next_probe)
+        return self._probe_offline(device, now, idle_until) or min(until, self._offline_lane)
+
+    def _probe_offline(self, device: Device, now: float, idle_until: float) -> Probe | None:
+        """Returns the probe that the wire has time for, if any."""
+        if idle_until <= now < self._offline_lane:
+            return None
+        short = short_timeout(device, self.devices)
+        if short is None or device.health.short_probes >= PATIENT_AFTER:
+            fits = idle_until - now >= probe_seconds(device)
+            self._in_idle_time = fits and not device.driver.traits.over_network
+            if self._in_idle_time or self._offline_lane <= now:
+                return self._probe(device, patient=True)
+        if short is None:
+            return None
+        room = idle_until - now
+        if room > 0.0:  # no poll is due
+            room = max(room, *(device.longest_poll for device in self.devices))
+        self._in_idle_time = room >= probe_seconds(device, short)
+        return self._probe(device) if self._in_idle_time or self._offline_lane <= now else None
+
+    def _probe(self, device: Device, *, patient: bool = False) -> Probe:
+        """Returns a probe. It is short if the device is offline, or starts."""
+        health, timeout = device.health, None
+        starting = health.state is State.STARTING and not health.short_probes
+        if not patient and (starting or health.state is State.OFFLINE):
+            timeout = short_timeout(device, self.devices)
+        health.probed(short=timeout is not None)
+        return Probe(device, health.outstanding, health.next_probe_token(), timeout=timeout)
 
     # Results
 
@@ -227,9 +284,11 @@ class Schedule:
 
     def went_offline(self, device: Device, now: float, took: float) -> None:
         """Makes the device offline, after a failed probe or last retry of `took` seconds."""
-        device.health.gave_up(now, self._random.uniform(0.9, 1.1))
-        others = any(other.health.online for other in self.devices)
-        self._offline_lane = now + took * (1 / OFFLINE_SHARE - 1) if others else now
+        spread = self._random.uniform(1 - PROBE_SPREAD, 1 + PROBE_SPREAD)
+        device.health.gave_up(now, spread)
+        if self._in_idle_time:
+            return
+        self._offline_lane = now + took * (1 / OFFLINE_SHARE - 1) if self._any_online else now
 
     def came_online(self, device: Device, now: float) -> None:
         """Makes all blocks of a device due, because it came online."""
@@ -247,6 +306,6 @@ class Schedule:
         self._wrote = self._expedited = False
 
 
-def _probe(device: Device) -> Probe:
-    health = device.health
-    return Probe(device, health.outstanding, health.next_probe_token())
+def _order_of_start(device: Device) -> tuple[bool, bool]:
+    """Devices that were not probed yet go first, of these the ones that replied last time."""
+    return device.health.short_probes > 0, device.health.silent

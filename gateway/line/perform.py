@@ -45,7 +45,9 @@ async def _perform(job: Transacted, transaction: Transaction) -> Result:
     match job:
         case Settle(guard=guard, gap=gap):
             return Settled(await transaction.settle(guard, gap))
-        case Probe(outstanding=outstanding, token=token):
+        case Probe(outstanding=outstanding, token=token, timeout=timeout):
+            if timeout is not None:
+                transaction.reply_timeout = timeout
             return Resynced(await driver.resync(transaction, outstanding, token))
         case Write() | Repeat():
             return await _write(job.write if isinstance(job, Repeat) else job, transaction)

@@ -59,6 +59,7 @@ class Transaction:
         "_open",
         "_stray",
         "has_sent",
+        "reply_timeout",
         "traffic",
     )
 
@@ -70,6 +71,7 @@ class Transaction:
     ) -> None:
         """`on_unmatched_frame` gets each frame that is no reply, at once."""
         self.has_sent = False  # earlier bytes do not belong to it
+        self.reply_timeout = device.settings.timing.reply_timeout  # a short probe waits less
         self.traffic = Traffic()
         self._channel = channel
         self._device = device
@@ -110,7 +112,7 @@ class Transaction:
         data = self._codec.encode(frame)
         started, character = channel.now(), channel.wire.character
         spoken = (len(data) * (2 if channel.echo.strip else 1) + reply) * character
-        until = started + spoken + device.settings.timing.reply_timeout
+        until = started + spoken + self.reply_timeout
         channel.alarm.by(until, self._expire)
         self.has_sent = True
         channel.send(data)

@@ -7,14 +7,24 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from gateway.engine.device import Device
-from gateway.engine.health import PAUSE_FIRST, PAUSE_LONGEST, State
+from gateway.engine.health import PAUSE_FIRST, PAUSE_LONGEST, PROBE_PAUSE, State
 from gateway.engine.jobs import Idle, Poll, Probe
+from gateway.engine.probes import (
+    OFFLINE_SHARE,
+    PATIENT_AFTER,
+    SHORTEST,
+    UNKNOWN,
+    USUAL,
+    probe_seconds,
+    short_timeout,
+)
 from gateway.engine.requests import MOST_WAITING, WRITE_EXPIRY, Write
-from gateway.engine.schedule import OFFLINE_SHARE, Schedule
+from gateway.engine.schedule import Schedule
 from gateway.errors import NoReply
 from gateway.planning.bad_addresses import RETRIES
-from gateway.protocols.modbus import ModbusRtu
+from gateway.protocols.modbus import ModbusRtu, ModbusTcp
 from gateway.tags import WriteRule
+from tests.engine.rig import weighing_machine
 from tests.sim.bench import WIRE
 from tests.sim.plant import device, made_device, make_tag
 
@@ -249,7 +259,7 @@ def test_an_offline_device_is_only_probed_at_growing_pauses() -> None:
         assert isinstance(schedule.next(job.until), Probe)
         now = job.until + 0.5
     for number, pause in enumerate(pauses):
-        assert 0.9 <= pause / min(PAUSE_FIRST * 2**number, PAUSE_LONGEST) <= 1.1
+        assert 0.9 <= pause / min(PAUSE_FIRST * 2**number, PROBE_PAUSE) <= 1.1
     assert len(set(pauses[8:])) == 4  # jitter
     dev.health.answered()
     schedule.came_online(dev, now)
@@ -290,14 +300,141 @@ def test_offline_devices_get_all_the_time_while_none_is_online() -> None:
     assert isinstance(schedule.next(1.7), Probe)
 
 
-def test_an_offline_device_is_reachable_only_when_its_probe_is_allowed() -> None:
+def test_an_offline_device_is_reachable_when_its_last_probe_is_a_second_old() -> None:
     healthy, offline = online(0), online(0, station=2)
     schedule = Schedule([healthy, offline], 0.0)
     fail(offline)
     schedule.went_offline(offline, 0.0, 0.5)
     assert schedule.reachable(healthy, 0.0)
-    assert not schedule.reachable(offline, 9.4)
+    assert not schedule.reachable(offline, 0.9)
+    assert schedule.reachable(offline, 1.0)
+
+
+def test_while_polls_are_late_an_offline_device_is_reachable_only_in_its_share() -> None:
+    healthy, offline = online(0, every=0.01), online(0, station=2)
+    schedule = Schedule([healthy, offline], 0.0)
+    fail(offline)
+    schedule.went_offline(offline, 0.0, 0.5)
+    polled(schedule, 5.0)
+    assert not schedule.reachable(offline, 5.0)
     assert schedule.reachable(offline, 9.5)
+
+
+def test_a_request_to_an_offline_device_has_it_probed_at_once_when_no_poll_is_due() -> None:
+    healthy, offline = online(0), online(0, station=2)
+    schedule = Schedule([healthy, offline], 0.0)
+    fail(offline)
+    for _ in range(3):
+        schedule.went_offline(offline, 0.0, 0.5)
+    schedule.requests.submit(write(offline))
+    schedule.requests.submit(other := write(healthy))
+    assert schedule.next(1.0) is other  # a poll is due
+    assert polled(schedule, 1.0).device is healthy
+    job = schedule.next(1.0)
+    assert isinstance(job, Probe)
+    assert job.device is offline
+    assert job.timeout is not None
+
+
+def test_starting_devices_get_one_short_probe_each_before_patient_ones() -> None:
+    devices = [device([make_tag("D0")], station=n) for n in (1, 2, 3)]
+    schedule = Schedule(devices, 0.0)
+    jobs = list[tuple[Device, bool]]()
+    for _ in range(6):
+        job = schedule.next(0.0)
+        assert isinstance(job, Probe)
+        jobs.append((job.device, job.timeout is not None))
+        fail(job.device)
+        if job.timeout is None:
+            schedule.went_offline(job.device, 0.0, 0.5)
+    assert jobs == [(each, short) for short in (True, False) for each in devices]
+
+
+def test_after_a_restart_the_devices_that_replied_last_time_go_first() -> None:
+    silent, well = online(0), online(0, station=2)
+    schedule = Schedule([silent, well], 0.0)
+    fail(silent)
+    schedule.went_offline(silent, 0.0, 0.5)
+    for each in (silent, well):
+        each.restart()
+    schedule.opened(1.0)
+    job = schedule.next(1.0)
+    assert isinstance(job, Probe)
+    assert job.device is well
+
+
+def test_a_short_probe_waits_a_multiple_of_the_usual_turnaround_of_its_neighbours() -> None:
+    healthy, offline = online(0), online(0, station=2)
+    schedule = Schedule([healthy, offline], 0.0)
+    fail(offline)
+
+    def timeout(now: float) -> float | None:
+        schedule.went_offline(offline, now, 0.5)
+        while not isinstance(job := schedule.next(now + 10.0), Probe):
+            assert isinstance(job, Poll)
+            schedule.polled(job, now + 10.0)
+        return job.timeout
+
+    assert timeout(0.0) == UNKNOWN
+    healthy.record.turnaround = 0.03
+    assert timeout(20.0) == USUAL * 0.03
+    healthy.record.turnaround = 0.001
+    assert timeout(40.0) == SHORTEST
+    offline.record.turnaround = 0.06
+    assert timeout(60.0) == USUAL * 0.06
+    offline.record.turnaround = 1.0
+    assert timeout(80.0) == offline.timing.reply_timeout
+
+
+def test_a_device_without_station_number_or_behind_a_network_gets_patient_probes_only() -> None:
+    tcp = ModbusTcp(station=1)
+    made = made_device("tcp", tcp, WIRE, tcp.timing, [make_tag("holding:1", tcp)])
+    frames, other = weighing_machine(), online(0)
+    for patient in (made, frames):
+        assert short_timeout(patient, [patient, other]) is None
+    assert short_timeout(other, [patient, other]) == UNKNOWN
+    assert short_timeout(other, [other]) is None
+
+
+def test_one_of_several_probes_of_an_offline_device_is_patient() -> None:
+    offline = online(0)
+    schedule = Schedule([offline, online(0, every=1000.0, station=2)], 0.0)
+    polled(schedule, 0.0)
+    fail(offline)
+    now, patient = 0.0, []
+    for _ in range(2 * PATIENT_AFTER + 2):
+        schedule.went_offline(offline, now, 0.1)
+        now += 10.0
+        job = schedule.next(now)
+        assert isinstance(job, Probe)
+        patient.append(job.timeout is None)
+    assert patient == 2 * [*[False] * PATIENT_AFTER, True]
+
+
+def test_a_probe_uses_idle_time_if_it_ends_before_the_next_poll_is_due() -> None:
+    healthy, offline = online(0), online(0, station=2)
+    assert healthy.longest_poll < probe_seconds(offline, UNKNOWN)
+    schedule = Schedule([healthy, offline], 0.0)
+    fail(offline)
+    schedule.went_offline(offline, 0.0, 0.5)  # beside idle time not before 9.5
+    polled(schedule, 4.0)
+    offline.health.next_probe = 0.0
+    room = probe_seconds(offline, UNKNOWN)
+    assert schedule.next(5.0 - 0.9 * room) == Idle(5.0)
+    assert isinstance(schedule.next(5.0 - 1.1 * room), Probe)
+
+
+def test_or_if_it_takes_no_longer_than_the_longest_poll() -> None:
+    longer = device([make_tag(f"D{n}") for n in range(60)])
+    longer.health.answered()
+    offline = online(0, station=2)
+    assert longer.longest_poll > probe_seconds(offline, UNKNOWN)
+    schedule = Schedule([longer, offline], 0.0)
+    fail(offline)
+    schedule.went_offline(offline, 0.0, 0.5)
+    polled(schedule, 4.0)
+    offline.health.next_probe = 0.0
+    assert isinstance(schedule.next(4.99), Probe)
 
 
 def test_a_broadcast_device_is_never_probed() -> None:
