@@ -1,5 +1,6 @@
 """Jobs that an engine hands to its line, and their results."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -34,6 +35,7 @@ class Poll:
     due: float
     tries: int = 0
     missed: int = 0  # rounds in a row without a reply, while the device replies to others
+    soon: float = math.inf  # an earlier deadline, because its values are bad
     asked: float = 0.0  # when it was handed out last
     expedited: bool = False  # before its time, because a client waits
     phased: bool = True  # it has found its place in the period
@@ -60,8 +62,11 @@ class Poll:
 
     @property
     def deadline(self) -> float:
-        """The latest time to start the poll: its interval after due, also for a bad address."""
-        return self.due + self.block.every
+        """The latest time to start the poll: its interval after due, also for a bad address.
+
+        It is earlier for a block of a long interval without good values.
+        """
+        return min(self.due + self.block.every, self.soon)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

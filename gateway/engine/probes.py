@@ -13,6 +13,11 @@ CHARACTERS = 50  # of a probe and its reply, at most about
 OFFLINE_SHARE = 0.05  # share of the wire time of all offline devices together, beside idle time
 
 
+def order_of_start(device: Device) -> tuple[bool, bool]:
+    """Devices that were not probed yet go first, of these the ones that replied last time."""
+    return device.health.short_probes > 0, device.health.silent
+
+
 def short_timeout(device: Device, devices: Sequence[Device]) -> float | None:
     """Returns the reply time-out of a short probe; None: the device gets only patient ones.
 
@@ -49,8 +54,10 @@ def probe_seconds(device: Device, timeout: float | None = None) -> float:
 def seen_within(
     devices: Sequence[Device], load: float, requests: float, longest: float
 ) -> tuple[float, float]:
-    """Returns the seconds until a device that returned is seen: while all others are silent, and
-    while as many reply as delay it most.
+    """Returns the seconds until a device that returned is seen.
+
+    The first figure is for a line on which all others are silent. The second one is for the number
+    of silent devices that delays it most.
 
     `load`: share of the wire for polls. `requests`: polls a second. `longest`: seconds of a poll.
     """

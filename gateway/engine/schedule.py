@@ -1,19 +1,20 @@
 """Decides the next job of one line."""
 
 import itertools
-import random
 from collections.abc import Iterable, Sequence
 
 from gateway.engine.device import Device
-from gateway.engine.health import PAUSE_LONGEST, PROBE_SPREAD, State
+from gateway.engine.health import PAUSE_LONGEST, State
 from gateway.engine.jobs import EXPEDITED, NOT_QUEUED, Idle, LastRead, Poll, Probe
 from gateway.engine.poll_queue import PollQueue
-from gateway.engine.probes import OFFLINE_SHARE, PATIENT_AFTER, probe_seconds, short_timeout
+from gateway.engine.probe_schedule import ProbeSchedule
 from gateway.engine.requests import Request, RequestQueue
 from gateway.planning.planner import Block
 from gateway.tags import Tag
 
 NEVER = float("inf")
+LONG = 10.0  # seconds: a longer interval is too long to wait for a first value
+FIRST_SHARE = 0.1  # share of the wire time for blocks of long intervals without good values
 GOLDEN = 0.6180339887498949  # any number of its multiples is spread evenly
 
 
@@ -26,6 +27,8 @@ class Schedule:
       used the wire least in recent seconds goes first.
     * An expedited poll goes before other polls, but not twice in a row while one is due.
     * A late poll is done once, not once per missed period.
+    * A block of a long interval without good values gets an early deadline, in turn with others:
+      all these together get a tenth of the wire's time.
     * After their first round the polls are spread over their periods.
     * A device that needs a resync is probed before anything else is sent to it.
     * A starting device is probed at once, first by a short probe. Devices that have replied last
@@ -40,19 +43,15 @@ class Schedule:
     def __init__(self, devices: Sequence[Device], now: float, seed: int = 0) -> None:
         self.devices = devices
         self.requests = RequestQueue()
-        self._random = random.Random(seed)  # noqa: S311  (jitter, not a secret)
         # The share of its period by which each poll begins early.
         self._phases = (n * GOLDEN % 1 / 2 for n in itertools.count())
+        self._probes = ProbeSchedule(devices, now, seed)
         self._queue = PollQueue(shared=len(devices) > 1)
         self._polls: dict[Device, list[Poll]] = {}
         self._readers: dict[Device, dict[Tag, Poll]] = {}  # made at the first call of `reader`
         self._wrote = False
         self._expedited = False
-        self._failing_lane = (
-            now  # the time of the next request that may fail, while others have due polls
-        )
-        self._offline_lane = now  # the time of the next probe of an offline device beside idle time
-        self._in_idle_time = False  # the current probe uses idle time of the wire
+        self._first_lane = now  # the deadline of the last block without good values
         for device in devices:
             self.plan(device, now)
 
@@ -79,7 +78,7 @@ class Schedule:
             polls.append(poll)
         for poll in before:
             poll.live = False
-        self._set_polls(device, polls, polls)
+        self._set_polls(device, polls, polls, now)
 
     def replace(self, poll: Poll, blocks: Iterable[Block], now: float) -> None:
         """Replaces one poll by polls of these blocks, due at once."""
@@ -89,12 +88,28 @@ class Schedule:
         last = poll.last
         new = [Poll(poll.device, block, now, last=LastRead(last.at, last.ever)) for block in blocks]
         kept = [other for other in self._polls[poll.device] if other is not poll]
-        self._set_polls(poll.device, kept + new, new)
+        self._set_polls(poll.device, kept + new, new, now)
 
-    def _set_polls(self, device: Device, polls: list[Poll], new: list[Poll]) -> None:
+    def _set_polls(self, device: Device, polls: list[Poll], new: list[Poll], now: float) -> None:
+        for poll in new:
+            self._hasten(poll, now)
         self._polls[device] = polls
         self._readers.pop(device, None)
         self._queue.push_all(new)
+
+    def _hasten(self, poll: Poll, now: float) -> None:
+        """Gives the poll an early deadline if the values of its block are bad."""
+        device, block = poll.device, poll.block
+        poll.soon = NEVER
+        if block.every <= LONG or poll.last.at is not None or not device.health.online:
+            return
+        if block.span in device.bad_addresses.bad:
+            return
+        turn = device.seconds(block.cost) / FIRST_SHARE
+        soon = max(self._first_lane, now) + turn
+        if max(soon, poll.due + turn) < poll.deadline:
+            self._first_lane = soon
+            poll.soon = max(soon, poll.due + turn)
 
     def expedite(self, poll: Poll) -> None:
         """Polls this next, after requests, because a client waits for it."""
@@ -107,15 +122,7 @@ class Schedule:
 
     def reachable(self, device: Device, now: float) -> bool:
         """False for an offline device that is not probed at once for a request."""
-        health = device.health
-        if health.state is not State.OFFLINE or not self._any_online:
-            return True
-        idle = not (device.driver.traits.over_network or self._queue.is_late)
-        return health.may_be_probed(now) and (idle or self._offline_lane <= now)
-
-    @property
-    def _any_online(self) -> bool:
-        return any(device.health.online for device in self.devices)
+        return self._probes.reachable(device, now, late=self._queue.is_late)
 
     def polls(self, device: Device) -> Sequence[Poll]:
         return self._polls[device]
@@ -132,7 +139,6 @@ class Schedule:
 
     def next(self, now: float) -> Request | Probe | Poll | Idle:
         due = self._queue.ripen(now)
-        self._in_idle_time = False
         if self.requests.waiting and not (self._wrote and due):
             job = self._next_request(now, due)
             if job is not None:
@@ -142,7 +148,7 @@ class Schedule:
         until = waiting[0][0] if waiting else NEVER
         others = [device for device in self.devices if not device.health.online]
         if others:
-            probe = self._next_probe(others, now, now if due else until)
+            probe = self._probes.next(others, now, now if due else until)
             if isinstance(probe, Probe):
                 return probe
             until = min(until, probe)
@@ -150,16 +156,14 @@ class Schedule:
 
     def _next_request(self, now: float, due: bool) -> Request | Probe | None:
         first = self.requests.first.device
-        offline = first.health.state is State.OFFLINE
-        lane = self._offline_lane if offline else self._failing_lane
-        if first.health.needs_resync and (lane <= now or (offline and not due)):
-            self._in_idle_time = not due
-            return self._probe(first)
+        probe = self._probes.for_request(first, now, due=due)
+        if probe is not None:
+            return probe
         request = self.requests.take()
         if request is not None:
             self._wrote = True
             return request
-        return None if due else self._probe(first)
+        return None if due else self._probes.probe(first)
 
     def _next_poll(self, now: float) -> Poll | Probe:
         queue = self._queue
@@ -168,9 +172,9 @@ class Schedule:
         if expedited or poll is None:
             poll = queue.expedited[0]
         if poll.device.health.needs_resync:
-            other = self._first_without_resync() if now < self._failing_lane else None
+            other = self._first_without_resync() if now < self._probes.failing_lane else None
             if other is None:
-                return self._probe(poll.device)
+                return self._probes.probe(poll.device)
             poll = other
             expedited = False
         self._expedited = poll.expedited = expedited
@@ -198,58 +202,6 @@ class Schedule:
         ready = (poll for poll in self._queue.valid() if not poll.device.health.needs_resync)
         return min(ready, key=lambda poll: poll.deadline, default=None)
 
-    # Probes
-
-    def _next_probe(self, others: Sequence[Device], now: float, idle_until: float) -> Probe | float:
-        """Returns the probe of a starting or an offline device, or the time of the next one.
-
-        `idle_until`: when the next poll is due; `now` while one is due.
-        """
-        until, idle = NEVER, idle_until > now
-        starting = [
-            device
-            for device in others
-            if device.health.state is State.STARTING and not device.broadcast
-        ]
-        if starting:
-            if idle or self._failing_lane <= now:
-                return self._probe(min(starting, key=_order_of_start))
-            until = self._failing_lane
-        offline = [device for device in others if device.health.state is State.OFFLINE]
-        if not offline:
-            return until
-        device = min(offline, key=lambda device: device.health.next_probe)
-        if device.health.next_probe > now:
-            return min(until, device.health.next_probe)
-        return self._probe_offline(device, now, idle_until) or min(until, self._offline_lane)
-
-    def _probe_offline(self, device: Device, now: float, idle_until: float) -> Probe | None:
-        """Returns the probe that the wire has time for, if any."""
-        if idle_until <= now < self._offline_lane:
-            return None
-        short = short_timeout(device, self.devices)
-        if short is None or device.health.short_probes >= PATIENT_AFTER:
-            fits = idle_until - now >= probe_seconds(device)
-            self._in_idle_time = fits and not device.driver.traits.over_network
-            if self._in_idle_time or self._offline_lane <= now:
-                return self._probe(device, patient=True)
-        if short is None:
-            return None
-        room = idle_until - now
-        if room > 0.0:  # no poll is due
-            room = max(room, *(device.longest_poll for device in self.devices))
-        self._in_idle_time = room >= probe_seconds(device, short)
-        return self._probe(device) if self._in_idle_time or self._offline_lane <= now else None
-
-    def _probe(self, device: Device, *, patient: bool = False) -> Probe:
-        """Returns a probe. It is short if the device is offline, or starts."""
-        health, timeout = device.health, None
-        starting = health.state is State.STARTING and not health.short_probes
-        if not patient and (starting or health.state is State.OFFLINE):
-            timeout = short_timeout(device, self.devices)
-        health.probed(short=timeout is not None)
-        return Probe(device, health.outstanding, health.next_probe_token(), timeout=timeout)
-
     # Results
 
     def polled(self, poll: Poll, now: float, *, answered: bool = True) -> None:
@@ -269,6 +221,8 @@ class Schedule:
         if poll.last.at is None and block.span not in device.bad_addresses.bad:
             poll.due = min(poll.due, now + PAUSE_LONGEST)  # the cause may have gone
         poll.tries = 0
+        if block.every > LONG:
+            self._hasten(poll, now)
         self._queue.push(poll)
 
     def again(self, poll: Poll, when: float | None = None) -> None:
@@ -280,15 +234,11 @@ class Schedule:
 
     def failed(self, now: float, took: float) -> None:
         """Notes an unclear transaction of `took` seconds with a device that is not offline."""
-        self._failing_lane = now + took
+        self._probes.failed(now, took)
 
     def went_offline(self, device: Device, now: float, took: float) -> None:
         """Makes the device offline, after a failed probe or last retry of `took` seconds."""
-        spread = self._random.uniform(1 - PROBE_SPREAD, 1 + PROBE_SPREAD)
-        device.health.gave_up(now, spread)
-        if self._in_idle_time:
-            return
-        self._offline_lane = now + took * (1 / OFFLINE_SHARE - 1) if self._any_online else now
+        self._probes.went_offline(device, now, took)
 
     def came_online(self, device: Device, now: float) -> None:
         """Makes all blocks of a device due, because it came online."""
@@ -302,10 +252,5 @@ class Schedule:
 
     def opened(self, now: float) -> None:
         """Starts again after the line was opened."""
-        self._failing_lane = self._offline_lane = now
+        self._probes.opened(now)
         self._wrote = self._expedited = False
-
-
-def _order_of_start(device: Device) -> tuple[bool, bool]:
-    """Devices that were not probed yet go first, of these the ones that replied last time."""
-    return device.health.short_probes > 0, device.health.silent

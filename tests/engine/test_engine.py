@@ -684,9 +684,7 @@ def test_a_request_to_an_offline_device_is_refused_while_its_probe_is_not_allowe
     assert isinstance(rig.outcomes[rig.write("D0")], Offline)
 
 
-def test_a_short_probe_that_fails_leaves_a_device_starting_and_tells_nothing_of_an_offline_one() -> (
-    None
-):
+def test_a_short_probe_that_fails_leaves_a_starting_device_starting() -> None:
     rig = Rig(link_device(), link_device(station=2))
     for short in (True, False, True):
         probe = rig.transacted()

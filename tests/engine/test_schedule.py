@@ -1,5 +1,6 @@
 """Each sentence of the class docstring is a test; in any order of calls no poll is lost."""
 
+import itertools
 from typing import Any
 
 from hypothesis import settings
@@ -506,6 +507,57 @@ def test_the_queue_takes_no_more_than_its_most_requests() -> None:
     schedule = Schedule([dev], 0.0)
     assert all(schedule.requests.submit(write(dev)) for _ in range(MOST_WAITING))
     assert not schedule.requests.submit(write(dev))
+
+
+def overloaded(*slow: int) -> Device:
+    """Blocks that are asked for three times what the wire can carry, and blocks once an hour."""
+    fast = [make_tag(f"D{1000 * n}", every=0.1) for n in range(6)]
+    dev = device([*fast, *(make_tag(f"D{n}", every=3600.0) for n in slow)])
+    dev.health.answered()
+    return dev
+
+
+def run_full(schedule: Schedule, begin: float, seconds: float) -> dict[str, list[float]]:
+    """Polls all the time, 0.05 s each. Returns the times of the polls by the first tag."""
+    now, found = begin, dict[str, list[float]]()
+    while now < begin + seconds:
+        job = schedule.next(now)
+        assert isinstance(job, Poll)
+        now += 0.05
+        found.setdefault(job.block.tags[0].text, []).append(now)
+        job.last.at = now
+        schedule.polled(job, now)
+    return found
+
+
+def test_on_an_overloaded_line_a_tag_of_once_an_hour_is_read_soon_after_start_and_return() -> None:
+    dev = overloaded(8000)
+    schedule = Schedule([dev, online(0, station=2)], 0.0)
+    assert run_full(schedule, 0.0, 30.0)["D8000"][0] < 5.0
+    schedule.came_online(dev, 100.0)
+    assert run_full(schedule, 100.0, 30.0)["D8000"][0] < 105.0
+
+
+def test_first_reads_of_many_blocks_leave_the_others_their_time() -> None:
+    slow = range(6100, 8100, 70)
+    dev = overloaded(*slow)
+    found = run_full(Schedule([dev, online(0, station=2)], 0.0), 0.0, 120.0)
+    assert all(f"D{n}" in found for n in slow)
+    for n in range(6):
+        gaps = [b - a for a, b in itertools.pairwise(found[f"D{1000 * n}"])]
+        assert max(gaps) < 1.0
+        assert len(gaps) > 0.85 * 120.0 / (7 * 0.05)
+
+
+def test_a_block_that_turned_bad_on_an_overloaded_line_is_tried_again_soon() -> None:
+    dev = overloaded(8000)
+    schedule = Schedule([dev, online(0, station=2)], 0.0)
+    run_full(schedule, 0.0, 30.0)
+    poll = schedule.reader(dev, dev.tags[-1])
+    assert poll is not None
+    poll.forget(30.0)
+    schedule.polled(poll, 30.0)  # it was refused, say
+    assert poll.deadline < 30.0 + PAUSE_LONGEST + 5.0
 
 
 class AnyOrder(RuleBasedStateMachine):
