@@ -36,7 +36,7 @@ class LineForecast:
     cycle: float  # one poll of every block
     worst_write: float  # from the request of the client to the acknowledgement
     worst_write_silent: float  # the same when a device does not reply
-    seen_within: float  # from the return of a silent device until it is seen; all others silent
+    seen_within: float  # from the return of a silent device until it is seen; all but one silent
     seen_at_worst: float  # the same while as many others reply as delay it most
     shortest: float  # the shortest interval that is possible for all tags
     unsolicited: tuple[tuple[Device, int], ...]  # devices with their number of unsolicited tags

@@ -73,7 +73,7 @@ class Health:
     needs_resync: bool = field(init=False)  # the next frame may answer an older request
     outstanding: Span | None = None  # the request whose reply may still arrive
     trouble: GatewayError | None = None
-    silent: bool = False  # it gave up, and has not replied since
+    heard: bool | None = None  # True: it has replied; False: it gave up after that
     pause: float = 0.0  # seconds until the next probe of an offline device
     next_probe: float = 0.0
     short_probes: int = 0  # since the last patient one, or the last reply
@@ -96,7 +96,7 @@ class Health:
         came = not self.online
         self._move(Event.ANSWERED)
         self.consecutive_failures = self.short_probes = 0
-        self.needs_resync = self.silent = False
+        self.needs_resync, self.heard = False, True
         self.outstanding = self.trouble = None
         self.pause = 0.0
         self._unanswered.clear()
@@ -140,7 +140,7 @@ class Health:
         `spread`: a random factor near 1, so that many devices are not probed at once.
         """
         self._move(Event.GAVE_UP)
-        self.silent = True
+        self.heard = False
         self.pause = min(max(2 * self.pause, PAUSE_FIRST), PROBE_PAUSE)
         self.next_probe = now + self.pause * spread
         self._last_probe = now

@@ -15,7 +15,7 @@ OFFLINE_SHARE = 0.05  # share of the wire time of all offline devices together, 
 
 def order_of_start(device: Device) -> tuple[bool, bool]:
     """Devices that were not probed yet go first, of these the ones that replied last time."""
-    return device.health.short_probes > 0, device.health.silent
+    return device.health.short_probes > 0, not device.health.heard
 
 
 def short_timeout(device: Device, devices: Sequence[Device]) -> float | None:
@@ -56,7 +56,7 @@ def seen_within(
 ) -> tuple[float, float]:
     """Returns the seconds until a device that returned is seen.
 
-    The first figure is for a line on which all others are silent. The second one is for the number
+    The first figure is for a line on which all but one are silent. The second one is for the number
     of silent devices that delays it most.
 
     `load`: share of the wire for polls. `requests`: polls a second. `longest`: seconds of a poll.
@@ -76,10 +76,10 @@ def seen_within(
         one_round += (PATIENT_AFTER * brief + patient) / (PATIENT_AFTER + 1)
         if brief > longest:  # it must fit between two polls
             lost = max(lost, requests * brief)
-    worst, count = 0.0, len(answerable)
-    for silent in range(1, count + 1):
-        healthy = 1.0 - silent / count
+    count, times = len(answerable), [0.0]
+    for silent in range(1, max(count, 2)):  # at least one replies, if there are several
+        healthy = 1.0 - silent / count if count else 0.0
         share = max(idle * (1.0 - healthy * (load + lost)), OFFLINE_SHARE)
-        worst = max(worst, silent / count * one_round / share)
+        times.append((1.0 - healthy) * one_round / share)
     pause = PROBE_PAUSE * (1.0 + PROBE_SPREAD) + longest
-    return pause + one_round / max(idle, OFFLINE_SHARE), pause + worst
+    return pause + times[-1], pause + max(times)

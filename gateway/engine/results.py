@@ -215,7 +215,7 @@ class Results:
         unknown = before in (State.STARTING, State.OFFLINE)
         if not unknown and health.consecutive_failures <= device.timing.retries:
             return
-        if short and before is State.STARTING and not health.silent:
+        if short and before is State.STARTING and health.heard is not False:
             return
         if device.broadcast:  # only its own frames can make it online again
             device.restart()

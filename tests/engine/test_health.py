@@ -196,14 +196,14 @@ def test_probe_soon_allows_a_probe_one_second_after_the_last_one() -> None:
     assert found.may_be_probed(100.0 + PAUSE_FIRST)
 
 
-def test_a_device_that_gave_up_is_silent_until_it_replies_also_after_a_restart() -> None:
-    found = health(S.OFFLINE)
-    found.restart()
-    assert found.silent
-    found.answered()
-    assert not found.silent
-    found.restart()
-    assert not found.silent
+def test_a_restart_keeps_if_the_device_was_heard() -> None:
+    found, heard = health(), []
+    for change in (found.answered, lambda: found.gave_up(0.0, 1.0), found.answered):
+        change()
+        found.restart()
+        heard.append(found.heard)
+    assert heard == [True, False, True]
+    assert Health().heard is None
 
 
 def test_short_probes_are_counted_until_a_patient_one_a_reply_or_a_restart() -> None:

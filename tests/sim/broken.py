@@ -21,7 +21,7 @@ MUTANTS = (
     Mutant(
         "no late-reply guard",
         "engine/conclusions.py",
-        "            0.0 if before is State.OFFLINE else device.settings.late_guard,\n",
+        "            0.0 if no_guard else device.settings.late_guard,\n",
         "            0.0,\n",
         "tests/line/test_late_replies.py",
         (54, 55, 53, 48),
@@ -462,14 +462,14 @@ MUTANTS = (
     Mutant(
         "after a reset the devices start in the order of the file",
         "engine/probes.py",
-        "    return device.health.short_probes > 0, device.health.silent\n",
+        "    return device.health.short_probes > 0, not device.health.heard\n",
         "    return device.health.short_probes > 0, False\n",
         "tests/engine/test_schedule.py tests/attacks/test_silent_stations.py",
     ),
     Mutant(
         "a device is offline after one short probe at the start",
         "engine/results.py",
-        "        if short and before is State.STARTING and not health.silent:\n",
+        "        if short and before is State.STARTING and health.heard is not False:\n",
         "        if False:\n",
         "tests/engine/test_engine.py",
     ),
