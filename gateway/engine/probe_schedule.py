@@ -32,24 +32,23 @@ class ProbeSchedule:
         self.failing_lane = self._offline_lane = now
 
     def reachable(self, device: Device, now: float, *, late: bool) -> bool:
-        """Returns False for an offline device that is not probed at once for a request.
+        """Returns True if the offline device is probed at once for a request.
 
         `late`: polls of others are late.
         """
-        health = device.health
-        if health.state is not State.OFFLINE or not self._any_online:
+        if not self._any_online:
             return True
         idle = not (device.driver.traits.over_network or late)
-        return health.may_be_probed(now) and (idle or self._offline_lane <= now)
+        return device.health.may_be_probed(now) and (idle or self._offline_lane <= now)
 
     def for_request(self, device: Device, now: float, *, due: bool) -> Probe | None:
-        """Returns the probe before a request to the device, if the device needs a resync.
+        """Returns the probe before a request to the device, which needs a resync.
 
         `due`: a poll is due.
         """
         offline = device.health.state is State.OFFLINE
         lane = self._offline_lane if offline else self.failing_lane
-        if not device.health.needs_resync or (lane > now and (due or not offline)):
+        if lane > now and (due or not offline):
             return None
         self._in_idle_time = not due
         return self.probe(device)

@@ -122,6 +122,8 @@ class Schedule:
 
     def reachable(self, device: Device, now: float) -> bool:
         """False for an offline device that is not probed at once for a request."""
+        if device.health.state is not State.OFFLINE:
+            return True
         return self._probes.reachable(device, now, late=self._queue.is_late)
 
     def polls(self, device: Device) -> Sequence[Poll]:
@@ -156,9 +158,10 @@ class Schedule:
 
     def _next_request(self, now: float, due: bool) -> Request | Probe | None:
         first = self.requests.first.device
-        probe = self._probes.for_request(first, now, due=due)
-        if probe is not None:
-            return probe
+        if first.health.needs_resync:
+            probe = self._probes.for_request(first, now, due=due)
+            if probe is not None:
+                return probe
         request = self.requests.take()
         if request is not None:
             self._wrote = True

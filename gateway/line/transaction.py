@@ -59,7 +59,6 @@ class Transaction:
         "_open",
         "_stray",
         "has_sent",
-        "reply_timeout",
         "traffic",
     )
 
@@ -71,7 +70,6 @@ class Transaction:
     ) -> None:
         """`on_unmatched_frame` gets each frame that is no reply, at once."""
         self.has_sent = False  # earlier bytes do not belong to it
-        self.reply_timeout = device.settings.timing.reply_timeout  # a short probe waits less
         self.traffic = Traffic()
         self._channel = channel
         self._device = device
@@ -103,7 +101,14 @@ class Transaction:
         # No reply follows; the wire is busy until the last character is out.
         channel.pause(len(data) * channel.wire.character)
 
-    async def ask(self, frame: Any, reply: int, answers: Callable[[Any], T | None]) -> T:
+    async def ask(
+        self,
+        frame: Any,
+        reply: int,
+        answers: Callable[[Any], T | None],
+        within: float | None = None,
+    ) -> T:
+        """As in `Talk`. `within`: seconds in place of `reply_timeout`, for a short probe."""
         channel, device = self._channel, self._device
         if not self._open:
             if channel.quiet_since + device.silence > channel.now():
@@ -112,7 +117,8 @@ class Transaction:
         data = self._codec.encode(frame)
         started, character = channel.now(), channel.wire.character
         spoken = (len(data) * (2 if channel.echo.strip else 1) + reply) * character
-        until = started + spoken + self.reply_timeout
+        wait = device.settings.timing.reply_timeout if within is None else within
+        until = started + spoken + wait
         channel.alarm.by(until, self._expire)
         self.has_sent = True
         channel.send(data)
