@@ -133,7 +133,10 @@ class PollQueue:
         if own is None:
             own = self.by_device[poll.device] = DuePolls(poll.device)
         heap = own.heap
-        heapq.heappush(heap, (poll.deadline, poll.ticket, poll))
+        deadline = min(
+            poll.due + poll.block.every, poll.soon
+        )  # as `poll.deadline`, which is slower
+        heapq.heappush(heap, (deadline, poll.ticket, poll))
         if len(heap) > own.most:
             heap[:] = [entry for entry in heap if _is_valid(entry)]
             own.most = _tidy(heap)
