@@ -30,6 +30,7 @@ schema: .venv/installed
 bench: .venv/ready
 	$(BIN)/python -m benchmarks.bus_use
 	$(BIN)/python -m benchmarks.transactions
+	$(BIN)/python -m benchmarks.overload
 	$(BIN)/python -m benchmarks.planning
 	$(BIN)/python -m benchmarks.northbound
 

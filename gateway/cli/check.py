@@ -63,6 +63,9 @@ def _line(line: LineForecast) -> Text:
         f"\n  worst write latency {seconds(line.worst_write)}, "
         f"{seconds(line.worst_write_silent)} when a station has just gone offline"
     )
+    returned = f"\n  a silent station that returns is seen within {seconds(line.seen_within)}"
+    if line.seen_at_worst > line.seen_within:
+        returned += f", {seconds(line.seen_at_worst)} while polls take all of the wire"
     if not line.blocks:
         text = f"line {line.name}: no requests {_speed(line.wire)}"
         return Text(text + writes if line.worst_write else text)
@@ -71,6 +74,7 @@ def _line(line: LineForecast) -> Text:
         f"{line.characters:.0f} characters a second {_speed(line.wire)}\n"
         f"  load {line.load:.1%} of the wire; one round of all requests takes {seconds(line.cycle)}"
         + writes
+        + returned
     )
 
 

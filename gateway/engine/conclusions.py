@@ -115,9 +115,10 @@ class Conclusions:
         """Lets the line settle next: the late reply must not disturb another transaction."""
         device = job.device
         before = self._results.unclear(device, error, span_of(job), now, time)
+        no_guard = before is State.OFFLINE or _is_short(job)
         self._in_flight.continuation = Settle(
             device,
-            0.0 if before is State.OFFLINE else device.settings.late_guard,
+            0.0 if no_guard else device.settings.late_guard,
             self._gap,
             after=job,
             error=error,
@@ -133,9 +134,10 @@ class Conclusions:
                 again = Probe(device, after.outstanding, after.token + 1, again=True)
                 self._in_flight.continuation = again
             return
-        late = result.late if isinstance(result, Settled) else None
+        short = _is_short(after)
+        late = result.late if isinstance(result, Settled) and not short else None
         took = now - self._in_flight.begun
-        self._results.settled(device, settle.before, took, late, now, time)
+        self._results.settled(device, settle.before, took, late, now, time, short=short)
         for poll, error in settle.failed:
             self._results.unread(poll, error, now, time)
         if not isinstance(after, Poll | Probe):
@@ -147,3 +149,8 @@ class Conclusions:
         self._in_flight.clear()
         if job is not None:
             self._requests.abandon(job, error, now)
+
+
+def _is_short(job: Unfinished) -> bool:
+    """Returns True for a probe that waits less than the `reply_timeout` of the device."""
+    return isinstance(job, Probe) and job.timeout is not None

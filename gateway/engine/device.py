@@ -102,7 +102,9 @@ class Device:
     silence: float = field(init=False)  # seconds before each request
     shapes: ReplyShapes | None = field(init=False)  # None: no reply, or each has a number
     _lists: bool = True  # reads by a monitor list are allowed
-    _use: tuple[float, float] = (0.0, 0.0)  # seconds of the wire, and the time of counting
+    # Its recent use of the wire, to compare with that of other devices: the binary logarithm of
+    # the seconds, plus the half-lives until the time of counting. It grows, and never decays.
+    use: float = -math.inf
 
     def __post_init__(self) -> None:
         driver = self.driver
@@ -146,6 +148,12 @@ class Device:
         """Seconds after a request until its reply can no longer arrive."""
         return self.timing.reply_timeout + self.settings.late_guard
 
+    @property
+    def usual_turnaround(self) -> float | None:
+        """Seconds of the station for a reply, measured or from the file; None: not known yet."""
+        measured, given = self.record.turnaround, self.turnaround.configured
+        return given if measured is None else max(measured, given or 0.0)
+
     def diagnosis(self) -> str:
         """Returns the likely cause of its trouble as a sentence; empty when there is none."""
         driver = self.driver
@@ -164,6 +172,12 @@ class Device:
     def seconds(self, cost: Cost) -> float:
         """Returns the seconds of one transaction with this station."""
         return self.wire.transaction(cost, self.timing, self.turnaround.expected)
+
+    @property
+    def longest_poll(self) -> float:
+        """Seconds of its longest poll."""
+        longest = max((self.seconds(block.cost) for block in self.blocks), default=0.0)
+        return longest * self.settings.verify_reads
 
     @property
     def load(self) -> float:
@@ -319,13 +333,11 @@ class Device:
     # Its share of the wire
 
     def used(self, now: float, begun: float) -> None:
-        """Adds the time since `begun` of a poll or a probe.
+        """Adds the time since `begun` of a poll or a probe. Past use counts half after `HALF_LIFE`.
 
         Writes and reads on demand do not count: the device must not lose polls because of them.
         """
-        self._use = (self.recent_use(now) + now - begun, now)
-
-    def recent_use(self, now: float) -> float:
-        """Returns the seconds of polls and probes in about the last ten seconds."""
-        use, when = self._use
-        return use * math.exp2((when - now) / HALF_LIFE)
+        if now > begun:
+            more = math.log2(now - begun) + now / HALF_LIFE
+            least, most = sorted((self.use, more))
+            self.use = most + math.log2(1.0 + math.exp2(least - most))

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 from gateway.engine.ages import load_of, polled_blocks, worst_ages
 from gateway.engine.device import Device
+from gateway.engine.probes import seen_within
 from gateway.planning.planner import Block, plan
 from gateway.planning.wire_timing import WireTiming
 from gateway.protocols.unsolicited import Unsolicited
@@ -34,7 +35,9 @@ class LineForecast:
     characters: float  # per second, both ways
     cycle: float  # one poll of every block
     worst_write: float  # from the request of the client to the acknowledgement
-    worst_write_silent: float  # the same when a device stopped to reply
+    worst_write_silent: float  # the same when a device does not reply
+    seen_within: float  # from the return of a silent device until it is seen; all but one silent
+    seen_at_worst: float  # the same while as many others reply as delay it most
     shortest: float  # the shortest interval that is possible for all tags
     unsolicited: tuple[tuple[Device, int], ...]  # devices with their number of unsolicited tags
 
@@ -62,6 +65,8 @@ def forecast(name: str, devices: Sequence[Device], wire: WireTiming) -> LineFore
     write = max((_longest_write(device) for device in devices), default=0.0)
     silence = max((device.longest_reply for device in devices), default=0.0)
     cycle = sum(one.seconds for one in blocks)
+    requests = sum(1 / one.block.every for one in blocks)
+    seen, seen_at_worst = seen_within(devices, load, requests, longest)
     unsolicited = [(device, _unsolicited_tags(device)) for device in devices]
     return LineForecast(
         name=name,
@@ -70,11 +75,13 @@ def forecast(name: str, devices: Sequence[Device], wire: WireTiming) -> LineFore
             BlockForecast(*one, age) for one, age in zip(blocks, worst_ages(blocks), strict=True)
         ),
         load=load,
-        requests=sum(1 / one.block.every for one in blocks),
+        requests=requests,
         characters=sum(sum(one.block.cost) / one.block.every for one in blocks),
         cycle=cycle,
         worst_write=longest + write,
         worst_write_silent=longest + write + silence,
+        seen_within=seen,
+        seen_at_worst=seen_at_worst,
         shortest=sum(_round(device) for device in devices) if load > 1 else cycle,
         unsolicited=tuple((device, tags) for device, tags in unsolicited if tags),
     )

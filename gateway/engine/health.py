@@ -3,6 +3,7 @@
 The table `TRANSITIONS` holds every change of state. No other module assigns a field of `Health`.
 """
 
+import math
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -12,7 +13,9 @@ from gateway.errors import DeviceError, Evidence, Garbled, GatewayError, LineDow
 from gateway.protocols.driver import Span
 from gateway.tags import Reason
 
-PAUSE_FIRST, PAUSE_LONGEST = 1.0, 60.0  # seconds between two probes of an offline device
+PAUSE_FIRST, PAUSE_LONGEST = 1.0, 60.0  # seconds between two tries of a block without replies
+PROBE_PAUSE = 4.0  # the longest time between two probes of an offline device; the first is 1 s
+PROBE_SPREAD = 0.1  # share by which it varies
 MOST_UNANSWERED = 64  # unanswered requests whose times are kept
 
 
@@ -70,8 +73,11 @@ class Health:
     needs_resync: bool = field(init=False)  # the next frame may answer an older request
     outstanding: Span | None = None  # the request whose reply may still arrive
     trouble: GatewayError | None = None
+    heard: bool | None = None  # True: it has replied; False: it gave up after that
     pause: float = 0.0  # seconds until the next probe of an offline device
     next_probe: float = 0.0
+    short_probes: int = 0  # since the last patient one, or the last reply
+    _last_probe: float = -math.inf  # of an offline device
     _unanswered: deque[float] = field(default_factory=lambda: deque(maxlen=MOST_UNANSWERED))
     _probe_token: int = 0
     _extra: bool = False  # an extra reply arrived since the last resync
@@ -83,7 +89,7 @@ class Health:
         """Starts again after the line was opened or lost: an older reply may still arrive."""
         self._move(Event.RESTARTED)
         self.trouble = trouble
-        self.consecutive_failures = 0
+        self.consecutive_failures = self.short_probes = 0
         self.needs_resync = self.answerable
 
     def answered(self, *, resynced: bool = False) -> bool:
@@ -95,8 +101,8 @@ class Health:
         if resynced:
             self._extra = False
         self._move(Event.ANSWERED)
-        self.consecutive_failures = 0
-        self.trouble = None
+        self.consecutive_failures = self.short_probes = 0
+        self.heard, self.trouble = True, None
         self.pause = 0.0
         if not self._extra:
             self.needs_resync = False
@@ -148,12 +154,22 @@ class Health:
         `spread`: a random factor near 1, so that many devices are not probed at once.
         """
         self._move(Event.GAVE_UP)
-        self.pause = min(max(2 * self.pause, PAUSE_FIRST), PAUSE_LONGEST)
+        self.heard = False
+        self.pause = min(max(2 * self.pause, PAUSE_FIRST), PROBE_PAUSE)
         self.next_probe = now + self.pause * spread
+        self._last_probe = now
+
+    def may_be_probed(self, now: float) -> bool:
+        """Returns True if its last probe is old enough for one on behalf of a client."""
+        return self._last_probe + PAUSE_FIRST <= now
 
     def probe_soon(self) -> None:
-        """Ends the pause, because a client waits; the share of wire time still limits the probe."""
-        self.next_probe = 0.0
+        """Shortens the pause, because a client waits."""
+        self.next_probe = min(self.next_probe, self._last_probe + PAUSE_FIRST)
+
+    def probed(self, *, short: bool) -> None:
+        """Counts a probe that is sent."""
+        self.short_probes = self.short_probes + 1 if short else 0
 
     def next_probe_token(self) -> int:
         """Returns a token for a resync. The token after it is free for a second resync request."""

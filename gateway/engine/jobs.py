@@ -1,5 +1,6 @@
 """Jobs that an engine hands to its line, and their results."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import cast
@@ -37,6 +38,7 @@ class Poll:
     span: Span = field(init=False)  # to be read: that of the block, or a longer one around it
     tries: int = 0
     missed: int = 0  # rounds in a row without a reply, while the device replies to others
+    soon: float = math.inf  # an earlier deadline, because its values are bad
     asked: float = 0.0  # when it was handed out last
     expedited: bool = False  # before its time, because a client waits
     phased: bool = True  # it has found its place in the period
@@ -66,8 +68,11 @@ class Poll:
 
     @property
     def deadline(self) -> float:
-        """The latest time to start the poll: its interval after due, also for a bad address."""
-        return self.due + self.block.every
+        """The latest time to start the poll: its interval after due, also for a bad address.
+
+        It is earlier for a block of a long interval without good values.
+        """
+        return min(self.due + self.block.every, self.soon)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,6 +83,7 @@ class Probe:
     outstanding: Span | None  # a late reply to it must not look like the reply to the probe
     token: int
     again: bool = False  # the line has settled: any reply belongs to this probe
+    timeout: float | None = None  # of a short probe; None: `reply_timeout` of the device
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -244,6 +244,9 @@ class Results:
         device.record.count_failure(error)
         device.forget_list()  # the device may have restarted
         name, why = device.name, str(error)
+        if before is State.OFFLINE:  # its probes fail every few seconds
+            self._effects.debug("transaction failed", line=self._line, device=name, why=why)
+            return before
         self._effects.info("transaction failed", line=self._line, device=name, why=why)
         self._staleness.look(now, time)
         return before
@@ -256,10 +259,13 @@ class Results:
         late: float | None,
         now: float,
         time: int,
+        *,
+        short: bool = False,
     ) -> None:
         """Applies an unclear transaction after the line has settled; it took `took` seconds.
 
-        `late`: seconds from the time-out to the late reply, if it arrived.
+        `late`: seconds from the time-out to the late reply, if it arrived. `short`: it was a short
+        probe. A device that starts is offline only after a patient one, unless it was before.
         """
         health = device.health
         if late is not None:
@@ -272,6 +278,8 @@ class Results:
         unknown = before in (State.STARTING, State.OFFLINE)
         if not unknown and health.consecutive_failures <= device.timing.retries:
             return
+        if short and before is State.STARTING and health.heard is not False:
+            return
         if device.broadcast:  # only its own frames can make it online again
             device.restart()
             if not unknown:
@@ -279,7 +287,8 @@ class Results:
             return
         self._schedule.went_offline(device, now, took)
         why = device.diagnosis()
-        self._effects.bad(device.polled_tags, health.reason, time, why)
+        if not (short and before is State.OFFLINE):  # the values are bad already
+            self._effects.bad(device.polled_tags, health.reason, time, why)
         if before is not State.OFFLINE:
             self._effects.online(device, False)
             self._effects.warning("device offline", device=device.name, why=why)

@@ -1,21 +1,22 @@
 """Decides the next job of one line."""
 
 import itertools
-import random
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 
 from gateway.engine.device import Device
 from gateway.engine.health import PAUSE_LONGEST, State
 from gateway.engine.jobs import EXPEDITED, NOT_QUEUED, Idle, LastRead, Poll, Probe
 from gateway.engine.poll_queue import PollQueue
+from gateway.engine.probe_schedule import ProbeSchedule
 from gateway.engine.reply_shapes import QUIET
 from gateway.engine.requests import Request, RequestQueue
 from gateway.planning.planner import Block
 from gateway.tags import Tag
 
 NEVER = float("inf")
+LONG = 10.0  # seconds: a longer interval is too long to wait for a first value
+FIRST_SHARE = 0.1  # share of the wire time for blocks of long intervals without good values
 GOLDEN = 0.6180339887498949  # any number of its multiples is spread evenly
-OFFLINE_SHARE = 0.05  # share of the wire time of all offline devices together
 
 
 class Schedule:
@@ -27,29 +28,31 @@ class Schedule:
       used the wire least in recent seconds goes first.
     * An expedited poll goes before other polls, but not twice in a row while one is due.
     * A late poll is done once, not once per missed period.
+    * A block of a long interval without good values gets an early deadline, in turn with others:
+      all these together get a tenth of the wire's time.
     * After their first round the polls are spread over their periods.
     * A device that needs a resync is probed before anything else is sent to it.
-    * A starting device is probed at once. While polls of others are due, its probes and those of
-      devices that have just failed get half of the wire's time.
-    * An offline device is probed at growing pauses. All offline devices together get a twentieth
-      of the wire's time while others are online.
+    * A starting device is probed at once, first by a short probe. Devices that have replied last
+      time go first. While polls of others are due, these probes and those of devices that have
+      just failed get half of the wire's time.
+    * An offline device is probed at growing pauses, mostly by short probes. A probe uses idle time
+      of the wire if it ends before the next poll is due, or takes no longer than the longest poll.
+      Otherwise all offline devices together get a twentieth of the wire's time.
+    * A request to an offline device has it probed at once, when no poll is due.
     """
 
     def __init__(self, devices: Sequence[Device], now: float, seed: int = 0) -> None:
         self.devices = devices
         self.requests = RequestQueue()
-        self._random = random.Random(seed)  # noqa: S311  (jitter, not a secret)
         # The share of its period by which each poll begins early.
         self._phases = (n * GOLDEN % 1 / 2 for n in itertools.count())
-        self._queue = PollQueue()
+        self._probes = ProbeSchedule(devices, now, seed)
+        self._queue = PollQueue(shared=len(devices) > 1)
         self._polls: dict[Device, list[Poll]] = {}
         self._readers: dict[Device, dict[Tag, Poll]] = {}  # made at the first call of `reader`
         self._wrote = False
         self._expedited = False
-        self._failing_lane = (
-            now  # the time of the next request that may fail, while others have due polls
-        )
-        self._offline_lane = now  # the time of the next probe of an offline device
+        self._first_lane = now  # the deadline of the last block without good values
         for device in devices:
             self.plan(device, now)
 
@@ -76,7 +79,7 @@ class Schedule:
             polls.append(poll)
         for poll in before:
             poll.live = False
-        self._set_polls(device, polls, polls)
+        self._set_polls(device, polls, polls, now)
 
     def replace(self, poll: Poll, blocks: Iterable[Block], now: float) -> None:
         """Replaces one poll by polls of these blocks, due at once."""
@@ -86,7 +89,7 @@ class Schedule:
         last = poll.last
         new = [Poll(poll.device, block, now, last=LastRead(last.at, last.ever)) for block in blocks]
         kept = [other for other in self._polls[poll.device] if other is not poll]
-        self._set_polls(poll.device, kept + new, new)
+        self._set_polls(poll.device, kept + new, new, now)
 
     def try_soon(self, device: Device, when: float) -> None:
         """Polls all bad addresses of the device before `when`, because one has returned."""
@@ -96,10 +99,26 @@ class Schedule:
             poll.due = when
         self._queue.push_all(later)
 
-    def _set_polls(self, device: Device, polls: list[Poll], new: list[Poll]) -> None:
+    def _set_polls(self, device: Device, polls: list[Poll], new: list[Poll], now: float) -> None:
+        for poll in new:
+            self._hasten(poll, now)
         self._polls[device] = polls
         self._readers.pop(device, None)
         self._queue.push_all(new)
+
+    def _hasten(self, poll: Poll, now: float) -> None:
+        """Gives the poll an early deadline if the values of its block are bad."""
+        device, block = poll.device, poll.block
+        poll.soon = NEVER
+        if block.every <= LONG or poll.last.at is not None or not device.health.online:
+            return
+        if block.span in device.bad_addresses.bad:
+            return
+        turn = device.seconds(block.cost) / FIRST_SHARE
+        soon = max(self._first_lane, now) + turn
+        if max(soon, poll.due + turn) < poll.deadline:
+            self._first_lane = soon
+            poll.soon = max(soon, poll.due + turn)
 
     def expedite(self, poll: Poll) -> None:
         """Polls this next, after requests, because a client waits for it."""
@@ -111,8 +130,10 @@ class Schedule:
     # Questions
 
     def reachable(self, device: Device, now: float) -> bool:
-        """False for an offline device whose next probe is not allowed yet."""
-        return device.health.state is not State.OFFLINE or self._offline_lane <= now
+        """False for an offline device that is not probed at once for a request."""
+        if device.health.state is not State.OFFLINE:
+            return True
+        return self._probes.reachable(device, now, late=self._queue.is_late)
 
     def polls(self, device: Device) -> Sequence[Poll]:
         return self._polls[device]
@@ -137,36 +158,38 @@ class Schedule:
         waiting = self._queue.waiting
         until = waiting[0][0] if waiting else NEVER
         others = [device for device in self.devices if not device.health.online]
-        for device, allowed in self._probes(others) if others else ():
-            starting = device.health.state is State.STARTING
-            if allowed <= now or (starting and not due):
-                return _probe(device)
-            until = min(until, allowed)
+        if others:
+            probe = self._probes.next(others, now, now if due else until)
+            if isinstance(probe, Probe):
+                return probe
+            until = min(until, probe)
         return self._next_poll(now) if due else Idle(until)
 
     def _next_request(self, now: float, due: bool) -> Request | Probe | None:
         first = self.requests.first.device
-        if first.health.needs_resync and self._failing_lane <= now:
-            return _probe(first)
+        if first.health.needs_resync:
+            probe = self._probes.for_request(first, now, due=due)
+            if probe is not None:
+                return probe
         request = self.requests.take()
         if request is not None:
             self._wrote = True
             return request
-        return None if due else _probe(first)
+        return None if due else self._probes.probe(first)
 
     def _next_poll(self, now: float) -> Poll | Probe:
         queue = self._queue
-        expedited = bool(queue.expedited) and not (self._expedited and queue.due)
-        poll = queue.expedited[0] if expedited else queue.due[0][2]
-        if not expedited and len(self.devices) > 1 and poll.deadline < now:
-            poll = self._fairest(now)
+        poll = queue.due
+        expedited = bool(queue.expedited) and not (self._expedited and poll is not None)
+        if expedited or poll is None:
+            poll = queue.expedited[0]
         shapes = poll.device.shapes
         if shapes is not None and shapes.mark_due <= now < shapes.at + QUIET:
             poll.device.health.left_outstanding(shapes.span, now)
         if poll.device.health.needs_resync:
-            other = self._first_without_resync() if now < self._failing_lane else None
+            other = self._first_without_resync() if now < self._probes.failing_lane else None
             if other is None:
-                return _probe(poll.device)
+                return self._probes.probe(poll.device)
             poll = other
             expedited = False
         self._expedited = poll.expedited = expedited
@@ -174,9 +197,7 @@ class Schedule:
 
     def alongside(self, poll: Poll, most: int, now: float) -> list[Poll]:
         """Returns more due polls of the device, if it accepts several requests at once."""
-        others = [other for other in self._queue.valid() if other.device is poll.device]
-        others.sort(key=lambda other: (other.deadline, other.ticket))
-        return [self._hand_out(other, now) for other in others[:most]]
+        return [self._hand_out(other, now) for other in self._queue.more(poll.device, most)]
 
     def _hand_out(self, poll: Poll, now: float) -> Poll:
         if poll.ticket == EXPEDITED:
@@ -193,26 +214,10 @@ class Schedule:
             poll.device.expect_list(listed)
         return poll
 
-    def _fairest(self, now: float) -> Poll:
-        """Returns the late poll whose device has recently used the wire least."""
-        late = (poll for poll in self._queue.valid() if poll.deadline < now)
-        return min(late, key=lambda poll: (poll.device.recent_use(now), poll.deadline))
-
     def _first_without_resync(self) -> Poll | None:
         """Returns the due poll with the earliest deadline whose device needs no resync."""
         ready = (poll for poll in self._queue.valid() if not poll.device.health.needs_resync)
         return min(ready, key=lambda poll: poll.deadline, default=None)
-
-    def _probes(self, others: Sequence[Device]) -> Iterator[tuple[Device, float]]:
-        """Yields the next starting and the next offline device to probe, with the earliest time."""
-        for device in others:
-            if device.health.state is State.STARTING and not device.broadcast:
-                yield device, self._failing_lane
-                break
-        offline = [device for device in others if device.health.state is State.OFFLINE]
-        if offline:
-            device = min(offline, key=lambda device: device.health.next_probe)
-            yield device, max(device.health.next_probe, self._offline_lane)
 
     # Results
 
@@ -233,6 +238,8 @@ class Schedule:
         if poll.last.at is None and block.span not in device.bad_addresses.bad:
             poll.due = min(poll.due, now + PAUSE_LONGEST)  # the cause may have gone
         poll.tries = 0
+        if block.every > LONG:
+            self._hasten(poll, now)
         self._queue.push(poll)
 
     def again(self, poll: Poll, when: float | None = None, *, counted: bool = True) -> None:
@@ -244,13 +251,11 @@ class Schedule:
 
     def failed(self, now: float, took: float) -> None:
         """Notes an unclear transaction of `took` seconds with a device that is not offline."""
-        self._failing_lane = now + took
+        self._probes.failed(now, took)
 
     def went_offline(self, device: Device, now: float, took: float) -> None:
         """Makes the device offline, after a failed probe or last retry of `took` seconds."""
-        device.health.gave_up(now, self._random.uniform(0.9, 1.1))
-        others = any(other.health.online for other in self.devices)
-        self._offline_lane = now + took * (1 / OFFLINE_SHARE - 1) if others else now
+        self._probes.went_offline(device, now, took)
 
     def came_online(self, device: Device, now: float) -> None:
         """Makes all blocks of a device due, because it came online."""
@@ -264,10 +269,5 @@ class Schedule:
 
     def opened(self, now: float) -> None:
         """Starts again after the line was opened."""
-        self._failing_lane = self._offline_lane = now
+        self._probes.opened(now)
         self._wrote = self._expedited = False
-
-
-def _probe(device: Device) -> Probe:
-    health = device.health
-    return Probe(device, health.outstanding, health.next_probe_token())

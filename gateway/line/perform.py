@@ -1,7 +1,8 @@
 """Performs one job on an open transaction: calls the driver, and decides nothing."""
 
-from collections.abc import Awaitable, Sequence
-from typing import Any
+from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeVar
 
 from gateway.engine.device import Device
 from gateway.engine.jobs import (
@@ -24,8 +25,27 @@ from gateway.line.transaction import Transaction
 from gateway.planning.planner import Block
 from gateway.protocols.driver import Controllable, Monitor, ScatteredWriter, Span, Talk
 
+T = TypeVar("T")
 TWO_REPLIES = "two replies arrived, and the first may be that to an earlier write"
 DIFFER = "two readings in a row differ; verify_reads is for values that change slowly"
+
+
+@dataclass(frozen=True, slots=True)
+class ShortTalk:
+    """The `Talk` of a short probe, which waits less than `reply_timeout`."""
+
+    transaction: Transaction
+    timeout: float
+
+    @property
+    def may_echo(self) -> bool:
+        return self.transaction.may_echo
+
+    async def tell(self, frame: Any) -> None:
+        await self.transaction.tell(frame)
+
+    async def ask(self, frame: Any, reply: int, answers: Callable[[Any], T | None]) -> T:
+        return await self.transaction.ask(frame, reply, answers, self.timeout)
 
 
 async def perform(job: Transacted, transaction: Transaction) -> Result:
@@ -50,9 +70,10 @@ async def _perform(job: Transacted, transaction: Transaction) -> Result:
     match job:
         case Settle(guard=guard, gap=gap):
             return Settled(await transaction.settle(guard, gap))
-        case Probe(outstanding=outstanding, token=token):
+        case Probe(outstanding=outstanding, token=token, timeout=timeout):
             spans = job.device.probe_spans
-            return Resynced(await driver.resync(transaction, outstanding, token, spans))
+            talk = transaction if timeout is None else ShortTalk(transaction, timeout)
+            return Resynced(await driver.resync(talk, outstanding, token, spans))
         case Write() | Repeat():
             return await _write(job.write if isinstance(job, Repeat) else job, transaction)
         case WriteTogether(writes=writes) if isinstance(driver, ScatteredWriter):

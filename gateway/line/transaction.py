@@ -102,7 +102,14 @@ class Transaction:
         # No reply follows; the wire is busy until the last character is out.
         channel.pause(len(data) * channel.wire.character)
 
-    async def ask(self, frame: Any, reply: int, answers: Callable[[Any], T | None]) -> T:
+    async def ask(
+        self,
+        frame: Any,
+        reply: int,
+        answers: Callable[[Any], T | None],
+        within: float | None = None,
+    ) -> T:
+        """As in `Talk`. `within`: seconds in place of `reply_timeout`, for a short probe."""
         channel, device = self._channel, self._device
         if not self._open:
             if channel.quiet_since + device.silence > channel.now():
@@ -111,7 +118,8 @@ class Transaction:
         data = self._codec.encode(frame)
         started, character = channel.now(), channel.wire.character
         spoken = (len(data) * (2 if channel.echo.strip else 1) + reply) * character
-        until = started + spoken + device.settings.timing.reply_timeout
+        wait = device.settings.timing.reply_timeout if within is None else within
+        until = started + spoken + wait
         channel.alarm.by(until, self._expire)
         self.has_sent = True
         channel.send(data)

@@ -19,6 +19,7 @@ def test_check_prints_the_plan(command: Command, config: Path) -> None:
     assert "line hall: " in done.out
     assert "characters a second at 19200 baud" in done.out
     assert "worst write latency" in done.out
+    assert "a silent station that returns is seen within" in done.out
     rows = [line.split() for line in done.out.splitlines() if line.startswith("  mixer")]
     assert "Y20" in [row[1] for row in rows]
     assert f"{config}: good, 7 tags on 1 line" in done.out

@@ -2,7 +2,7 @@
 
 The configuration says `every: 1s`, `reply_timeout: 200ms` and `retries: 5`, and leaves
 `late_guard` as long as the reply time-out: the station is offline after 2.4 s, and its values
-must turn bad before. It is then probed at most every 8 s, as the other station is polled.
+must turn bad before. It is then probed every 1 to 4 s.
 """
 
 import signal

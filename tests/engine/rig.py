@@ -144,6 +144,8 @@ class Rig:
         assert isinstance(probe, Probe)
         if state is State.OFFLINE:
             self.fail(probe)
+            if probe.timeout is not None:  # a short one
+                self.fail(self.transacted())
         else:
             self.conclude(probe, Resynced(1))
         if state is State.FAILING:

@@ -1,8 +1,10 @@
 """One device: its health and diagnosis, its plan, its record and its use of the wire."""
 
+import math
+
 import pytest
 
-from gateway.engine.device import Device
+from gateway.engine.device import HALF_LIFE, Device
 from gateway.engine.health import State
 from gateway.errors import Evidence, Garbled, NoReply, Unclear
 from gateway.protocols.driver import Span
@@ -185,7 +187,8 @@ def test_a_measured_turnaround_is_expected_though_the_plan_stays() -> None:
 def test_half_of_the_use_of_the_wire_is_forgotten_every_ten_seconds() -> None:
     dev = device([make_tag("D0")])
     dev.used(100.0, 96.0)
-    assert dev.recent_use(100.0) == 4.0
-    assert dev.recent_use(110.0) == pytest.approx(2.0)
+    assert dev.use == 2.0 + 100.0 / HALF_LIFE
     dev.used(110.0, 109.0)
-    assert dev.recent_use(110.0) == pytest.approx(3.0)
+    assert dev.use == pytest.approx(math.log2(3.0) + 110.0 / HALF_LIFE)
+    dev.used(110.0, 110.0)
+    assert dev.use == pytest.approx(math.log2(3.0) + 110.0 / HALF_LIFE)

@@ -413,20 +413,20 @@ failing  Settle/NotSent        quiet         failing   Busy                     
 failing  Settle/NotSent        late          failing   Busy                                 Poll
 failing  Settle/LastPoll       quiet         offline   bad:garbled+offline                  Idle
 failing  Settle/LastPoll       late          offline   bad:garbled+offline                  Idle
-failing  Settle/LastWrite      quiet         offline   bad:garbled+offline+NoReply          Probe
-failing  Settle/LastWrite      late          offline   bad:garbled+offline+NoReply          Probe
+failing  Settle/LastWrite      quiet         offline   bad:garbled+offline+NoReply          Idle
+failing  Settle/LastWrite      late          offline   bad:garbled+offline+NoReply          Idle
 failing  Settle/LastVerified   quiet         offline   bad:garbled+offline                  Confirm
 failing  Settle/LastVerified   late          offline   bad:garbled+offline                  Confirm
-failing  Settle/LastTogether   quiet         offline   bad:garbled+offline+NoReply+NoReply  Probe
-failing  Settle/LastTogether   late          offline   bad:garbled+offline+NoReply+NoReply  Probe
+failing  Settle/LastTogether   quiet         offline   bad:garbled+offline+NoReply+NoReply  Idle
+failing  Settle/LastTogether   late          offline   bad:garbled+offline+NoReply+NoReply  Idle
 failing  Settle/LastCommand    quiet         offline   bad:garbled+offline+NoReply          Idle
 failing  Settle/LastCommand    late          offline   bad:garbled+offline+NoReply          Idle
 failing  Settle/LastProbe      quiet         offline   bad:no-reply+offline                 Idle
 failing  Settle/LastProbe      late          offline   bad:garbled+offline                  Idle
-failing  Settle/Confirm        quiet         offline   bad:no-reply+offline+NoReply         Probe
-failing  Settle/Confirm        late          offline   bad:garbled+offline+NoReply          Probe
-failing  Settle/Repeat         quiet         offline   bad:no-reply+offline+NoReply         Probe
-failing  Settle/Repeat         late          offline   bad:garbled+offline+NoReply          Probe
+failing  Settle/Confirm        quiet         offline   bad:no-reply+offline+NoReply         Idle
+failing  Settle/Confirm        late          offline   bad:garbled+offline+NoReply          Idle
+failing  Settle/Repeat         quiet         offline   bad:no-reply+offline+NoReply         Idle
+failing  Settle/Repeat         late          offline   bad:garbled+offline+NoReply          Idle
 
 offline  Probe                 resynced      online    online                               Poll
 offline  Probe                 ambiguous     offline   -                                    Settle
@@ -443,7 +443,7 @@ offline  ProbeAgain            any-refusal   online    online                   
 offline  ProbeAgain            any-unclear   offline   -                                    Settle
 offline  ProbeAgain            lost          offline   -                                    -
 offline  Write                 sent          online    online+written                       Poll
-offline  Write                 to-all        offline   pause+sent                           Probe
+offline  Write                 to-all        offline   pause+sent                           Idle
 offline  Write                 any-refusal   online    online+Refused                       Poll
 offline  Write                 any-unclear   offline   -                                    Settle
 offline  Write                 lost          offline   Unclear                              -
@@ -451,7 +451,7 @@ offline  Write                 not-sent      offline   -                        
 offline  WriteVerified         held          online    online+verified                      Poll
 offline  WriteVerified         differs       online    online+Differs                       Poll
 offline  WriteVerified         refused-back  online    online+Differs                       Poll
-offline  WriteVerified         to-all        offline   pause+sent                           Probe
+offline  WriteVerified         to-all        offline   pause+sent                           Idle
 offline  WriteVerified         any-refusal   online    online+Refused                       Poll
 offline  WriteVerified         any-unclear   offline   -                                    Settle
 offline  WriteVerified         lost          offline   Unclear                              -
@@ -473,7 +473,7 @@ offline  Confirm               any-refusal   online    online+NoReply           
 offline  Confirm               any-unclear   offline   -                                    Settle
 offline  Confirm               lost          offline   Unclear                              -
 offline  ConfirmVerify         held          online    online+verified                      Poll
-offline  ConfirmVerify         differs       offline   NoReply                              Probe
+offline  ConfirmVerify         differs       offline   NoReply                              Idle
 offline  ConfirmVerify         any-refusal   online    online+NoReply                       Poll
 offline  ConfirmVerify         any-unclear   offline   -                                    Settle
 offline  ConfirmVerify         lost          offline   Unclear                              -
@@ -483,14 +483,14 @@ offline  ConfirmBoth           any-refusal   online    online+NoReply           
 offline  ConfirmBoth           any-unclear   offline   -                                    Settle
 offline  ConfirmBoth           lost          offline   Unclear                              -
 offline  Repeat                sent          online    online+written                       Poll
-offline  Repeat                to-all        offline   pause+sent                           Probe
+offline  Repeat                to-all        offline   pause+sent                           Idle
 offline  Repeat                any-refusal   online    online+NoReply                       Poll
 offline  Repeat                any-unclear   offline   -                                    Settle
 offline  Repeat                lost          offline   Unclear                              -
-offline  Settle/Confirm        quiet         offline   bad:garbled+NoReply                  Probe
-offline  Settle/Confirm        late          offline   bad:garbled+NoReply                  Probe
-offline  Settle/Repeat         quiet         offline   bad:garbled+NoReply                  Probe
-offline  Settle/Repeat         late          offline   bad:garbled+NoReply                  Probe
+offline  Settle/Confirm        quiet         offline   bad:garbled+NoReply                  Idle
+offline  Settle/Confirm        late          offline   bad:garbled+NoReply                  Idle
+offline  Settle/Repeat         quiet         offline   bad:garbled+NoReply                  Idle
+offline  Settle/Repeat         late          offline   bad:garbled+NoReply                  Idle
 """
 
 
@@ -683,6 +683,27 @@ def test_a_request_to_an_offline_device_is_refused_while_its_probe_is_not_allowe
     rig.fail(poll)
     assert rig.device.state is State.OFFLINE
     assert isinstance(rig.outcomes[rig.write("D0")], Offline)
+
+
+def test_a_short_probe_that_fails_leaves_a_starting_device_starting() -> None:
+    rig = Rig(link_device(), link_device(station=2))
+    for short in (True, False, True):
+        probe = rig.transacted()
+        while probe.device is not rig.device:
+            rig.conclude(probe, Resynced(1) if isinstance(probe, Probe) else UNITS)
+            probe = rig.transacted()
+        assert isinstance(probe, Probe)
+        assert (probe.timeout is not None) is short
+        before = rig.device.state
+        rig.conclude(probe, SILENCE)
+        settle = rig.next()
+        assert isinstance(settle, Settle)
+        assert (settle.guard == 0.0) is short
+        found = kinds(rig.conclude(settle, Settled(None)))
+        if short:
+            assert (rig.device.state, found) == (before, "-")
+        else:
+            assert (rig.device.state, found) == (State.OFFLINE, "bad:no-reply+offline")
 
 
 def test_the_latest_of_several_waiting_values_takes_the_place_of_the_others() -> None:

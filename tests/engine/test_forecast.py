@@ -15,7 +15,9 @@ from gateway.app import forecasts
 from gateway.config import load
 from gateway.engine.device import Device
 from gateway.engine.forecast import LineForecast, forecast
+from gateway.planning.wire_timing import WireTiming
 from tests.e2e.processes import vigor_line, write_config
+from tests.sim.plant import device, words
 from tests.vectors import vectors
 
 LENGTH = {vector.id: len(vector.frame) for vector in vectors("vigor")}
@@ -146,3 +148,25 @@ def test_a_line_that_is_exactly_full_is_not_overloaded(tmp_path: Path) -> None:
     line = forecast("hall", [device], section.wire)
     assert line.load == pytest.approx(1)
     assert not math.isinf(line.blocks[0].worst_age)
+
+
+def test_a_returned_station_is_seen_after_a_pause_and_one_round_of_probes() -> None:
+    """32 stations at 9600 baud, as in `benchmarks/returns.py`, asked every 10 s."""
+    wire = WireTiming(9600, 10)
+    tags = words(0, 20, every=10.0)
+    devices = [device(tags, station=n, wire=wire) for n in range(1, 33)]
+    found = forecast("line", devices, wire)
+    short = 0.005 + 50 / 960 + 0.05
+    patient = 0.005 + 50 / 960 + 0.5
+    one_round = 31 * (15 * short + patient) / 16 / (1 - found.load / 32)
+    longest = max(block.seconds for block in found.blocks)
+    assert found.seen_within == pytest.approx(1.1 * 4.0 + longest + one_round)
+    assert found.seen_at_worst == pytest.approx(found.seen_within)
+    assert found.seen_within < 10.0
+
+
+def test_on_an_overloaded_line_it_is_seen_later() -> None:
+    devices = [device(words(0, 60, every=0.5), station=n) for n in range(1, 9)]
+    found = forecast("line", devices, devices[0].wire)
+    assert found.overloaded
+    assert found.seen_at_worst > 2 * found.seen_within

@@ -7,7 +7,7 @@ import pytest
 from gateway.engine.health import (
     MOST_UNANSWERED,
     PAUSE_FIRST,
-    PAUSE_LONGEST,
+    PROBE_PAUSE,
     TRANSITIONS,
     Event,
     Health,
@@ -182,14 +182,41 @@ def test_the_pause_between_probes_doubles_up_to_the_longest() -> None:
         found.gave_up(100.0, 1.1)
         pauses.append(found.pause)
         assert found.next_probe == 100.0 + 1.1 * found.pause
-    assert pauses == [min(PAUSE_FIRST * 2**n, PAUSE_LONGEST) for n in range(9)]
+    assert pauses == [min(PAUSE_FIRST * 2**n, PROBE_PAUSE) for n in range(9)]
 
 
-def test_probe_soon_allows_the_next_probe_at_once() -> None:
+def test_probe_soon_allows_a_probe_one_second_after_the_last_one() -> None:
     found = health(S.OFFLINE)
-    assert found.next_probe > 0.0
+    for _ in range(5):
+        found.gave_up(100.0, 1.0)
+    assert found.next_probe == 100.0 + PROBE_PAUSE
     found.probe_soon()
-    assert found.next_probe == 0.0
+    assert found.next_probe == 100.0 + PAUSE_FIRST
+    assert not found.may_be_probed(100.0 + PAUSE_FIRST - 0.1)
+    assert found.may_be_probed(100.0 + PAUSE_FIRST)
+
+
+def test_a_restart_keeps_if_the_device_was_heard() -> None:
+    found, heard = health(), []
+    for change in (found.answered, lambda: found.gave_up(0.0, 1.0), found.answered):
+        change()
+        found.restart()
+        heard.append(found.heard)
+    assert heard == [True, False, True]
+    assert Health().heard is None
+
+
+def test_short_probes_are_counted_until_a_patient_one_a_reply_or_a_restart() -> None:
+    found, counts = health(S.OFFLINE), []
+    for short in (True, True, False, True):
+        found.probed(short=short)
+        counts.append(found.short_probes)
+    assert counts == [1, 2, 0, 1]
+    found.restart()
+    assert found.short_probes == 0
+    found.probed(short=True)
+    found.answered()
+    assert found.short_probes == 0
 
 
 def test_probe_tokens_grow_by_two() -> None:

@@ -2,14 +2,17 @@
 
 import random
 
+import pytest
+
 from gateway.engine.device import Device
 from gateway.engine.jobs import EXPEDITED, NOT_QUEUED, Poll
 from gateway.engine.poll_queue import ROOM, PollQueue
 from tests.sim.plant import device, make_tag
 
 
-def online() -> Device:
-    found = device([make_tag("D0", every=1.0), make_tag("D900", every=5.0)])
+def online(station: int = 1) -> Device:
+    tags = [make_tag("D0", every=1.0), make_tag("D900", every=5.0)]
+    found = device(tags, station=station)
     found.health.answered()
     return found
 
@@ -25,7 +28,7 @@ def queue(*pushed: Poll) -> PollQueue:
 
 
 def first(made: PollQueue, now: float) -> Poll | None:
-    return made.due[0][2] if made.ripen(now) and made.due else None
+    return made.due if made.ripen(now) else None
 
 
 def test_a_poll_is_due_from_its_due_time_on() -> None:
@@ -103,5 +106,46 @@ def test_stale_entries_are_dropped_when_there_are_many() -> None:
         made.push(poll)
         made.ripen(n / 2)
         assert len(made.waiting) <= 2 * len(many) + ROOM + 1
-        assert len(made.due) <= 2 * len(many) + ROOM + 1
+        assert made.entries <= 2 * (2 * len(many) + ROOM + 1)
     assert first(made, 1e9) is min(made.valid(), key=lambda poll: (poll.deadline, poll.ticket))
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_late_polls_go_by_use_of_the_wire_and_others_by_deadline(seed: int) -> None:
+    """The queue compares few polls; this test compares all."""
+    chance = random.Random(seed)
+    devices = [online(station) for station in range(1, 9)]
+    made, now = PollQueue(), 0.0
+    made.push_all(poll for of in devices for poll in polls(of, *range(6)))
+    for _ in range(600):
+        now += chance.choice((0.0, 0.01, 0.3, 1.5))
+        if not made.ripen(now):
+            continue
+        due = list(made.valid())
+        late = [poll for poll in due if poll.deadline < now]
+        by_use = min((poll.device.use, poll.deadline) for poll in late) if late else None
+        poll = made.due
+        assert poll is not None
+        if by_use is None:
+            assert poll.deadline == min(other.deadline for other in due)
+        else:
+            assert (poll.device.use, poll.deadline) == by_use
+        taken = [poll]
+        poll.ticket = NOT_QUEUED
+        if chance.random() < 0.3:
+            own = sorted(p.deadline for p in due if p.device is poll.device and p is not poll)
+            more = made.more(poll.device, 2)
+            assert [other.deadline for other in more] == own[:2]
+            taken += more
+        if chance.random() < 0.1:
+            made.expedite(other := chance.choice(due))
+            assert made.ripen(now)
+            made.expedited.clear()
+            taken.append(other)
+        took = chance.choice((0.02, 0.2, 0.6))
+        poll.device.used(now + took, now)
+        now += took
+        for each in dict.fromkeys(taken):
+            each.ticket = NOT_QUEUED
+            each.due = now + chance.choice((0.0, 0.5, 4.0))
+            made.push(each)

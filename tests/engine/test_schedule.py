@@ -1,5 +1,6 @@
 """Each sentence of the class docstring is a test; in any order of calls no poll is lost."""
 
+import itertools
 from typing import Any
 
 from hypothesis import settings
@@ -7,14 +8,24 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from gateway.engine.device import Device
-from gateway.engine.health import PAUSE_FIRST, PAUSE_LONGEST, State
+from gateway.engine.health import PAUSE_FIRST, PAUSE_LONGEST, PROBE_PAUSE, State
 from gateway.engine.jobs import Idle, Poll, Probe
+from gateway.engine.probes import (
+    OFFLINE_SHARE,
+    PATIENT_AFTER,
+    SHORTEST,
+    UNKNOWN,
+    USUAL,
+    probe_seconds,
+    short_timeout,
+)
 from gateway.engine.requests import MOST_WAITING, WRITE_EXPIRY, Write
-from gateway.engine.schedule import OFFLINE_SHARE, Schedule
+from gateway.engine.schedule import Schedule
 from gateway.errors import NoReply
 from gateway.planning.bad_addresses import RETRIES
-from gateway.protocols.modbus import ModbusRtu
+from gateway.protocols.modbus import ModbusRtu, ModbusTcp
 from gateway.tags import WriteRule
+from tests.engine.rig import weighing_machine
 from tests.sim.bench import WIRE
 from tests.sim.plant import device, made_device, make_tag
 
@@ -249,7 +260,7 @@ def test_an_offline_device_is_only_probed_at_growing_pauses() -> None:
         assert isinstance(schedule.next(job.until), Probe)
         now = job.until + 0.5
     for number, pause in enumerate(pauses):
-        assert 0.9 <= pause / min(PAUSE_FIRST * 2**number, PAUSE_LONGEST) <= 1.1
+        assert 0.9 <= pause / min(PAUSE_FIRST * 2**number, PROBE_PAUSE) <= 1.1
     assert len(set(pauses[8:])) == 4  # jitter
     dev.health.answered()
     schedule.came_online(dev, now)
@@ -290,14 +301,141 @@ def test_offline_devices_get_all_the_time_while_none_is_online() -> None:
     assert isinstance(schedule.next(1.7), Probe)
 
 
-def test_an_offline_device_is_reachable_only_when_its_probe_is_allowed() -> None:
+def test_an_offline_device_is_reachable_when_its_last_probe_is_a_second_old() -> None:
     healthy, offline = online(0), online(0, station=2)
     schedule = Schedule([healthy, offline], 0.0)
     fail(offline)
     schedule.went_offline(offline, 0.0, 0.5)
     assert schedule.reachable(healthy, 0.0)
-    assert not schedule.reachable(offline, 9.4)
+    assert not schedule.reachable(offline, 0.9)
+    assert schedule.reachable(offline, 1.0)
+
+
+def test_while_polls_are_late_an_offline_device_is_reachable_only_in_its_share() -> None:
+    healthy, offline = online(0, every=0.01), online(0, station=2)
+    schedule = Schedule([healthy, offline], 0.0)
+    fail(offline)
+    schedule.went_offline(offline, 0.0, 0.5)
+    polled(schedule, 5.0)
+    assert not schedule.reachable(offline, 5.0)
     assert schedule.reachable(offline, 9.5)
+
+
+def test_a_request_to_an_offline_device_has_it_probed_at_once_when_no_poll_is_due() -> None:
+    healthy, offline = online(0), online(0, station=2)
+    schedule = Schedule([healthy, offline], 0.0)
+    fail(offline)
+    for _ in range(3):
+        schedule.went_offline(offline, 0.0, 0.5)
+    schedule.requests.submit(write(offline))
+    schedule.requests.submit(other := write(healthy))
+    assert schedule.next(1.0) is other  # a poll is due
+    assert polled(schedule, 1.0).device is healthy
+    job = schedule.next(1.0)
+    assert isinstance(job, Probe)
+    assert job.device is offline
+    assert job.timeout is not None
+
+
+def test_starting_devices_get_one_short_probe_each_before_patient_ones() -> None:
+    devices = [device([make_tag("D0")], station=n) for n in (1, 2, 3)]
+    schedule = Schedule(devices, 0.0)
+    jobs = list[tuple[Device, bool]]()
+    for _ in range(6):
+        job = schedule.next(0.0)
+        assert isinstance(job, Probe)
+        jobs.append((job.device, job.timeout is not None))
+        fail(job.device)
+        if job.timeout is None:
+            schedule.went_offline(job.device, 0.0, 0.5)
+    assert jobs == [(each, short) for short in (True, False) for each in devices]
+
+
+def test_after_a_restart_the_devices_that_replied_last_time_go_first() -> None:
+    silent, well = online(0), online(0, station=2)
+    schedule = Schedule([silent, well], 0.0)
+    fail(silent)
+    schedule.went_offline(silent, 0.0, 0.5)
+    for each in (silent, well):
+        each.restart()
+    schedule.opened(1.0)
+    job = schedule.next(1.0)
+    assert isinstance(job, Probe)
+    assert job.device is well
+
+
+def test_a_short_probe_waits_a_multiple_of_the_usual_turnaround_of_its_neighbours() -> None:
+    healthy, offline = online(0), online(0, station=2)
+    schedule = Schedule([healthy, offline], 0.0)
+    fail(offline)
+
+    def timeout(now: float) -> float | None:
+        schedule.went_offline(offline, now, 0.5)
+        while not isinstance(job := schedule.next(now + 10.0), Probe):
+            assert isinstance(job, Poll)
+            schedule.polled(job, now + 10.0)
+        return job.timeout
+
+    assert timeout(0.0) == UNKNOWN
+    healthy.record.turnaround = 0.03
+    assert timeout(20.0) == USUAL * 0.03
+    healthy.record.turnaround = 0.001
+    assert timeout(40.0) == SHORTEST
+    offline.record.turnaround = 0.06
+    assert timeout(60.0) == USUAL * 0.06
+    offline.record.turnaround = 1.0
+    assert timeout(80.0) == offline.timing.reply_timeout
+
+
+def test_a_device_without_station_number_or_behind_a_network_gets_patient_probes_only() -> None:
+    tcp = ModbusTcp(station=1)
+    made = made_device("tcp", tcp, WIRE, tcp.timing, [make_tag("holding:1", tcp)])
+    frames, other = weighing_machine(), online(0)
+    for patient in (made, frames):
+        assert short_timeout(patient, [patient, other]) is None
+    assert short_timeout(other, [patient, other]) == UNKNOWN
+    assert short_timeout(other, [other]) is None
+
+
+def test_one_of_several_probes_of_an_offline_device_is_patient() -> None:
+    offline = online(0)
+    schedule = Schedule([offline, online(0, every=1000.0, station=2)], 0.0)
+    polled(schedule, 0.0)
+    fail(offline)
+    now, patient = 0.0, []
+    for _ in range(2 * PATIENT_AFTER + 2):
+        schedule.went_offline(offline, now, 0.1)
+        now += 10.0
+        job = schedule.next(now)
+        assert isinstance(job, Probe)
+        patient.append(job.timeout is None)
+    assert patient == 2 * [*[False] * PATIENT_AFTER, True]
+
+
+def test_a_probe_uses_idle_time_if_it_ends_before_the_next_poll_is_due() -> None:
+    healthy, offline = online(0), online(0, station=2)
+    assert healthy.longest_poll < probe_seconds(offline, UNKNOWN)
+    schedule = Schedule([healthy, offline], 0.0)
+    fail(offline)
+    schedule.went_offline(offline, 0.0, 0.5)  # beside idle time not before 9.5
+    polled(schedule, 4.0)
+    offline.health.next_probe = 0.0
+    room = probe_seconds(offline, UNKNOWN)
+    assert schedule.next(5.0 - 0.9 * room) == Idle(5.0)
+    assert isinstance(schedule.next(5.0 - 1.1 * room), Probe)
+
+
+def test_or_if_it_takes_no_longer_than_the_longest_poll() -> None:
+    longer = device([make_tag(f"D{n}") for n in range(60)])
+    longer.health.answered()
+    offline = online(0, station=2)
+    assert longer.longest_poll > probe_seconds(offline, UNKNOWN)
+    schedule = Schedule([longer, offline], 0.0)
+    fail(offline)
+    schedule.went_offline(offline, 0.0, 0.5)
+    polled(schedule, 4.0)
+    offline.health.next_probe = 0.0
+    assert isinstance(schedule.next(4.99), Probe)
 
 
 def test_a_broadcast_device_is_never_probed() -> None:
@@ -369,6 +507,57 @@ def test_the_queue_takes_no_more_than_its_most_requests() -> None:
     schedule = Schedule([dev], 0.0)
     assert all(schedule.requests.submit(write(dev)) for _ in range(MOST_WAITING))
     assert not schedule.requests.submit(write(dev))
+
+
+def overloaded(*slow: int) -> Device:
+    """Blocks that are asked for three times what the wire can carry, and blocks once an hour."""
+    fast = [make_tag(f"D{1000 * n}", every=0.1) for n in range(6)]
+    dev = device([*fast, *(make_tag(f"D{n}", every=3600.0) for n in slow)])
+    dev.health.answered()
+    return dev
+
+
+def run_full(schedule: Schedule, begin: float, seconds: float) -> dict[str, list[float]]:
+    """Polls all the time, 0.05 s each. Returns the times of the polls by the first tag."""
+    now, found = begin, dict[str, list[float]]()
+    while now < begin + seconds:
+        job = schedule.next(now)
+        assert isinstance(job, Poll)
+        now += 0.05
+        found.setdefault(job.block.tags[0].text, []).append(now)
+        job.last.at = now
+        schedule.polled(job, now)
+    return found
+
+
+def test_on_an_overloaded_line_a_tag_of_once_an_hour_is_read_soon_after_start_and_return() -> None:
+    dev = overloaded(8000)
+    schedule = Schedule([dev, online(0, station=2)], 0.0)
+    assert run_full(schedule, 0.0, 30.0)["D8000"][0] < 5.0
+    schedule.came_online(dev, 100.0)
+    assert run_full(schedule, 100.0, 30.0)["D8000"][0] < 105.0
+
+
+def test_first_reads_of_many_blocks_leave_the_others_their_time() -> None:
+    slow = range(6100, 8100, 70)
+    dev = overloaded(*slow)
+    found = run_full(Schedule([dev, online(0, station=2)], 0.0), 0.0, 120.0)
+    assert all(f"D{n}" in found for n in slow)
+    for n in range(6):
+        gaps = [b - a for a, b in itertools.pairwise(found[f"D{1000 * n}"])]
+        assert max(gaps) < 1.0
+        assert len(gaps) > 0.85 * 120.0 / (7 * 0.05)
+
+
+def test_a_block_that_turned_bad_on_an_overloaded_line_is_tried_again_soon() -> None:
+    dev = overloaded(8000)
+    schedule = Schedule([dev, online(0, station=2)], 0.0)
+    run_full(schedule, 0.0, 30.0)
+    poll = schedule.reader(dev, dev.tags[-1])
+    assert poll is not None
+    poll.forget(30.0)
+    schedule.polled(poll, 30.0)  # it was refused, say
+    assert poll.deadline < 30.0 + PAUSE_LONGEST + 5.0
 
 
 class AnyOrder(RuleBasedStateMachine):
@@ -480,8 +669,8 @@ class AnyOrder(RuleBasedStateMachine):
 
     def _queues(self, poll: Poll) -> int:
         queue = self.schedule._queue  # private: a lost poll shows only after its whole period
-        heaps = [*queue.waiting, *queue.due]
-        valid = [one for _, ticket, one in heaps if one is poll and ticket == poll.ticket]
+        entries = [*queue.waiting, *(e for own in queue.by_device.values() for e in own.heap)]
+        valid = [one for _, ticket, one in entries if one is poll and ticket == poll.ticket]
         return len(valid) + sum(one is poll for one in queue.expedited)
 
     def _due(self) -> list[Poll]:

@@ -1,6 +1,7 @@
 """Stations that do not reply: their values turn bad, the others keep their reads."""
 
 import asyncio
+import itertools
 
 import pytest
 
@@ -9,7 +10,6 @@ from gateway.errors import Offline
 from gateway.planning.bad_addresses import SPLIT_FIRST
 from gateway.tags import Quality, Reason, WriteRule
 from tests.line.clocks import clocks, wind_up
-from tests.sim.bench import WIRE
 from tests.sim.plant import device, make_tag, plant, running
 from tests.sim.virtual import now, on_virtual_time
 
@@ -76,7 +76,10 @@ async def test_a_mute_station_does_not_turn_the_values_of_others_bad() -> None:
 async def test_healthy_stations_keep_95_percent_of_their_reads(
     healthy: int, mute: int, full: bool, first: bool
 ) -> None:
-    """Counted once each mute station has timed out twice. Before, a part of the reads is enough."""
+    """Counted once each mute station has timed out twice. Before, a part of the reads is enough.
+
+    On a full line probes get a twentieth of the time, on others the idle time too.
+    """
     every, span = (0.05, 120) if full else (1.0, 400)
     devices = [clocks(20, station=n, every=every) for n in range(1, healthy + mute + 1)]
     alive = devices[:healthy] if first else devices[mute:]
@@ -90,13 +93,13 @@ async def test_healthy_stations_keep_95_percent_of_their_reads(
         async with running(line):
             await asyncio.sleep(2)
             start = now()
-            await asyncio.sleep(2 * mute)
+            await asyncio.sleep(2.5 * mute)
             settled = now()
             await asyncio.sleep(span)
         ok = [d for d in line.devices if d.name in [a.name for a in alive]]
         probed = sum(
-            len(data) * WIRE.character + 0.5
-            for at, data in line.bench.sent
+            later - at
+            for (at, data), (later, _) in itertools.pairwise(line.bench.sent)
             if at >= settled and int(data[1:3], 16) not in [d.driver.station for d in ok]
         )
         settling = sum(sum(at < settled for at in line.reads(d, start)) for d in ok)
@@ -104,8 +107,9 @@ async def test_healthy_stations_keep_95_percent_of_their_reads(
 
     with_mute, kept, probing = await reads(dead=True)
     without, best, _ = await reads(dead=False)
-    assert kept >= 0.95 * best
-    assert probing <= 0.05
+    assert kept >= (0.95 if full else 0.98) * best
+    if full:
+        assert probing <= 0.05
     if first or mute == 1:
         assert with_mute >= (0.3 if full else 0.8) * without
 
@@ -139,11 +143,11 @@ async def test_writes_to_a_silent_station_do_not_occupy_the_line() -> None:
             outcomes.append(line.submit(devices[1], devices[1].tags[0], value))
             await asyncio.sleep(0.1)
         probes = [at for at, data in line.bench.sent if at >= start and data[1:3] == b"02"]
-        assert len(probes) * 0.5 <= 0.06 * 60
+        assert len(probes) <= 61  # short ones, one a second at most
         await asyncio.sleep(WRITE_EXPIRY)
         assert all(isinstance(o.once, Offline) for o in outcomes)
         assert line.writes_sent() == []
-        assert len(line.reads(devices[0], start)) >= 57
+        assert len(line.reads(devices[0], start)) >= 59
 
 
 @on_virtual_time

@@ -182,8 +182,7 @@ class Expectations:
         """Private attributes are read here: a leak shows in no public figure."""
         schedule, name, broke = engine.schedule, engine.name, self.judge.broke
         polls = sum(len(schedule.polls(device)) for device in engine.devices)
-        queue = schedule._queue
-        kept = len(queue.waiting) + len(queue.due) + len(queue.expedited)
+        kept = schedule._queue.entries
         if kept > 5 * polls + 50:  # twice as many in two heaps, and the expedited polls
             broke(f"{name}: {kept} entries in the queues for {polls} polls")
         requests = len(schedule.requests.waiting)
