@@ -20,6 +20,7 @@ from gateway.engine.jobs import (
     WriteTogether,
     span_of,
 )
+from gateway.engine.line_silence import LineSilence
 from gateway.engine.request_results import RequestResults
 from gateway.engine.requests import Command, Write
 from gateway.engine.results import Results
@@ -42,6 +43,7 @@ class Conclusions:
         gap: float,
     ) -> None:
         """`gap`: seconds without a byte that end a run of noise."""
+        self.silence = LineSilence()
         self._in_flight = in_flight
         self._results = results
         self._requests = requests
@@ -50,6 +52,8 @@ class Conclusions:
 
     def poll_failed(self, poll: Poll, result: Exception, now: float, time: int) -> None:
         """Applies the result of a poll without units."""
+        if self.silence.noted:
+            self.silence.concluded(result)
         device, results = poll.device, self._results
         match result:
             case Refused():
@@ -69,6 +73,8 @@ class Conclusions:
         self, job: Transacted, result: Result, traffic: Traffic, now: float, time: int
     ) -> None:
         """Applies the result of a job that is no poll."""
+        if self.silence.noted:
+            self.silence.concluded(result)
         match job:
             case Settle():
                 self._settled(job, result, now, time)
@@ -114,6 +120,8 @@ class Conclusions:
     ) -> None:
         """Lets the line settle next: the late reply must not disturb another transaction."""
         device = job.device
+        if traffic.sent:
+            self.silence.unanswered(error, self._in_flight.begun)
         before = self._results.unclear(device, error, span_of(job), now, time)
         self._in_flight.continuation = Settle(
             device,

@@ -12,6 +12,7 @@ from typing import Any, cast
 from gateway.engine.conclusions import Conclusions
 from gateway.engine.device import Device
 from gateway.engine.effects import Effect, Effects
+from gateway.engine.health import State
 from gateway.engine.jobs import (
     Idle,
     InFlight,
@@ -70,13 +71,16 @@ class Engine:
     # The cycle of the line
 
     def next(self, now: float) -> Job:
-        """Returns the next job. Each job except `Idle` must be concluded before the next call."""
+        """Returns the next job. All except `Idle` and `Reopen` are concluded before the next."""
         in_flight = self._in_flight
         if in_flight.continuation is not None:
             return in_flight.resume(now)
         if in_flight.job is not None:
             raise AssertionError(f"{in_flight.job!r} is not concluded")
-        job: Job | None = None
+        silence = self._conclusions.silence
+        if silence.noted and silence.due <= now and self._every_station_failed():
+            return silence.reopen(now)
+        job: Transacted | Idle | None = None
         if self._unsolicited.speakers:
             job = self._unsolicited.next(now)
         if job is None:
@@ -84,7 +88,7 @@ class Engine:
             if type(job) is Write and (others := self.schedule.requests.companions(job)):
                 job = WriteTogether(job.device, [job, *others])
         if isinstance(job, Idle):
-            return job
+            return Idle(silence.due) if now < silence.due < job.until else job
         in_flight.job, in_flight.begun = job, now
         if isinstance(job, Poll):
             in_flight.open_polls = 1
@@ -92,6 +96,14 @@ class Engine:
         else:
             in_flight.charged = job.device if isinstance(job, Probe) else None
         return job
+
+    def _every_station_failed(self) -> bool:
+        """Polls a station that replied last time, before the port is opened again."""
+        for device in self.devices:
+            if device.health.state is State.ONLINE and (polls := self.schedule.polls(device)):
+                self.schedule.expedite(polls[0])
+                return False
+        return True
 
     def alongside(self, poll: Poll, now: float) -> Sequence[Poll]:
         """Other due polls of a device that takes several requests at once.
@@ -116,6 +128,8 @@ class Engine:
             if isinstance(result, Exception):
                 self._conclusions.poll_failed(job, result, now, time)
             else:  # units are the only good result of a poll
+                if self._conclusions.silence.noted:
+                    self._conclusions.silence.heard()
                 self._results.read(job, cast("Sequence[int]", result), now, time)
             if in_flight.open_polls:
                 return self._effects.take()
@@ -175,6 +189,8 @@ class Engine:
         """Takes bytes that arrived outside of a transaction."""
         self.record.unasked += len(data)
         self._stray.received(data, now)
+        if self._unsolicited.speakers:
+            self._conclusions.silence.heard()
         self._unsolicited.received(data, now, time)
         self._set_deadline()
         return self._effects.take()
@@ -182,6 +198,7 @@ class Engine:
     def unmatched(self, device: Device, frame: Any, now: float, time: int) -> list[Effect]:
         """Takes a frame that arrived in a transaction with this device and is not its reply."""
         device.record.count_stray()
+        self._conclusions.silence.heard()
         self._stray.frames(device, [frame], now)
         self._unsolicited.unmatched(device, frame, now, time)
         self._set_deadline()
@@ -206,6 +223,7 @@ class Engine:
         self.record.opened += 1
         self.record.since, self.record.trouble = now, ""
         self._in_flight.clear()
+        self._conclusions.silence.opened()
         for device in self.devices:
             device.restart()
         self.schedule.opened(now)
@@ -219,7 +237,7 @@ class Engine:
         self._conclusions.abandon(error, now)
         if self.is_open:
             self.record.open_before += now - self.record.since
-        self.record.trouble = why
+        self.record.trouble = self.record.last_trouble = why
         for device in self.devices:
             device.restart(error)
             self._effects.online(device, False)

@@ -140,8 +140,15 @@ class Idle:
     until: float
 
 
+@dataclass(frozen=True, slots=True)
+class Reopen:
+    """Close the port and open it again, because no station has replied for a long time."""
+
+    why: str
+
+
 Transacted = Unfinished | Answer | Settle
-Job = Transacted | Idle
+Job = Transacted | Idle | Reopen
 
 
 @dataclass(slots=True)

@@ -424,4 +424,25 @@ MUTANTS = (
         "        if transaction is not None:\n",
         "tests/line/test_ports.py tests/engine/test_unsolicited.py",
     ),
+    Mutant(
+        "a hung session is never reopened",
+        "engine/engine.py",
+        "        if silence.noted and silence.due <= now and self._every_station_failed():\n",
+        "        if False:\n",
+        "tests/engine/test_line_silence.py tests/attacks/test_hung_session.py",
+    ),
+    Mutant(
+        "a silent plant is reopened every 20 s",
+        "engine/line_silence.py",
+        "        self._limit = min(2 * (self._limit or FIRST), LONGEST)\n",
+        "",
+        "tests/engine/test_line_silence.py",
+    ),
+    Mutant(
+        "a port is opened again beside a station that replies",
+        "engine/engine.py",
+        "            if device.health.state is State.ONLINE and (polls",
+        "            if False and (polls",
+        "tests/engine/test_line_silence.py",
+    ),
 )
