@@ -93,15 +93,19 @@ class Readings:
         await self.until(lambda: self.good >= wanted)
 
 
-def made_line(number: int, tags: Sequence[str], sink: Readings, **device: Any) -> Line:
+def made_line(
+    number: int, tags: Sequence[str], sink: Readings, stations: int = 1, **device: Any
+) -> Line:
     """A Modbus TCP line to this port; `device`: its settings, and those of the line in `line`."""
-    settings = {"protocol": "modbus-tcp", "station": 1, "reply_timeout": "200ms", **device}
+    settings = {"protocol": "modbus-tcp", "reply_timeout": "200ms", **device}
     line = {"port": f"tcp://127.0.0.1:{number}", **settings.pop("line", {})}
     named = {f"t{n}": {"address": text, "type": "uint16"} for n, text in enumerate(tags)}
+    every = settings.pop("every", "50ms")
+    devices = {f"plc{n}": {**settings, "station": n, "tags": named} for n in range(1, stations + 1)}
     document = {
         "gateway": {"name": "demo"},
-        "defaults": {"every": settings.pop("every", "50ms")},
-        "lines": {"net": {**line, "devices": {"plc": {**settings, "tags": named}}}},
+        "defaults": {"every": every},
+        "lines": {"net": {**line, "devices": devices}},
     }
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder, "line.yaml")

@@ -84,7 +84,9 @@ def test_one_station_that_replies_keeps_the_port_open() -> None:
 
 def test_a_station_that_is_rarely_read_is_read_before_the_port_is_opened_again() -> None:
     rare = link_device(station=2)
-    rare = Device(replace(rare.settings, tags=tuple(words(0, 1, device="plc2", every=3600.0))), WIRE)
+    rare = Device(
+        replace(rare.settings, tags=tuple(words(0, 1, device="plc2", every=3600.0))), WIRE
+    )
     rig = Rig(link_device(station=1), rare)
     assert not reopens(rig)
     assert rare.record.exchanges > 2

@@ -445,4 +445,18 @@ MUTANTS = (
         "            if False and (polls",
         "tests/engine/test_line_silence.py",
     ),
+    Mutant(
+        "a peer may pour",
+        "transport/stream.py",
+        "        if self._level <= MOST_AT_ONCE:\n",
+        "        if True:\n",
+        "tests/transport/test_allowance.py tests/attacks/test_pouring_peer.py",
+    ),
+    Mutant(
+        "replies to requests count as poured",
+        "transport/stream.py",
+        "        self._level = max(0.0, self._level - PER_REQUEST)\n",
+        "        pass\n",
+        "tests/transport/test_allowance.py",
+    ),
 )
