@@ -459,4 +459,18 @@ MUTANTS = (
         "        pass\n",
         "tests/transport/test_allowance.py",
     ),
+    Mutant(
+        "a reply that waited gets a new time stamp",
+        "line/arrival.py",
+        "        behind = max(self._behind, self._now() - self._due)\n",
+        "        behind = 0.0\n",
+        "tests/line/test_arrival.py tests/attacks/test_loop_stands_still.py",
+    ),
+    Mutant(
+        "a timer that ran first ends the old time stamps",
+        "line/arrival.py",
+        "        self._behind = max(0.0, now - self._due)\n",
+        "        self._behind = 0.0\n",
+        "tests/line/test_arrival.py",
+    ),
 )
