@@ -24,6 +24,7 @@ from gateway.engine.line_silence import LineSilence
 from gateway.engine.request_results import RequestResults
 from gateway.engine.requests import Command, Write
 from gateway.engine.results import Results
+from gateway.engine.together import Together
 from gateway.errors import BadValue, DeviceError, Garbled, LineDown, Refused, Unclear, Unsteady
 
 
@@ -44,6 +45,7 @@ class Conclusions:
     ) -> None:
         """`gap`: seconds without a byte that end a run of noise."""
         self.silence = LineSilence()
+        self.together = Together(effects)
         self._in_flight = in_flight
         self._results = results
         self._requests = requests
@@ -68,6 +70,15 @@ class Conclusions:
                 device.health.left_outstanding(poll.block.span)
             case _:
                 raise result
+
+    def polls_ended(self, last: Poll, traffic: Traffic, now: float, time: int) -> None:
+        """Applies the end of a transaction of polls, some of which failed or were together."""
+        failed = self._in_flight.failed
+        if last.device.window > 1:
+            polls = [poll for poll, _ in failed]
+            self.together.concluded(last, self._in_flight.together, polls, now)
+        if failed:
+            self.unclear(*failed[0], traffic, now, time)
 
     def conclude(
         self, job: Transacted, result: Result, traffic: Traffic, now: float, time: int

@@ -80,6 +80,7 @@ class Device:
     )  # it receives writes or sends unsolicited frames, and never replies
     window: int = field(init=False)  # requests that may be outstanding at once
     silence: float = field(init=False)  # seconds before each request
+    one_at_a_time: bool = False  # it loses requests that are sent together
     _lists: bool = True  # reads by a monitor list are allowed
     _use: tuple[float, float] = (0.0, 0.0)  # seconds of the wire, and the time of counting
 
@@ -127,8 +128,14 @@ class Device:
     def diagnosis(self) -> str:
         """Returns the likely cause of its trouble as a sentence; empty when there is none."""
         driver = self.driver
+        if self.one_at_a_time and self.health.trouble is None:
+            return f"It takes one request at a time, not {self.window}: set `window: 1`"
         causes = driver.no_reply_causes if isinstance(driver, NoReplyCauses) else ""
         return diagnosis(self.health.trouble, causes)
+
+    def takes_one_at_a_time(self, only: bool) -> None:
+        """Notes if the device loses requests that are sent together."""
+        self.one_at_a_time = only
 
     def restart(self, trouble: LineDown | None = None) -> None:
         """Starts again after the line was opened or lost."""

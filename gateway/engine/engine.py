@@ -91,7 +91,7 @@ class Engine:
             return Idle(silence.due) if now < silence.due < job.until else job
         in_flight.job, in_flight.begun = job, now
         if isinstance(job, Poll):
-            in_flight.open_polls = 1
+            in_flight.open_polls = in_flight.together = 1
             in_flight.charged = None if job.expedited else job.device
         else:
             in_flight.charged = job.device if isinstance(job, Probe) else None
@@ -110,8 +110,10 @@ class Engine:
 
         They share the transaction of `poll`; each is concluded by itself.
         """
-        others = self.schedule.alongside(poll, poll.device.window - 1, now)
+        most = self._conclusions.together.others(poll, now)
+        others = self.schedule.alongside(poll, most, now)
         self._in_flight.open_polls += len(others)
+        self._in_flight.together += len(others)
         return others
 
     def conclude(
@@ -133,8 +135,8 @@ class Engine:
                 self._results.read(job, cast("Sequence[int]", result), now, time)
             if in_flight.open_polls:
                 return self._effects.take()
-            if in_flight.failed:
-                self._conclusions.unclear(*in_flight.failed[0], traffic, now, time)
+            if in_flight.failed or device.window > 1:
+                self._conclusions.polls_ended(job, traffic, now, time)
         else:
             self._conclusions.conclude(job, result, traffic, now, time)
         if in_flight.continuation is None:

@@ -159,6 +159,7 @@ class InFlight:
     begun: float = 0.0  # by the line's clock
     charged: Device | None = None  # its use of the wire grows: by polls that were due, and probes
     open_polls: int = 0
+    together: int = 0  # polls of the transaction
     failed: list[tuple[Poll, DeviceError]] = field(default_factory=list)
     continuation: Transacted | None = None
 

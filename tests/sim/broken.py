@@ -473,4 +473,18 @@ MUTANTS = (
         "        self._behind = 0.0\n",
         "tests/line/test_arrival.py",
     ),
+    Mutant(
+        "a device that takes one request at a time gets several",
+        "engine/together.py",
+        "now < window.apart_until or poll in window.suspects",
+        "False",
+        "tests/engine/test_together.py tests/attacks/test_one_at_a_time.py",
+    ),
+    Mutant(
+        "single losses reduce the window",
+        "engine/together.py",
+        "                window.proofs = 0\n",
+        "                pass\n",
+        "tests/engine/test_together.py",
+    ),
 )
