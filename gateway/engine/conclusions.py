@@ -131,7 +131,7 @@ class Conclusions:
     ) -> None:
         """Lets the line settle next: the late reply must not disturb another transaction."""
         device = job.device
-        if traffic.sent:
+        if traffic.sent and not device.broadcast:  # only polled devices must reply
             self.silence.unanswered(error, self._in_flight.begun)
         before = self._results.unclear(device, error, span_of(job), now, time)
         self._in_flight.continuation = Settle(

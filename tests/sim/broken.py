@@ -107,9 +107,9 @@ MUTANTS = (
     ),
     Mutant(
         "Modbus TCP: one request more than the window",
-        "engine/engine.py",
-        "self.schedule.alongside(poll, poll.device.window - 1, now)",
-        "self.schedule.alongside(poll, poll.device.window, now)",
+        "engine/together.py",
+        "        return poll.device.window - 1\n",
+        "        return poll.device.window\n",
         "tests/line/test_modbus_window.py",
         (1, 2, 7),
         "lean",
