@@ -15,6 +15,7 @@ from gateway.app import Gateway
 from gateway.config import Config
 from gateway.history import Historian
 from gateway.history.state_file import StateFile
+from gateway.line.arrival import ArrivalClock
 from gateway.northbound import Northbound, StandbySettings
 from gateway.tags import Sample
 
@@ -52,7 +53,8 @@ async def _serve(config: Config, stop: asyncio.Event, started: Callable[[], None
 
     Returns True if it was replaced: then it starts again, as standby.
     """
-    gateway = Gateway(config)
+    clock = ArrivalClock()
+    gateway = Gateway(config, clock)
     gc.collect()
     gc.freeze()  # tags live as long as the gateway: each collection skips them
     history = _history(config)
@@ -65,6 +67,8 @@ async def _serve(config: Config, stop: asyncio.Event, started: Callable[[], None
         gateway.subscribe(_Recording(history))
         gateway.add_document("history", history.document)
     async with AsyncExitStack() as cleanup:  # in reverse order of the start
+        clock.start()
+        cleanup.callback(clock.stop)
         zenoh = asyncio.create_task(northbound.run(), name="zenoh")
         cleanup.push_async_callback(_close, zenoh, history, state_file)
         exclusive, active, opened, replaced, stopping = events = [

@@ -20,9 +20,11 @@ from gateway.engine.jobs import (
     WriteTogether,
     span_of,
 )
+from gateway.engine.line_silence import LineSilence
 from gateway.engine.request_results import RequestResults
 from gateway.engine.requests import Command, Write
 from gateway.engine.results import Results
+from gateway.engine.together import Together
 from gateway.errors import BadValue, DeviceError, Garbled, LineDown, Refused, Unclear, Unsteady
 
 
@@ -42,6 +44,8 @@ class Conclusions:
         gap: float,
     ) -> None:
         """`gap`: seconds without a byte that end a run of noise."""
+        self.silence = LineSilence()
+        self.together = Together(effects)
         self._in_flight = in_flight
         self._results = results
         self._requests = requests
@@ -50,6 +54,8 @@ class Conclusions:
 
     def poll_failed(self, poll: Poll, result: Exception, now: float, time: int) -> None:
         """Applies the result of a poll without units."""
+        if self.silence.noted:
+            self.silence.concluded(result)
         device, results = poll.device, self._results
         match result:
             case Refused():
@@ -65,10 +71,21 @@ class Conclusions:
             case _:
                 raise result
 
+    def polls_ended(self, last: Poll, traffic: Traffic, now: float, time: int) -> None:
+        """Applies the end of a transaction of polls, some of which failed or were together."""
+        failed = self._in_flight.failed
+        if last.device.window > 1:
+            polls = [poll for poll, _ in failed]
+            self.together.concluded(last, self._in_flight.together, polls, now)
+        if failed:
+            self.unclear(*failed[0], traffic, now, time)
+
     def conclude(
         self, job: Transacted, result: Result, traffic: Traffic, now: float, time: int
     ) -> None:
         """Applies the result of a job that is no poll."""
+        if self.silence.noted:
+            self.silence.concluded(result)
         match job:
             case Settle():
                 self._settled(job, result, now, time)
@@ -114,6 +131,8 @@ class Conclusions:
     ) -> None:
         """Lets the line settle next: the late reply must not disturb another transaction."""
         device = job.device
+        if traffic.sent and not device.broadcast:  # only polled devices must reply
+            self.silence.unanswered(error, self._in_flight.begun)
         before = self._results.unclear(device, error, span_of(job), now, time)
         no_guard = before is State.OFFLINE or _is_short(job)
         self._in_flight.continuation = Settle(

@@ -101,6 +101,7 @@ class Device:
     window: int = field(init=False)  # requests that may be outstanding at once
     silence: float = field(init=False)  # seconds before each request
     shapes: ReplyShapes | None = field(init=False)  # None: no reply, or each has a number
+    one_at_a_time: bool = False  # it loses requests that are sent together
     _lists: bool = True  # reads by a monitor list are allowed
     # Its recent use of the wire, to compare with that of other devices: the binary logarithm of
     # the seconds, plus the half-lives until the time of counting. It grows, and never decays.
@@ -159,8 +160,14 @@ class Device:
         driver = self.driver
         if self.health.trouble is None and self.shapes is not None and self.shapes.answers_twice:
             return ANSWERS_TWICE.format(station=driver.station)
+        if self.one_at_a_time and self.health.trouble is None:
+            return f"It takes one request at a time, not {self.window}: set `window: 1`"
         causes = driver.no_reply_causes if isinstance(driver, NoReplyCauses) else ""
         return diagnosis(self.health.trouble, causes)
+
+    def takes_one_at_a_time(self, only: bool) -> None:
+        """Notes if the device loses requests that are sent together."""
+        self.one_at_a_time = only
 
     def restart(self, trouble: LineDown | None = None) -> None:
         """Starts again after the line was opened or lost."""

@@ -12,6 +12,7 @@ from typing import Any, cast
 from gateway.engine.conclusions import Conclusions
 from gateway.engine.device import Device
 from gateway.engine.effects import Effect, Effects
+from gateway.engine.health import State
 from gateway.engine.jobs import (
     Idle,
     InFlight,
@@ -71,13 +72,16 @@ class Engine:
     # The cycle of the line
 
     def next(self, now: float) -> Job:
-        """Returns the next job. Each job except `Idle` must be concluded before the next call."""
+        """Returns the next job. All except `Idle` and `Reopen` are concluded before the next."""
         in_flight = self._in_flight
         if in_flight.continuation is not None:
             return in_flight.resume(now)
         if in_flight.job is not None:
             raise AssertionError(f"{in_flight.job!r} is not concluded")
-        job: Job | None = None
+        silence = self._conclusions.silence
+        if silence.noted and silence.due <= now and self._every_station_failed():
+            return silence.reopen(now)
+        job: Transacted | Idle | None = None
         if self._unsolicited.speakers:
             job = self._unsolicited.next(now)
         if job is None:
@@ -85,24 +89,34 @@ class Engine:
             if type(job) is Write and (others := self.schedule.requests.companions(job)):
                 job = WriteTogether(job.device, [job, *others])
         if isinstance(job, Idle):
-            return job
+            return Idle(silence.due) if now < silence.due < job.until else job
         in_flight.job, in_flight.begun = job, now
         if job.device.shapes is not None and not isinstance(job, Poll):
             resync_around(job, job.device.shapes, now)
         if isinstance(job, Poll):
-            in_flight.open_polls = 1
+            in_flight.open_polls = in_flight.together = 1
             in_flight.charged = None if job.expedited else job.device
         else:
             in_flight.charged = job.device if isinstance(job, Probe) else None
         return job
+
+    def _every_station_failed(self) -> bool:
+        """Polls a station that replied last time, before the port is opened again."""
+        for device in self.devices:
+            if device.health.state is State.ONLINE and (polls := self.schedule.polls(device)):
+                self.schedule.expedite(polls[0])
+                return False
+        return True
 
     def alongside(self, poll: Poll, now: float) -> Sequence[Poll]:
         """Other due polls of a device that takes several requests at once.
 
         They share the transaction of `poll`; each is concluded by itself.
         """
-        others = self.schedule.alongside(poll, poll.device.window - 1, now)
+        most = self._conclusions.together.others(poll, now)
+        others = self.schedule.alongside(poll, most, now)
         self._in_flight.open_polls += len(others)
+        self._in_flight.together += len(others)
         return others
 
     def conclude(
@@ -110,22 +124,19 @@ class Engine:
     ) -> list[Effect]:
         """Applies the result of a job. Polls of one transaction report its traffic once."""
         device, in_flight = job.device, self._in_flight
-        characters = (traffic.sent + traffic.heard) * self.wire.character
-        self.record.busy += characters
-        self.record.turnarounds += traffic.turnaround
-        if device.shapes is not None:
-            device.shapes.at = now
-        device.record.count_exchanges(traffic.exchanges, characters, traffic.turnaround)
+        self._count(device, traffic, now)
         if isinstance(job, Poll):
             in_flight.open_polls -= 1
             if isinstance(result, Exception):
                 self._conclusions.poll_failed(job, result, now, time)
             else:  # units are the only good result of a poll
+                if self._conclusions.silence.noted:
+                    self._conclusions.silence.heard()
                 self._results.read(job, cast("Sequence[int]", result), now, time)
             if in_flight.open_polls:
                 return self._effects.take()
-            if in_flight.failed:
-                self._conclusions.unclear(*in_flight.failed[0], traffic, now, time)
+            if in_flight.failed or device.window > 1:
+                self._conclusions.polls_ended(job, traffic, now, time)
         else:
             self._conclusions.conclude(job, result, traffic, now, time)
         if in_flight.continuation is None:
@@ -140,6 +151,14 @@ class Engine:
             self._set_deadline()
         effects, self._effects.collected = self._effects.collected, []
         return effects
+
+    def _count(self, device: Device, traffic: Traffic, now: float) -> None:
+        characters = (traffic.sent + traffic.heard) * self.wire.character
+        self.record.busy += characters
+        self.record.turnarounds += traffic.turnaround
+        device.record.count_exchanges(traffic.exchanges, characters, traffic.turnaround)
+        if device.shapes is not None:
+            device.shapes.at = now
 
     @property
     def is_idle(self) -> bool:
@@ -181,6 +200,8 @@ class Engine:
         self.record.unasked += len(data)
         for device in self._stray.received(data, now):
             self._results.answered_twice(device, now, time)
+        if self._unsolicited.speakers:
+            self._conclusions.silence.heard()
         self._unsolicited.received(data, now, time)
         self._set_deadline()
         return self._effects.take()
@@ -193,6 +214,8 @@ class Engine:
         `echo`: it is equal to the request.
         """
         device.record.count_stray()
+        if not echo:
+            self._conclusions.silence.heard()
         self._stray.frames(device, [frame], now)
         for each in self.devices:
             if not echo and is_extra_reply(each, frame):
@@ -220,6 +243,7 @@ class Engine:
         self.record.opened += 1
         self.record.since, self.record.trouble = now, ""
         self._in_flight.clear()
+        self._conclusions.silence.opened()
         for device in self.devices:
             device.restart()
         self.schedule.opened(now)
@@ -233,7 +257,7 @@ class Engine:
         self._conclusions.abandon(error, now)
         if self.is_open:
             self.record.open_before += now - self.record.since
-        self.record.trouble = why
+        self.record.trouble = self.record.last_trouble = why
         for device in self.devices:
             device.restart(error)
             self._effects.online(device, False)

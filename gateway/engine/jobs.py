@@ -152,8 +152,15 @@ class Idle:
     until: float
 
 
+@dataclass(frozen=True, slots=True)
+class Reopen:
+    """Close the port and open it again, because no station has replied for a long time."""
+
+    why: str
+
+
 Transacted = Unfinished | Answer | Settle
-Job = Transacted | Idle
+Job = Transacted | Idle | Reopen
 
 
 @dataclass(slots=True)
@@ -164,6 +171,7 @@ class InFlight:
     begun: float = 0.0  # by the line's clock
     charged: Device | None = None  # its use of the wire grows: by polls that were due, and probes
     open_polls: int = 0
+    together: int = 0  # polls of the transaction
     failed: list[tuple[Poll, DeviceError]] = field(default_factory=list)
     continuation: Transacted | None = None
 

@@ -17,6 +17,7 @@ class LineRecord:
     turnarounds: float = 0.0  # of stations that replied
     unasked: int = 0  # bytes that arrived outside of a transaction
     trouble: str = ""  # why the port is not open
+    last_trouble: str = ""  # why the port was not open last
 
 
 @dataclass(slots=True)

@@ -29,7 +29,12 @@ class Stray:
         self._line = line
         self._devices = devices
         self._effects = effects
-        self._codecs: dict[Device, Codec[Any]] = {}
+        # The devices whose frames are read, by their codecs: equal ones read the bytes once.
+        self._readers: dict[object, list[Device]] = {}
+        for device in devices:
+            if device.shapes is not None or isinstance(device.driver, StrayFrames):
+                self._readers.setdefault(_kind(device.driver.codec()), []).append(device)
+        self._codecs: dict[object, Codec[Any]] = {}
         self._last = float("-inf")
         self._logged: dict[Device, float] = {}
 
@@ -41,16 +46,15 @@ class Stray:
         self._last = now
         for device in self._devices:
             device.forget_list()
-            driver = device.driver
-            explained = isinstance(driver, StrayFrames)
-            if device.shapes is None and not explained:
-                continue
-            found = self._feed(device, data)
-            own = [frame for frame in found if frame.station == driver.station]
-            device.record.count_stray(len(own))
-            self.frames(device, own, now)
-            if any(is_extra_reply(device, frame) for frame in own):
-                replied.append(device)
+        for kind, devices in self._readers.items():
+            found = self._feed(kind, devices[0], data)
+            for device in devices if found else ():
+                station = device.driver.station
+                own = [frame for frame in found if frame.station == station]
+                device.record.count_stray(len(own))
+                self.frames(device, own, now)
+                if any(is_extra_reply(device, frame) for frame in own):
+                    replied.append(device)
         return replied
 
     def frames(self, device: Device, frames: Iterable[Any], now: float) -> None:
@@ -62,12 +66,14 @@ class Stray:
             if text := device.driver.describe_stray(frame):
                 self._log(device, text, now)
 
-    def _feed(self, device: Device, data: bytes) -> list[Any]:
-        codec = self._codecs.setdefault(device, device.driver.codec())
+    def _feed(self, kind: object, device: Device, data: bytes) -> list[Any]:
+        codec = self._codecs.get(kind)
+        if codec is None:
+            codec = self._codecs[kind] = device.driver.codec()
         try:
             return codec.feed(data)
         except Garbled:
-            del self._codecs[device]
+            del self._codecs[kind]
             return []
 
     def _log(self, device: Device, text: str, now: float) -> None:
@@ -77,3 +83,8 @@ class Stray:
         log = self._effects.info if due else self._effects.debug
         count = device.record.unasked
         log("stray frame", line=self._line, device=device.name, what=text, count=count)
+
+
+def _kind(codec: Codec[Any]) -> object:
+    """Returns the same for fresh codecs that read the same frames."""
+    return type(codec), str(vars(codec))

@@ -16,7 +16,7 @@ import structlog
 from gateway.engine.device import Device
 from gateway.engine.effects import Effect, LogEvent, OnlineChange, Pause, RequestEnded, Samples
 from gateway.engine.engine import Engine
-from gateway.engine.jobs import Idle, Poll, Settle, Traffic
+from gateway.engine.jobs import Idle, Poll, Reopen, Settle, Traffic
 from gateway.engine.requests import Command, Outcome, Request, Write
 from gateway.errors import GatewayError, LineDown
 from gateway.line.channel import NEVER, Alarm, Channel, Echo
@@ -178,6 +178,8 @@ class Line:
                 self._transaction = None
                 await self._idle(job.until)
                 continue
+            if isinstance(job, Reopen):
+                raise LineDown(job.why)
             if self._transaction is None or not isinstance(job, Settle):
                 self._transaction = Transaction(channel, job.device, self._unmatched)
             if isinstance(job, Poll) and job.device.window > 1:

@@ -82,6 +82,7 @@ def line_document(engine: Engine, expected: LineForecast, now: float) -> Documen
     return {
         "open": engine.is_open,
         "trouble": record.trouble,
+        "last_trouble": record.last_trouble,
         "opened": record.opened,
         "open_for": round(open_for, 1),
         "baudrate": engine.wire.baudrate,

@@ -28,7 +28,7 @@ async def open_port(
         case SerialPath():
             return await open_serial(where, settings, receiver, timeout=timeout)
         case TcpAddress():
-            return await open_tcp(where, receiver, timeout=timeout)
+            return await open_tcp(where, receiver, timeout=timeout, baudrate=settings.baudrate)
         case Rfc2217Address():
             return await open_rfc2217(where, settings, receiver, timeout=timeout)
         case SimulatorAddress():

@@ -44,7 +44,8 @@ async def open_rfc2217(
     loop = asyncio.get_running_loop()
     begin = loop.time()
     port = Rfc2217Port(receiver)
-    tcp = await open_tcp(TcpAddress(where.host, where.port), port, timeout=timeout)
+    address = TcpAddress(where.host, where.port)
+    tcp = await open_tcp(address, port, timeout=timeout, baudrate=settings.baudrate)
     try:
         left = max(begin + timeout - loop.time(), LONGEST_WAIT)
         await port.set_up(tcp, settings, left)

@@ -34,7 +34,7 @@ async def open_serial(
 
     Bytes that the system received before are discarded.
     """
-    port = StreamPort(where.path, receiver)
+    port = StreamPort(where.path, receiver, settings.baudrate)
     data_bits, parity, stop_bits = tuple(settings.format)
     if await asyncio.to_thread(_is_pty, where.path):
         data_bits, parity = "8", "N"

@@ -14,8 +14,42 @@ MOST_UNSENT = 4096  # bytes
 # asyncio and serialx allocate 256 KiB for every read. On some systems the allocation costs more
 # than the read itself.
 MOST_READ = 4096  # bytes
+# A wire carries no more than its baud rate. A peer that sends more costs all lines their time. A
+# device server may deliver at once what it has kept while the link stalled, and the baud rate of
+# the file may be lower than its own.
+TIMES_THE_WIRE = 4
+SLOWEST_RATE = 20_000.0  # bytes per second that every port may deliver
+MOST_AT_ONCE = 32_768  # bytes beyond the rate
+PER_REQUEST = 4096  # bytes that each request may bring back; network devices have no baud rate
 # A driver may close a port only after it has sent its buffer; `close` waits no longer than this.
 LONGEST_CLOSE = 1.0  # seconds
+
+
+class Allowance:
+    """The bytes that a peer may send: as many as a wire carries, and the replies to requests."""
+
+    __slots__ = ("_begun", "_bytes", "_level", "_now", "_rate")
+
+    def __init__(self, baudrate: int) -> None:
+        self._rate = max(SLOWEST_RATE, TIMES_THE_WIRE * baudrate / 10)
+        self._level = 0.0  # bytes beyond the rate
+        self._now = self._begun = 0.0
+        self._bytes = 0  # since `begun`, when the level was zero
+
+    def requested(self) -> None:
+        """Allows the reply to one more request."""
+        self._level = max(0.0, self._level - PER_REQUEST)
+
+    def received(self, size: int, now: float) -> float:
+        """Notes received bytes. Returns the bytes per second if they are too many, else 0."""
+        level = self._level - (now - self._now) * self._rate
+        if level <= 0.0:
+            level, self._begun, self._bytes = 0.0, now, 0
+        self._level, self._now = level + size, now
+        self._bytes += size
+        if self._level <= MOST_AT_ONCE:
+            return 0.0
+        return self._bytes / max(now - self._begun, 0.01)
 
 
 class StreamPort(asyncio.Protocol):
@@ -25,8 +59,10 @@ class StreamPort(asyncio.Protocol):
     earlier loss.
     """
 
-    def __init__(self, name: str, receiver: Receiver) -> None:
+    def __init__(self, name: str, receiver: Receiver, baudrate: int = 0) -> None:
+        """`baudrate`: of the wire behind the port; 0: not known."""
         self.name = name
+        self._allowance = Allowance(baudrate)
         self._receiver = receiver
         self._is_open = False
         self._loss: LineDown | None = None
@@ -43,6 +79,7 @@ class StreamPort(asyncio.Protocol):
         transport = self._transport
         if transport is None or transport.is_closing():
             raise self._line_down()
+        self._allowance.requested()
         try:
             transport.write(data)
         except OSError as error:
@@ -73,10 +110,17 @@ class StreamPort(asyncio.Protocol):
             transport.max_size = MOST_READ
 
     def data_received(self, data: bytes) -> None:
+        rate = self._allowance.received(len(data), asyncio.get_running_loop().time())
+        if rate:
+            self._break(f"pours {rate:.0f} bytes/s: more than the wire can carry")
+            return
         self._receiver.received(data)
 
     def pause_writing(self) -> None:
-        self._loss = LineDown(f"{self.name}: the other side accepts no data")
+        self._break("the other side accepts no data")
+
+    def _break(self, why: str) -> None:
+        self._loss = self._loss or LineDown(f"{self.name}: {why}")
         if self._transport is not None:
             self._transport.abort()
 

@@ -20,10 +20,15 @@ KEEPALIVE = {
 }
 
 
-async def open_tcp(where: TcpAddress, receiver: Receiver, *, timeout: float = 5.0) -> StreamPort:
-    """Connects to a device server or network device. Raises `LineDown`."""
+async def open_tcp(
+    where: TcpAddress, receiver: Receiver, *, timeout: float = 5.0, baudrate: int = 0
+) -> StreamPort:
+    """Connects to a device server or network device. Raises `LineDown`.
+
+    `baudrate`: of the wire behind it; 0: not known.
+    """
     name = f"{where.host}:{where.port}"
-    port = StreamPort(name, receiver)
+    port = StreamPort(name, receiver, baudrate)
     try:
         async with asyncio.timeout(timeout):
             transport, _ = await asyncio.get_running_loop().create_connection(

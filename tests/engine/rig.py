@@ -14,6 +14,7 @@ from gateway.engine.jobs import (
     Job,
     Poll,
     Probe,
+    Reopen,
     Result,
     Resynced,
     Settle,
@@ -116,7 +117,7 @@ class Rig:
         if isinstance(job, Idle):
             self.now = job.until
             job = self.next()
-        assert not isinstance(job, Idle)
+        assert not isinstance(job, Idle | Reopen)
         return job
 
     def conclude(

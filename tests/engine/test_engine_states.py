@@ -21,6 +21,7 @@ from gateway.engine.jobs import (
     Job,
     Poll,
     Probe,
+    Reopen,
     Repeat,
     Result,
     Resynced,
@@ -175,6 +176,9 @@ class Machine(RuleBasedStateMachine):
         if isinstance(job, Idle):
             assert job.until > self.now
             return job
+        if isinstance(job, Reopen):
+            assert not any(device.health.state is State.ONLINE for device in self.devices)
+            return job
         if not isinstance(job, Repeat | Settle | Confirm):
             for request in requests_of(job):
                 assert request.expires > self.now, "no request is sent after its expiry"
@@ -207,6 +211,9 @@ class Machine(RuleBasedStateMachine):
         job = self.take()
         if isinstance(job, Idle):
             return
+        if isinstance(job, Reopen):
+            self.lose(concluded=False)
+            return
         self.in_flight = [job]
         if isinstance(job, Poll) and job.device.window > 1:
             others = self.engine.alongside(job, self.now)
@@ -231,6 +238,8 @@ class Machine(RuleBasedStateMachine):
                 self.command(4, "stop")
             if not self.in_flight:
                 self.next()
+            if not self.engine.is_open:
+                return
             while self.in_flight:
                 number = chance.randrange(100) if chance.random() < trouble else 0
                 self._conclude(number, chance.choice([0.02, 0.02, 0.02, 0.6]), sent=True)

@@ -189,7 +189,7 @@ def test_a_device_that_goes_offline_starts_no_search() -> None:
         job = rig.transacted()
         assert isinstance(job, Poll | Probe)
         rig.fail(job)
-    for _ in range(20):
+    for _ in range(3):
         job = rig.transacted()
         assert isinstance(job, Probe)
         rig.fail(job)

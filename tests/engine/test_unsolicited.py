@@ -430,7 +430,7 @@ async def test_an_inverter_that_is_switched_off_goes_offline_and_is_probed_with_
     async with running(example("inverter"), replies=inverter) as bench:
         await asyncio.sleep(1)
         inverter.mute = True
-        await asyncio.sleep(20)
+        await asyncio.sleep(12)
         assert bench.last("frequency") is Reason.NO_REPLY
         assert bench.onlines == [True, False]
         inverter.mute = False

@@ -255,7 +255,7 @@ async def test_port_loss_while_the_line_settles_is_reported_at_once(
     async with running(line):
         await asyncio.sleep(5)
         server.flows.clear()
-        await asyncio.sleep(8 * dev.longest_reply)
+        await asyncio.sleep(3 * dev.longest_reply)
         asked = len(server.sent)
         server.flows.set()
         await asyncio.sleep(0.4)

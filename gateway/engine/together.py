@@ -1,0 +1,65 @@
+"""Requests together: finds devices that take one request at a time, although `window` is larger."""
+
+from dataclasses import dataclass, field
+
+from gateway.engine.device import Device
+from gateway.engine.effects import Effects
+from gateway.engine.jobs import Poll
+
+PROOFS = 3  # requests that were answered alone and not beside others
+LOST = "requests that are sent together stay unanswered: now one at a time; set window: 1"
+TRY_AGAIN = 3600.0  # seconds; a device may have been busy
+
+
+@dataclass(slots=True)
+class _Window:
+    """The evidence of one device."""
+
+    suspects: list[Poll] = field(default_factory=list)  # unanswered beside others, not yet alone
+    proofs: int = 0
+    apart_until: float = 0.0
+
+
+class Together:
+    """Decides how many polls of a device share a transaction.
+
+    A poll without a reply beside others is polled alone. A reply then proves that the device lost
+    the request because of the others. A transaction in which all are answered proves the opposite.
+    """
+
+    def __init__(self, effects: Effects) -> None:
+        self._effects = effects
+        self._windows: dict[Device, _Window] = {}
+
+    def others(self, poll: Poll, now: float) -> int:
+        """Returns how many polls may be sent beside this one."""
+        window = self._windows.get(poll.device)
+        if window is not None and (now < window.apart_until or poll in window.suspects):
+            return 0
+        return poll.device.window - 1
+
+    def concluded(self, poll: Poll, count: int, failed: list[Poll], now: float) -> None:
+        """Takes the end of a transaction with `count` polls, of which `poll` was the last."""
+        device = poll.device
+        window = self._windows.get(device)
+        if window is None:
+            window = self._windows[device] = _Window()
+        if count > 1:
+            window.suspects = failed
+            if not failed:
+                window.proofs = 0
+                device.takes_one_at_a_time(False)
+        elif poll in window.suspects:
+            window.suspects.remove(poll)
+            if not failed:
+                window.suspects = []
+                window.proofs += 1
+                self._judge(device, window, now)
+
+    def _judge(self, device: Device, window: _Window, now: float) -> None:
+        if window.proofs < PROOFS and not device.one_at_a_time:
+            return
+        window.apart_until = now + TRY_AGAIN
+        if not device.one_at_a_time:
+            device.takes_one_at_a_time(True)
+            self._effects.warning("window reduced", device=device.name, why=LOST)

@@ -1,0 +1,49 @@
+"""The time when bytes arrived, although the event loop handles them late."""
+
+import asyncio
+import time
+from collections.abc import Callable
+
+PERIOD = 0.1  # seconds between two measurements: no stamp is newer by more than this
+NEVER = float("inf")
+
+
+class ArrivalClock:
+    """A wall clock for samples: it stays behind while the event loop is late.
+
+    Bytes that arrive while the loop stands still wait in the system. Nothing tells when they
+    arrived. So all stamps are those of the last time when the loop was on time: a stamp may be too
+    old by the time that the loop stood still, but it is never new for an old value.
+    """
+
+    def __init__(self, wall: Callable[[], int] = time.time_ns) -> None:
+        """`wall`: ns since 1970."""
+        self._wall = wall
+        self._due = NEVER  # the time of the next measurement
+        self._behind = 0.0  # seconds, until that time
+        self._timer: asyncio.TimerHandle | None = None
+        self._now: Callable[[], float] = lambda: 0.0
+
+    def start(self) -> None:
+        """Measures the running loop until `stop`."""
+        loop = asyncio.get_running_loop()
+        self._now = loop.time
+        self._due = loop.time() + PERIOD
+        self._timer = loop.call_at(self._due, self._measure, loop)
+
+    def stop(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+        self._due, self._behind, self._timer = NEVER, 0.0, None
+
+    def __call__(self) -> int:
+        """Returns ns since 1970."""
+        behind = max(self._behind, self._now() - self._due)
+        return self._wall() - int(behind * 1e9)
+
+    def _measure(self, loop: asyncio.AbstractEventLoop) -> None:
+        now = loop.time()
+        # Bytes may be read only after this timer: they keep the stamp for one more period.
+        self._behind = max(0.0, now - self._due)
+        self._due = now + PERIOD
+        self._timer = loop.call_at(self._due, self._measure, loop)

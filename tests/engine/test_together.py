@@ -1,0 +1,101 @@
+"""A device that loses requests sent together gets one at a time."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+from gateway.engine.device import Device
+from gateway.engine.jobs import Idle, Poll, Probe, Resynced, Settle, Settled, Traffic
+from gateway.engine.together import PROOFS, TRY_AGAIN
+from tests.engine.rig import REPLIED, SILENCE, Rig, tcp_device
+from tests.sim.bench import WIRE
+
+
+def busy_device() -> Device:
+    """Its blocks are always due together."""
+    plain = tcp_device().settings
+    tags = tuple(replace(tag, every=0.002) for tag in plain.tags)
+    return Device(replace(plain, tags=tags), WIRE)
+
+
+Answers = Callable[[Poll, int], bool]  # by the poll and its place in the transaction
+
+
+def transactions(rig: Rig, seconds: float, answers: Answers) -> list[int]:
+    """Runs the line. Returns how many polls each transaction had."""
+    sizes, end = [], rig.now + seconds
+    while rig.now < end:
+        job = rig.next()
+        match job:
+            case Idle(until=until):
+                rig.now = until
+            case Probe():
+                rig.conclude(job, Resynced(1000))
+            case Settle():
+                rig.conclude(job, Settled(None))
+            case Poll():
+                polls = [job, *rig.engine.alongside(job, rig.now)]
+                sizes.append(len(polls))
+                for place, poll in enumerate(polls):
+                    rig.conclude(
+                        poll,
+                        (0,) * poll.block.span.size if answers(poll, place) else SILENCE,
+                        REPLIED if poll is polls[-1] else Traffic(),
+                        took=0.002,
+                    )
+    return sizes
+
+
+def first_only(poll: Poll, place: int) -> bool:
+    return place == 0
+
+
+def every_one(poll: Poll, place: int) -> bool:
+    return True
+
+
+def reduced(rig: Rig) -> int:
+    return sum(log.event == "window reduced" for log in rig.logged)
+
+
+def test_a_device_that_replies_to_the_first_gets_one_at_a_time_and_says_so() -> None:
+    rig = Rig(busy_device())
+    sizes = transactions(rig, 5.0, first_only)
+    assert PROOFS <= sum(size > 1 for size in sizes) <= 3 * PROOFS
+    assert max(sizes[-1000:]) == 1
+    assert reduced(rig) == 1
+    assert rig.device.diagnosis() == "It takes one request at a time, not 4: set `window: 1`"
+
+
+def test_it_is_tried_again_after_an_hour_once() -> None:
+    rig = Rig(busy_device())
+    transactions(rig, 5.0, first_only)
+    for _ in range(2):
+        rig.now += TRY_AGAIN
+        sizes = transactions(rig, 5.0, first_only)
+        assert sum(size > 1 for size in sizes) == 1
+    assert reduced(rig) == 1
+    rig.now += TRY_AGAIN
+    sizes = transactions(rig, 5.0, every_one)
+    assert max(sizes) == 4
+    assert rig.device.diagnosis() == ""
+
+
+def test_a_block_that_is_never_answered_costs_no_window() -> None:
+    rig = Rig(busy_device())
+    silent = rig.device.blocks[2].span
+    sizes = transactions(rig, 20.0, lambda poll, place: poll.block.span != silent)
+    assert reduced(rig) == 0
+    assert max(sizes[-50:]) == 4
+
+
+def test_single_losses_cost_no_window() -> None:
+    rig, count = Rig(busy_device()), 0
+
+    def seldom(poll: Poll, place: int) -> bool:
+        nonlocal count
+        count += 1
+        return count % 50 != 0
+
+    sizes = transactions(rig, 20.0, seldom)
+    assert reduced(rig) == 0
+    assert max(sizes[-50:]) == 4
