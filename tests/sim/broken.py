@@ -424,4 +424,18 @@ MUTANTS = (
         "        if transaction is not None:\n",
         "tests/line/test_ports.py tests/engine/test_unsolicited.py",
     ),
+    Mutant(
+        "a scaled integer is read as a float",
+        "tags/scaling.py",
+        "        number = raw * factor + summand\n",
+        "        number = int(float(raw) * factor + summand)\n",
+        "tests/tags/test_scaling.py",
+    ),
+    Mutant(
+        "a scaled integer is written as a float",
+        "tags/scaling.py",
+        "round((_decimal(value) - _decimal(offset)) / _decimal(scale))",
+        "round((value - offset) / scale)",
+        "tests/tags/test_scaling.py",
+    ),
 )
