@@ -39,7 +39,8 @@ def check(
         if (limit := tag.exact_below) is not None:
             err.print(
                 f"note: {tag.key} ({tag.text}): a JSON number has 53 bits. Beyond {limit:.4g}"
-                " either way two values of the device can look equal, and a write can be one step off"
+                " either way two values of the device can look equal, and a write can be one"
+                " step off"
             )
     for line in lines:
         if line.overloaded:
