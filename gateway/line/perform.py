@@ -7,8 +7,10 @@ from gateway.engine.device import Device
 from gateway.engine.jobs import (
     Answer,
     Confirm,
+    HeldTogether,
     Poll,
     Probe,
+    ReadBack,
     Repeat,
     Result,
     Resynced,
@@ -52,6 +54,8 @@ async def _perform(job: Transacted, transaction: Transaction) -> Result:
         case WriteTogether(writes=writes) if isinstance(driver, ScatteredWriter):
             parts = [(write.tag.span, write.units) for write in writes]
             return Sent(await driver.write_scattered(transaction, parts))
+        case ReadBack():
+            return await _read_back(job, transaction)
         case Confirm():
             return await _confirm(job, transaction)
         case Command(name=name, argument=argument) if isinstance(driver, Controllable):
@@ -103,6 +107,17 @@ async def _write(write: Write, talk: Talk[Any]) -> Sent:
         return Sent(held=await driver.read(talk, tag.span))
     except Refused as error:
         return Sent(refused_back=error)
+
+
+async def _read_back(job: ReadBack, talk: Talk[Any]) -> HeldTogether:
+    driver = job.device.driver
+    held: list[Sequence[int] | Refused | None] = []
+    for span in (write.tag.span for write in job.writes):
+        try:
+            held.append(None if driver.cost(span) is None else await driver.read(talk, span))
+        except Refused as error:
+            held.append(error)
+    return HeldTogether(held)
 
 
 async def _confirm(job: Confirm, talk: Talk[Any]) -> Sent:

@@ -413,7 +413,7 @@ MUTANTS = (
     Mutant(
         "a write that was never sent ends unclear",
         "engine/request_results.py",
-        "error if settle.sent or isinstance(job, Confirm | Repeat) else Busy(str(error))",
+        "Busy(str(error)) if unsent else error",
         "error",
         "tests/engine tests/line/test_stalled_link.py",
     ),
@@ -437,5 +437,19 @@ MUTANTS = (
         "round((_decimal(value) - _decimal(offset)) / _decimal(scale))",
         "round((value - offset) / scale)",
         "tests/tags/test_scaling.py",
+    ),
+    Mutant(
+        "writes that were refused in part are sent again",
+        "engine/request_results.py",
+        "            if not result.unexecuted:\n",
+        "            if False:\n",
+        "tests/engine tests/attacks/test_part_of_a_write.py",
+    ),
+    Mutant(
+        "reading back after a joint refusal believes everything",
+        "engine/request_results.py",
+        "                if write.holds(held):\n                    outcome =",
+        "                if True:\n                    outcome =",
+        "tests/engine tests/attacks/test_part_of_a_write.py",
     ),
 )
