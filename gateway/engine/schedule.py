@@ -9,6 +9,7 @@ from gateway.engine.health import PAUSE_LONGEST, State
 from gateway.engine.jobs import EXPEDITED, NOT_QUEUED, Idle, LastRead, Poll, Probe
 from gateway.engine.poll_queue import PollQueue
 from gateway.engine.requests import Request, RequestQueue
+from gateway.engine.unanswered import Unanswered
 from gateway.planning.planner import Block
 from gateway.tags import Tag
 
@@ -37,6 +38,7 @@ class Schedule:
     def __init__(self, devices: Sequence[Device], now: float, seed: int = 0) -> None:
         self.devices = devices
         self.requests = RequestQueue()
+        self.unanswered = Unanswered()
         self._random = random.Random(seed)  # noqa: S311  (jitter, not a secret)
         # The share of its period by which each poll begins early.
         self._phases = (n * GOLDEN % 1 / 2 for n in itertools.count())
@@ -251,6 +253,7 @@ class Schedule:
     def opened(self, now: float) -> None:
         """Starts again after the line was opened."""
         self._failing_lane = self._offline_lane = now
+        self.unanswered.requests.clear()
         self._wrote = self._expedited = False
 
 

@@ -18,6 +18,7 @@ class PartPeer(Peer):
         super().__init__(5, 4, True)
         self.commands: Counter[str] = Counter()
         self.puts: Counter[str] = Counter()
+        self.closed = asyncio.Event()
 
     def obey(self, command: str, area: str) -> bytes:
         self.commands[command] += 1
@@ -37,6 +38,7 @@ class PartPeer(Peer):
                 writer.write(self.hear(await reader.readuntil(b"\r\n")))
         except asyncio.IncompleteReadError:
             writer.close()
+            self.closed.set()
 
 
 async def test_no_value_is_written_twice_and_no_end_is_claimed_that_is_not_known(
@@ -57,6 +59,7 @@ async def test_no_value_is_written_twice_and_no_end_is_claimed_that_is_not_known
                 for n, word in enumerate(WORDS):  # faster than the wire
                     await client.put(f"plant/oven/{word}/@set", str(7 + n).encode())
                 await told.until(lambda h: len(h.samples) == len(WORDS))
+        await plc.closed.wait()
     assert plc.commands["WT"] > 0
     assert max(plc.puts.values()) == 1
     for sample in told.samples:

@@ -452,4 +452,25 @@ MUTANTS = (
         "                if True:\n                    outcome =",
         "tests/engine tests/attacks/test_part_of_a_write.py",
     ),
+    Mutant(
+        "a request behind a bridge waits no longer than alone",
+        "line/transaction.py",
+        "            until += max(0.0, unanswered.held_up_until(device) - started)\n",
+        "            pass\n",
+        "tests/attacks/test_bridge.py",
+    ),
+    Mutant(
+        "a late answer with a known number speaks against the present device",
+        "line/transaction.py",
+        "bool(unanswered.requests) and unanswered.take(frame, self._channel.quiet_since)",
+        "False",
+        "tests/line/test_modbus_window.py",
+    ),
+    Mutant(
+        "a request holds up others after a later one was answered",
+        "engine/unanswered.py",
+        "            each.holds_up = False\n",
+        "            pass\n",
+        "tests/engine/test_unanswered.py",
+    ),
 )
