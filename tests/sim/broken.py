@@ -473,4 +473,11 @@ MUTANTS = (
         "            pass\n",
         "tests/engine/test_unanswered.py",
     ),
+    Mutant(
+        "a frame that a device sends during a poll of another is lost",
+        "engine/unsolicited.py",
+        " or sender.listener.framed_as(device.driver):",
+        ":",
+        "tests/engine/test_unsolicited.py",
+    ),
 )
