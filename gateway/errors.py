@@ -56,13 +56,22 @@ class Refusal(StrEnum):
 class Refused(DeviceError):
     """An error reply.
 
-    `code` is the maker's code as the manual prints it ("28", "06", "02").
+    `code` is the maker's code as the manual prints it ("28", "06", "02"). `unexecuted`: the device
+    refused the frame itself, so of several writes in it none was done.
     """
 
-    def __init__(self, message: str, *, code: str, refusal: Refusal = Refusal.OTHER) -> None:
+    def __init__(
+        self,
+        message: str,
+        *,
+        code: str,
+        refusal: Refusal = Refusal.OTHER,
+        unexecuted: bool = False,
+    ) -> None:
         super().__init__(message)
         self.code = code
         self.refusal = refusal
+        self.unexecuted = unexecuted
 
 
 class Unclear(DeviceError):

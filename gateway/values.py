@@ -9,6 +9,7 @@ import re
 import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from decimal import Decimal
 from enum import StrEnum
 
 from gateway.errors import BadValue, ConfigError
@@ -68,6 +69,7 @@ _FLOATS = (Kind.FLOAT32, Kind.FLOAT64)
 _BCD = (Kind.BCD16, Kind.BCD32)
 _SINGLE = struct.Struct(">f")
 _LARGEST_SINGLE = 3.4028234663852886e38
+_WHOLE_FLOATS = 2.0**53  # from here on floats skip whole numbers
 LONGEST_STRING = 250
 
 
@@ -242,6 +244,18 @@ def whole(value: Value) -> int:
     if isinstance(value, float) and not value.is_integer():
         raise BadValue(f"{value} is not a whole number")
     return int(value)
+
+
+def parse_decimal(text: str) -> int | float:
+    """Returns the number of a JSON text with a point or an exponent, infinite if too large.
+
+    It is an integer where a float would change a whole number of 64 bits: 9007199254740993.0.
+    """
+    number = float(text)
+    if not _WHOLE_FLOATS <= abs(number) < 2.0**64:
+        return number
+    exact = Decimal(text)
+    return int(exact) if exact == exact.to_integral_value() else number
 
 
 def real(value: Value) -> float:

@@ -35,6 +35,13 @@ def check(
                 f"note: writing {tag.key} ({tag.text}) reads the word, changes one bit and writes "
                 "the word back; changes by the PLC in between are lost"
             )
+    for tag in (tag for device in loaded.devices for tag in device.tags):
+        if (limit := tag.exact_below) is not None:
+            err.print(
+                f"note: {tag.key} ({tag.text}): a JSON number has 53 bits. Beyond {limit:.4g}"
+                " either way two values of the device can look equal, and a write can be one"
+                " step off"
+            )
     for line in lines:
         if line.overloaded:
             err.print(f"warning: {line.advice()}")

@@ -6,6 +6,7 @@ Each takes a value of the file, of any type, and raises `ConfigError` with a cor
 import math
 import re
 import unicodedata
+from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
 
@@ -161,6 +162,16 @@ def web_address(text: object) -> tuple[str, int]:
     if match is None or not 1 <= int(match[2]) <= 65535:
         raise ConfigError(f"{shown(text)} is no address to listen on: write 127.0.0.1:8080")
     return match[1].strip("[]"), int(match[2])
+
+
+def every_digit(written: object, as_float: Callable[[object], float]) -> float:
+    """Returns an integer of at most 64 bits as an integer, if a float would change it."""
+    number = as_float(written)
+    if not isinstance(written, int) or written == number:
+        return number
+    if not -(2**63) <= written < 2**64:
+        raise ConfigError(f"{written} has more digits than the gateway keeps")
+    return written
 
 
 def scale(factor: float) -> float:

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, Field, PlainValidator, WithJsonSchema
+from pydantic import AfterValidator, Field, PlainValidator, WithJsonSchema, WrapValidator
 
 from gateway.config import parsers
 from gateway.transport.port import PortAddress
@@ -87,4 +87,4 @@ FilePath = Annotated[Path, PlainValidator(parsers.path), WithJsonSchema({"type":
 OrderName = Annotated[Order, PlainValidator(parsers.order), WithJsonSchema(_ORDER_SCHEMA)]
 Endpoint = Annotated[str, PlainValidator(parsers.endpoint), WithJsonSchema(_ENDPOINT_SCHEMA)]
 Endpoints = Annotated[list[Endpoint], AfterValidator(parsers.once)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False), WrapValidator(parsers.every_digit)]

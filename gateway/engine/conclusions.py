@@ -8,6 +8,7 @@ from gateway.engine.jobs import (
     InFlight,
     Poll,
     Probe,
+    ReadBack,
     Repeat,
     RequestJob,
     Result,
@@ -95,7 +96,7 @@ class Conclusions:
                 if isinstance(result, Garbled):
                     why = str(result)
                     self._effects.warning("reply dropped", device=job.device.name, why=why)
-            case Write() | WriteTogether() | Command() | Confirm() | Repeat():
+            case Write() | WriteTogether() | ReadBack() | Command() | Confirm() | Repeat():
                 self._requested(job, result, traffic, now, time)
 
     def _probed(
@@ -123,8 +124,8 @@ class Conclusions:
         match self._requests.conclude(job, result, traffic, now, time):
             case Unclear() as error:
                 self.unclear(job, error, traffic, now, time)
-            case Repeat() as repeat:
-                self._in_flight.continuation = repeat
+            case ReadBack() | Repeat() as following:
+                self._in_flight.continuation = following
 
     def unclear(
         self, job: Unfinished, error: DeviceError, traffic: Traffic, now: float, time: int

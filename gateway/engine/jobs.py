@@ -10,7 +10,7 @@ from gateway.engine.health import PAUSE_FIRST, PAUSE_LONGEST, State
 from gateway.engine.records import PollRecord
 from gateway.engine.reply_shapes import ReplyShapes
 from gateway.engine.requests import Command, Request, Resyncs, Write
-from gateway.errors import BadValue, DeviceError, LineDown
+from gateway.errors import BadValue, DeviceError, LineDown, Refused, Unclear
 from gateway.planning.planner import Block
 from gateway.protocols.driver import Span, UnnumberedReplies
 from gateway.tags import Sample
@@ -95,6 +95,20 @@ class WriteTogether:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class ReadBack:
+    """A job: read back the tags of writes that were refused together, perhaps after a part."""
+
+    device: Device
+    writes: Sequence[Write]
+    refused: Refused
+
+    @property
+    def error(self) -> Unclear:
+        """The end of a write whose tag does not show that it was done."""
+        return Unclear(f"refused together with others, perhaps after it was done: {self.refused}")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Confirm:
     """A job: resync, then read back the tag of an unclear write."""
 
@@ -123,7 +137,7 @@ class Answer:
     until: float
 
 
-RequestJob = Write | WriteTogether | Command | Confirm | Repeat
+RequestJob = Write | WriteTogether | ReadBack | Command | Confirm | Repeat
 Unfinished = Poll | Probe | RequestJob
 
 
@@ -182,12 +196,12 @@ class InFlight:
         self.failed.clear()
 
     def resume(self, now: float) -> Transacted:
-        """Returns the continuation. `Confirm` and `Repeat` begin their own time."""
+        """Returns the continuation. All but `Settle` and `Probe` begin their own time."""
         job, self.continuation = self.continuation, None
         if job is None:
             raise AssertionError("no continuation")
         self.job = job
-        if isinstance(job, Confirm | Repeat):
+        if isinstance(job, ReadBack | Confirm | Repeat):
             self.begun = now
         return job
 
@@ -197,7 +211,7 @@ def requests_of(job: Job) -> Sequence[Request]:
     match job:
         case Write() | Command():
             return (job,)
-        case WriteTogether(writes=writes):
+        case WriteTogether(writes=writes) | ReadBack(writes=writes):
             return writes
         case Confirm(write=write) | Repeat(write=write):
             return (write,)
@@ -213,7 +227,7 @@ def span_of(job: Unfinished) -> Span | None:
             return job.span
         case Write(tag=tag):
             return tag.span
-        case WriteTogether(writes=[first, *_]):
+        case WriteTogether(writes=[first, *_]) | ReadBack(writes=[first, *_]):
             return first.tag.span
         case Confirm(write=write) | Repeat(write=write):
             return write.tag.span
@@ -272,10 +286,18 @@ class Sent:
 
 
 @dataclass(frozen=True, slots=True)
+class HeldTogether:
+    """The units of several tags, read back one by one. None: the tag cannot be read."""
+
+    units: Sequence[Sequence[int] | Refused | None]
+
+
+@dataclass(frozen=True, slots=True)
 class Settled:
     """The line has settled. `late`: seconds from the time-out to the late reply, if any."""
 
     late: float | None
 
 
-Result = Sequence[int] | Resynced | Sent | Settled | str | DeviceError | BadValue | LineDown | None
+Success = Sequence[int] | Resynced | Sent | HeldTogether | Settled | str | None
+Result = Success | DeviceError | BadValue | LineDown

@@ -5,6 +5,8 @@ from gateway.engine.effects import Effects, RequestEnded
 from gateway.engine.health import State
 from gateway.engine.jobs import (
     Confirm,
+    HeldTogether,
+    ReadBack,
     Repeat,
     RequestJob,
     Result,
@@ -18,7 +20,7 @@ from gateway.engine.jobs import (
 from gateway.engine.requests import Command, Outcome, Request, Write
 from gateway.engine.results import Results
 from gateway.engine.schedule import Schedule
-from gateway.errors import Busy, DeviceError, LineDown, Refused, Unclear
+from gateway.errors import Busy, DeviceError, LineDown, Refusal, Refused, Unclear
 
 BROADCAST_PAUSE = 0.1  # seconds
 STOPPED = "the gateway stopped before the acknowledgement arrived; it may be done"
@@ -41,8 +43,8 @@ class RequestResults:
 
     def conclude(
         self, job: RequestJob, result: Result, traffic: Traffic, now: float, time: int
-    ) -> Unclear | Repeat | None:
-        """Returns the next step: settle after an unclear end, or write again."""
+    ) -> Unclear | ReadBack | Repeat | None:
+        """Returns the next step: settle after an unclear end, read back, or write again."""
         if isinstance(result, Unclear):
             return result
         if isinstance(result, LineDown):
@@ -54,7 +56,9 @@ class RequestResults:
             case Command():
                 self._commanded(job, result, traffic, now, time)
             case WriteTogether():
-                self._written_together(job, result, now, time)
+                return self._written_together(job, result, now, time)
+            case ReadBack():
+                self._read_back(job, result, now, time)
             case Write() as write:
                 self._end(write, self._written(write, result, None, now, time), now)
             case Repeat(write=write, error=error):
@@ -72,9 +76,10 @@ class RequestResults:
                     health = device.health
                     token = health.next_probe_token()
                     return Confirm(device, job, error, health.outstanding, token)
-            case Confirm(error=first) | Repeat(error=first):
+            case ReadBack(error=first) | Confirm(error=first) | Repeat(error=first):
                 error = first
-        outcome = error if settle.sent or isinstance(job, Confirm | Repeat) else Busy(str(error))
+        unsent = not settle.sent and not isinstance(job, ReadBack | Confirm | Repeat)
+        outcome = Busy(str(error)) if unsent else error
         for request in requests_of(job):
             self._end(request, outcome, now)
         return None
@@ -114,11 +119,19 @@ class RequestResults:
                 return first or result  # a refused repetition says nothing about the first try
         raise TypeError(f"{result!r} is no result of a write")
 
-    def _written_together(self, job: WriteTogether, result: Result, now: float, time: int) -> None:
+    def _written_together(
+        self, job: WriteTogether, result: Result, now: float, time: int
+    ) -> ReadBack | None:
+        """Ends the writes, or returns the job that shows how many of them were done.
+
+        A device can refuse an address after it has written those before it.
+        """
         if isinstance(result, Refused):
             self._refused(job.device, result, now, time)
+            if not result.unexecuted:
+                return ReadBack(job.device, job.writes, result)
             self._schedule.requests.each_alone(job.writes)
-            return
+            return None
         if not isinstance(result, Sent):
             raise TypeError(f"{result!r} is no result of a write")
         self._results.answered(job.device, now, time)
@@ -126,6 +139,27 @@ class RequestResults:
             job.device.shapes.acknowledged(now)
         for write in job.writes:
             self._end(write, write.result(now, time), now)
+        return None
+
+    def _read_back(self, job: ReadBack, result: Result, now: float, time: int) -> None:
+        """Ends writes that were refused together. None is sent again: it may have been done.
+
+        Another value does not show that a write was not done: the program of the PLC may have
+        changed it since.
+        """
+        if not isinstance(result, HeldTogether):
+            raise TypeError(f"{result!r} is no result of reading back")
+        for write, held in zip(job.writes, result.units, strict=True):
+            outcome: Outcome = job.error
+            if isinstance(held, Refused):
+                self._refused(job.device, held, now, time)
+                if held.refusal is job.refused.refusal is Refusal.ADDRESS:
+                    outcome = job.refused  # this is the address that does not exist
+            elif held is not None:
+                self._results.answered(job.device, now, time)
+                if write.holds(held):
+                    outcome = write.result(now, time, verified=True)
+            self._end(write, outcome, now)
 
     def _confirmed(self, job: Confirm, result: Result, now: float, time: int) -> Repeat | None:
         """Ends the write, or returns its repetition. `result.held`: None without `verify`."""

@@ -44,7 +44,7 @@ class Write:
     tag: Tag
     units: Sequence[int]
     submitted: float
-    alone: bool = False  # refused together with others: it is now sent alone
+    alone: bool = False  # refused together with others before any was done: now sent alone
     resyncs: Resyncs = NO_RESYNCS
     value: Value = field(init=False)  # as the device will hold it, rounded to its steps
 
@@ -105,11 +105,17 @@ Request = Write | Command
 
 
 def can_share(writes: Sequence[Write]) -> bool:
-    """Returns True if all these writes to one device fit in one request."""
-    driver = writes[0].device.driver
+    """Returns True if all these writes to one device fit in one request.
+
+    A known bad address goes alone: the device would refuse the others with it.
+    """
+    device = writes[0].device
+    driver, spans = device.driver, [write.tag.span for write in writes]
     if not isinstance(driver, ScatteredWriter) or not all(write.plain for write in writes):
         return False
-    return driver.scattered_write_cost([write.tag.span for write in writes]) is not None
+    if any(bad.overlaps(span) for bad in device.bad_addresses.bad for span in spans):
+        return False
+    return driver.scattered_write_cost(spans) is not None
 
 
 def why_not_commanded(driver: AnyDriver, command: str, *, control: bool) -> str:
@@ -167,7 +173,7 @@ class RequestQueue:
         return found
 
     def each_alone(self, writes: Sequence[Write]) -> None:
-        """Puts back writes that were refused together, so none was done: now one by one."""
+        """Puts back writes of which none was done: now one by one."""
         for write in reversed(writes):
             write.alone = True
             self.waiting.appendleft(write)

@@ -10,6 +10,7 @@ from gateway.engine.poll_queue import PollQueue
 from gateway.engine.probe_schedule import ProbeSchedule
 from gateway.engine.reply_shapes import QUIET
 from gateway.engine.requests import Request, RequestQueue
+from gateway.engine.unanswered import Unanswered
 from gateway.planning.planner import Block
 from gateway.tags import Tag
 
@@ -44,6 +45,7 @@ class Schedule:
     def __init__(self, devices: Sequence[Device], now: float, seed: int = 0) -> None:
         self.devices = devices
         self.requests = RequestQueue()
+        self.unanswered = Unanswered()
         # The share of its period by which each poll begins early.
         self._phases = (n * GOLDEN % 1 / 2 for n in itertools.count())
         self._probes = ProbeSchedule(devices, now, seed)
@@ -270,4 +272,5 @@ class Schedule:
     def opened(self, now: float) -> None:
         """Starts again after the line was opened."""
         self._probes.opened(now)
+        self.unanswered.requests.clear()
         self._wrote = self._expedited = False

@@ -53,6 +53,7 @@ class Staleness:
         failing = any(device.health.state is State.FAILING for device in devices)
         stretch = 1.0 if failing else 2.0
         longest_reply = max(device.longest_reply for device in devices)
+        longest_reply += self._schedule.unanswered.longest
         for poll, age in zip(*self._worst_ages(), strict=True):
             if poll.device.health.state is State.FAILING:
                 yield poll, 2 * poll.block.every

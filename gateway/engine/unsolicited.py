@@ -83,9 +83,12 @@ class UnsolicitedFrames:
             self._apply(sender, sender.listener.received(data, now), now, time)
 
     def unmatched(self, device: Device, frame: Any, now: float, time: int) -> None:
-        """Takes a frame that arrived in a transaction with this device and is not its reply."""
+        """Takes a frame that arrived in a transaction with this device and is not its reply.
+
+        It can be an unsolicited frame of another device with the same framing.
+        """
         for sender in self.speakers:
-            if sender.device is device:
+            if sender.device is device or sender.listener.framed_as(device.driver):
                 self._apply(sender, sender.listener.unmatched(frame, now), now, time)
 
     def transaction_ended(self, device: Device, now: float, *, sent: int, heard: int) -> None:

@@ -5,6 +5,7 @@ from collections.abc import Callable
 
 import structlog
 
+from gateway.engine.unanswered import Unanswered
 from gateway.errors import Garbled, LineDown
 from gateway.line.wire_log import WireLog
 from gateway.planning.wire_timing import WireTiming
@@ -137,6 +138,7 @@ class Channel:
         "lost_by",
         "now",
         "quiet_since",
+        "unanswered",
         "wire",
         "wire_log",
     )
@@ -150,6 +152,7 @@ class Channel:
         self.quiet_since = 0.0  # the last time when the wire was busy
         self.alarm = Alarm()  # for the time-outs of its transactions
         self.lost_by: LineDown | None = None
+        self.unanswered = Unanswered()  # the numbered requests of this connection that timed out
         self._port = port
 
     def send(self, data: bytes) -> None:

@@ -149,6 +149,7 @@ class Line:
         try:
             port = await self._open_port(self)
             self._channel = Channel(port, self.engine.wire, WireLog(name), self._echo)
+            self._channel.unanswered = self.engine.schedule.unanswered
             log.info("line open", line=name)
             self._deliver(self.engine.opened(_now()))
             self.tried.set()

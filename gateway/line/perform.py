@@ -8,8 +8,10 @@ from gateway.engine.device import Device
 from gateway.engine.jobs import (
     Answer,
     Confirm,
+    HeldTogether,
     Poll,
     Probe,
+    ReadBack,
     Repeat,
     Result,
     Resynced,
@@ -80,6 +82,8 @@ async def _perform(job: Transacted, transaction: Transaction) -> Result:
             parts = [(write.tag.span, write.units) for write in writes]
             sending = driver.write_scattered(transaction, parts)
             return Sent(await _only_reply(sending, writes[0], transaction))
+        case ReadBack():
+            return await _read_back(job, transaction)
         case Confirm():
             return await _confirm(job, transaction)
         case Command(name=name, argument=argument) if isinstance(driver, Controllable):
@@ -167,6 +171,17 @@ async def _only_reply(sending: Awaitable[bool], write: Write, talk: Transaction)
     if refused is not None:
         raise refused
     return acknowledged
+
+
+async def _read_back(job: ReadBack, talk: Talk[Any]) -> HeldTogether:
+    driver = job.device.driver
+    held: list[Sequence[int] | Refused | None] = []
+    for span in (write.tag.span for write in job.writes):
+        try:
+            held.append(None if driver.cost(span) is None else await driver.read(talk, span))
+        except Refused as error:
+            held.append(error)
+    return HeldTogether(held)
 
 
 async def _confirm(job: Confirm, talk: Talk[Any]) -> Sent:

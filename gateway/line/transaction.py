@@ -7,6 +7,7 @@ from typing import Any, TypeVar
 
 from gateway.engine.device import Device
 from gateway.engine.jobs import Traffic
+from gateway.engine.unanswered import TimedOut
 from gateway.errors import DeviceError, Evidence, Garbled, LineDown, NoReply
 from gateway.line.channel import KEPT, NEVER, Channel
 from gateway.protocols.driver import Codec, EndedByGap
@@ -24,6 +25,8 @@ class _Request:
     reply: int  # characters of the longest reply
     future: "asyncio.Future[Any]"
     heard: int = 0  # characters of its reply
+    number: int = 0  # 0: this protocol numbers no request
+    sent: float = 0.0  # by the line's clock
 
 
 @dataclass(slots=True, eq=False)
@@ -120,17 +123,23 @@ class Transaction:
         spoken = (len(data) * (2 if channel.echo.strip else 1) + reply) * character
         wait = device.settings.timing.reply_timeout if within is None else within
         until = started + spoken + wait
+        unanswered = channel.unanswered
+        if unanswered.requests:
+            until += max(0.0, unanswered.held_up_until(device) - started)
         channel.alarm.by(until, self._expire)
         self.has_sent = True
         channel.send(data)
         self.traffic.sent += len(data)
         future: asyncio.Future[T] = asyncio.get_running_loop().create_future()
-        request = _Request(data, frame, answers, until, reply, future)
+        number = getattr(frame, "transaction", 0)
+        request = _Request(data, frame, answers, until, reply, future, number=number, sent=started)
         self._open.append(request)
         try:
             answer = await future
         finally:
             self._open.remove(request)
+        if unanswered.requests:
+            unanswered.answered(started, channel.quiet_since)
         busy = (len(data) + request.heard) * character
         # Of several outstanding requests, each has its own part of the time.
         alone = max(started, self._answered)
@@ -242,10 +251,7 @@ class Transaction:
                 request.heard, self._heard = len(self._heard), b""
                 request.future.set_result(answer)
                 return
-        late = self._late
-        if late is not None and not late.arrived and self._is_late_reply(late, frame):
-            late.arrived = True
-            late.wake()
+        if self._takes_late(frame):
             return
         is_echo = self.may_echo and any(frame == request.frame for request in self._open)
         station = self._device.settings.driver.station
@@ -256,6 +262,17 @@ class Transaction:
             self.traffic.extra += 1
         if self._on_unmatched_frame is not None:
             self._on_unmatched_frame(self._device, frame, is_echo)
+
+    def _takes_late(self, frame: Any) -> bool:
+        """Returns True for the answer to a request that timed out, here or in an older one."""
+        late, unanswered = self._late, self._channel.unanswered
+        if late is not None and not late.arrived and self._is_late_reply(late, frame):
+            late.arrived = True
+            late.wake()
+            if unanswered.requests:
+                unanswered.forget(frame)
+            return True
+        return bool(unanswered.requests) and unanswered.take(frame, self._channel.quiet_since)
 
     def _is_late_reply(self, late: _LateReply, frame: Any) -> bool:
         try:
@@ -273,6 +290,10 @@ class Transaction:
                 again = min(again, request.until)
             else:
                 self._late = _LateReply(request.answers)
+                if request.number:
+                    device, answers = self._device, request.answers
+                    known = TimedOut(device, request.number, answers, request.sent)
+                    self._channel.unanswered.requests.append(known)
                 request.future.set_exception(self._verdict(request.data))
         return again
 

@@ -19,7 +19,7 @@ from gateway.engine.requests import CommandResult
 from gateway.errors import BadValue, Busy, GatewayError, LineDown, Offline, Refused
 from gateway.tags import Quality, Reason, Sample, Tag, WriteResult
 from gateway.tags.timestamps import rfc3339
-from gateway.values import Value
+from gateway.values import Value, parse_decimal
 
 LONGEST_WRITE = 64 * 1024  # bytes; a tag holds 250 characters at most
 _LONGEST_REASON = 300
@@ -267,8 +267,8 @@ def _no_number(text: str) -> Never:
     raise BadValue(f"{text} is no number in JSON")
 
 
-def _finite(text: str) -> float:
-    number = float(text)
+def _finite(text: str) -> int | float:
+    number = parse_decimal(text)
     if not math.isfinite(number):
         raise BadValue("the number in the payload is too large")
     return number

@@ -49,6 +49,14 @@ class Span(NamedTuple):
     start: int
     size: int
 
+    def overlaps(self, other: "Span") -> bool:
+        """Returns True if the two have an address in common."""
+        return (
+            self.area == other.area
+            and self.start < other.start + other.size
+            and other.start < self.start + self.size
+        )
+
 
 class Cost(NamedTuple):
     """The characters of one request and its reply on the wire."""

@@ -58,6 +58,9 @@ class UnsolicitedListener(Protocol):
     def received(self, data: bytes, now: float) -> Collection[UnsolicitedEvent]:
         """Decodes bytes that arrived at `now` outside of a transaction."""
 
+    def framed_as(self, driver: object) -> bool:
+        """Returns True if a transaction of this driver finds the frames of the device too."""
+
     def unmatched(self, frame: Any, now: float) -> Collection[UnsolicitedEvent]:
         """Decodes a whole frame that arrived during a transaction and is not its reply."""
 

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 from gateway.errors import BadValue, Garbled
 from gateway.protocols.driver import Address, Span, Unit
 from gateway.protocols.typed_fields import Shape
+from gateway.tags.scaling import exact_below, scaled, unscaled
 from gateway.values import Kind, Layout, Value, from_words, to_words
 
 # Larger whole numbers are refused at once: as many bits as the largest float has.
@@ -73,7 +74,7 @@ class Tag:
     decode: Callable[[Sequence[Any]], Value | None] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        scale, offset = float(self.scale), float(self.offset)
+        scale, offset = self.scale, self.offset
         decode: Callable[[Sequence[Any]], Value | None]
         if self.shape is None:
             decode = _decoder(self.layout, self.unit_kind, self.address.bit, scale, offset)
@@ -85,6 +86,13 @@ class Tag:
     def key(self) -> str:
         """Unique in the gateway: `device/name`."""
         return f"{self.device}/{self.name}"
+
+    @property
+    def exact_below(self) -> float | None:
+        """The amount below which a JSON number tells all values apart; None: it always does."""
+        if not self._rounds:
+            return None
+        return exact_below(self.layout.type, self.scale, self.offset)
 
     def encode(self, value: Value) -> list[int]:
         """Returns the units to write for `value`. Raises `BadValue`.
@@ -144,30 +152,20 @@ class Tag:
             return value
         if self.scale == 1 and self.offset == 0:
             return value
+        if not _is_float(self.layout):
+            return unscaled(value, self.scale, self.offset)
         try:
-            raw = (value - self.offset) / self.scale
+            return (value - self.offset) / self.scale
         except OverflowError:
             raise BadValue(f"{value} is too large") from None
-        if _is_float(self.layout):
-            return raw
-        if not math.isfinite(raw):
-            raise BadValue(f"{value} is not a finite number")
-        return round(raw)
 
 
 def _short(number: float) -> str:
-    return f"{number:.15g}"
+    return str(number) if isinstance(number, int) else f"{number:.15g}"
 
 
 def _is_float(layout: Layout) -> bool:
     return layout.type.kind in (Kind.FLOAT32, Kind.FLOAT64)
-
-
-def _decimals(number: float) -> int:
-    """Counts the decimals of a number as a person writes it: 0.1 -> 1, 2 -> 0, 1e-05 -> 5."""
-    mantissa, _, exponent = repr(number).partition("e")
-    fraction = mantissa.partition(".")[2].rstrip("0")
-    return max(0, len(fraction) - int(exponent or 0))
 
 
 @lru_cache(maxsize=4096)
@@ -186,20 +184,28 @@ def _decoder(
 
     if (scale == 1 and offset == 0) or not layout.type.is_number:
         return plain
-    decimals = max(_decimals(scale), _decimals(offset))
-    exact = not _is_float(layout)
+    if _is_float(layout):
+        return _scaled_float(plain, scale, offset)
+    value_of = scaled(scale, offset)
 
-    def scaled(units: Sequence[int]) -> Value | None:
+    def integer(units: Sequence[int]) -> Value | None:
+        raw = plain(units)
+        return value_of(raw) if isinstance(raw, int) else None
+
+    return integer
+
+
+def _scaled_float(
+    plain: Callable[[Sequence[int]], Value | None], scale: float, offset: float
+) -> Callable[[Sequence[int]], Value | None]:
+    def value(units: Sequence[int]) -> Value | None:
         raw = plain(units)
         if raw is None or isinstance(raw, str):
             return raw
-        value = raw * scale + offset
-        if not math.isfinite(value):
-            return None
-        # People expect 123 x 0.1 = 12.3; binary fractions give 12.3000000000000007.
-        return round(value, decimals) if exact else value
+        scaled = raw * scale + offset
+        return scaled if math.isfinite(scaled) else None
 
-    return scaled
+    return value
 
 
 @lru_cache(maxsize=4096)
@@ -208,8 +214,7 @@ def _field_decoder(
 ) -> Callable[[Sequence[Any]], Value | None]:
     """Returns the decoder for a field of a frame: units[0] is its value or a `Garbled`."""
     scales = layout.type.is_number and not (scale == 1 and offset == 0)
-    exact = not _is_float(layout)
-    decimals = max(_decimals(scale), _decimals(offset))
+    value_of = None if _is_float(layout) or not scales else scaled(scale, offset)
 
     def value(units: Sequence[Any]) -> Value | None:
         raw: Value | Garbled = units[0]
@@ -217,10 +222,10 @@ def _field_decoder(
             return None
         if not scales or isinstance(raw, str):
             return raw
-        scaled = raw * scale + offset
-        if not math.isfinite(scaled):
-            return None
+        if value_of is not None and isinstance(raw, int):
+            return value_of(raw)
+        number = raw * scale + offset
         # The device sends decimal digits: 600.0 x 0.1 is 60, not 60.00000000000001.
-        return round(scaled, decimals) if exact else float(f"{scaled:.15g}")
+        return float(f"{number:.15g}") if math.isfinite(number) else None
 
     return value

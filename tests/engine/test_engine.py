@@ -27,6 +27,7 @@ from gateway.engine.effects import Effect
 from gateway.engine.health import State
 from gateway.engine.jobs import (
     Answer,
+    HeldTogether,
     Idle,
     Poll,
     Probe,
@@ -99,6 +100,8 @@ RESULTS: dict[str, tuple[Result, Traffic | None]] = {
     "bad-value": (BadValue("no argument"), NOTHING_SENT),
     "quiet": (Settled(None), None),
     "late": (Settled(0.1), None),
+    "held-both": (HeldTogether([HELD, HELD]), None),
+    "held-first": (HeldTogether([HELD, ADDRESS]), None),
 }
 REFUSALS = ["address", "damaged", "busy", "refused"]
 UNCLEAR = ["silence", "noise"]
@@ -114,6 +117,7 @@ RESULTS_OF = {
     "Write": ["sent", "to-all", *FAILURES, "not-sent"],
     "WriteVerified": ["held", "differs", "refused-back", "to-all", *FAILURES, "not-sent"],
     "WriteTogether": ["sent", *FAILURES, "not-sent"],
+    "ReadBack": ["held-both", "held-first", *UNCLEAR, "lost"],
     "Command": ["obeyed", "obeyed-by-all", "bad-value", *FAILURES, "not-sent"],
     "Confirm": ["sent", *FAILURES],
     "ConfirmVerify": ["held", "differs", *FAILURES],
@@ -179,6 +183,11 @@ def write_together(rig: Rig) -> Transacted:
     return rig.transacted()
 
 
+def read_back(rig: Rig) -> Transacted:
+    rig.conclude(write_together(rig), ADDRESS)
+    return rig.transacted()
+
+
 def command(rig: Rig) -> Transacted:
     rig.command()
     return rig.transacted()
@@ -228,6 +237,7 @@ SITUATIONS: dict[str, tuple[State, Setup]] = {
     "online Write": (S.ONLINE, write("D0")),
     "online WriteVerified": (S.ONLINE, write("D2")),
     "online WriteTogether": (S.ONLINE, write_together),
+    "online ReadBack": (S.ONLINE, read_back),
     "online Command": (S.ONLINE, command),
     "failing Poll": (S.FAILING, first),
     "failing Write": (S.FAILING, write("D0")),
@@ -245,6 +255,7 @@ SITUATIONS: dict[str, tuple[State, Setup]] = {
     "failing Settle/Write": (S.ONLINE, settle(write("D0"))),
     "failing Settle/WriteVerified": (S.ONLINE, settle(write("D2"))),
     "failing Settle/WriteTogether": (S.ONLINE, settle(write_together)),
+    "failing Settle/ReadBack": (S.ONLINE, settle(read_back)),
     "failing Settle/Command": (S.ONLINE, settle(command)),
     "failing Settle/NotSent": (S.ONLINE, settle(write("D2"), NOTHING_SENT)),
     "failing Settle/LastPoll": (S.FAILING, settle(first)),
@@ -322,10 +333,14 @@ online   WriteVerified         any-unclear   failing   -                        
 online   WriteVerified         lost          online    Unclear                              -
 online   WriteVerified         not-sent      failing   -                                    Settle
 online   WriteTogether         sent          online    written+written                      Poll
-online   WriteTogether         any-refusal   online    -                                    Poll
+online   WriteTogether         any-refusal   online    -                                    ReadBack
 online   WriteTogether         any-unclear   failing   -                                    Settle
 online   WriteTogether         lost          online    Unclear+Unclear                      -
 online   WriteTogether         not-sent      failing   -                                    Settle
+online   ReadBack              held-both     online    verified+verified                    Poll
+online   ReadBack              held-first    online    verified+Refused                     Poll
+online   ReadBack              any-unclear   failing   -                                    Settle
+online   ReadBack              lost          online    Unclear+Unclear                      -
 online   Command               obeyed        online    obeyed                               Poll
 online   Command               obeyed-by-all online    pause+obeyed                         Poll
 online   Command               bad-value     online    BadValue                             Poll
@@ -357,7 +372,7 @@ failing  WriteVerified         any-unclear   failing   -                        
 failing  WriteVerified         lost          failing   Unclear                              -
 failing  WriteVerified         not-sent      failing   -                                    Settle
 failing  WriteTogether         sent          online    written+written                      Poll
-failing  WriteTogether         any-refusal   online    -                                    Poll
+failing  WriteTogether         any-refusal   online    -                                    ReadBack
 failing  WriteTogether         any-unclear   failing   -                                    Settle
 failing  WriteTogether         lost          failing   Unclear+Unclear                      -
 failing  WriteTogether         not-sent      failing   -                                    Settle
@@ -407,6 +422,8 @@ failing  Settle/WriteVerified  quiet         failing   -                        
 failing  Settle/WriteVerified  late          failing   -                                    Confirm
 failing  Settle/WriteTogether  quiet         failing   NoReply+NoReply                      Probe
 failing  Settle/WriteTogether  late          failing   NoReply+NoReply                      Poll
+failing  Settle/ReadBack       quiet         failing   Unclear+Unclear                      Probe
+failing  Settle/ReadBack       late          failing   Unclear+Unclear                      Poll
 failing  Settle/Command        quiet         failing   NoReply                              Probe
 failing  Settle/Command        late          failing   NoReply                              Poll
 failing  Settle/NotSent        quiet         failing   Busy                                 Probe
@@ -457,7 +474,7 @@ offline  WriteVerified         any-unclear   offline   -                        
 offline  WriteVerified         lost          offline   Unclear                              -
 offline  WriteVerified         not-sent      offline   -                                    Settle
 offline  WriteTogether         sent          online    online+written+written               Poll
-offline  WriteTogether         any-refusal   online    online                               Poll
+offline  WriteTogether         any-refusal   online    online                               ReadBack
 offline  WriteTogether         any-unclear   offline   -                                    Settle
 offline  WriteTogether         lost          offline   Unclear+Unclear                      -
 offline  WriteTogether         not-sent      offline   -                                    Settle

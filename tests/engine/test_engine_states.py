@@ -17,10 +17,12 @@ from gateway.engine.health import TRANSITIONS, Event, State
 from gateway.engine.jobs import (
     Answer,
     Confirm,
+    HeldTogether,
     Idle,
     Job,
     Poll,
     Probe,
+    ReadBack,
     Reopen,
     Repeat,
     Result,
@@ -109,16 +111,22 @@ def possible(job: Transacted) -> list[Result]:
             return [None, Garbled("noise")]
         case WriteTogether():
             return [Sent(), *FAILED]
+        case ReadBack(writes=writes):
+            held = [list(write.units) for write in writes]
+            refused = Refused("no such address", code="06", refusal=Refusal.ADDRESS)
+            return [HeldTogether(held), HeldTogether([refused] * len(held)), *UNCLEAR]
         case Write() | Confirm() | Repeat():
-            write = job if isinstance(job, Write) else job.write
-            if job.device.broadcast:
-                return [Sent(acknowledged=False), Sent(), *UNCLEAR]
-            if write.tag.write is None or not write.tag.write.verify:
-                return [Sent(), *FAILED]
-            results: list[Result] = [Sent(held=list(write.units)), Sent(held=[12345]), *FAILED]
-            return (
-                results if isinstance(job, Confirm) else [*results, Sent(refused_back=REFUSED[0])]
-            )
+            return possible_of_write(job)
+
+
+def possible_of_write(job: Write | Confirm | Repeat) -> list[Result]:
+    write = job if isinstance(job, Write) else job.write
+    if job.device.broadcast:
+        return [Sent(acknowledged=False), Sent(), *UNCLEAR]
+    if write.tag.write is None or not write.tag.write.verify:
+        return [Sent(), *FAILED]
+    results: list[Result] = [Sent(held=list(write.units)), Sent(held=[12345]), *FAILED]
+    return results if isinstance(job, Confirm) else [*results, Sent(refused_back=REFUSED[0])]
 
 
 class Machine(RuleBasedStateMachine):
@@ -179,7 +187,7 @@ class Machine(RuleBasedStateMachine):
         if isinstance(job, Reopen):
             assert not any(device.health.state is State.ONLINE for device in self.devices)
             return job
-        if not isinstance(job, Repeat | Settle | Confirm):
+        if not isinstance(job, Repeat | Settle | Confirm | ReadBack):
             for request in requests_of(job):
                 assert request.expires > self.now, "no request is sent after its expiry"
         assert all(request not in self.ended for request in requests_of(job))

@@ -1,11 +1,15 @@
 """One write from its submission to its outcome, as a table: the rules of its tag decide."""
 
+from typing import Any
+
 import pytest
 
 from gateway.engine.effects import Pause
 from gateway.engine.health import State
 from gateway.engine.jobs import (
     Confirm,
+    HeldTogether,
+    ReadBack,
     Repeat,
     Result,
     Resynced,
@@ -18,11 +22,15 @@ from gateway.engine.jobs import (
 )
 from gateway.engine.request_results import BROADCAST_PAUSE, STOPPED, Differs
 from gateway.engine.requests import WRITE_EXPIRY, Command, Write
-from gateway.errors import Busy, Garbled, NoReply, Refused, Unclear
+from gateway.errors import Busy, Garbled, NoReply, Refusal, Refused, Unclear
+from gateway.planning.bad_addresses import BadRange
+from gateway.protocols.driver import Span
 from gateway.tags import WriteResult
 from tests.engine.rig import LOST, REPLIED, Rig, broadcast_device, ended
 
 HELD, OLD = Sent(held=[7]), Sent(held=[0])
+DAMAGED = Refused("sum check error", code="02", refusal=Refusal.DAMAGED, unexecuted=True)
+NO_ADDRESS = Refused("no such device", code="06", refusal=Refusal.ADDRESS)
 OK, NO, GONE = Sent(), Refused("not in RUN", code="18"), NoReply("no reply")
 NOISE = Garbled("noise")
 TAGS = {"plain": "D0", "verify": "D2", "repeat": "D3", "both": "D4"}
@@ -179,10 +187,10 @@ def test_a_group_without_an_acknowledgement_is_unclear_for_each_and_is_not_sent_
     assert not rig.engine.schedule.requests.waiting
 
 
-def test_writes_refused_together_are_sent_alone_in_their_order() -> None:
+def test_writes_refused_together_before_any_was_done_are_sent_alone_in_their_order() -> None:
     rig = online()
     writes = [rig.write("D0"), rig.write("D1")]
-    rig.conclude(rig.transacted(), NO)
+    rig.conclude(rig.transacted(), DAMAGED)
     assert rig.outcomes == {}
     sent = list[Transacted]()
     while rig.engine.schedule.requests.waiting:
@@ -196,11 +204,49 @@ def test_writes_refused_together_are_sent_alone_in_their_order() -> None:
 def test_a_write_refused_together_that_expires_was_refused_and_not_sent_alone() -> None:
     rig = online()
     writes = [rig.write("D0"), rig.write("D1")]
-    rig.conclude(rig.transacted(), NO)
+    rig.conclude(rig.transacted(), DAMAGED)
     rig.now += WRITE_EXPIRY
     rig.note(rig.engine.expire(rig.now, rig.time))
     for write in writes:
         assert str(rig.outcomes[write]).endswith("refused together with others, and not sent alone")
+
+
+@pytest.mark.parametrize(
+    ("joint", "held", "outcomes"),
+    [
+        (NO, ([7], [7]), "verified verified"),
+        (NO, ([7], [0]), "verified Unclear"),  # the program may have cleared the second again
+        (NO_ADDRESS, ([7], NO_ADDRESS), "verified Refused"),
+        (NO_ADDRESS, ([0], NO_ADDRESS), "Unclear Refused"),
+        (NO, ([7], NO_ADDRESS), "verified Unclear"),
+        (NO_ADDRESS, (None, NO), "Unclear Unclear"),
+        (NO_ADDRESS, GONE, "Unclear Unclear"),
+        (NO_ADDRESS, LOST, "Unclear Unclear"),
+    ],
+)
+def test_writes_refused_together_perhaps_in_part_are_read_back_and_never_sent_again(
+    joint: Refused, held: Any, outcomes: str
+) -> None:
+    rig = online()
+    writes = [rig.write("D0"), rig.write("D1")]
+    rig.conclude(rig.transacted(), joint)
+    job = rig.transacted()
+    assert isinstance(job, ReadBack)
+    rig.conclude(job, HeldTogether(held) if isinstance(held, tuple) else held)
+    if held is GONE:
+        settle(rig)
+    if held is LOST:
+        rig.note(rig.engine.lost(LOST, rig.now, rig.time))
+    assert " ".join(ended(rig.outcomes[write]) for write in writes) == outcomes
+    assert not rig.engine.schedule.requests.waiting
+
+
+def test_a_known_bad_address_is_written_alone() -> None:
+    rig = online()
+    block = rig.device.blocks[0]
+    rig.device.bad_addresses.bad[Span("D", 1, 1)] = BadRange(Span("D", 1, 1), 0, "06", block.tags)
+    writes = [rig.write("D0"), rig.write("D1")]
+    assert rig.transacted() is writes[0]
 
 
 @pytest.mark.parametrize(

@@ -115,9 +115,9 @@ async def test_a_driver_without_scattered_writes_sends_one_after_the_other() -> 
 
 
 @on_virtual_time
-async def test_one_refused_address_leaves_the_other_writes_their_own_outcomes() -> None:
+async def test_a_damaged_group_is_sent_again_one_by_one_with_outcomes_of_their_own() -> None:
     line, dev = one(*BITS)
-    line.stations[0].inner.holes = {("M", 21)}
+    intercept(line.stations[0], damaged_group)
     async with running(line):
         await asyncio.sleep(3)
         asked = now()
@@ -129,6 +129,45 @@ async def test_one_refused_address_leaves_the_other_writes_their_own_outcomes() 
         assert set(written(outcomes).values()) == {True}
         sent = commands(line.stations[0], asked)
         assert (sent.count("BT"), sent.count("BW")) == (1, 20)
+
+
+@on_virtual_time
+async def test_a_known_bad_address_leaves_the_other_writes_together() -> None:
+    line, dev = one(*BITS)
+    line.stations[0].inner.holes = {("M", 21)}
+    async with running(line):
+        await asyncio.sleep(3)
+        asked = now()
+        outcomes = submit_all(line, dev, dict.fromkeys(BITS, True))
+        await asyncio.sleep(4)
+        assert isinstance(outcomes.pop("M21").once, Refused)
+        assert set(written(outcomes).values()) == {True}
+        sent = [c for c in commands(line.stations[0], asked) if c in ("BT", "BW")]
+        assert sent == ["BT", "BW", "BT"]
+
+
+@on_virtual_time
+async def test_a_group_that_was_refused_in_part_is_read_back_and_never_sent_again() -> None:
+    line, dev = one(*WORDS[:4])
+    station = line.stations[0]
+
+    def in_part(data: bytes) -> list[bytes] | None:
+        if data[5:7] != b"WT":
+            return None
+        for entry in (data[10:19], data[19:28]):  # the first two of four
+            station.memory.write("D", int(entry[1:5]), [int(entry[5:9], 16)])
+        return [b"\x1505FF06"]
+
+    intercept(station, in_part)
+    async with running(line):
+        await asyncio.sleep(3)
+        asked = now()
+        outcomes = submit_all(line, dev, {text: 7 + n for n, text in enumerate(WORDS[:4])})
+        await asyncio.sleep(4)
+        results = [outcomes[text].once for text in WORDS[:4]]
+        assert [type(result) for result in results] == [WriteResult, WriteResult, Unclear, Unclear]
+        assert "perhaps after it was done" in str(results[2])
+        assert "WW" not in commands(station, asked)
 
 
 @on_virtual_time
@@ -176,7 +215,7 @@ async def test_after_a_refused_group_no_late_reply_counts_for_the_next_write(obe
     """Each write needs a resync of its own: the write after an unclear one waits for it."""
     line, dev = one("M0", "M21", "M42", "M63", guard=0.05)
     station = line.stations[0]
-    station.inner.holes = {("M", 21)}
+    intercept(station, damaged_group)
     deaf = 0
 
     def late(_: Any) -> float:
@@ -208,7 +247,7 @@ async def test_after_a_refused_group_no_late_reply_counts_for_the_next_write(obe
 async def test_a_refused_group_is_not_sent_on_to_a_device_that_went_offline() -> None:
     line, dev = one("M0", "M21", "M42", retries=0)
     station = line.stations[0]
-    station.inner.holes = {("M", 21)}
+    intercept(station, damaged_group)
     async with running(line):
         await asyncio.sleep(3)
         outcomes = submit_all(line, dev, dict.fromkeys(["M0", "M21", "M42"], True))
@@ -221,6 +260,13 @@ async def test_a_refused_group_is_not_sent_on_to_a_device_that_went_offline() ->
         assert isinstance(outcomes["M21"].once, Offline)
         assert isinstance(outcomes["M42"].once, Offline)
         assert commands(station).count("BW") == 1
+
+
+def damaged_group(data: bytes) -> list[bytes] | None:
+    """Refuses BT as damaged, and M21 for ever."""
+    if data[5:7] == b"BT":
+        return [b"\x1505FF02"]
+    return [b"\x1505FF06"] if data[5:13] == b"BW0M0021" else None
 
 
 # In order

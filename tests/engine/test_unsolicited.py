@@ -578,6 +578,28 @@ async def test_an_unsolicited_frame_during_a_poll_is_not_lost(
         assert bench.values("key") == [7] * asked
 
 
+@on_virtual_time
+async def test_an_unsolicited_frame_during_a_poll_of_another_device_is_not_lost(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "plant.yaml"
+    reader = """
+      reader:
+        protocol: frames
+        framing: {header: "<STX>", terminator: "<ETX>"}
+        listen: {scan: {match: 'S(?P<code>[0-9]{1,20})', fields: {code: {type: text}}}}
+        tags: {code: {address: code, event: true}}
+"""
+    silent = [row for row in POLLED_AND_UNSOLICITED.splitlines() if "key" not in row]
+    path.write_text("\n".join(silent) + reader)
+    async with running(load(path), replies=lambda _: b"\x02S7\x03\x02W12\x03") as bench:
+        await asyncio.sleep(2)
+        asked = len(bench.sent)
+        assert asked >= 9
+        assert bench.values("code") == ["7"] * asked
+        assert bench.values("weight") == [12] * (asked - 1)
+
+
 SHARED = """
 lines:
   hall:

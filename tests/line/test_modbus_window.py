@@ -155,3 +155,22 @@ async def test_a_connection_cut_in_a_frame_is_reopened_without_the_half_frame() 
     assert line.turned(dev.tags[0], Quality.GOOD, cut) - cut < 0.5
     assert witness.wrong == []
     assert not dev.record.failures
+
+
+@on_virtual_time
+async def test_a_late_answer_with_a_known_number_is_no_evidence_against_the_present_request() -> (
+    None
+):
+    """The reply to request 42 arrives long after the guard, while every other request is lost."""
+    dev = windowed(1, blocks=2, every=0.5, retries=9)
+    first = 42
+    line, bench, _ = network(
+        dev, latency=lambda n: {first: 1.0}.get(n, None if n > first else 0.02)
+    )
+    async with running(line):
+        while len(bench.numbers) <= first:
+            await asyncio.sleep(0.01)
+        await asyncio.sleep(2.0)
+    assert dev.record.late == 1
+    assert set(dev.record.failures) == {"silence"}
+    assert dev.record.unasked == 0

@@ -11,8 +11,10 @@ from gateway.engine.device import Device
 from gateway.engine.jobs import (
     Answer,
     Confirm,
+    HeldTogether,
     Poll,
     Probe,
+    ReadBack,
     Repeat,
     Result,
     Resynced,
@@ -183,6 +185,18 @@ def test_several_writes_share_one_request() -> None:
     assert plc.perform(WriteTogether(plc.device, writes)) == Sent()
     assert plc.commands == ["WT"]
     assert (plc.words(5), plc.words(500)) == ([42], [43])
+
+
+def test_writes_refused_together_are_read_back_one_by_one() -> None:
+    plc = Plc(holes=[("D", 500)])
+    plc.station.memory.write("D", 5, [42])
+    writes = [plc.write("D5", [42]), plc.write("D500", [43])]
+    result = plc.perform(ReadBack(plc.device, writes, Refused("no", code="06")))
+    assert isinstance(result, HeldTogether)
+    first, second = result.units
+    assert first == [42]
+    assert isinstance(second, Refused)
+    assert plc.commands == ["WR", "WR"]
 
 
 def test_a_repetition_sends_the_same_write() -> None:

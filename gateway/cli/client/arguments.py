@@ -8,7 +8,7 @@ import zenoh
 from gateway.config import Config
 from gateway.errors import ConfigError
 from gateway.tags import Tag
-from gateway.values import Value
+from gateway.values import Value, parse_decimal
 
 
 def tags_by_key(config: Config) -> dict[str, Tag]:
@@ -46,7 +46,7 @@ def matches(key: str, wanted: list[str]) -> bool:
 def parse_value(text: str) -> Value:
     """Parses a JSON scalar (`true`, `12.5`, `"AB"`); any other text is a string."""
     try:
-        value = json.loads(text)
+        value = json.loads(text, parse_float=parse_decimal)
     except ValueError:
         return text
     if isinstance(value, float) and not math.isfinite(value):

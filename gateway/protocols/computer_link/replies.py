@@ -9,6 +9,7 @@ from gateway.protocols.computer_link.codec import PC, PC_ON_DEMAND, Ack, Enquiry
 T = TypeVar("T")
 
 # The Liyan manual prints the error code field but no list; these are Mitsubishi's.
+_UNEXECUTED = ("02", "03", "0A", "10")  # errors of the block itself, before its devices are used
 _MEANINGS = {
     "02": (Refusal.DAMAGED, "sum check error"),
     "03": (Refusal.OTHER, "protocol error: the PLC expects another format, or has no such command"),
@@ -75,7 +76,10 @@ def _raise_refusal(frame: Frame, station: int) -> None:
         case Nak(source, code, pc) if source == station and pc == PC:
             refusal, meaning = _MEANINGS.get(code, (Refusal.OTHER, "an undefined error code"))
             raise Refused(
-                f"station {station} answered NAK {code}, {meaning}", code=code, refusal=refusal
+                f"station {station} answered NAK {code}, {meaning}",
+                code=code,
+                refusal=refusal,
+                unexecuted=code in _UNEXECUTED,
             )
 
 

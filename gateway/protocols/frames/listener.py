@@ -66,6 +66,11 @@ class Listener:
             del self._stale_at[name]
         return [*said, Stale(stale)] if stale else said
 
+    def framed_as(self, driver: object) -> bool:
+        """Returns True for a driver with the same framing."""
+        other = getattr(driver, "settings", None)
+        return isinstance(other, Frames) and other.framing == self._device.framing
+
     def unmatched(self, frame: bytes, now: float) -> list[UnsolicitedEvent]:
         """Decodes a whole frame of a transaction that is not its reply; ignores an unknown one."""
         event = self._decoded(frame, now)
