@@ -14,13 +14,14 @@ from gateway.protocols.frames.driver import LISTENED
 from gateway.tags import Quality, Tag, WriteResult
 from gateway.values import Kind, Value
 from tests.sim.bus import Bus, summed
+from tests.sim.hostile import DELAYING
 from tests.sim.judge import Judge
 from tests.sim.stations import Troubled
 from tests.sim.wire import SimWire
 
 SOON = 1.0  # seconds within which an unacknowledged request arrives, if ever
 NOT_SENT = (Busy, Offline, LineDown)
-_QUIET = ("deaf", "reboot", "vanish", "flicker", "hang", "stall")
+_QUIET = ("deaf", "reboot", "vanish", "flicker", "hang", *DELAYING)
 
 
 @dataclass(eq=False)
@@ -121,10 +122,10 @@ class Client:
         done = isinstance(outcome, WriteResult)
         if bus.hurt_at >= since:
             self.blind("blind writes")
-        elif obeyed and (holds or not done) and self.deaf(tag.device, since, ("stall",)):
+        elif obeyed and (holds or not done) and self.deaf(tag.device, since, DELAYING):
             judge.story.counts["older writes that a stalled link brought"] += 1
         elif tag.shape is not None and (
-            bus.untimely(tag.device) or self.deaf(tag.device, since - 30.0, ("stall",))
+            bus.untimely(tag.device) or self.deaf(tag.device, since - 30.0, DELAYING)
         ):
             judge.story.counts["stale acknowledgements of frames"] += 1
         else:

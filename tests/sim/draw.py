@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.sim.episodes import Episode, disappearances, line_episodes
+from tests.sim.hostile import hostile_episodes
 from tests.sim.more import add_to, net_line, raw_line, rule
 
 PROTOCOLS = ("vigor", "computer-link", "modbus-rtu", "modbus-ascii")
@@ -18,6 +19,7 @@ PACES = {
     "tardy": ("500ms", "1s"),
     "storm": ("500ms", "1s", "2s"),  # ten times as many faults
     "lean": ("20s", "30s", "60s", "60s"),
+    "hostile": ("500ms", "1s", "2s"),  # other parties on the line, and no other fault
 }
 
 
@@ -65,6 +67,7 @@ def draw(seed: int, seconds: float, pace: str = "busy") -> Drawn:
             for device, settings in line["devices"].items():
                 if settings["protocol"] != "frames" and settings["station"] != 0:
                     episodes += disappearances(name, device, settings, more, seconds)
+    episodes += hostile_episodes(lines, seed, seconds, pace)
     jumps = []
     at = chance.expovariate(1 / 1800)
     while at < seconds:

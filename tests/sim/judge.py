@@ -82,6 +82,8 @@ class Judge:
             self._blind("blind reads", tag)
         elif tag.shape is not None and bus.untimely(tag.device):
             self.story.counts["stale reads of frames"] += 1  # their frames name no request
+        elif bus.foreign.took(bus.heard):
+            self.story.counts["foreign answers"] += 1
         else:
             self.broke(
                 f"{tag.key} is told as good {value!r}, which was not in the PLC since "

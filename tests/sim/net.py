@@ -10,8 +10,9 @@ from dataclasses import dataclass, field
 
 from gateway.errors import LineDown
 from gateway.transport import Receiver
+from tests.sim.noise import Noise
 from tests.sim.stations import Troubled
-from tests.sim.wire import Noise, Watch
+from tests.sim.wire import Watch
 
 HOP = 0.0004  # seconds from one end to the other
 

@@ -64,6 +64,8 @@ class Troubled:
     junk: float = 0.0  # share of replies after meaningless bytes
     foreign: float = 0.0  # share of replies replaced by another station's last
     late: Callable[[random.Random], float] | None = None  # seconds more than usual
+    twice: float = 0.0  # share of replies that arrive twice
+    other: random.Random = field(default_factory=random.Random)  # for `twice`
     last: bytes = b""
     others: list["Troubled"] = field(default_factory=list)
     written: dict[tuple[str, int], list[tuple[float, int]]] = field(default_factory=dict)
@@ -119,6 +121,13 @@ class Troubled:
             delay = max(delay, self._busy_until - now)  # as a PLC's do
         self._busy_until = now + delay + len(said) * self.character + 0.002
         return said, delay
+
+    def copies(self) -> list[tuple[float, bool]]:
+        """Returns the copies of its last reply: seconds after it, and if they are on the wire."""
+        if not self.twice or self.other.random() >= self.twice:
+            return []
+        after = self.other.choice((0.0, 0.002, 0.02, 0.06, 0.2, 1.0)) * self.other.uniform(0.5, 1)
+        return [(after, self.other.random() < 0.3)]
 
     @property
     def speaks(self) -> bool:

@@ -31,11 +31,13 @@ from tests.sim.faults import Faults
 from tests.sim.gadgets import Gadget
 from tests.sim.judge import Judge
 from tests.sim.net import SimNet
+from tests.sim.noise import Format
+from tests.sim.parties import Parties
 from tests.sim.requests import ALL, protocol_of, station_in
 from tests.sim.stations import Troubled, set_going, station_of
 from tests.sim.story import Story
 from tests.sim.virtual import run_virtual
-from tests.sim.wire import Format, SimWire
+from tests.sim.wire import SimWire
 
 SECOND = 1_000_000_000
 COARSE = 16  # bits: where each block is read twice, values change every 65.5 s
@@ -67,7 +69,8 @@ class World:
         tags = {tag.key: tag for device in config.devices for tag in device.tags}
         self.faults = Faults(
             *(drawn, self._lines, self.devices, tags),
-            *(self.judge, self.expect, self._jump, self.note),
+            *(self.judge, self.expect, Parties(story.seed, self._lines, self.stations)),
+            *(self._jump, self.note),
         )
 
     def _wall(self) -> int:
@@ -155,6 +158,7 @@ class World:
             missing=missing,
         )
         station.turnaround = chance.choice((0.001, 0.005, 0.02, 0.05))
+        station.other = random.Random(f"other {self.story.seed} {device.name}")
         set_going(station, device.tags)
         self.stations[device.name] = station
         return station
