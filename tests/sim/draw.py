@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from tests.sim.episodes import Episode, disappearances, line_episodes
-from tests.sim.hostile import hostile_episodes
+from tests.sim.hostile import bridges, hostile_episodes, hostile_manners
+from tests.sim.manners import Manners
 from tests.sim.more import add_to, net_line, raw_line, rule
 
 PROTOCOLS = ("vigor", "computer-link", "modbus-rtu", "modbus-ascii")
@@ -33,6 +34,8 @@ class Drawn:
     jumps: tuple[tuple[float, float], ...]  # of the wall clock: when, by how many seconds
     chunks: dict[str, int]  # by line: characters in a piece of a UART
     zeros: dict[str, bool]  # by line: a broken character is read as zero
+    manners: dict[str, Manners]  # by device
+    bridges: dict[str, float]  # by line: the time-out of a bridge to serial units
 
     def write(self, folder: Path) -> Path:
         path = folder / "config.yaml"
@@ -78,9 +81,9 @@ def draw(seed: int, seconds: float, pace: str = "busy") -> Drawn:
         "defaults": {"publish": chance.choice(("always", "always", "change"))},
         "lines": lines,
     }
-    return Drawn(
-        document, missing, tuple(sorted(episodes, key=_order)), tuple(jumps), chunks, zeros
-    )
+    manners, between = hostile_manners(lines, seed, pace), bridges(lines, seed, pace)
+    in_order = tuple(sorted(episodes, key=_order))
+    return Drawn(document, missing, in_order, tuple(jumps), chunks, zeros, manners, between)
 
 
 def _order(episode: Episode) -> tuple[float, str, str, str]:

@@ -5,7 +5,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-SILENT = ("deaf", "mute", "vanish", "hang", "stall", "held-replies", "held-requests", "reset")
+SILENT = (
+    *("deaf", "mute", "vanish", "hang", "hung", "stall", "reset"),
+    *("held-replies", "held-requests"),
+)
 CALM = 1000.0  # seconds without faults at the end
 
 

@@ -7,14 +7,18 @@ import random
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from tests.sim.episodes import Episode, series
+from tests.sim.episodes import CALM, Episode, series
+from tests.sim.manners import Manners, manners_of
 
-STATION_KINDS: tuple[str, ...] = ("twice", "twice", "held-replies", "held-requests")
-LINE_KINDS: tuple[str, ...] = ("reset", "reset", "master", "master", "buffering")
-NET_STATION_KINDS: tuple[str, ...] = ("twice",)
-NET_LINE_KINDS: tuple[str, ...] = ()
-PARTIES = frozenset(STATION_KINDS + LINE_KINDS)
+STATION_KINDS: tuple[str, ...] = (
+    *("twice", "twice", "held-replies", "held-requests", "twin", "refusing"),
+)
+LINE_KINDS: tuple[str, ...] = ("reset", "reset", "master", "master", "buffering", "pour", "hung")
+NET_STATION_KINDS: tuple[str, ...] = ("twice", "refusing", "deaf")
+NET_LINE_KINDS: tuple[str, ...] = ("hung",)
+PARTIES = frozenset((*STATION_KINDS, *LINE_KINDS, "frozen"))
 DELAYING = ("stall", "held-requests", "reset", "master", "buffering")  # requests arrive later
+HUNG = 120.0  # seconds within which a connection without any reply is opened again
 RESETS = 4  # at most, in one episode
 HASTE = {"hostile": 0.1}  # paces with other parties: how short the pauses between them are
 
@@ -35,6 +39,33 @@ def hostile_episodes(
             if settings.get("station") != 0:
                 yield from series(name, device, stations, chance, seconds, 700.0 * haste, LASTS)
 
+    at = chance.expovariate(1 / (3600.0 * haste))
+    while at < seconds - CALM:
+        end = min(at + chance.uniform(1.0, 5.0), seconds - CALM)
+        for name in lines:
+            yield Episode(at, end, name, "", "frozen", 1.0)
+        at = end + chance.expovariate(1 / (3600.0 * haste))
+
+
+def hostile_manners(lines: dict[str, Any], seed: int, pace: str) -> dict[str, Manners]:
+    """Draws the manners of all devices, by name."""
+    if pace not in HASTE:
+        return {}
+    chance = random.Random(f"manners {seed}")
+    return {
+        name: manners_of(device, chance)
+        for line in lines.values()
+        for name, device in line["devices"].items()
+    }
+
+
+def bridges(lines: dict[str, Any], seed: int, pace: str) -> dict[str, float]:
+    """Draws the connections that end at a bridge to serial units: by line, its time-out."""
+    chance = random.Random(f"bridge {seed}")
+    timeouts = {name: chance.choice((0.0, 0.6, 1.0, 3.0)) for name in sorted(lines)}
+    tcp = {name for name, line in lines.items() if line["port"].startswith("tcp:")}
+    return {name: timeouts[name] for name in tcp if pace in HASTE}
+
 
 def resets(episode: Episode) -> list[float]:
     """Returns the times at which the connection is reset in an episode."""
@@ -50,6 +81,9 @@ def _held(chance: random.Random) -> float:
 
 
 LASTS: dict[str, Callable[[random.Random], float]] = {
+    "hung": lambda chance: HUNG,
+    "pour": lambda chance: chance.uniform(0.3, 3.0),
+    "refusing": lambda chance: chance.uniform(0.3, 5.0),
     "held-replies": _held,
     "held-requests": _held,
     "reset": lambda chance: chance.choice((1.0, 3.0, 10.0)) * chance.uniform(0.5, 1),

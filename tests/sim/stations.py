@@ -6,7 +6,7 @@ another address or station, differs from the expected one.
 
 import asyncio
 import random
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 
 from gateway.protocols.driver import AnyDriver, Unit
@@ -16,6 +16,8 @@ from gateway.stations.station import Memory, Station
 from gateway.tags import Tag
 from gateway.values import Value
 from tests.sim.gadgets import Gadget, wrapping_of
+from tests.sim.manners import SILENT, Holes, Manners, is_unknown, outside, refusal
+from tests.sim.requests import shape_of
 
 BLINK = 4096  # ms between two changes of a moving bit
 SLACK = 2  # ms: moments are rounded to milliseconds on both sides
@@ -66,6 +68,10 @@ class Troubled:
     late: Callable[[random.Random], float] | None = None  # seconds more than usual
     twice: float = 0.0  # share of replies that arrive twice
     other: random.Random = field(default_factory=random.Random)  # for `twice`
+    refusing: str = ""  # the code with which it refuses all reads
+    manners: Manners = field(default_factory=Manners)
+    outside: list[tuple[str, int, int]] = field(default_factory=list)  # ranges it does not have
+    protocol: str = ""
     last: bytes = b""
     others: list["Troubled"] = field(default_factory=list)
     written: dict[tuple[str, int], list[tuple[float, int]]] = field(default_factory=dict)
@@ -98,10 +104,10 @@ class Troubled:
         memory.write = write  # type: ignore[method-assign,assignment]  # the only place to observe writes
 
     def hear(self, data: bytes, now: float) -> tuple[bytes, float] | None:
-        if self.deaf:
+        if self.deaf or (self.manners.single and now < self._busy_until):
             return None
         self._now = now
-        said = b"".join(self.inner.hear(data, now))
+        said = self._mannered(data, b"".join(self.inner.hear(data, now)))
         if not said:
             return None
         chance = self.chance
@@ -121,6 +127,15 @@ class Troubled:
             delay = max(delay, self._busy_until - now)  # as a PLC's do
         self._busy_until = now + delay + len(said) * self.character + 0.002
         return said, delay
+
+    def _mannered(self, data: bytes, said: bytes) -> bytes:
+        """Returns the reply as this station sends it, refusals in its own way."""
+        if self.refusing and said and shape_of(self.protocol, data) is not None:
+            return refusal(self.inner, said, self.refusing)
+        unknown = self.manners.unknown
+        if unknown and said and is_unknown(self.inner, said):
+            return b"" if unknown == SILENT else refusal(self.inner, said, unknown)
+        return said
 
     def copies(self) -> list[tuple[float, bool]]:
         """Returns the copies of its last reply: seconds after it, and if they are on the wire."""
@@ -150,13 +165,13 @@ class Troubled:
         for where in _places(tag):
             self.missing.add(where)
             self.absent.setdefault(where, []).append([_now(), float("inf")])
-        set_holes(self.inner, self.missing)
+        set_holes(self.inner, self.missing, self.outside)
 
     def come_back(self, tag: Tag) -> None:
         for where in _places(tag):
             self.missing.discard(where)
             self.absent[where][-1][1] = _now()
-        set_holes(self.inner, self.missing)
+        set_holes(self.inner, self.missing, self.outside)
 
     def lacks(self, tag: Tag) -> bool:
         return not self.missing.isdisjoint(_places(tag))
@@ -235,8 +250,8 @@ def station_of(driver: AnyDriver, device: str) -> Station:
     return station_for(driver, ())
 
 
-def set_going(station: Troubled, tags: tuple[Tag, ...]) -> None:
-    """Makes every tag move, except those that can be written."""
+def set_going(station: Troubled, tags: tuple[Tag, ...], areas: Iterable[str] = ()) -> None:
+    """Makes every tag move, except those that can be written. `areas`: all of the station."""
     memory = station.inner.memory
     for tag in tags:
         area, start, size = tag.span
@@ -250,7 +265,8 @@ def set_going(station: Troubled, tags: tuple[Tag, ...]) -> None:
             motion = moving(station.number, area, start, kind, part, station.coarse)
             memory.animate(area, start + part, motion)
             station.computed.add((area, start + part))
-    set_holes(station.inner, station.missing)
+    station.outside = outside(station.manners.has, tags, areas)
+    set_holes(station.inner, station.missing, station.outside)
 
 
 def _places(tag: Tag) -> list[tuple[str, int]]:
@@ -261,13 +277,15 @@ def _now() -> float:
     return asyncio.get_running_loop().time()
 
 
-def set_holes(station: Station, missing: set[tuple[str, int]]) -> None:
-    """Sets the addresses (area, number) that the station refuses."""
+def set_holes(
+    station: Station, missing: set[tuple[str, int]], ranges: list[tuple[str, int, int]]
+) -> None:
+    """Sets the addresses (area, number) and ranges that the station refuses."""
     if isinstance(station, Gadget):
         return
     if hasattr(station, "_store"):
         holes = tuple((area, number, number) for area, number in sorted(missing))
         # Private: a Modbus station gets its holes at its creation.
-        station._store._holes = holes
+        station._store._holes = (*holes, *ranges)
     else:
-        station.holes = set(missing)  # type: ignore[attr-defined]  # Vigor and Computer Link
+        station.holes = Holes(frozenset(missing), tuple(ranges))  # type: ignore[attr-defined]  # Vigor and Computer Link

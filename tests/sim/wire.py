@@ -7,6 +7,7 @@ clock, and all chance comes from one `random.Random`.
 import asyncio
 import random
 from collections.abc import Callable, Sequence
+from contextvars import copy_context
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Protocol
@@ -84,6 +85,7 @@ class SimWire:
     noise: Noise = field(default_factory=Noise)
     gone: str = ""  # the reason why the port is lost
     hanging: bool = False  # no byte passes, and no error is reported
+    hung: bool = False  # the same, until the port is opened again
     opened: int = 0
     closed: int = 0
     addressed: Callable[[bytes], Sequence[Speaker]] | None = (
@@ -97,12 +99,15 @@ class SimWire:
         self._sendings: list[Sending] = []
         self._ours_until = 0.0
         self.server = DeviceServer(self)
+        self._context = copy_context()  # the world's, also where the gateway sends
 
     # The port
 
     async def open(self, ear: Receiver) -> "SimWire":
         if self.gone:
             raise LineDown(self.gone)
+        if self.hung:
+            self.hung = self.hanging = False
         self._ear = ear
         if not self.server.lasting:
             self._generation += 1
@@ -217,7 +222,8 @@ class SimWire:
         if start <= now():
             self._begin(sending)
         else:
-            asyncio.get_running_loop().call_at(start, self._begin, sending)
+            loop = asyncio.get_running_loop()
+            loop.call_at(start, self._begin, sending, context=self._context)
 
     def _begin(self, sending: Sending) -> None:
         """Finds the collisions at the beginning of the bytes: earlier they are unknown."""
@@ -277,9 +283,9 @@ class SimWire:
 
         loop = asyncio.get_running_loop()
         if due <= loop.time():
-            loop.call_soon(unless_closed)
+            loop.call_soon(unless_closed, context=self._context)
         else:
-            loop.call_at(due, unless_closed)
+            loop.call_at(due, unless_closed, context=self._context)
 
 
 def now() -> float:
