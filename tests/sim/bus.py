@@ -216,14 +216,10 @@ class Bus:
         if self.protocol != "modbus-tcp":
             return self.sent_at
         device = next(d for d in self.line.engine.devices if d.name == tag.device)
-        return max(
-            (
-                at
-                for at, question in self.questions
-                if question.unit == device.driver.station and question.covers(*tag.span)
-            ),
-            default=self.now(),
-        )
+        for at, question in reversed(self.questions):  # the latest
+            if question.unit == device.driver.station and question.covers(*tag.span):
+                return at
+        return self.now()
 
     # Excuses
 

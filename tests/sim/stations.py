@@ -6,8 +6,9 @@ another address or station, differs from the expected one.
 
 import asyncio
 import random
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import takewhile
 
 from gateway.protocols.driver import AnyDriver, Unit
 from gateway.protocols.frames import FrameDriver
@@ -229,10 +230,10 @@ class Troubled:
     def _was_written(self, tag: Tag, value: Value, since: float, until: float) -> bool:
         area, start, size = tag.span
         histories = [self.written.get((area, start + i), [(0.0, 0)]) for i in range(size)]
-        moments = {
-            since,
-            *(at for history in histories for at, _ in history if since < at <= until),
-        }
+        moments = {since}
+        for history in histories:
+            recent = takewhile(lambda write: write[0] > since, reversed(history))
+            moments |= {at for at, _ in recent if at <= until}
         for moment in moments:
             units = [
                 next((unit for at, unit in reversed(history) if at <= moment), 0)
@@ -250,8 +251,13 @@ def station_of(driver: AnyDriver, device: str) -> Station:
     return station_for(driver, ())
 
 
-def set_going(station: Troubled, tags: tuple[Tag, ...], areas: Iterable[str] = ()) -> None:
-    """Makes every tag move, except those that can be written. `areas`: all of the station."""
+def set_going(
+    station: Troubled, tags: Sequence[Tag], areas: Iterable[str] = (), others: Sequence[Tag] = ()
+) -> None:
+    """Makes every tag move, except those that can be written.
+
+    `areas`: all of the station; `others`: tags of broadcasts, which it has too.
+    """
     memory = station.inner.memory
     for tag in tags:
         area, start, size = tag.span
@@ -265,7 +271,7 @@ def set_going(station: Troubled, tags: tuple[Tag, ...], areas: Iterable[str] = (
             motion = moving(station.number, area, start, kind, part, station.coarse)
             memory.animate(area, start + part, motion)
             station.computed.add((area, start + part))
-    station.outside = outside(station.manners.has, tags, areas)
+    station.outside = outside(station.manners.has, [*tags, *others], areas)
     set_holes(station.inner, station.missing, station.outside)
 
 
@@ -288,4 +294,5 @@ def set_holes(
         # Private: a Modbus station gets its holes at its creation.
         station._store._holes = (*holes, *ranges)
     else:
-        station.holes = Holes(frozenset(missing), tuple(ranges))  # type: ignore[attr-defined]  # Vigor and Computer Link
+        lacks = Holes(frozenset(missing), tuple(ranges)) if ranges else set(missing)
+        station.holes = lacks  # type: ignore[attr-defined]  # Vigor and Computer Link

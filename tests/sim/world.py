@@ -50,12 +50,13 @@ COARSE = 16  # bits: where each block is read twice, values change every 65.5 s
 class World:
     """Gateway, stations, faults, clients and judge."""
 
-    def __init__(self, drawn: Drawn, story: Story, seconds: float) -> None:
+    def __init__(self, drawn: Drawn, story: Story, seconds: float, traced: bool) -> None:
         self.drawn, self.story, self.seconds = drawn, story, seconds
         self.stations: dict[str, Troubled] = {}  # by device
         self._lines: dict[str, Bus] = {}
         self._wall_offset = 0.0
         self._trace = hashlib.sha256()
+        self.note = self._note if traced else _nothing
         self._loop = asyncio.get_running_loop()
         self._began = self._loop.time()
         self.freezer = Freezer()
@@ -89,7 +90,7 @@ class World:
     def _jump(self, by: float) -> None:
         self._wall_offset += by
 
-    def note(self, *what: object) -> None:
+    def _note(self, *what: object) -> None:
         self._trace.update(repr((self._loop.time(), *what)).encode())
 
     def publish(self, samples: Sequence[Sample]) -> None:
@@ -176,7 +177,8 @@ class World:
         station.manners = self.drawn.manners.get(device.name, Manners())
         station.turnaround = chance.choice((0.001, 0.005, 0.02, 0.05))
         station.other = random.Random(f"other {self.story.seed} {device.name}")
-        set_going(station, device.tags, device.driver.areas)
+        told = [tag for d in line.devices if d.driver.station == 0 for tag in d.tags]
+        set_going(station, device.tags, device.driver.areas, told)
         self.stations[device.name] = station
         return station
 
@@ -249,20 +251,29 @@ class World:
         self.story.trace = self._trace.hexdigest()
 
 
-def run(seed: int, hours: float, pace: str = "busy", only: Sequence[str] = ()) -> Story:
+def _nothing(*_: object) -> None:
+    """Notes nothing."""
+
+
+def run(
+    seed: int, hours: float, pace: str = "busy", only: Sequence[str] = (), *, traced: bool = True
+) -> Story:
     """Runs one seed, from drawing its plant to the last check.
 
-    `only`: the kinds of faults that happen, to find the one that breaks a rule; empty: all.
+    `only`: the kinds of faults that happen, to find the one that breaks a rule, also `manners`
+    and `bridge`; empty: all. `traced`: the story has the hash of all events.
     """
     story = Story(seed, hours, pace, tuple(only))
     seconds = hours * 3600
     drawn = draw(seed, seconds, pace)
     if only:
         kept = tuple(episode for episode in drawn.episodes if episode.kind in only)
-        drawn = replace(drawn, episodes=kept)
+        manners = drawn.manners if "manners" in only else {}
+        bridges = drawn.bridges if "bridge" in only else {}
+        drawn = replace(drawn, episodes=kept, manners=manners, bridges=bridges)
 
     async def whole() -> None:
-        await World(drawn, story, seconds).live()
+        await World(drawn, story, seconds, traced).live()
 
     before = structlog.get_config()
     structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.CRITICAL))
