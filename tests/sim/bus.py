@@ -243,6 +243,18 @@ class Bus:
             for e in self.episodes
         )
 
+    def stood_still(self, ago: float) -> float:
+        """Returns for how long the loop of the gateway stood still lately, `ago` seconds ago."""
+        passed = self.now() - self.began
+        return max(
+            (
+                e.end - e.start
+                for e in self.episodes
+                if e.kind == "frozen" and e.start <= passed < e.end + ago
+            ),
+            default=0.0,
+        )
+
     def blind(self, since: float) -> bool:
         """A frame was damaged since then and still has a right check sum, or has none."""
         device = self.asked

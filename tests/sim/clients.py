@@ -228,8 +228,8 @@ class Client:
         obeyed = _switched(station) - known
         runs = station.inner.running  # type: ignore[attr-defined]
         match name, outcome:
-            case _, BadValue():
-                true = sent == 0 and argument in ("no\x01", "maybe")
+            case _, BadValue():  # another client may send `global` at the same time
+                true = argument in ("no\x01", "maybe") and (sent == 0 or name == "global")
             case _, Busy() | Offline() | LineDown():
                 true = sent == 0
             case "run" | "stop", str():

@@ -197,7 +197,7 @@ class Expectations:
         judge = self.judge
         for bus in self.lines.values():
             devices = bus.line.engine.devices
-            if not devices:
+            if not devices or bus.stood_still(10.0):
                 continue
             longest, _ = self.times(bus.line)
             one_round = sum(

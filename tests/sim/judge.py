@@ -10,10 +10,12 @@ from gateway.protocols.frames.driver import LISTENED
 from gateway.tags import Quality, Reason, Sample, Tag
 from tests.sim.bus import Bus, summed
 from tests.sim.gadgets import Gadget
+from tests.sim.net import SimNet
 from tests.sim.stations import Troubled
 from tests.sim.story import Story
 from tests.sim.wire import SimWire
 
+SPOKEN = 0.45  # seconds: the longest request and reply of a seed, with an echo and a gap
 MOST_TROUBLES = 20  # recorded in one run
 
 
@@ -49,7 +51,10 @@ class Judge:
         for sample in samples:
             if sample.quality is Quality.GOOD:
                 self._judge(sample)
-            elif sample.reason is Reason.LINE_DOWN and "internal error" in sample.detail:
+            elif (
+                "another station" in sample.detail
+                and isinstance(self.buses[sample.tag.device].wire, SimNet)
+            ) or (sample.reason is Reason.LINE_DOWN and "internal error" in sample.detail):
                 self.broke(f"{sample.tag.key}: {sample.detail}")
         self._plain(samples)
 
@@ -76,6 +81,7 @@ class Judge:
             self._judge_unasked(sample, bus)
             return
         since = bus.asked_at(tag)
+        self._judge_time(tag, bus, self.now - since)
         if self.stations[tag.device].was(tag, value, since, self.now):
             return
         if bus.blind(since):
@@ -90,12 +96,19 @@ class Judge:
                 f"{since - self.began:.3f}: heard {bus.heard!r}"
             )
 
+    def _judge_time(self, tag: Tag, bus: Bus, took: float) -> None:
+        """A reply that came after its time-out counts for nothing, also after a frozen loop."""
+        device = next(d for d in bus.line.engine.devices if d.name == tag.device)
+        if took > device.timing.reply_timeout + SPOKEN:
+            self.broke(f"{tag.key} came after its time-out, {took:.2f} s after its question")
+
     def _judge_unasked(self, sample: Sample, bus: Bus) -> None:
         """The device sent the value just now, or while its own request was open."""
         station = self.stations[sample.tag.device].inner
         assert isinstance(station, Gadget)
         device = next(d for d in bus.line.engine.devices if d.name == sample.tag.device)
         since = self.now - 0.6 - device.timing.reply_timeout - device.settings.late_guard
+        since -= bus.stood_still(0.1)  # its bytes waited
         if any(end >= since and value == sample.value for _, end, value in station.said):
             return
         if bus.hurt["<"] >= since - 0.5:
