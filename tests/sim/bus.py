@@ -163,7 +163,7 @@ class Bus:
     def answered_other(self, station: Speaker, request: bytes, reply: bytes) -> None:
         self.story.counts["foreign replies"] += 1
         unknown = isinstance(self.wire, SimWire) and station in self.wire.twins
-        self.foreign.answered_other(request, reply, unknown=unknown)
+        self.foreign.answered_other(request, reply, self.now(), unknown=unknown)
 
     # Unsolicited frames
 

@@ -124,6 +124,8 @@ class Client:
             self.blind("blind writes")
         elif obeyed and (holds or not done) and self.deaf(tag.device, since, DELAYING):
             judge.story.counts["older writes that a stalled link brought"] += 1
+        elif bus.foreign.unknown_at >= since:
+            judge.story.counts["foreign acknowledgements"] += 1
         elif tag.shape is not None and (
             bus.untimely(tag.device) or self.deaf(tag.device, since - 30.0, DELAYING)
         ):
@@ -198,6 +200,7 @@ class Client:
         since = asked - most - 1.5
         was = judge.stations[tag.device].was(tag, sample.value, since, judge.now)
         excused = self.bus.hurt_at >= since or self.bus.untimely(tag.device)
+        excused = excused or judge.foreign_at.get(tag) == judge.read_at[tag]
         if not was and not excused and self.device not in self.bus.misled:
             judge.broke(f"{tag.key}: {sample.value!r} is not fresh within {most} s")
 

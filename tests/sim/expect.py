@@ -93,7 +93,7 @@ class Expectations:
         """The line has another fault at that time."""
         return any(
             other is not episode
-            and not other.device
+            and (not other.device or other.kind == "twin")
             and other.start < episode.end
             and other.end + 100 > episode.start
             for other in self.lines[episode.line].episodes

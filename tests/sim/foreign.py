@@ -23,6 +23,7 @@ class Foreign:
     shape_of: Callable[[bytes], Shape | None]  # of a request
     reads: deque[bytes] = field(default_factory=lambda: deque(maxlen=12))  # of the gateway
     asked: bytes = b""  # what the gateway sent last
+    unknown_at: float = -1.0  # when an unknown station answered the open question last
     _others: list[tuple[bytes, bytes]] = field(default_factory=list)  # since then, with replies
     _own: deque[tuple[bytes, bytes]] = field(default_factory=lambda: deque(maxlen=64))
 
@@ -37,10 +38,13 @@ class Foreign:
         """A station replies to the gateway, perhaps late."""
         self._own.append((request, reply))
 
-    def answered_other(self, request: bytes, reply: bytes, *, unknown: bool) -> None:
+    def answered_other(self, request: bytes, reply: bytes, now: float, *, unknown: bool) -> None:
         """A reply to another master arrived; `unknown`: of an unknown station to the gateway."""
-        if not unknown or request == self.asked:
-            self._others.append((request, reply))
+        if unknown and request != self.asked:
+            return
+        self._others.append((request, reply))
+        if unknown:
+            self.unknown_at = now
 
     def took(self, heard: bytes) -> bool:
         """The open question, after which this arrived, was ended by an answer that nobody can tell.

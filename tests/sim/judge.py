@@ -29,6 +29,7 @@ class Judge:
     story: Story
     began: float
     read_at: dict[Tag, float] = field(default_factory=dict)  # when it was last good
+    foreign_at: dict[Tag, float] = field(default_factory=dict)  # when a value was foreign
     online: dict[str, bool] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -90,6 +91,7 @@ class Judge:
             self.story.counts["stale reads of frames"] += 1  # their frames name no request
         elif bus.foreign.took(bus.heard):
             self.story.counts["foreign answers"] += 1
+            self.foreign_at[tag] = self.now
         else:
             self.broke(
                 f"{tag.key} is told as good {value!r}, which was not in the PLC since "
@@ -99,7 +101,8 @@ class Judge:
     def _judge_time(self, tag: Tag, bus: Bus, took: float) -> None:
         """A reply that came after its time-out counts for nothing, also after a frozen loop."""
         device = next(d for d in bus.line.engine.devices if d.name == tag.device)
-        if took > device.timing.reply_timeout + SPOKEN:
+        serial = isinstance(bus.wire, SimWire)  # on TCP a reply has the number of its question
+        if serial and took > device.timing.reply_timeout + SPOKEN:
             self.broke(f"{tag.key} came after its time-out, {took:.2f} s after its question")
 
     def _judge_unasked(self, sample: Sample, bus: Bus) -> None:
