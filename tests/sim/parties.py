@@ -96,7 +96,7 @@ class Parties:
             case "twin", _ if episode.device in self._twins:
                 wire.twins.remove(self._twins[episode.device])
             case (("held-replies" | "held-requests"), Troubled()):
-                wire.server.release(station)
+                wire.server.release(station, 0.3 * episode.strength**2)
 
     def _chance(self, episode: Episode) -> random.Random:
         return random.Random(f"party {self.seed} {episode}")
@@ -137,7 +137,7 @@ class OtherMaster(Master):
     strength: float
 
     async def ask_now_and_then(self) -> None:
-        server, pause = self.wire.server, 0.3 / self.strength
+        server, pause = self.wire.server, 0.1 / self.strength
         server.buffering = True
         try:
             while True:

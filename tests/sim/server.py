@@ -32,7 +32,7 @@ class DeviceServer:
         # By station that is held up: its replies, or the requests to it and who asked.
         self._replies: dict[Speaker, list[Sending]] = {}
         self._requests: dict[Speaker, list[tuple[bytes, bytes]]] = {}
-        self._releasing_until = 0.0
+        self._rest = REST
 
     # Requests
 
@@ -141,8 +141,9 @@ class DeviceServer:
         held.append((data, request))
         return True
 
-    def release(self, station: "Speaker") -> None:
-        """Passes on what was held, in order."""
+    def release(self, station: "Speaker", rest: float) -> None:
+        """Passes on what was held, in order, with `rest` seconds between two frames."""
+        self._rest = rest
         if station in self._replies:
             self._pass_held(station)
         if station in self._requests:
@@ -156,7 +157,7 @@ class DeviceServer:
         data = held.pop(0).data
         at = _now() + len(data) * self._wire.wire.character
         self._wire.at(at, partial(self.pass_on, data))
-        self._wire.at(at + REST, partial(self._pass_held, station))
+        self._wire.at(at + self._rest, partial(self._pass_held, station))
 
     def _ask_held(self, station: "Speaker") -> None:
         """The station gets the requests one by one, and replies to each."""
@@ -174,7 +175,7 @@ class DeviceServer:
         if said is not None and said[0]:
             ends = now + said[1] + len(said[0]) * character
             self._wire.at(ends, partial(self.pass_on, said[0]))
-        self._wire.at(ends + REST, partial(self._ask_held, station))
+        self._wire.at(ends + self._rest, partial(self._ask_held, station))
 
 
 def _now() -> float:

@@ -70,6 +70,7 @@ class World:
             self._lines[line.engine.name].line = line
             self._lines[line.engine.name].config = settings
         self.devices = {d.name: d for line in gateway.lines for d in line.engine.devices}
+        self._settings = {d.name: d for line in config.lines for d in line.devices}
         self._buses = {d.name: self._lines[s.name] for s in config.lines for d in s.devices}
         self.judge = Judge(gateway, self._buses, self.stations, story, self._began)
         most = 400 + 8 * len(self.judge.known) + 4 * len(drawn.episodes)
@@ -184,7 +185,7 @@ class World:
 
     def _twin(self, name: str) -> Troubled:
         """Makes a second PLC with the number of this device, and other values."""
-        device, first = self.devices[name].settings, self.stations[name]
+        device, first = self._settings[name], self.stations[name]
         chance = random.Random(f"twin {self.story.seed} {name}")
         inner = station_of(device.driver, device.name)
         twin = Troubled(first.number + 1000, inner, chance, first.character)
