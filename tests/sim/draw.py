@@ -20,7 +20,7 @@ PACES = {
     "tardy": ("500ms", "1s"),
     "storm": ("500ms", "1s", "2s"),  # ten times as many faults
     "lean": ("20s", "30s", "60s", "60s"),
-    "hostile": ("500ms", "1s", "2s"),  # other parties on the line, and no other fault
+    "hostile": ("200ms", "200ms", "500ms", "1s"),  # other parties on the line, and no other fault
 }
 
 

@@ -1,5 +1,6 @@
 """Replies that are not for the gateway, and the theory of which nobody can tell."""
 
+import asyncio
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -23,6 +24,7 @@ class Foreign:
     shape_of: Callable[[bytes], Shape | None]  # of a request
     reads: deque[bytes] = field(default_factory=lambda: deque(maxlen=12))  # of the gateway
     asked: bytes = b""  # what the gateway sent last
+    asks: asyncio.Event = field(default_factory=asyncio.Event)  # the gateway has just asked
     unknown_at: float = -1.0  # when an unknown station answered the open question last
     _others: list[tuple[bytes, bytes]] = field(default_factory=list)  # since then, with replies
     _own: deque[tuple[bytes, bytes]] = field(default_factory=lambda: deque(maxlen=64))
@@ -30,6 +32,7 @@ class Foreign:
     def sent(self, request: bytes, *, resync: bool) -> None:
         """The gateway asks. Other masters do not repeat its resyncs."""
         self.asked = request
+        self.asks.set()
         self._others.clear()
         if not resync and request not in self.reads and self.shape_of(request):
             self.reads.append(request)

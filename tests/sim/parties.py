@@ -13,6 +13,7 @@ from tests.sim.stations import Troubled
 from tests.sim.wire import Master, SimWire
 
 POURED, PIECE = 20, 0.02  # times the baud rate; seconds between two pieces
+BESIDE = 0.7  # share of its questions that another master asks just after the gateway
 MOST_WAITING = 8  # requests in the server; another master waits meanwhile
 
 
@@ -48,7 +49,7 @@ class Parties:
             case "reset", _:
                 wire.server.stalled = wire.server.lasting = True
             case "buffering", _:
-                wire.server.buffering = True
+                wire.server.buffer()
             case "master", _:
                 master = OtherMaster(
                     self.lines[episode.line], wire, self._chance(episode), episode.strength
@@ -90,7 +91,7 @@ class Parties:
             case "reset", _:
                 wire.server.flow()
             case "buffering", _:
-                wire.server.buffering = False
+                wire.server.end_buffering()
             case (("master" | "pour"), _):
                 self._tasks.pop(episode).cancel()
             case "twin", _ if episode.device in self._twins:
@@ -138,12 +139,16 @@ class OtherMaster(Master):
 
     async def ask_now_and_then(self) -> None:
         server, pause = self.wire.server, 0.1 / self.strength
-        server.buffering = True
+        server.buffer()
         try:
             while True:
                 await asyncio.sleep(self.chance.expovariate(1 / pause))
-                reads = self.bus.foreign.reads
+                foreign = self.bus.foreign
+                if self.chance.random() < BESIDE:
+                    foreign.asks.clear()
+                    await foreign.asks.wait()
+                reads = foreign.reads
                 if reads and server.backlog < MOST_WAITING and not self.wire.hanging:
                     server.send(self.chance.choice(reads), self.bus.now(), self)
         finally:
-            server.buffering = False
+            server.end_buffering()

@@ -24,6 +24,7 @@ class DeviceServer:
         self._wire = wire
         self.stalled = False
         self.buffering = False
+        self._draining = False  # it buffers until it has kept nothing
         self.lasting = False
         self._kept: deque[tuple[bytes, Master | None]] = deque()  # the first is being sent
         self._turn = 0
@@ -62,8 +63,17 @@ class DeviceServer:
         else:
             self.lasting = False
 
+    def buffer(self) -> None:
+        self.buffering, self._draining = True, False
+
+    def end_buffering(self) -> None:
+        """Passes on what is kept, one request at a time, and then each at once."""
+        self._draining = True
+        self.buffering = bool(self._kept)
+
     def clear(self) -> None:
         self._kept.clear()
+        self.buffering = self.buffering and not self._draining
         self._unread.clear()
         for replies in self._replies.values():
             replies.clear()
@@ -93,6 +103,7 @@ class DeviceServer:
             self._say_kept()
         elif not self._kept and not self.stalled:
             self.lasting = False
+            self.buffering = self.buffering and not self._draining
 
     # Replies while no connection is open
 
