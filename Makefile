@@ -55,7 +55,9 @@ EXAMPLES ?= 20000
 MINUTES ?= 30
 
 sim: .venv/ready
-	$(BIN)/python -m tests.sim.campaign --seeds $(SEEDS) --hours $(HOURS) --pace $(PACE)
+	$(BIN)/python -m tests.sim.campaign --seeds $(SEEDS) --hours $(HOURS) --pace $(PACE) \
+	    $(if $(ONLY),--only $(ONLY)) $(if $(PART),--part $(PART)) \
+	    $(if $(RESULT),--result $(RESULT)) $(if $(WORKERS),--workers $(WORKERS))
 
 fuzz: .venv/ready
 	EXAMPLES=$(EXAMPLES) $(BIN)/python -m pytest -q tests/fuzz

@@ -12,7 +12,9 @@ from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.frames import FrameDriver
 from gateway.tags import Tag
 from tests.sim.episodes import Episode
+from tests.sim.foreign import Foreign
 from tests.sim.gadgets import Gadget
+from tests.sim.hostile import PARTIES
 from tests.sim.net import SimNet
 from tests.sim.oracle import CHECKS
 from tests.sim.requests import (
@@ -24,6 +26,7 @@ from tests.sim.requests import (
     is_registration,
     is_write,
     protocol_of,
+    shape_of,
     station_in,
 )
 from tests.sim.stations import Troubled
@@ -40,6 +43,7 @@ UNTIMELY = (
     "hang",
     "stall",
     "flicker",
+    *PARTIES,
 )
 SPOKE_LATELY = 1.0 + 0.7  # seconds: the reply to an unsolicited frame comes within one
 AFTER_ALL = 0.09  # seconds that stations need after a broadcast
@@ -71,12 +75,16 @@ class Bus:
     misled: set[Device] = field(default_factory=set)  # that accepted a damaged monitor list
     questions: deque[tuple[float, Asked]] = field(default_factory=lambda: deque(maxlen=64))
     open: dict[tuple[int, int], float] = field(default_factory=dict)  # Modbus TCP: since when
+    foreign: Foreign = field(init=False)
     speaking: tuple[float, float] = (
         0.0,
         0.0,
     )  # the last unsolicited frame that the gateway could hear
     _to_all_until: float = -1.0
     _registering: Device | None = None
+
+    def __post_init__(self) -> None:
+        self.foreign = Foreign(lambda data: shape_of(protocol_of(self.protocol, data), data))
 
     # Traffic
 
@@ -99,6 +107,8 @@ class Bus:
             self.broke(f"{self.config.name}: spoke to station {number}, which is not served")
             return
         self.asked = named[0]
+        health = self.asked.health
+        self.foreign.sent(data, resync=health.needs_resync or not health.online)
         self.writes[number] += is_write(protocol, data)
         self.commands[number] += is_command(protocol, data)
         if is_registration(protocol, data):
@@ -146,6 +156,14 @@ class Bus:
                 self.open.pop((data[6], int.from_bytes(data[:2], "big")), None)
         else:
             self.request += data
+
+    def answered(self, request: bytes, reply: bytes) -> None:
+        self.foreign.answered(request, reply)
+
+    def answered_other(self, station: Speaker, request: bytes, reply: bytes) -> None:
+        self.story.counts["foreign replies"] += 1
+        unknown = isinstance(self.wire, SimWire) and station in self.wire.twins
+        self.foreign.answered_other(request, reply, self.now(), unknown=unknown)
 
     # Unsolicited frames
 
@@ -198,14 +216,10 @@ class Bus:
         if self.protocol != "modbus-tcp":
             return self.sent_at
         device = next(d for d in self.line.engine.devices if d.name == tag.device)
-        return max(
-            (
-                at
-                for at, question in self.questions
-                if question.unit == device.driver.station and question.covers(*tag.span)
-            ),
-            default=self.now(),
-        )
+        for at, question in reversed(self.questions):  # the latest
+            if question.unit == device.driver.station and question.covers(*tag.span):
+                return at
+        return self.now()
 
     # Excuses
 
@@ -223,8 +237,22 @@ class Bus:
         """The device replies, or replied recently, later than the line waits."""
         passed = self.now() - self.began
         return any(
-            e.device == device and e.kind == "very-late" and e.start <= passed < e.end + 10.0
+            e.device in ("", device)
+            and e.kind in ("very-late", *PARTIES)
+            and e.start <= passed < e.end + 10.0
             for e in self.episodes
+        )
+
+    def stood_still(self, ago: float) -> float:
+        """Returns for how long the loop of the gateway stood still lately, `ago` seconds ago."""
+        passed = self.now() - self.began
+        return max(
+            (
+                e.end - e.start
+                for e in self.episodes
+                if e.kind == "frozen" and e.start <= passed < e.end + ago
+            ),
+            default=0.0,
         )
 
     def blind(self, since: float) -> bool:

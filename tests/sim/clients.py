@@ -14,13 +14,14 @@ from gateway.protocols.frames.driver import LISTENED
 from gateway.tags import Quality, Tag, WriteResult
 from gateway.values import Kind, Value
 from tests.sim.bus import Bus, summed
+from tests.sim.hostile import DELAYING
 from tests.sim.judge import Judge
 from tests.sim.stations import Troubled
 from tests.sim.wire import SimWire
 
 SOON = 1.0  # seconds within which an unacknowledged request arrives, if ever
 NOT_SENT = (Busy, Offline, LineDown)
-_QUIET = ("deaf", "reboot", "vanish", "flicker", "hang", "stall")
+_QUIET = ("deaf", "reboot", "vanish", "flicker", "hang", "hung", *DELAYING)
 
 
 @dataclass(eq=False)
@@ -121,10 +122,12 @@ class Client:
         done = isinstance(outcome, WriteResult)
         if bus.hurt_at >= since:
             self.blind("blind writes")
-        elif obeyed and (holds or not done) and self.deaf(tag.device, since, ("stall",)):
+        elif obeyed and (holds or not done) and self.deaf(tag.device, since, DELAYING):
             judge.story.counts["older writes that a stalled link brought"] += 1
+        elif bus.foreign.unknown_at >= since:
+            judge.story.counts["foreign acknowledgements"] += 1
         elif tag.shape is not None and (
-            bus.untimely(tag.device) or self.deaf(tag.device, since - 30.0, ("stall",))
+            bus.untimely(tag.device) or self.deaf(tag.device, since - 30.0, DELAYING)
         ):
             judge.story.counts["stale acknowledgements of frames"] += 1
         else:
@@ -197,6 +200,7 @@ class Client:
         since = asked - most - 1.5
         was = judge.stations[tag.device].was(tag, sample.value, since, judge.now)
         excused = self.bus.hurt_at >= since or self.bus.untimely(tag.device)
+        excused = excused or judge.foreign_at.get(tag) == judge.read_at[tag]
         if not was and not excused and self.device not in self.bus.misled:
             judge.broke(f"{tag.key}: {sample.value!r} is not fresh within {most} s")
 
@@ -227,8 +231,8 @@ class Client:
         obeyed = _switched(station) - known
         runs = station.inner.running  # type: ignore[attr-defined]
         match name, outcome:
-            case _, BadValue():
-                true = sent == 0 and argument in ("no\x01", "maybe")
+            case _, BadValue():  # another client may send `global` at the same time
+                true = argument in ("no\x01", "maybe") and (sent == 0 or name == "global")
             case _, Busy() | Offline() | LineDown():
                 true = sent == 0
             case "run" | "stop", str():

@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from tests.sim.episodes import Episode, disappearances, line_episodes
+from tests.sim.hostile import bridges, hostile_episodes, hostile_manners
+from tests.sim.manners import Manners
 from tests.sim.more import add_to, net_line, raw_line, rule
 
 PROTOCOLS = ("vigor", "computer-link", "modbus-rtu", "modbus-ascii")
@@ -18,6 +20,7 @@ PACES = {
     "tardy": ("500ms", "1s"),
     "storm": ("500ms", "1s", "2s"),  # ten times as many faults
     "lean": ("20s", "30s", "60s", "60s"),
+    "hostile": ("200ms", "200ms", "500ms", "1s"),  # other parties on the line, and no other fault
 }
 
 
@@ -31,6 +34,8 @@ class Drawn:
     jumps: tuple[tuple[float, float], ...]  # of the wall clock: when, by how many seconds
     chunks: dict[str, int]  # by line: characters in a piece of a UART
     zeros: dict[str, bool]  # by line: a broken character is read as zero
+    manners: dict[str, Manners]  # by device
+    bridges: dict[str, float]  # by line: the time-out of a bridge to serial units
 
     def write(self, folder: Path) -> Path:
         path = folder / "config.yaml"
@@ -65,6 +70,7 @@ def draw(seed: int, seconds: float, pace: str = "busy") -> Drawn:
             for device, settings in line["devices"].items():
                 if settings["protocol"] != "frames" and settings["station"] != 0:
                     episodes += disappearances(name, device, settings, more, seconds)
+    episodes += hostile_episodes(lines, seed, seconds, pace)
     jumps = []
     at = chance.expovariate(1 / 1800)
     while at < seconds:
@@ -75,9 +81,9 @@ def draw(seed: int, seconds: float, pace: str = "busy") -> Drawn:
         "defaults": {"publish": chance.choice(("always", "always", "change"))},
         "lines": lines,
     }
-    return Drawn(
-        document, missing, tuple(sorted(episodes, key=_order)), tuple(jumps), chunks, zeros
-    )
+    manners, between = hostile_manners(lines, seed, pace), bridges(lines, seed, pace)
+    in_order = tuple(sorted(episodes, key=_order))
+    return Drawn(document, missing, in_order, tuple(jumps), chunks, zeros, manners, between)
 
 
 def _order(episode: Episode) -> tuple[float, str, str, str]:

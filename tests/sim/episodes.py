@@ -1,10 +1,14 @@
 """Draws the faults of a line, each with its time."""
 
 import random
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+SILENT = (
+    *("deaf", "mute", "vanish", "hang", "hung", "stall", "reset"),
+    *("held-replies", "held-requests"),
+)
 CALM = 1000.0  # seconds without faults at the end
 
 
@@ -23,7 +27,7 @@ class Episode:
     @property
     def silent(self) -> bool:
         """The device does not reply meanwhile."""
-        return self.kind in ("deaf", "mute", "vanish", "hang", "stall")
+        return self.kind in SILENT
 
 
 _STATION_KINDS = (
@@ -58,6 +62,7 @@ _ONLY: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "noisy": ((), ("noise-after",)),
     "late": (("late",), ()),
     "tardy": (("very-late",), ()),
+    "hostile": ((), ()),
 }
 
 
@@ -78,9 +83,9 @@ def line_episodes(
         may = _ONLY[pace]
         stations = tuple(kind for kind in may[0] if kind in stations)
         wires = tuple(kind for kind in may[1] if kind in wires)
-    found = _series(name, "", wires, chance, seconds, 1500.0 * haste)
+    found = series(name, "", wires, chance, seconds, 1500.0 * haste, _LASTS)
     for device in line["devices"]:
-        found += _series(name, device, stations, chance, seconds, 700.0 * haste)
+        found += series(name, device, stations, chance, seconds, 700.0 * haste, _LASTS)
     return found
 
 
@@ -107,20 +112,21 @@ def disappearances(
     return found
 
 
-def _series(
+def series(
     line: str,
     device: str,
     kinds: tuple[str, ...],
     chance: random.Random,
     seconds: float,
     pause: float,
+    lasts: Mapping[str, Callable[[random.Random], float]],
 ) -> list[Episode]:
     """Draws episodes that do not overlap."""
     found = []
     at = chance.expovariate(1 / pause)
     while kinds and at < seconds - CALM:
         kind = chance.choice(kinds)
-        last = _LASTS.get(kind, _usual)
+        last = lasts.get(kind, _usual)
         end = min(at + last(chance), seconds - CALM)
         found.append(Episode(at, end, line, device, kind, _STRENGTHS.get(kind, _half)(chance)))
         at = end + chance.expovariate(1 / pause)

@@ -93,7 +93,7 @@ class Expectations:
         """The line has another fault at that time."""
         return any(
             other is not episode
-            and not other.device
+            and (not other.device or other.kind == "twin")
             and other.start < episode.end
             and other.end + 100 > episode.start
             for other in self.lines[episode.line].episodes
@@ -201,7 +201,7 @@ class Expectations:
         judge = self.judge
         for bus in self.lines.values():
             devices = bus.line.engine.devices
-            if not devices:
+            if not devices or bus.stood_still(10.0):
                 continue
             longest, _ = self.times(bus.line)
             one_round = sum(

@@ -12,9 +12,12 @@ from tests.sim.bus import Bus
 from tests.sim.draw import Drawn
 from tests.sim.episodes import Episode
 from tests.sim.expect import Expectations
+from tests.sim.hostile import PARTIES, resets
 from tests.sim.judge import Judge
+from tests.sim.noise import Noise
+from tests.sim.parties import Parties
 from tests.sim.stations import Troubled
-from tests.sim.wire import Noise, SimWire
+from tests.sim.wire import SimWire
 
 DEFAULT_TIMES = 0.5  # seconds, for a device without a poll
 
@@ -29,6 +32,7 @@ class Faults:
     tags: Mapping[str, Tag]  # by key
     judge: Judge
     expect: Expectations
+    parties: Parties
     jump: Callable[[float], None]  # of the wall clock
     note: Callable[..., None]
 
@@ -37,6 +41,8 @@ class Faults:
         for episode in self.drawn.episodes:
             moments.append((episode.start, len(moments), "begin", episode))
             moments.append((episode.end, len(moments), "end", episode))
+            for reset in resets(episode):
+                moments.append((reset, len(moments), "reset", episode))
         moments += [(at, -1, "jump", by) for at, by in self.drawn.jumps]
         for at, _, what, which in sorted(moments, key=lambda m: m[:3]):
             await asyncio.sleep(max(0.0, self.judge.began + at - self.judge.now))
@@ -48,9 +54,15 @@ class Faults:
                     self._begin(which)
                 case "end":
                     self._end(which)
+                case "reset":
+                    self.parties.reset(which)
 
     def _begin(self, episode: Episode) -> None:
         self.judge.story.counts[f"episode {episode.kind}"] += 1
+        if episode.kind in PARTIES:
+            self.parties.begin(episode)
+            self.expect.bad(episode)
+            return
         wire = self.lines[episode.line].wire
         match episode.kind:
             case "noise":
@@ -62,7 +74,7 @@ class Faults:
             case "hang":
                 wire.hanging = True
             case "stall" if isinstance(wire, SimWire):
-                wire.stalled = True
+                wire.server.stalled = True
             case "gone":
                 tag = self.tags[f"{episode.device}/{episode.tag}"]
                 self.judge.stations[episode.device].vanish(tag)
@@ -97,6 +109,10 @@ class Faults:
                 station.late = lambda c: c.uniform(0.0, 3.0) if c.random() < strength else 0.0
 
     def _end(self, episode: Episode) -> None:
+        if episode.kind in PARTIES:
+            self.parties.end(episode)
+            self.expect.good(episode)
+            return
         wire = self.lines[episode.line].wire
         match episode.kind:
             case "noise" | "noise-after":
@@ -106,7 +122,7 @@ class Faults:
             case "hang":
                 wire.hanging = False
             case "stall" if isinstance(wire, SimWire):
-                wire.flow()
+                wire.server.flow()
             case "gone":
                 tag = self.tags[f"{episode.device}/{episode.tag}"]
                 self.judge.stations[episode.device].come_back(tag)

@@ -10,10 +10,12 @@ from gateway.protocols.frames.driver import LISTENED
 from gateway.tags import Quality, Reason, Sample, Tag
 from tests.sim.bus import Bus, summed
 from tests.sim.gadgets import Gadget
+from tests.sim.net import SimNet
 from tests.sim.stations import Troubled
 from tests.sim.story import Story
 from tests.sim.wire import SimWire
 
+SPOKEN = 0.45  # seconds: the longest request and reply of a seed, with an echo and a gap
 MOST_TROUBLES = 20  # recorded in one run
 
 
@@ -27,6 +29,7 @@ class Judge:
     story: Story
     began: float
     read_at: dict[Tag, float] = field(default_factory=dict)  # when it was last good
+    foreign_at: dict[Tag, float] = field(default_factory=dict)  # when a value was foreign
     online: dict[str, bool] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -49,7 +52,10 @@ class Judge:
         for sample in samples:
             if sample.quality is Quality.GOOD:
                 self._judge(sample)
-            elif sample.reason is Reason.LINE_DOWN and "internal error" in sample.detail:
+            elif (
+                "another station" in sample.detail
+                and isinstance(self.buses[sample.tag.device].wire, SimNet)
+            ) or (sample.reason is Reason.LINE_DOWN and "internal error" in sample.detail):
                 self.broke(f"{sample.tag.key}: {sample.detail}")
         self._plain(samples)
 
@@ -76,17 +82,28 @@ class Judge:
             self._judge_unasked(sample, bus)
             return
         since = bus.asked_at(tag)
+        self._judge_time(tag, bus, self.now - since)
         if self.stations[tag.device].was(tag, value, since, self.now):
             return
         if bus.blind(since):
             self._blind("blind reads", tag)
         elif tag.shape is not None and bus.untimely(tag.device):
             self.story.counts["stale reads of frames"] += 1  # their frames name no request
+        elif bus.foreign.took(bus.heard):
+            self.story.counts["foreign answers"] += 1
+            self.foreign_at[tag] = self.now
         else:
             self.broke(
                 f"{tag.key} is told as good {value!r}, which was not in the PLC since "
                 f"{since - self.began:.3f}: heard {bus.heard!r}"
             )
+
+    def _judge_time(self, tag: Tag, bus: Bus, took: float) -> None:
+        """A reply that came after its time-out counts for nothing, also after a frozen loop."""
+        device = next(d for d in bus.line.engine.devices if d.name == tag.device)
+        serial = isinstance(bus.wire, SimWire)  # on TCP a reply has the number of its question
+        if serial and took > device.timing.reply_timeout + SPOKEN:
+            self.broke(f"{tag.key} came after its time-out, {took:.2f} s after its question")
 
     def _judge_unasked(self, sample: Sample, bus: Bus) -> None:
         """The device sent the value just now, or while its own request was open."""
@@ -94,10 +111,13 @@ class Judge:
         assert isinstance(station, Gadget)
         device = next(d for d in bus.line.engine.devices if d.name == sample.tag.device)
         since = self.now - 0.6 - device.timing.reply_timeout - device.settings.late_guard
+        since -= bus.stood_still(0.1)  # its bytes waited
         if any(end >= since and value == sample.value for _, end, value in station.said):
             return
         if bus.hurt["<"] >= since - 0.5:
             self._blind("blind reads", sample.tag)
+        elif bus.untimely(sample.tag.device):
+            self.story.counts["stale unsolicited frames"] += 1  # a held frame tells no time
         else:
             self.broke(f"{sample.tag.key} is told as good {sample.value!r}, which was not said")
 

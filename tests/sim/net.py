@@ -5,13 +5,16 @@ Both directions work at once and keep the order. Bytes on their way in a stall a
 
 import asyncio
 import random
+from collections import deque
 from collections.abc import Callable, Mapping
+from contextvars import copy_context
 from dataclasses import dataclass, field
 
 from gateway.errors import LineDown
 from gateway.transport import Receiver
+from tests.sim.noise import Noise
 from tests.sim.stations import Troubled
-from tests.sim.wire import Noise, Watch
+from tests.sim.wire import Watch
 
 HOP = 0.0004  # seconds from one end to the other
 
@@ -26,6 +29,8 @@ class SimNet:
     split: bool = False  # answers arrive in two pieces
     noise: Noise = field(default_factory=Noise)  # none by default
     gone: str = ""
+    hung: bool = False  # no byte passes until the connection is opened again
+    bridge: float = 0.0  # seconds that a bridge to serial units waits for a reply; 0: no bridge
     opened: int = 0
     closed: int = 0
 
@@ -34,10 +39,14 @@ class SimNet:
         self._generation = 0
         self._hanging = False
         self._stuck: list[Callable[[], None]] = []
+        self._context = copy_context()  # the world's, also where the gateway sends
+        self._waiting: deque[tuple[bytes, int]] = deque()  # requests in the bridge
 
     # The port
 
     async def open(self, ear: Receiver) -> "SimNet":
+        if self.hung:
+            self.hung, self._hanging = False, False
         if self.gone or self._hanging:
             raise LineDown(self.gone or "no answer within 5 s")
         self._ear = ear
@@ -90,15 +99,43 @@ class SimNet:
 
     def _arrive(self, data: bytes) -> None:
         self.watch.passed(">", data)
-        unit = self.units.get(data[6])
+        if not self.bridge:
+            self._ask(data, self.units.get(data[6]))
+            return
+        self._waiting.append((data, self._generation))
+        if len(self._waiting) == 1:
+            self._ask_next()
+
+    def _ask(self, data: bytes, unit: Troubled | None) -> float | None:
+        """Passes the request on. Returns the seconds until the reply ended, or None."""
         said = None if unit is None else unit.hear(data, _now())
         if unit is None or said is None:
-            return
+            return None
         reply, delay = said
         if unit.broke_off:
             self._pass(delay, lambda: self._break_off(reply))
         else:
             self._pass(delay + HOP, lambda: self._deliver(reply))
+        for after, _ in unit.copies():
+            self._pass(delay + HOP + after, lambda: self._deliver(reply))
+        return delay
+
+    # A bridge asks one serial unit at a time, and waits for each reply with its own time-out
+
+    def _ask_next(self) -> None:
+        data, generation = self._waiting[0]
+        took = self._ask(data, self.units.get(data[6])) if generation == self._generation else 0.0
+        wait = self.bridge if took is None else took
+        asyncio.get_running_loop().call_later(
+            wait, self._bridged, data, took is None, context=self._context
+        )
+
+    def _bridged(self, data: bytes, silent: bool) -> None:
+        _, generation = self._waiting.popleft()
+        if silent and generation == self._generation:
+            self._pass(HOP, lambda: self._deliver(no_reply(data)))
+        if self._waiting:
+            self._ask_next()
 
     def _break_off(self, reply: bytes) -> None:
         self._deliver(reply)
@@ -122,7 +159,12 @@ class SimNet:
             else:
                 then()
 
-        asyncio.get_running_loop().call_later(after, unless_closed)
+        asyncio.get_running_loop().call_later(after, unless_closed, context=self._context)
+
+
+def no_reply(request: bytes) -> bytes:
+    """Returns exception 0B: the unit behind the bridge did not reply."""
+    return request[:4] + b"\x00\x03" + bytes((request[6], request[7] | 0x80, 0x0B))
 
 
 def _now() -> float:

@@ -60,6 +60,31 @@ def is_write(protocol: str, data: bytes) -> bool:
     return data[3:5] in (b"05", b"06", b"0F", b"10")
 
 
+def shape_of(protocol: str, data: bytes) -> tuple[object, ...] | None:
+    """Returns what a reply to a read tells: the station, the function or text, the length.
+
+    None for a request whose reply is not that of a plain read.
+    """
+    match protocol:
+        case "modbus-rtu" if 1 <= data[1] <= 4:
+            return data[0], data[1], _bytes(data[1], int.from_bytes(data[4:6], "big"))
+        case "modbus-ascii" if b"01" <= data[3:5] <= b"04":
+            function = int(data[3:5])
+            return int(data[1:3], 16), function, _bytes(function, int(data[9:13], 16))
+        case "vigor" if data[3:5] == b"51":
+            return data[1:3], int(data[9:11], 16)
+        case "computer-link" if data[5:7] in (b"BR", b"WR"):
+            digits = 8 if b"CN200" <= data[8:13] <= b"CN255" else 4
+            return data[1:3], int(data[13:15], 16) * (1 if data[5:7] == b"BR" else digits)
+        case "frames" if data.lstrip(b"\x01")[1:2] == b"Q":
+            return (data,)
+    return None
+
+
+def _bytes(function: int, count: int) -> int:
+    return (count + 7) // 8 if function in (1, 2) else 2 * count
+
+
 def is_command(protocol: str, data: bytes) -> bool:
     return protocol == "computer-link" and data[5:7] in (b"RR", b"RS", b"GW")
 

@@ -30,8 +30,8 @@ from gateway.protocols.driver import Address, AnyDriver, Span
 from gateway.protocols.modbus import ModbusAscii, ModbusRtu
 from gateway.protocols.vigor import Vigor
 from gateway.simulator.plant import station_for
+from tests.sim.noise import Format, Noise, spoil
 from tests.sim.plant import made_device, make_tag
-from tests.sim.wire import Format, Noise, spoil
 
 RATES = (1e-5, 1e-4, 1e-3)
 WORDS = [0x1234, 0xFFFF, 0x0000, 0xA5A5, 0x0BAD, 100, 42, 0x8001]

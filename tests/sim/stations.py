@@ -6,8 +6,9 @@ another address or station, differs from the expected one.
 
 import asyncio
 import random
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import takewhile
 
 from gateway.protocols.driver import AnyDriver, Unit
 from gateway.protocols.frames import FrameDriver
@@ -16,6 +17,8 @@ from gateway.stations.station import Memory, Station
 from gateway.tags import Tag
 from gateway.values import Value
 from tests.sim.gadgets import Gadget, wrapping_of
+from tests.sim.manners import SILENT, Holes, Manners, is_unknown, outside, refusal
+from tests.sim.requests import shape_of
 
 BLINK = 4096  # ms between two changes of a moving bit
 SLACK = 2  # ms: moments are rounded to milliseconds on both sides
@@ -64,6 +67,12 @@ class Troubled:
     junk: float = 0.0  # share of replies after meaningless bytes
     foreign: float = 0.0  # share of replies replaced by another station's last
     late: Callable[[random.Random], float] | None = None  # seconds more than usual
+    twice: float = 0.0  # share of replies that arrive twice
+    other: random.Random = field(default_factory=random.Random)  # for `twice`
+    refusing: str = ""  # the code with which it refuses all reads
+    manners: Manners = field(default_factory=Manners)
+    outside: list[tuple[str, int, int]] = field(default_factory=list)  # ranges it does not have
+    protocol: str = ""
     last: bytes = b""
     others: list["Troubled"] = field(default_factory=list)
     written: dict[tuple[str, int], list[tuple[float, int]]] = field(default_factory=dict)
@@ -96,10 +105,10 @@ class Troubled:
         memory.write = write  # type: ignore[method-assign,assignment]  # the only place to observe writes
 
     def hear(self, data: bytes, now: float) -> tuple[bytes, float] | None:
-        if self.deaf:
+        if self.deaf or (self.manners.single and now < self._busy_until):
             return None
         self._now = now
-        said = b"".join(self.inner.hear(data, now))
+        said = self._mannered(data, b"".join(self.inner.hear(data, now)))
         if not said:
             return None
         chance = self.chance
@@ -119,6 +128,22 @@ class Troubled:
             delay = max(delay, self._busy_until - now)  # as a PLC's do
         self._busy_until = now + delay + len(said) * self.character + 0.002
         return said, delay
+
+    def _mannered(self, data: bytes, said: bytes) -> bytes:
+        """Returns the reply as this station sends it, refusals in its own way."""
+        if self.refusing and said and shape_of(self.protocol, data) is not None:
+            return refusal(self.inner, said, self.refusing)
+        unknown = self.manners.unknown
+        if unknown and said and is_unknown(self.inner, said):
+            return b"" if unknown == SILENT else refusal(self.inner, said, unknown)
+        return said
+
+    def copies(self) -> list[tuple[float, bool]]:
+        """Returns the copies of its last reply: seconds after it, and if they are on the wire."""
+        if not self.twice or self.other.random() >= self.twice:
+            return []
+        after = self.other.choice((0.0, 0.002, 0.02, 0.06, 0.2, 1.0)) * self.other.uniform(0.5, 1)
+        return [(after, self.other.random() < 0.3)]
 
     @property
     def speaks(self) -> bool:
@@ -141,13 +166,13 @@ class Troubled:
         for where in _places(tag):
             self.missing.add(where)
             self.absent.setdefault(where, []).append([_now(), float("inf")])
-        set_holes(self.inner, self.missing)
+        set_holes(self.inner, self.missing, self.outside)
 
     def come_back(self, tag: Tag) -> None:
         for where in _places(tag):
             self.missing.discard(where)
             self.absent[where][-1][1] = _now()
-        set_holes(self.inner, self.missing)
+        set_holes(self.inner, self.missing, self.outside)
 
     def lacks(self, tag: Tag) -> bool:
         return not self.missing.isdisjoint(_places(tag))
@@ -205,10 +230,10 @@ class Troubled:
     def _was_written(self, tag: Tag, value: Value, since: float, until: float) -> bool:
         area, start, size = tag.span
         histories = [self.written.get((area, start + i), [(0.0, 0)]) for i in range(size)]
-        moments = {
-            since,
-            *(at for history in histories for at, _ in history if since < at <= until),
-        }
+        moments = {since}
+        for history in histories:
+            recent = takewhile(lambda write: write[0] > since, reversed(history))
+            moments |= {at for at, _ in recent if at <= until}
         for moment in moments:
             units = [
                 next((unit for at, unit in reversed(history) if at <= moment), 0)
@@ -226,8 +251,13 @@ def station_of(driver: AnyDriver, device: str) -> Station:
     return station_for(driver, ())
 
 
-def set_going(station: Troubled, tags: tuple[Tag, ...]) -> None:
-    """Makes every tag move, except those that can be written."""
+def set_going(
+    station: Troubled, tags: Sequence[Tag], areas: Iterable[str] = (), others: Sequence[Tag] = ()
+) -> None:
+    """Makes every tag move, except those that can be written.
+
+    `areas`: all of the station; `others`: tags of broadcasts, which it has too.
+    """
     memory = station.inner.memory
     for tag in tags:
         area, start, size = tag.span
@@ -241,7 +271,8 @@ def set_going(station: Troubled, tags: tuple[Tag, ...]) -> None:
             motion = moving(station.number, area, start, kind, part, station.coarse)
             memory.animate(area, start + part, motion)
             station.computed.add((area, start + part))
-    set_holes(station.inner, station.missing)
+    station.outside = outside(station.manners.has, [*tags, *others], areas)
+    set_holes(station.inner, station.missing, station.outside)
 
 
 def _places(tag: Tag) -> list[tuple[str, int]]:
@@ -252,13 +283,16 @@ def _now() -> float:
     return asyncio.get_running_loop().time()
 
 
-def set_holes(station: Station, missing: set[tuple[str, int]]) -> None:
-    """Sets the addresses (area, number) that the station refuses."""
+def set_holes(
+    station: Station, missing: set[tuple[str, int]], ranges: list[tuple[str, int, int]]
+) -> None:
+    """Sets the addresses (area, number) and ranges that the station refuses."""
     if isinstance(station, Gadget):
         return
     if hasattr(station, "_store"):
         holes = tuple((area, number, number) for area, number in sorted(missing))
         # Private: a Modbus station gets its holes at its creation.
-        station._store._holes = holes
+        station._store._holes = (*holes, *ranges)
     else:
-        station.holes = set(missing)  # type: ignore[attr-defined]  # Vigor and Computer Link
+        lacks = Holes(frozenset(missing), tuple(ranges)) if ranges else set(missing)
+        station.holes = lacks  # type: ignore[attr-defined]  # Vigor and Computer Link

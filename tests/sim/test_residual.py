@@ -5,9 +5,9 @@ import pytest
 from gateway.protocols.driver import Span
 from gateway.protocols.modbus import ModbusRtu
 from gateway.protocols.vigor import Vigor
+from tests.sim.noise import Format
 from tests.sim.residual import Case
 from tests.sim.twice import BARE, CASES, counted, in_a_row, theory
-from tests.sim.wire import Format
 
 SUM = CASES[0]  # Vigor without parity
 STRONG = (

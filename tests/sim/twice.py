@@ -33,8 +33,8 @@ from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.driver import Span
 from gateway.protocols.modbus import ModbusAscii
 from gateway.protocols.vigor import Vigor
+from tests.sim.noise import Format, flips, strike
 from tests.sim.residual import Bench, Case, exchange, noisy
-from tests.sim.wire import Format, flips, strike
 
 PLAIN = Format(8)
 BARE = Case(

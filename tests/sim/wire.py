@@ -5,10 +5,9 @@ clock, and all chance comes from one `random.Random`.
 """
 
 import asyncio
-import math
 import random
-from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
+from contextvars import copy_context
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Protocol
@@ -16,14 +15,26 @@ from typing import Protocol
 from gateway.errors import LineDown
 from gateway.planning.wire_timing import WireTiming
 from gateway.transport import Receiver
-
-SERVER_WAITS = 0.25  # seconds between two kept requests
+from tests.sim.noise import Format, Noise, spoil
+from tests.sim.server import DeviceServer
 
 
 class Speaker(Protocol):
     """A station with its faults: its replies, each with its delay after the request."""
 
     def hear(self, data: bytes, now: float) -> tuple[bytes, float] | None: ...
+
+    def copies(self) -> list[tuple[float, bool]]:
+        """Returns the copies of its last reply: seconds after it, and if they are on the wire."""
+
+
+class Master:
+    """Another master. It only asks; the replies reach every master."""
+
+    def hear(self, data: bytes, now: float) -> None: ...
+
+    def copies(self) -> list[tuple[float, bool]]:
+        return []
 
 
 class Watch(Protocol):
@@ -41,35 +52,22 @@ class Watch(Protocol):
     def passed(self, way: str, data: bytes) -> None:
         """Bytes arrived."""
 
+    def answered(self, request: bytes, reply: bytes) -> None:
+        """A station replies to the gateway."""
 
-@dataclass
-class Noise:
-    """Bit errors. `before`: before the receiver checks the parity; `after`: after it."""
-
-    before: float = 0.0
-    after: float = 0.0
-
-
-@dataclass
-class Format:
-    """A character format such as `7E1`, and the receiver's reaction to a broken character."""
-
-    data_bits: int = 8
-    parity: bool = False
-    stop_bits: int = 1
-    broken_as_zero: bool = False  # otherwise it is dropped
-
-    @property
-    def bits(self) -> int:
-        return 1 + self.data_bits + self.parity + self.stop_bits
+    def answered_other(self, station: Speaker, request: bytes, reply: bytes) -> None:
+        """A reply arrived that another master asked for, or that an unknown station sent."""
 
 
 @dataclass(eq=False)
-class _Sending:
+class Sending:
+    """Bytes on the wire. `station`: None for the gateway."""
+
     start: float
     end: float
     data: bytes
-    station: Speaker | None  # None: the gateway
+    station: Speaker | None
+    request: bytes = b""  # of another master, or answered by an unknown station
     spoilt: bool = False
 
 
@@ -87,74 +85,61 @@ class SimWire:
     noise: Noise = field(default_factory=Noise)
     gone: str = ""  # the reason why the port is lost
     hanging: bool = False  # no byte passes, and no error is reported
-    stalled: bool = False  # the device server keeps the bytes and passes them on later, in order
+    hung: bool = False  # the same, until the port is opened again
     opened: int = 0
     closed: int = 0
     addressed: Callable[[bytes], Sequence[Speaker]] | None = (
         None  # the stations that a whole request is for
     )
+    twins: list[Speaker] = field(default_factory=list)  # stations with the number of another
 
     def __post_init__(self) -> None:
         self._ear: Receiver | None = None
         self._generation = 0
-        self._sendings: list[_Sending] = []
+        self._sendings: list[Sending] = []
         self._ours_until = 0.0
-        self._kept: deque[bytes] = deque()  # the first is being sent
-        self._behind = -math.inf
+        self.server = DeviceServer(self)
+        self._context = copy_context()  # the world's, also where the gateway sends
 
     # The port
 
     async def open(self, ear: Receiver) -> "SimWire":
         if self.gone:
             raise LineDown(self.gone)
+        if self.hung:
+            self.hung = self.hanging = False
         self._ear = ear
-        self._generation += 1
+        if not self.server.lasting:
+            self._generation += 1
         self.opened += 1
+        self.server.opened()
         return self
 
     def write(self, data: bytes) -> None:
         if self._ear is None:
             raise LineDown(self.gone or "closed")
-        start = max(_now(), self._ours_until)
+        start = max(now(), self._ours_until)
         self._ours_until = start + len(data) * self.wire.character
         self.watch.sent(data, start, self._ours_until)
-        if self.hanging:
-            return
-        if self.stalled or self._kept:
-            self._kept.append(data)
-        else:
-            self._say_ours(data, start)
+        if not self.hanging:
+            self.server.send(data, start)
 
     @property
     def behind(self) -> float:
         """The last time at which the device server had kept bytes."""
-        return _now() if self.stalled or self._kept else self._behind
+        return self.server.behind
 
-    def flow(self) -> None:
-        """Ends the stall."""
-        self.stalled = False
-        if self._kept:
-            self._say_kept()
-
-    def _say_kept(self) -> None:
-        """Sends the kept requests one by one, and waits a while for each reply."""
-        ends = self._say_ours(self._kept[0], _now())
-        self._at(ends + SERVER_WAITS, self._next_kept)
-
-    def _next_kept(self) -> None:
-        self._kept.popleft()
-        self._behind = _now()
-        if self._kept and not self.stalled:
-            self._say_kept()
-
-    def _say_ours(self, data: bytes, start: float) -> float:
-        sending = _Sending(start, start + len(data) * self.wire.character, data, None)
+    def say_request(self, data: bytes, start: float, master: Master | None) -> float:
+        """Sends the request of the gateway, or of another master. Returns its end."""
+        request = data if master is not None else b""
+        end = start + len(data) * self.wire.character
+        sending = Sending(start, end, data, master, request)
         for other in self._collide(sending):
-            if other.station is not None:
+            if other.station is not None and master is None:
                 self.watch.overlapped(other.station)
-        self._at(sending.end, lambda: self._reach_stations(sending))
+        self.at(sending.end, lambda: self._reach_stations(sending))
         if self.echo:
-            self._at(sending.end, lambda: self._deliver(sending, sending.data))
+            self.at(sending.end, lambda: self._deliver(sending, sending.data))
         return sending.end
 
     async def close(self) -> None:
@@ -164,6 +149,10 @@ class SimWire:
 
     def vanish(self, why: str) -> None:
         self.gone = why
+        self.reset(why)
+
+    def reset(self, why: str) -> None:
+        """Ends the connection; the next one can be opened at once."""
         ear, self._ear = self._ear, None
         self._end()
         if ear is not None:
@@ -173,14 +162,15 @@ class SimWire:
         self.gone = ""
 
     def _end(self) -> None:
-        self._generation += 1
-        self._kept.clear()
+        if not self.server.lasting:
+            self._generation += 1
+            self.server.clear()
 
     # The wire
 
-    def _collide(self, sending: _Sending) -> list[_Sending]:
-        now = _now()
-        self._sendings = [other for other in self._sendings if other.end > now]
+    def _collide(self, sending: Sending) -> list[Sending]:
+        current = now()
+        self._sendings = [other for other in self._sendings if other.end > current]
         least = 0.1 * self.wire.character
         hit = [
             other
@@ -192,50 +182,88 @@ class SimWire:
         self._sendings.append(sending)
         return hit
 
-    def _reach_stations(self, request: _Sending) -> None:
+    def _reach_stations(self, request: Sending) -> None:
         data = self._through(request, request.data, ">")
         if not data or self.hanging:
             return
-        self.watch.passed(">", data)
+        if not request.request:
+            self.watch.passed(">", data)
         # Without damage the other stations ignore the request; this saves their time.
         well = self.addressed is not None and data is request.data
         for station in self.addressed(data) if well and self.addressed else self.stations:
-            said = station.hear(data, request.end)
-            if said is not None and said[0]:
-                self._say(said[0], request.end + said[1], station)
+            if not self.server.keeps_from(station, data, request.request):
+                self.ask(station, data, request.end, request.request)
+        for station in self.twins:
+            self.ask(station, data, request.end, data)
+
+    def ask(self, station: Speaker, data: bytes, end: float, request: bytes) -> None:
+        """The request, which ended at `end`, reaches the station."""
+        said = station.hear(data, end)
+        if said is None or not said[0]:
+            return
+        if not request:
+            self.watch.answered(data, said[0])
+        self._say(said[0], end + said[1], station, request)
+        for after, on_wire in station.copies():
+            start = end + said[1] + len(said[0]) * self.wire.character + after
+            if on_wire:
+                self._say(said[0], start, station)
+            else:
+                self.at(start, partial(self.server.pass_on, said[0]))
 
     def speak(self, data: bytes, station: Speaker) -> None:
         """The station sends this now, with or without a request."""
         if not self.hanging:
-            self._say(data, _now(), station)
+            self._say(data, now(), station)
 
-    def _say(self, data: bytes, start: float, station: Speaker) -> None:
-        sending = _Sending(start, start + len(data) * self.wire.character, data, station)
-        if start <= _now():
+    def _say(self, data: bytes, start: float, station: Speaker, request: bytes = b"") -> None:
+        end = start + len(data) * self.wire.character
+        sending = Sending(start, end, data, station, request)
+        if start <= now():
             self._begin(sending)
         else:
-            asyncio.get_running_loop().call_at(start, self._begin, sending)
+            loop = asyncio.get_running_loop()
+            loop.call_at(start, self._begin, sending, context=self._context)
 
-    def _begin(self, sending: _Sending) -> None:
+    def _begin(self, sending: Sending) -> None:
         """Finds the collisions at the beginning of the bytes: earlier they are unknown."""
         for other in self._collide(sending):
             if other.station is None:
                 self.watch.overlapped(sending.station)
+        self.server.replies(sending.end)
+        if self.server.holds(sending):
+            return
         chunk = self.chunk or len(sending.data)
         for first in range(0, len(sending.data), chunk):
             piece = sending.data[first : first + chunk]
             due = sending.start + (first + len(piece)) * self.wire.character
-            self._at(due, partial(self._deliver, sending, piece))
+            self.at(due, partial(self._deliver, sending, piece))
 
-    def _deliver(self, sending: _Sending, piece: bytes) -> None:
+    def _deliver(self, sending: Sending, piece: bytes) -> None:
         if self._ear is None or self.hanging:
+            self.server.unheard_piece(piece)
             return
         data = self._through(sending, piece, "<")
         if data:
             self.watch.passed("<", data)
+            if sending.request and sending.station is not None and sending.data.endswith(data):
+                self.watch.answered_other(sending.station, sending.request, sending.data)
             self._ear.received(data)
 
-    def _through(self, sending: _Sending, data: bytes, way: str) -> bytes:
+    @property
+    def free_at(self) -> float:
+        """The time from which no station sends."""
+        return max((s.end for s in self._sendings if s.station is not None), default=0.0)
+
+    def deliver(self, data: bytes) -> None:
+        """Passes bytes to the gateway that were not on the wire just now."""
+        if self._ear is None or self.hanging:
+            self.server.unheard_piece(data)
+            return
+        self.watch.passed("<", data)
+        self._ear.received(data)
+
+    def _through(self, sending: Sending, data: bytes, way: str) -> bytes:
         """Returns the bytes that arrive."""
         heard = data
         if sending.spoilt:
@@ -246,7 +274,7 @@ class SimWire:
             self.watch.damaged(way)
         return heard
 
-    def _at(self, due: float, then: Callable[[], None]) -> None:
+    def at(self, due: float, then: Callable[[], None]) -> None:
         generation = self._generation
 
         def unless_closed() -> None:
@@ -255,57 +283,10 @@ class SimWire:
 
         loop = asyncio.get_running_loop()
         if due <= loop.time():
-            loop.call_soon(unless_closed)
+            loop.call_soon(unless_closed, context=self._context)
         else:
-            loop.call_at(due, unless_closed)
+            loop.call_at(due, unless_closed, context=self._context)
 
 
-def spoil(data: bytes, noise: Noise, shape: Format, chance: random.Random) -> bytes:
-    """Adds bit errors of both kinds, also in start, parity and stop bits."""
-    if noise.before:
-        data = strike(data, flips(len(data) * shape.bits, noise.before, chance), shape)
-    out: list[int] = list(data)
-    if noise.after:
-        for bit in flips(len(out) * shape.data_bits, noise.after, chance):
-            out[bit // shape.data_bits] ^= 1 << bit % shape.data_bits
-    return bytes(out)
-
-
-def strike(data: bytes, bits: Iterable[int], shape: Format) -> bytes:
-    """Returns the bytes received when these bits flip, counted from the first start bit."""
-    masks: dict[int, int] = {}
-    for bit in bits:
-        masks[bit // shape.bits] = masks.get(bit // shape.bits, 0) | 1 << bit % shape.bits
-    out: list[int] = list(data)
-    for place, mask in sorted(masks.items(), reverse=True):
-        _break(out, place, mask, shape)
-    return bytes(out)
-
-
-def _break(out: list[int], place: int, mask: int, shape: Format) -> None:
-    """Returns one character with flipped bits: bit 0 is the start bit, then data, parity, stop."""
-    framed = mask & 1 or mask >> (1 + shape.data_bits + shape.parity)
-    data = mask >> 1 & ((1 << shape.data_bits) - 1)
-    parity = mask >> (1 + shape.data_bits) & 1 if shape.parity else 0
-    odd = shape.parity and (data.bit_count() + parity) % 2
-    if not framed and not odd:
-        out[place] ^= data
-    elif shape.broken_as_zero:
-        out[place] = 0
-    else:
-        del out[place]
-
-
-def flips(bits: int, rate: float, chance: random.Random) -> list[int]:
-    """Returns the numbers of the bits that flip."""
-    found = []
-    scale = math.log1p(-rate)
-    place = int(math.log(1.0 - chance.random()) / scale)
-    while place < bits:
-        found.append(place)
-        place += 1 + int(math.log(1.0 - chance.random()) / scale)
-    return found
-
-
-def _now() -> float:
+def now() -> float:
     return asyncio.get_running_loop().time()

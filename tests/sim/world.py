@@ -10,7 +10,8 @@ import hashlib
 import logging
 import random
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Coroutine, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -28,14 +29,19 @@ from tests.sim.clients import Client
 from tests.sim.draw import Drawn, draw
 from tests.sim.expect import Expectations
 from tests.sim.faults import Faults
+from tests.sim.freezer import Ear, Freezer
 from tests.sim.gadgets import Gadget
 from tests.sim.judge import Judge
+from tests.sim.manners import Manners
 from tests.sim.net import SimNet
+from tests.sim.noise import Format
+from tests.sim.parties import Parties
 from tests.sim.requests import ALL, protocol_of, station_in
+from tests.sim.speaker import speak_now_and_then
 from tests.sim.stations import Troubled, set_going, station_of
 from tests.sim.story import Story
 from tests.sim.virtual import run_virtual
-from tests.sim.wire import Format, SimWire
+from tests.sim.wire import SimWire
 
 SECOND = 1_000_000_000
 COARSE = 16  # bits: where each block is read twice, values change every 65.5 s
@@ -44,14 +50,18 @@ COARSE = 16  # bits: where each block is read twice, values change every 65.5 s
 class World:
     """Gateway, stations, faults, clients and judge."""
 
-    def __init__(self, drawn: Drawn, story: Story, seconds: float) -> None:
+    def __init__(self, drawn: Drawn, story: Story, seconds: float, traced: bool) -> None:
         self.drawn, self.story, self.seconds = drawn, story, seconds
         self.stations: dict[str, Troubled] = {}  # by device
         self._lines: dict[str, Bus] = {}
         self._wall_offset = 0.0
         self._trace = hashlib.sha256()
+        self.note = self._note if traced else _nothing
         self._loop = asyncio.get_running_loop()
         self._began = self._loop.time()
+        self.freezer = Freezer()
+        if any(episode.kind == "frozen" for episode in drawn.episodes):
+            self.freezer.install()
         with tempfile.TemporaryDirectory() as folder:
             config = load(drawn.write(Path(folder)))
         self.gateway = gateway = Gateway(config, self._wall, self._opener)
@@ -60,6 +70,7 @@ class World:
             self._lines[line.engine.name].line = line
             self._lines[line.engine.name].config = settings
         self.devices = {d.name: d for line in gateway.lines for d in line.engine.devices}
+        self._settings = {d.name: d for line in config.lines for d in line.devices}
         self._buses = {d.name: self._lines[s.name] for s in config.lines for d in s.devices}
         self.judge = Judge(gateway, self._buses, self.stations, story, self._began)
         most = 400 + 8 * len(self.judge.known) + 4 * len(drawn.episodes)
@@ -67,8 +78,12 @@ class World:
         tags = {tag.key: tag for device in config.devices for tag in device.tags}
         self.faults = Faults(
             *(drawn, self._lines, self.devices, tags),
-            *(self.judge, self.expect, self._jump, self.note),
+            *(self.judge, self.expect, self._parties()),
+            *(self._jump, self.note),
         )
+
+    def _parties(self) -> Parties:
+        return Parties(self.story.seed, self._lines, self.stations, self._twin, self.freezer)
 
     def _wall(self) -> int:
         return 1_700_000_000 * SECOND + int((self._loop.time() + self._wall_offset) * SECOND)
@@ -76,7 +91,7 @@ class World:
     def _jump(self, by: float) -> None:
         self._wall_offset += by
 
-    def note(self, *what: object) -> None:
+    def _note(self, *what: object) -> None:
         self._trace.update(repr((self._loop.time(), *what)).encode())
 
     def publish(self, samples: Sequence[Sample]) -> None:
@@ -116,11 +131,16 @@ class World:
         by_number = {station.number: station for station in stations.values()}
         if isinstance(config.port, TcpAddress):
             bus.wire = SimNet(by_number, chance, bus, bool(self.drawn.chunks[config.name]))
+            bus.wire.bridge = self.drawn.bridges.get(config.name, 0.0)
             for station in stations.values():
                 station.numbered, station.ordered = True, chance.random() < 0.5
         else:
             bus.wire = self._wire(config, bus, by_number, chance)
-        return bus.wire.open
+
+        async def open_port(ear: Receiver) -> SimWire | SimNet:
+            return await bus.wire.open(Ear(self.freezer, ear))
+
+        return open_port
 
     def _wire(
         self,
@@ -154,10 +174,26 @@ class World:
             coarse=COARSE if device.verify_reads > 1 else 0,
             missing=missing,
         )
+        station.protocol = device.driver.protocol
+        station.manners = self.drawn.manners.get(device.name, Manners())
         station.turnaround = chance.choice((0.001, 0.005, 0.02, 0.05))
-        set_going(station, device.tags)
+        station.other = random.Random(f"other {self.story.seed} {device.name}")
+        told = [tag for d in line.devices if d.driver.station == 0 for tag in d.tags]
+        set_going(station, device.tags, device.driver.areas, told)
         self.stations[device.name] = station
         return station
+
+    def _twin(self, name: str) -> Troubled:
+        """Makes a second PLC with the number of this device, and other values."""
+        device, first = self._settings[name], self.stations[name]
+        chance = random.Random(f"twin {self.story.seed} {name}")
+        inner = station_of(device.driver, device.name)
+        twin = Troubled(first.number + 1000, inner, chance, first.character)
+        twin.turnaround = first.turnaround + chance.choice((0.0, 0.002, 0.02, 0.1, 0.3))
+        twin.missing = set(first.missing)
+        twin.manners = first.manners
+        set_going(twin, device.tags, device.driver.areas)
+        return twin
 
     # The run
 
@@ -171,54 +207,28 @@ class World:
                 chance = random.Random(f"{who} {self.story.seed} {device.name}")
                 person = Client(device, self.judge, bus, chance, haste)
                 if who == "writer":
-                    tasks.append(asyncio.create_task(person.write_now_and_then()))
+                    tasks.append(self._start(person.write_now_and_then()))
                 elif who == "reader":
-                    tasks.append(asyncio.create_task(person.ask_now_and_then()))
+                    tasks.append(self._start(person.ask_now_and_then()))
                 elif device.settings.control and device.driver.protocol == "computer-link":
-                    tasks.append(asyncio.create_task(person.command_now_and_then()))
+                    tasks.append(self._start(person.command_now_and_then()))
             if isinstance(device.driver, FrameDriver) and device.driver.sends_unsolicited:
-                tasks.append(asyncio.create_task(self._speak(device.name, bus)))
+                chance = random.Random(f"speaker {self.story.seed} {device.name}")
+                station = self.stations[device.name]
+                weight = next(tag for tag in device.tags if tag.span.area == LISTENED)
+                every = self.expect.every(bus, device, weight)
+                speaking = speak_now_and_then(device.name, station, every, bus, self.judge, chance)
+                tasks.append(asyncio.create_task(speaking))
         return tasks
 
-    async def _speak(self, name: str, bus: Bus) -> None:
-        """Runs a device that sends its weight by itself."""
-        station, wire = self.stations[name], bus.wire
-        gadget = station.inner
-        assert isinstance(gadget, Gadget)
-        assert isinstance(wire, SimWire)
-        chance = random.Random(f"speaker {self.story.seed} {name}")
-        device = self.devices[name]
-        weight = next(tag for tag in device.tags if tag.span.area == LISTENED)
-        every = self.expect.every(bus, device, weight)
-        character = wire.wire.character
-        while True:
-            await asyncio.sleep(every * chance.uniform(0.8, 1.2))
-            if station.deaf or station.mute or station.speaks or chance.random() < station.lose:
-                continue
-            what = chance.choice((2,) * 30 + (0, 1))
-            data = gadget.speak(self._loop.time(), character, what)
-            if chance.random() < station.cut:
-                data = data[: chance.randrange(1, len(data))]
-            elif chance.random() < station.junk:
-                data = chance.randbytes(chance.randrange(1, 6)) + data
-            elif what == 2:
-                self.judge.said(name, gadget)
-            wire.speak(data, station)
-            first = wire.chunk * character
-            whole = not (wire.hanging or station.junk)
-            if gadget.wrapping.header and 0 < wire.chunk < len(data) and whole:
-                self._loop.call_later(
-                    first + 1e-6, self._begun, bus, self._loop.time() + len(data) * character
-                )
-
-    def _begun(self, bus: Bus, until: float) -> None:
-        """Notes the first byte of an unsolicited frame, if the line was idle then."""
-        if bus.line.engine.is_open and bus.line.engine.is_idle:
-            bus.speaking = self._loop.time(), until
+    def _start(self, client: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+        """Starts a client: it stands still together with the gateway."""
+        return asyncio.create_task(client, context=self.freezer.inside())
 
     async def live(self) -> None:
         lines = [
-            asyncio.create_task(line.run(), name=line.engine.name) for line in self.gateway.lines
+            asyncio.create_task(line.run(), name=line.engine.name, context=self.freezer.inside())
+            for line in self.gateway.lines
         ]
         others = [*self._tasks(), asyncio.create_task(self.expect.look_around())]
         suffering = asyncio.create_task(self.faults.suffer())
@@ -242,13 +252,29 @@ class World:
         self.story.trace = self._trace.hexdigest()
 
 
-def run(seed: int, hours: float, pace: str = "busy") -> Story:
-    """Runs one seed, from drawing its plant to the last check."""
-    story = Story(seed, hours, pace)
+def _nothing(*_: object) -> None:
+    """Notes nothing."""
+
+
+def run(
+    seed: int, hours: float, pace: str = "busy", only: Sequence[str] = (), *, traced: bool = True
+) -> Story:
+    """Runs one seed, from drawing its plant to the last check.
+
+    `only`: the kinds of faults that happen, to find the one that breaks a rule, also `manners`
+    and `bridge`; empty: all. `traced`: the story has the hash of all events.
+    """
+    story = Story(seed, hours, pace, tuple(only))
     seconds = hours * 3600
+    drawn = draw(seed, seconds, pace)
+    if only:
+        kept = tuple(episode for episode in drawn.episodes if episode.kind in only)
+        manners = drawn.manners if "manners" in only else {}
+        bridges = drawn.bridges if "bridge" in only else {}
+        drawn = replace(drawn, episodes=kept, manners=manners, bridges=bridges)
 
     async def whole() -> None:
-        await World(draw(seed, seconds, pace), story, seconds).live()
+        await World(drawn, story, seconds, traced).live()
 
     before = structlog.get_config()
     structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.CRITICAL))

@@ -1,0 +1,65 @@
+"""Replies that are not for the gateway, and the theory of which nobody can tell."""
+
+import asyncio
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+Shape = tuple[object, ...]
+
+
+@dataclass(eq=False)
+class Foreign:
+    """Replies to another master, or of an unknown station with the number of another.
+
+    A reply tells its station, its function and its length, and nothing else: together its shape.
+    So the answer that a station gives to another master's question of the same shape is the
+    answer, if it arrives after the question of the gateway and before its own answer. No check of
+    any master can tell the two apart. The same is true for the answer of a second station with
+    this number to this very question. All else can be told, and breaks a rule: an answer of
+    another shape, one that arrived before the question, and the answer to an older question of
+    the gateway, also if another master's answer had ended that one.
+    """
+
+    shape_of: Callable[[bytes], Shape | None]  # of a request
+    reads: deque[bytes] = field(default_factory=lambda: deque(maxlen=12))  # of the gateway
+    asked: bytes = b""  # what the gateway sent last
+    asks: asyncio.Event = field(default_factory=asyncio.Event)  # the gateway has just asked
+    unknown_at: float = -1.0  # when an unknown station answered the open question last
+    _others: list[tuple[bytes, bytes]] = field(default_factory=list)  # since then, with replies
+    _own: deque[tuple[bytes, bytes]] = field(default_factory=lambda: deque(maxlen=64))
+
+    def sent(self, request: bytes, *, resync: bool) -> None:
+        """The gateway asks. Other masters do not repeat its resyncs."""
+        self.asked = request
+        self.asks.set()
+        self._others.clear()
+        if not resync and request not in self.reads and self.shape_of(request):
+            self.reads.append(request)
+
+    def answered(self, request: bytes, reply: bytes) -> None:
+        """A station replies to the gateway, perhaps late."""
+        self._own.append((request, reply))
+
+    def answered_other(self, request: bytes, reply: bytes, now: float, *, unknown: bool) -> None:
+        """A reply to another master arrived; `unknown`: of an unknown station to the gateway."""
+        if unknown and request != self.asked:
+            return
+        self._others.append((request, reply))
+        if unknown:
+            self.unknown_at = now
+
+    def took(self, heard: bytes) -> bool:
+        """The open question, after which this arrived, was ended by an answer that nobody can tell.
+
+        `heard` begins with the first byte after the question.
+        """
+        shape = self.shape_of(self.asked)
+        for request, reply in self._others if shape is not None else ():
+            place = heard.find(reply)
+            if place >= 0 and self.shape_of(request) == shape:
+                before = heard[:place]
+                return not any(
+                    said in before and self.shape_of(asked) == shape for asked, said in self._own
+                )
+        return False
