@@ -325,8 +325,9 @@ def bare(tags: int, devices: int, seconds: float, *, like_ours: bool) -> Rate:
                 lambda _: None, indirect=False
             )
             for device in range(devices):
-                kept.append(session.declare_queryable(f"plant/d{device}/**/@set", ignore))
-                kept.append(session.liveliness().declare_token(f"plant/d{device}"))
+                key = f"plant/@gateway/demo/alive/d{device}"
+                kept.append(session.liveliness().declare_token(key))
+            kept.append(session.declare_queryable("plant/**/@set", ignore))
         counter = Counter(process)
         time.sleep(0.3)
         first, used = counter.now(), time.process_time()
@@ -363,6 +364,8 @@ async def gateway(tags: int, devices: int, seconds: float, for_flood: float) -> 
     print(f"memory: {before:.0f} MB empty, {with_tags - before:.0f} MB more with the tags, "
           f"{memory() - with_tags:.0f} MB more on Zenoh")  # fmt: skip
     try:
+        for device in made.made:
+            northbound.set_online(device.name, True)
         with other("count", endpoint) as process:
             counter = await asyncio.to_thread(Counter, process)
             await asyncio.sleep(1.0)

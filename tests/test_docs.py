@@ -493,6 +493,7 @@ def _example_keys() -> set[str]:
         *(key for name in devices for key in (keys.device(name), keys.block(name))),
         *(keys.status(f"devices/{name}") for name in devices),
         *(keys.status(f"lines/{line.name}") for line in config.lines),
+        *(keys.alive(name) for name in devices),
         *(keys.own, keys.status("status"), keys.writes),
         *(
             keys.command(name, command)
@@ -500,7 +501,7 @@ def _example_keys() -> set[str]:
             for command in commands
         ),
         *(keys.status(f"lines/{line.name}/{TO_ALL}") for line in config.lines),
-        *(keys.late, f"{keys.group('hall')}/**"),
+        *(keys.claim("1a2b"), keys.late, f"{keys.group('hall')}/**"),
     }
 
 

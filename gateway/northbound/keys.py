@@ -1,6 +1,8 @@
 """Tag <-> key expression: the Zenoh keys of values, writes, descriptions and status.
 
-No wildcard matches a chunk that begins with `@`, so each family of keys below is queried by name:
+No wildcard matches a chunk that begins with `@`, so each family of keys below is queried by name.
+Zenoh compares each put with every declaration beside its key, level by level. So nothing is
+declared for a single device, tag or command below `<prefix>/`: the wildcards below serve them all.
 
     <prefix>/<device>/<tag>             the value
     <prefix>/<device>/<tag>/@set        a write
@@ -8,6 +10,8 @@ No wildcard matches a chunk that begins with `@`, so each family of keys below i
     <prefix>/<device>/@run              a command; also @stop, @loopback, @model
     <prefix>/<device>/@block            all tags of the device that changed in one scan
     <prefix>/@gateway/<name>/…          state and statistics, the outcome of every write
+    <prefix>/@gateway/<name>/alive/…    liveliness tokens of its devices
+    <prefix>/@gateway/<name>/claim/…    its claim to its devices: a document, and a token
     <prefix>/@standby/<group>/…         liveliness tokens of the gateways of a standby group
     …/@adv/**                           queries of a Zenoh AdvancedSubscriber that starts late
 """
@@ -92,6 +96,15 @@ class Keys:
         return f"{self.prefix}/**/@meta"
 
     @property
+    def sets(self) -> str:
+        """Every write to any gateway under the prefix."""
+        return f"{self.prefix}/**/@set"
+
+    def commands(self, command: str) -> str:
+        """One command to any device of any gateway under the prefix."""
+        return f"{self.prefix}/*/@{command}"
+
+    @property
     def blocks(self) -> str:
         return f"{self.prefix}/*/@block"
 
@@ -117,13 +130,26 @@ class Keys:
         """The liveliness token of one gateway's role in a standby group."""
         return f"{self.group(group)}/{role}/{gateway}/{session}"
 
+    @property
+    def claims(self) -> str:
+        """The claims of all gateways under the prefix."""
+        return f"{self.prefix}/@gateway/*/claim/*"
+
+    def claim(self, session: str) -> str:
+        """The claim of this gateway: a token, and a document with its devices."""
+        return f"{self.own}/claim/{session}"
+
     def status(self, path: str) -> str:
         """`status`, `lines/<line>` or `devices/<device>` of this gateway."""
         return f"{self.own}/{path}"
 
     def device(self, device: str) -> str:
-        """The liveliness token of a device; its values lie below."""
+        """The values of a device lie below."""
         return f"{self.prefix}/{device}"
+
+    def alive(self, device: str) -> str:
+        """The liveliness token of a device."""
+        return f"{self.own}/alive/{device}"
 
     def value(self, tag: str) -> str:
         """The value's key; `tag` is `device/name`."""
@@ -133,10 +159,6 @@ class Keys:
         """`device/name` of a value's key, the inverse of `value`; None if it lies elsewhere."""
         stem = f"{self.prefix}/"
         return value_key[len(stem) :] if value_key.startswith(stem) else None
-
-    def sets(self, device: str) -> str:
-        """Every write to one device."""
-        return f"{self.prefix}/{device}/**/@set"
 
     def set(self, tag: str) -> str:
         return f"{self.prefix}/{tag}/@set"

@@ -19,6 +19,7 @@ def test_the_keys_of_the_contract() -> None:
     assert KEYS.block("mixer") == "site/plant/mixer/@block"
     assert KEYS.device("mixer") == "site/plant/mixer"
     assert KEYS.own == "site/plant/@gateway/hall-1"
+    assert KEYS.alive("mixer") == "site/plant/@gateway/hall-1/alive/mixer"
     assert KEYS.status("lines/hall-1") == "site/plant/@gateway/hall-1/lines/hall-1"
     assert KEYS.writes == "site/plant/@gateway/hall-1/writes"
 
