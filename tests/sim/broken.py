@@ -424,4 +424,25 @@ MUTANTS = (
         "        if transaction is not None:\n",
         "tests/line/test_ports.py tests/engine/test_unsolicited.py",
     ),
+    Mutant(
+        "a gateway replies to writes for devices of others",
+        "northbound/queries.py",
+        "return is_request and not parsed.has_wildcard and not self._index.owns(parsed.target)",
+        "return False",
+        "tests/northbound/test_writes.py",
+    ),
+    Mutant(
+        "a device that another gateway claimed is served",
+        "northbound/claims.py",
+        "        if not taken <= withheld.keys():\n",
+        "        if False:\n",
+        "tests/northbound/test_claims.py",
+    ),
+    Mutant(
+        "a clock that is behind displaces the first gateway",
+        "northbound/claims.py",
+        "max([now, *(other.ticket + 1 for other in self._others.values())])",
+        "now",
+        "tests/northbound/test_claims.py",
+    ),
 )
