@@ -1,8 +1,8 @@
 """Speed of samples from the mirror to a subscriber, compared with a bare loop of puts.
 
-    python -m benchmarks.northbound [--tags 50000] [--devices 100] [--seconds 5] [--flood 5]
+    python -m benchmarks.northbound [--tags 50000] [--devices 10 100 1000] [--seconds 5] [--flood 5]
 
-The subscriber is another process on the same machine. One run measures:
+The subscriber is another process on the same machine. One run measures, for each number of devices:
 
 * a bare loop of `session.put` with one fixed payload of the same size, in a session without a
   gateway: the best that Python can do here; and again with the declarations of a gateway;
@@ -232,11 +232,11 @@ def ask(endpoint: str, seconds: float) -> None:
 
 
 async def idle(seconds: float) -> None:
-    """Prints the delay of an idle event loop on this machine."""
+    """Prints the delay of an idle event loop on this machine, with all that runs beside it."""
     lag = Lag()
     with suppress(TimeoutError):
         await asyncio.wait_for(lag.run(), seconds)
-    print(json.dumps(sorted(lag.late)), flush=True)
+    print(f"idle event loop: {lag.shown()}")
 
 
 @contextmanager
@@ -475,14 +475,26 @@ async def flooded(
 def main(arguments: Iterable[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--tags", type=int, default=50_000)
-    parser.add_argument("--devices", type=int, default=100)
+    parser.add_argument("--devices", type=int, nargs="+", default=[10, 100, 1000])
     parser.add_argument("--seconds", type=float, default=5.0)
     parser.add_argument("--flood", type=float, default=0.0)
     options = parser.parse_args(arguments)
     structlog.configure(processors=[_quiet])
-    load = options.tags, options.devices, options.seconds
+    asyncio.run(idle(options.seconds))
+    rates = {
+        devices: compared(options.tags, devices, options.seconds, options.flood)
+        for devices in options.devices
+    }
+    for devices, (rate, share) in rates.items():
+        print(f"{devices} devices: {rate.each:,.0f}/s arrived, {share:.2f} of the bare loop, "
+              f"{rate.ours / rate.put * 1e6:.1f} us here")  # fmt: skip
+
+
+def compared(tags: int, devices: int, seconds: float, for_flood: float) -> tuple[Rate, float]:
+    """The gateway, and its share of the bare loop just before and after it."""
+    load = tags, devices, seconds
     best = bare(*load, like_ours=False)
-    rate = asyncio.run(gateway(*load, options.flood))
+    rate = asyncio.run(gateway(*load, for_flood))
     blocks = asyncio.run(gateway_of_blocks(*load))
     again = bare(*load, like_ours=False)
     like = bare(*load, like_ours=True)
@@ -490,6 +502,7 @@ def main(arguments: Iterable[str] | None = None) -> None:
     print(f"arrived: {rate.each:,.0f}/s; {rate.each / most:.2f} of the bare loop with nothing "
           f"else, {rate.each / like.each:.2f} of the one like ours; "
           f"in blocks {blocks.each:,.0f}/s, {blocks.each / most:.2f}")  # fmt: skip
+    return rate, rate.each / most
 
 
 def _quiet(*_: object) -> str:
@@ -504,7 +517,5 @@ if __name__ == "__main__":
             flood(where, float(how_long))
         case ["ask", where, how_long]:
             ask(where, float(how_long))
-        case ["idle", how_long]:
-            asyncio.run(idle(float(how_long)))
         case _:
             main()

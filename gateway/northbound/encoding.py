@@ -18,7 +18,8 @@ _TEXT = zenoh.Encoding.TEXT_PLAIN
 def put(session: zenoh.Session, key: str, sample: Sample, stamp: zenoh.Timestamp | None) -> None:
     """Raises `ZError`."""
     if sample.tag.payload is Form.JSON:
-        put_json(session, key, payload.value(sample), stamp)
+        data = payload.value(sample)
+        session.put(key, data, encoding=_JSON, congestion_control=_DROP, timestamp=stamp)
         return
     text, attachment = payload.value_text(sample), payload.attachment(sample)
     if text is None:
@@ -36,13 +37,7 @@ def put(session: zenoh.Session, key: str, sample: Sample, stamp: zenoh.Timestamp
 
 def put_json(session: zenoh.Session, key: str, data: bytes, stamp: zenoh.Timestamp | None) -> None:
     """Raises `ZError`."""
-    session.put(
-        key,
-        data,
-        encoding=_JSON,
-        congestion_control=_DROP,
-        timestamp=stamp,
-    )
+    session.put(key, data, encoding=_JSON, congestion_control=_DROP, timestamp=stamp)
 
 
 def reply(query: zenoh.Query, key: str, sample: Sample, stamp: zenoh.Timestamp) -> None:

@@ -445,4 +445,11 @@ MUTANTS = (
         "now",
         "tests/northbound/test_claims.py",
     ),
+    Mutant(
+        "a router that visited once is needed for ever",
+        "northbound/election.py",
+        "        if self._had_router and not self._is_direct:\n",
+        "        if self._had_router:\n",
+        "tests/northbound/test_election.py",
+    ),
 )
