@@ -47,7 +47,9 @@ async def run(config: Config, started: Callable[[], None] = lambda: None) -> Non
     withheld: Mapping[str, str] = {}
     while (now_withheld := await _serve(config, withheld, stop, started)) is not None:
         withheld = now_withheld
-        if len(withheld) == len(config.devices):
+        gc.unfreeze()  # the tags of the ended gateway
+        gc.collect()
+        if withheld and len(withheld) == len(config.devices):
             others = " and ".join(sorted(set(withheld.values())))
             raise GatewayError(
                 f"gateway {others} serves every device of this file already: a device belongs to "

@@ -17,13 +17,14 @@ declared for a single device, tag or command below `<prefix>/`: the wildcards be
 """
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import NamedTuple
 
+from gateway.config import parsers
 from gateway.errors import BadValue, ConfigError
 
-_CHUNK = re.compile(r"[\w.\-]+\Z")
 _DURATION = re.compile(r"([0-9]{1,9}(?:\.[0-9]{0,9})?)(ms|s|min|m|h|d|)\Z")
 _SECONDS = {"ms": 0.001, "s": 1.0, "": 1.0, "min": 60.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
 
@@ -77,9 +78,8 @@ class Keys:
     gateway: str
 
     def __post_init__(self) -> None:
-        for chunk in self.prefix.split("/"):
-            _check(chunk, f"the prefix {self.prefix!r}")
-        _check(self.gateway, f"the gateway's name {self.gateway!r}")
+        _check(parsers.prefix, self.prefix, "the prefix")
+        _check(parsers.name, self.gateway, "the gateway's name")
 
     @property
     def values(self) -> str:
@@ -186,9 +186,9 @@ def max_age(text: str) -> float:
     return float(match[1]) * _SECONDS[match[2]]
 
 
-def _check(chunk: str, what: str) -> None:
-    if not _CHUNK.match(chunk):
-        raise ConfigError(
-            f"{what}: each part between slashes is letters, digits, '_', '-' and '.', "
-            f"and {chunk!r} is not"
-        )
+def _check(parse: Callable[[object], str], text: str, what: str) -> None:
+    """The rule of the configuration file, so that `check` and `run` never differ."""
+    try:
+        parse(text)
+    except ConfigError as error:
+        raise ConfigError(f"{what} {error}") from None

@@ -224,6 +224,7 @@ class Northbound:
 
 def check(config: Config) -> None:
     """Checks Zenoh settings and files without opening anything. Raises `ConfigError`."""
+    Keys(config.zenoh.prefix, config.name)
     configure(config.zenoh)
     if config.writers_file is not None:
         Writers(config.writers_file)

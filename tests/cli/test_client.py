@@ -20,7 +20,7 @@ from tests.zenoh_peer import free_endpoint
 TIME = "2026-11-20T12:00:00.123456Z"
 Answer = Callable[[zenoh.Query], None]
 Request = Callable[[Client], object]
-META = "plant/mixer/speed/@meta"
+META = "plant/mixer/**/@meta"
 REQUESTS: list[Request] = [
     lambda client: client.write("mixer/speed", 5),
     lambda client: client.control("hall", "mixer", "stop", ""),
@@ -134,7 +134,7 @@ def answering(config: Config, answers: Mapping[str, Answer]) -> Iterator[zenoh.S
 def described(query: zenoh.Query) -> None:
     """Replies as the gateway of the device."""
     with query:
-        query.reply(META, b"{}")
+        query.reply("plant/mixer/speed/@meta", b"{}")
 
 
 def saying(*rows: tuple[str, bytes, Mapping[str, object] | None]) -> Answer:

@@ -96,7 +96,7 @@ async def test_a_scale_streams_weights(tmp_path: Path, endpoint: str) -> None:
             async with ZenohPeer("client", connect=[endpoint]) as client:
                 heard = await client.subscribe("plant/scale/**")
                 await client.until_alive(
-                    "plant/@gateway/*/alive/*", ["plant/@gateway/demo/alive/scale"]
+                    "plant/@gateway/*/alive/*", ["plant/@gateway/weighing-room/alive/scale"]
                 )
                 [reply] = await client.get("plant/scale/weight")
                 assert reply.json["value"] == 1234.5
@@ -176,7 +176,7 @@ async def test_an_inverter_is_read_and_written_by_ascii_commands(
             async with ZenohPeer("client", connect=[endpoint]) as client:
                 heard = await client.subscribe("plant/inverter/**")
                 await client.until_alive(
-                    "plant/@gateway/*/alive/*", ["plant/@gateway/demo/alive/inverter"]
+                    "plant/@gateway/*/alive/*", ["plant/@gateway/drives/alive/inverter"]
                 )
                 [reply] = await client.get("plant/inverter/setpoint/@set", b"37.5")
                 assert reply.ok, reply

@@ -452,4 +452,25 @@ MUTANTS = (
         "        if self._had_router:\n",
         "tests/northbound/test_election.py",
     ),
+    Mutant(
+        "a prefix may have any character",
+        "config/parsers.py",
+        'a wildcard of Zenoh: remove it")\n    return name(text, slashes=True)',
+        'a wildcard of Zenoh: remove it")\n    return text',
+        "tests/northbound/test_keys.py",
+    ),
+    Mutant(
+        "the tags of a replaced gateway stay in memory",
+        "service.py",
+        "        gc.unfreeze()",
+        "        pass",
+        "tests/attacks/test_reliefs.py",
+    ),
+    Mutant(
+        "the uptime follows the wall clock",
+        "app.py",
+        "round(time.monotonic() - self._started, 1)",
+        "round(time.time() - self._started, 1)",
+        "tests/northbound/test_status.py",
+    ),
 )
