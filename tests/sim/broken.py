@@ -473,4 +473,11 @@ MUTANTS = (
         "round(time.time() - self._started, 1)",
         "tests/northbound/test_status.py",
     ),
+    Mutant(
+        "the log waits for its reader",
+        "cli/logs.py",
+        "            self._queue.put_nowait(text)\n",
+        "            self._queue.put(text)\n",
+        "tests/cli/test_logs.py",
+    ),
 )
