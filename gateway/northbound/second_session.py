@@ -12,6 +12,8 @@ import zenoh
 
 from gateway.northbound.session import as_client, off_loop, open_session
 
+_CLOSE_WITHIN = 0.3  # seconds; a router that hangs must not delay the end
+
 
 class SecondSession:
     """Opens the second session, or uses the gateway's own where that sees all."""
@@ -44,5 +46,6 @@ class SecondSession:
             await asyncio.Event().wait()
         finally:
             if opened is not own:
-                with suppress(zenoh.ZError):
-                    await off_loop(opened.close)
+                with suppress(zenoh.ZError, TimeoutError):
+                    async with asyncio.timeout(_CLOSE_WITHIN):
+                        await off_loop(opened.close)

@@ -2,6 +2,8 @@
 
 import asyncio
 import json
+import os
+import signal
 from collections.abc import AsyncIterator
 from contextlib import ExitStack, asynccontextmanager
 from pathlib import Path
@@ -155,3 +157,18 @@ async def test_two_that_started_without_a_network_share_out_when_it_is_there(
             [reply] = await client.get(RECIPE, b"7", target="ALL")
             assert reply.ok
             assert not a.has_said("starts over")
+
+
+async def test_a_gateway_that_was_frozen_keeps_its_device_when_it_wakes(tmp_path: Path) -> None:
+    async with plant(tmp_path) as p:
+        a = p.run(p.file("left", {"mixer": 1}))
+        await p.until_alive("left/alive/mixer")
+        os.kill(a.pid, signal.SIGSTOP)
+        b = p.run(p.file("right", {"mixer": 1}))
+        await asyncio.to_thread(b.says, "device online")
+        os.kill(a.pid, signal.SIGCONT)
+        assert await asyncio.to_thread(b.ended) == 1
+        assert b.has_said("gateway left serves every device of this file already")
+        await p.until_alive("left/alive/mixer")
+        [reply] = await p.client.get(RECIPE, b"7", target="ALL")
+        assert reply.ok
