@@ -24,6 +24,7 @@ from gateway.values import Value
 
 LONGEST_WRITE = 64 * 1024  # bytes; a tag holds 250 characters at most
 _LONGEST_REASON = 300
+_GOOD = Quality.GOOD  # looking up a member of an enumeration takes 0.2 µs
 
 
 class Problem(StrEnum):
@@ -94,7 +95,7 @@ def failure(error: GatewayError) -> Failure:
 def value(sample: Sample) -> bytes:
     """The value with quality and time. A good one in half the time that `_sample` takes."""
     known = sample.value
-    if sample.quality is not Quality.GOOD or not _has_json(known):
+    if sample.quality is not _GOOD or not _has_json(known):
         return orjson.dumps(_sample(sample))
     return b'{"value":%b%b' % (orjson.dumps(known), _end_of_good(sample.time))
 
