@@ -13,7 +13,7 @@ import structlog
 
 log = structlog.get_logger("gateway.log")
 
-LIMIT = 10_000  # entries that wait while nobody reads stderr: 2 to 4 MB
+LIMIT = 10_000  # entries that wait while the reader of stderr stalls: 2 to 4 MB
 _END_WITHIN = 0.2  # seconds for the last entries
 
 
