@@ -1,8 +1,8 @@
 """Speed of samples from the mirror to a subscriber, compared with a bare loop of puts.
 
-    python -m benchmarks.northbound [--tags 50000] [--devices 100] [--seconds 5] [--flood 5]
+    python -m benchmarks.northbound [--tags 50000] [--devices 10 100 1000] [--seconds 5] [--flood 5]
 
-The subscriber is another process on the same machine. One run measures:
+The subscriber is another process on the same machine. One run measures, for each number of devices:
 
 * a bare loop of `session.put` with one fixed payload of the same size, in a session without a
   gateway: the best that Python can do here; and again with the declarations of a gateway;
@@ -232,7 +232,7 @@ def ask(endpoint: str, seconds: float) -> None:
 
 
 async def idle(seconds: float) -> None:
-    """Prints the delay of an idle event loop on this machine."""
+    """Prints the delays of an idle event loop on this machine."""
     lag = Lag()
     with suppress(TimeoutError):
         await asyncio.wait_for(lag.run(), seconds)
@@ -325,8 +325,9 @@ def bare(tags: int, devices: int, seconds: float, *, like_ours: bool) -> Rate:
                 lambda _: None, indirect=False
             )
             for device in range(devices):
-                kept.append(session.declare_queryable(f"plant/d{device}/**/@set", ignore))
-                kept.append(session.liveliness().declare_token(f"plant/d{device}"))
+                key = f"plant/@gateway/demo/alive/d{device}"
+                kept.append(session.liveliness().declare_token(key))
+            kept.append(session.declare_queryable("plant/**/@set", ignore))
         counter = Counter(process)
         time.sleep(0.3)
         first, used = counter.now(), time.process_time()
@@ -363,6 +364,8 @@ async def gateway(tags: int, devices: int, seconds: float, for_flood: float) -> 
     print(f"memory: {before:.0f} MB empty, {with_tags - before:.0f} MB more with the tags, "
           f"{memory() - with_tags:.0f} MB more on Zenoh")  # fmt: skip
     try:
+        for device in made.made:
+            northbound.set_online(device.name, True)
         with other("count", endpoint) as process:
             counter = await asyncio.to_thread(Counter, process)
             await asyncio.sleep(1.0)
@@ -472,14 +475,29 @@ async def flooded(
 def main(arguments: Iterable[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--tags", type=int, default=50_000)
-    parser.add_argument("--devices", type=int, default=100)
+    parser.add_argument("--devices", type=int, nargs="+", default=[10, 100, 1000])
     parser.add_argument("--seconds", type=float, default=5.0)
     parser.add_argument("--flood", type=float, default=0.0)
     options = parser.parse_args(arguments)
     structlog.configure(processors=[_quiet])
-    load = options.tags, options.devices, options.seconds
+    with other("idle", options.seconds) as process:
+        assert process.stdout is not None
+        late = json.loads(process.stdout.readline())
+        print(f"an idle event loop here is late: p99 {late[int(len(late) * 0.99)] * 1e3:.2f} ms")
+    rates = {
+        devices: compared(options.tags, devices, options.seconds, options.flood)
+        for devices in options.devices
+    }
+    for devices, (rate, share) in rates.items():
+        print(f"{devices} devices: {rate.each:,.0f}/s arrived, {share:.2f} of the bare loop, "
+              f"{rate.ours / rate.put * 1e6:.1f} us here")  # fmt: skip
+
+
+def compared(tags: int, devices: int, seconds: float, for_flood: float) -> tuple[Rate, float]:
+    """The gateway, and its share of the bare loop just before and after it."""
+    load = tags, devices, seconds
     best = bare(*load, like_ours=False)
-    rate = asyncio.run(gateway(*load, options.flood))
+    rate = asyncio.run(gateway(*load, for_flood))
     blocks = asyncio.run(gateway_of_blocks(*load))
     again = bare(*load, like_ours=False)
     like = bare(*load, like_ours=True)
@@ -487,6 +505,7 @@ def main(arguments: Iterable[str] | None = None) -> None:
     print(f"arrived: {rate.each:,.0f}/s; {rate.each / most:.2f} of the bare loop with nothing "
           f"else, {rate.each / like.each:.2f} of the one like ours; "
           f"in blocks {blocks.each:,.0f}/s, {blocks.each / most:.2f}")  # fmt: skip
+    return rate, rate.each / most
 
 
 def _quiet(*_: object) -> str:

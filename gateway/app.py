@@ -92,7 +92,7 @@ class Gateway:
         self.mirror = Mirror((tag for device in config.devices for tag in device.tags), wall())
         self.lines: list[Line] = []
         self._wall = wall
-        self._started = wall()
+        self._started = time.monotonic()  # the wall clock may be set back
         self._subscribers: list[Subscriber] = []
         self._documents: dict[str, Callable[[], Document]] = {}  # of other parts, in the status
         self._tags = {tag.key: tag for device in config.devices for tag in device.tags}
@@ -256,7 +256,7 @@ class Gateway:
                 "name": self.config.name,
                 "version": __version__,
                 "time": rfc3339(self._wall()),
-                "up": round((self._wall() - self._started) / 1e9, 1),
+                "up": round(time.monotonic() - self._started, 1),
                 "tags": len(self._tags),
                 "lines": {line.engine.name: line.engine.is_open for line in self.lines},
                 "devices": {name: standing(d) for name, (_, d) in self._places.items()},

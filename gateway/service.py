@@ -5,7 +5,7 @@ import gc
 import signal
 import sys
 import time
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager
 from typing import Any
 
@@ -13,6 +13,7 @@ import structlog
 
 from gateway.app import Gateway
 from gateway.config import Config
+from gateway.errors import GatewayError
 from gateway.history import Historian
 from gateway.history.state_file import StateFile
 from gateway.line.arrival import ArrivalClock
@@ -44,21 +45,36 @@ async def run(config: Config, started: Callable[[], None] = lambda: None) -> Non
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop.set)
-    while await _serve(config, stop, started):
-        log.warning("gateway stands by", why="another gateway of the group is active")
+    withheld: Mapping[str, str] = {}
+    while (now_withheld := await _serve(config, withheld, stop, started)) is not None:
+        withheld = now_withheld
+        gc.unfreeze()  # the tags of the ended gateway
+        gc.collect()
+        if withheld and len(withheld) == len(config.devices):
+            others = " and ".join(sorted(set(withheld.values())))
+            raise GatewayError(
+                f"gateway {others} serves every device of this file already: a device belongs to "
+                "one gateway, or to the gateways of one standby group"
+            )
+        log.warning("gateway starts over", why="another gateway serves its devices")
 
 
-async def _serve(config: Config, stop: asyncio.Event, started: Callable[[], None]) -> bool:
-    """Runs one gateway until `stop`, or until another gateway of its group replaces it.
+async def _serve(
+    file: Config, withheld: Mapping[str, str], stop: asyncio.Event, started: Callable[[], None]
+) -> Mapping[str, str] | None:
+    """Runs one gateway until `stop`, or until another gateway serves devices of the file.
 
-    Returns True if it was replaced: then it starts again, as standby.
+    `withheld`: devices that other gateways serve. Returns them if they have changed, or if a
+    gateway of the standby group replaced this one: then it starts again. Otherwise None.
     """
+    config = file.without(withheld)
     clock = ArrivalClock()
     gateway = Gateway(config, clock)
     gc.collect()
     gc.freeze()  # tags live as long as the gateway: each collection skips them
     history = _history(config)
     northbound = _northbound(config, gateway, history)
+    northbound.withhold(withheld)
     state_file = None if config.state_file is None else StateFile(config.state_file)
     if state_file is not None:
         state_file.restore(gateway.enabled_devices)
@@ -88,14 +104,14 @@ async def _serve(config: Config, stop: asyncio.Event, started: Callable[[], None
         if exclusive.done():  # otherwise another process may have this file and these lines
             if history is not None:
                 history.start()
-            await _first(active, zenoh, stopping)
+            await _first(active, zenoh, stopping, replaced)
             if active.done():
                 lines = await _start_lines(gateway, history, state_file, cleanup)
         await _first(opened, zenoh, stopping, replaced)
         if opened.done():
             started()
         await _first(zenoh, stopping, replaced, *lines)
-    return northbound.replaced.is_set() and not stop.is_set()
+    return northbound.withheld if northbound.replaced.is_set() and not stop.is_set() else None
 
 
 async def _first(*tasks: asyncio.Task[Any]) -> None:

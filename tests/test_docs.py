@@ -493,6 +493,7 @@ def _example_keys() -> set[str]:
         *(key for name in devices for key in (keys.device(name), keys.block(name))),
         *(keys.status(f"devices/{name}") for name in devices),
         *(keys.status(f"lines/{line.name}") for line in config.lines),
+        *(keys.alive(name) for name in devices),
         *(keys.own, keys.status("status"), keys.writes),
         *(
             keys.command(name, command)
@@ -500,7 +501,7 @@ def _example_keys() -> set[str]:
             for command in commands
         ),
         *(keys.status(f"lines/{line.name}/{TO_ALL}") for line in config.lines),
-        *(keys.late, f"{keys.group('hall')}/**"),
+        *(keys.claim("1a2b"), keys.late, f"{keys.group('hall')}/**"),
     }
 
 
@@ -622,7 +623,7 @@ def test_the_status_documents_have_the_fields_of_the_page(endpoint: str, tmp_pat
         assert asking.ended() == 0
         found = dict(line.split(maxsplit=1) for line in asking.lines)
     known: dict[str, Any] = {"history": Historian(tmp_path / "history.db", 1, 10**8).document()}
-    known |= Standby(StandbySettings("hall"), Keys("plant", "demo"), zenoh.Config()).documents()
+    known |= Standby(StandbySettings("hall"), Keys("plant", "demo")).documents()
     for key, text in found.items():
         path_there = re.sub(r"/.*", "/", key.removeprefix("plant/@gateway/demo/"))
         known[path_there] = json.loads(text)

@@ -11,8 +11,8 @@ In a test:
         replies = await client.many([("plant/mixer/recipe/@set", b"7")] * 1000)   # all at once
         await client.put("plant/mixer/recipe/@set", b"7")
         await client.delete("plant/mixer/recipe/@set")
-        tokens = await client.liveliness("plant/**")           # a Subscription: PUT and DELETE
-        await client.until_alive("plant/*", ["plant/mixer"])   # these and no others
+        tokens = await client.liveliness("plant/@gateway/**")  # a Subscription: PUT and DELETE
+        await client.until_alive("plant/@gateway/*", ["plant/@gateway/demo"])  # no others
         await client.kill()                                    # SIGKILL; other signals by `.pid`
 
 `subscribe(key, advanced=True)` is Zenoh's AdvancedSubscriber with history.

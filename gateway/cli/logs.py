@@ -1,10 +1,20 @@
 """Configures the log."""
 
 import logging
+import os
+import queue
+import select
 import sys
+import threading
+from collections.abc import Callable
 from enum import StrEnum
 
 import structlog
+
+log = structlog.get_logger("gateway.log")
+
+LIMIT = 10_000  # entries that wait while the reader of stderr stalls: 2 to 4 MB
+_END_WITHIN = 0.2  # seconds for the last entries
 
 
 class LogFormat(StrEnum):
@@ -19,10 +29,68 @@ class LogLevel(StrEnum):
     ERROR = "error"
 
 
-def set_up(form: LogFormat, level: LogLevel) -> None:
-    """Logs to stderr: text for people, or one JSON document per line for programs."""
+class QueuedHandler(logging.Handler):
+    """Writes entries on a thread of its own, so that a reader that stalls stops nothing else.
+
+    Beyond `LIMIT` waiting entries the next are dropped and counted. The thread writes to the file
+    itself: the lock of `sys.stderr` would hold up the end of the process.
+    """
+
+    def __init__(self, file: int) -> None:
+        super().__init__()
+        self.dropped = 0
+        self._file = file
+        self._reported = 0
+        self._queue: queue.Queue[str | None] = queue.Queue(LIMIT)
+        self._thread = threading.Thread(target=self._run, name="log", daemon=True)
+        self._thread.start()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.write(self.format(record))
+
+    def write(self, text: str) -> None:
+        """Queues lines. Never blocks."""
+        try:
+            self._queue.put_nowait(text)
+        except queue.Full:
+            self.dropped += 1
+
+    def close(self) -> None:
+        """Writes what waits, for a limited time."""
+        try:
+            self._queue.put_nowait(None)
+            self._thread.join(_END_WITHIN)
+        except queue.Full:
+            pass  # the reader stalls
+        super().close()
+
+    def _run(self) -> None:
+        while (text := self._queue.get()) is not None:
+            try:
+                self._write_all(f"{text}\n".encode(errors="backslashreplace"))
+            except OSError:  # the reader has gone, or the disk is full
+                self.dropped += 1
+                continue  # a report would be dropped too
+            if self.dropped > self._reported and self._queue.qsize() <= LIMIT // 2:
+                count, self._reported = self.dropped - self._reported, self.dropped
+                log.warning("log entries dropped", count=count)
+
+    def _write_all(self, data: bytes) -> None:
+        while data:
+            try:
+                data = data[os.write(self._file, data) :]
+            except BlockingIOError:
+                select.select((), (self._file,), ())
+
+
+def set_up(form: LogFormat, level: LogLevel) -> Callable[[str], None]:
+    """Logs to stderr: text for people, or one JSON document per line for programs.
+
+    Returns a function that writes lines for people between the log entries.
+    """
+    handler = QueuedHandler(sys.stderr.fileno())
     logging.basicConfig(
-        format="%(message)s", stream=sys.stderr, level=getattr(logging, level.upper())
+        format="%(message)s", handlers=[handler], level=getattr(logging, level.upper())
     )
     render = (
         structlog.processors.JSONRenderer()
@@ -41,3 +109,4 @@ def set_up(form: LogFormat, level: LogLevel) -> None:
         wrapper_class=structlog.stdlib.BoundLogger,
         cache_logger_on_first_use=True,
     )
+    return handler.write

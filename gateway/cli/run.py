@@ -12,7 +12,7 @@ import typer
 from gateway import service
 from gateway.cli.check import size
 from gateway.cli.logs import LogFormat, LogLevel, set_up
-from gateway.cli.terminal import ConfigPath, err
+from gateway.cli.terminal import ConfigPath
 from gateway.config import Config, load
 from gateway.tags import Tag, WriteRule
 from gateway.transport.loop import new_event_loop
@@ -28,10 +28,10 @@ def run(
 ) -> None:
     """Run the service: poll, publish on Zenoh, accept writes. SIGTERM or Ctrl-C ends it."""
     loaded = load(config)
-    set_up(log_format, log_level)
+    say = set_up(log_format, log_level)
     hint = next_steps(loaded, config, program())
     with asyncio.Runner(loop_factory=new_event_loop) as runner:
-        runner.run(service.run(loaded, lambda: err.print(hint)))
+        runner.run(service.run(loaded, lambda: say(hint)))
 
 
 def program() -> str:

@@ -113,7 +113,7 @@ def tag_name(text: object) -> str:
 
 
 def prefix(text: object) -> str:
-    """Parses a Zenoh key prefix of one or more chunks: `plant/site-1`."""
+    """Parses a Zenoh key prefix of one or more chunks, each a name: `plant/site-1`."""
     text = _text(text)
     for chunk in text.split("/"):
         if not chunk:
@@ -122,9 +122,7 @@ def prefix(text: object) -> str:
             raise ConfigError(f"{text!r}: chunks with @ are reserved for the gateway: remove the @")
         if wild := next((letter for letter in "*$?#" if letter in chunk), None):
             raise ConfigError(f"{text!r} has {wild}, a wildcard of Zenoh: remove it")
-        if not chunk.isprintable():
-            raise ConfigError(f"{text!r} has an invisible character: remove it")
-    return text
+    return name(text, slashes=True)
 
 
 def endpoint(text: object) -> str:

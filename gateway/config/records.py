@@ -1,6 +1,7 @@
 """The checked and complete configuration: plain data for the rest of the gateway."""
 
-from dataclasses import dataclass
+from collections.abc import Container
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
 
@@ -99,3 +100,16 @@ class Config:
     @property
     def devices(self) -> tuple[DeviceSettings, ...]:
         return tuple(device for line in self.lines for device in line.devices)
+
+    def without(self, devices: Container[str]) -> "Config":
+        """Returns the file without some devices, and without lines that have no others."""
+        lines = [
+            replace(line, devices=tuple(d for d in line.devices if d.name not in devices))
+            for line in self.lines
+        ]
+        left = (
+            line
+            for line, before in zip(lines, self.lines, strict=True)
+            if line.devices or not before.devices
+        )
+        return replace(self, lines=tuple(left))

@@ -116,14 +116,21 @@ class AnswerPool:
             self.counters.unanswered += 1
             query.drop()  # type: ignore[no-untyped-call]  # Zenoh's stub lacks it
             return
-        self._narrow.submit(self._refuse, query).add_done_callback(_report)
+        self._narrow.submit(self._refuse, query, self._reply_busy).add_done_callback(_report)
+
+    def dismiss(self, query: zenoh.Query) -> None:
+        """Ends a query without a reply: it is for another gateway."""
+        if self._closing or not self._refusals.acquire(blocking=False):
+            query.drop()  # type: ignore[no-untyped-call]  # Zenoh's stub lacks it
+            return
+        self._narrow.submit(self._refuse, query, _no_reply).add_done_callback(_report)
 
     # -- answering threads --
 
-    def _refuse(self, query: zenoh.Query) -> None:
+    def _refuse(self, query: zenoh.Query, reply: Answer) -> None:
         try:
             with query:
-                self._reply_busy(query)
+                reply(query)
         finally:
             self._refusals.release()
 
@@ -139,6 +146,10 @@ class AnswerPool:
             log.debug("reply failed", error=str(error))
         finally:
             self._open.release()
+
+
+def _no_reply(_: zenoh.Query) -> None:
+    pass
 
 
 def _report(future: Future[None]) -> None:

@@ -54,6 +54,8 @@ class _Links:
         self.changed = now  # the network itself was lost or restored
         self.lost = now  # no link since
         self._needed = needed
+        # The active gateway was last seen through a link of its own: a router does not matter.
+        self._is_direct = False
         self._all: set[str] = set()
         self._routers: set[str] = set()
         self._had_link = self._had_router = False
@@ -71,9 +73,16 @@ class _Links:
         if not self._all:
             self.lost = now
 
+    def saw(self, session: str) -> None:
+        """The active gateway is seen now, with this session."""
+        self._is_direct = session in self._all
+
+    def are_settled(self, now: float) -> bool:
+        return self._is_direct or now - self.changed >= SETTLE_TIME
+
     @property
     def are_up(self) -> bool:
-        if self._had_router:
+        if self._had_router and not self._is_direct:
             return bool(self._routers)
         # Without routers the other gateway's link may be the only one, and ends with it.
         return self._had_link or not self._needed
@@ -127,6 +136,9 @@ class Election:
         """Updates the state. Call it several times a second, and after every change."""
         paused = now - self._decided > LONGEST_PAUSE
         self._decided = now
+        for token in self._tokens:
+            if token.role is Role.ACTIVE:
+                self._links.saw(token.session)
         match self.state:
             case State.REPLACED:
                 pass
@@ -160,7 +172,7 @@ class Election:
         if self._sees(Role.ACTIVE, now) or self._sees(Role.CLAIM, now, before_me=True):
             return False
         if self._links.are_up:
-            return now - self._links.changed >= SETTLE_TIME
+            return self._links.are_settled(now)
         return self._alone is not None and now - self._links.lost >= max(self._alone, SETTLE_TIME)
 
     def _sees(self, role: Role, now: float, *, before_me: bool = False) -> bool:

@@ -13,12 +13,14 @@ from gateway.tags import Form, Sample
 _DROP = zenoh.CongestionControl.DROP
 _JSON = zenoh.Encoding.APPLICATION_JSON
 _TEXT = zenoh.Encoding.TEXT_PLAIN
+_JSON_FORM = Form.JSON  # looking up a member of an enumeration takes 0.2 µs
 
 
 def put(session: zenoh.Session, key: str, sample: Sample, stamp: zenoh.Timestamp | None) -> None:
     """Raises `ZError`."""
-    if sample.tag.payload is Form.JSON:
-        put_json(session, key, payload.value(sample), stamp)
+    if sample.tag.payload is _JSON_FORM:
+        data = payload.value(sample)
+        session.put(key, data, encoding=_JSON, congestion_control=_DROP, timestamp=stamp)
         return
     text, attachment = payload.value_text(sample), payload.attachment(sample)
     if text is None:
@@ -36,18 +38,12 @@ def put(session: zenoh.Session, key: str, sample: Sample, stamp: zenoh.Timestamp
 
 def put_json(session: zenoh.Session, key: str, data: bytes, stamp: zenoh.Timestamp | None) -> None:
     """Raises `ZError`."""
-    session.put(
-        key,
-        data,
-        encoding=_JSON,
-        congestion_control=_DROP,
-        timestamp=stamp,
-    )
+    session.put(key, data, encoding=_JSON, congestion_control=_DROP, timestamp=stamp)
 
 
 def reply(query: zenoh.Query, key: str, sample: Sample, stamp: zenoh.Timestamp) -> None:
     """Raises `ZError`."""
-    if sample.tag.payload is Form.JSON:
+    if sample.tag.payload is _JSON_FORM:
         reply_json(query, key, payload.value(sample), stamp)
         return
     text, attachment = payload.value_text(sample), payload.attachment(sample)

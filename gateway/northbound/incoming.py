@@ -64,7 +64,7 @@ class Incoming:
         self._puts = PutWrites(writes, self._index)
         queries = Inbox(self._queries.take, self._queries.refuse)
         puts = Inbox(self._puts.take, self._puts.refuse)
-        return Declarations(session, self._keys, self._command_keys(), self._index, queries, puts)
+        return Declarations(session, self._keys, self._commands(), self._index, queries, puts)
 
     async def close(self) -> None:
         """Ends what waits for devices; replies that are on their way get half a second."""
@@ -78,13 +78,9 @@ class Incoming:
         if self._queries is not None:
             self._queries.end()
 
-    def _command_keys(self) -> list[str]:
-        """One key per device and command; the commands to a line lie under the status keys."""
-        return [
-            self._keys.command(device, command)
-            for device, commands in self._plant.commands().items()
-            for command in sorted(commands)
-        ]
+    def _commands(self) -> list[str]:
+        """Returns the commands of all devices; those to a line lie under the status keys."""
+        return sorted(frozenset().union(*self._plant.commands().values()))
 
 
 class Declarations:
@@ -97,37 +93,36 @@ class Declarations:
         self,
         session: zenoh.Session,
         keys: Keys,
-        command_keys: list[str],
+        commands: list[str],
         index: TagIndex,
         queries: Inbox[zenoh.Query],
         puts: Inbox[zenoh.Sample],
     ) -> None:
         self._session = session
         self._keys = keys
-        self._command_keys = command_keys
+        self._commands = commands
         self._devices = index.devices
         self._queries = queries
         self._puts = puts
 
     def status(self) -> list[object]:
         """Declares the status keys; a standby gateway answers them too."""
-        return [self._queryable(self._keys.statuses, complete=False)]
+        return [self._queryable(self._keys.statuses)]
 
     def plant(self) -> list[object]:
         """Declares values, writes and commands; only the active gateway answers them.
 
-        Values are not `complete`: other gateways may share the prefix, and Zenoh is to query all
-        of them. A device has one gateway, so its writes go to one queryable only.
+        Other gateways may share the prefix, and Zenoh queries all of them, because no queryable is
+        `complete`. So a write reaches each of them, and only the gateway of its device takes it.
         """
-        shared = [self._keys.values, self._keys.late, self._keys.metas]
+        keys = [self._keys.values, self._keys.late, self._keys.metas, self._keys.sets]
+        keys += [self._keys.commands(command) for command in self._commands]
         if any(device.blocks for device in self._devices):
-            shared.append(self._keys.blocks)
+            keys.append(self._keys.blocks)
         return [
-            *(self._queryable(key, complete=False) for key in shared),
-            *(self._queryable(self._keys.sets(d.name), complete=True) for d in self._devices),
-            *(self._queryable(key, complete=True) for key in self._command_keys),
+            *(self._queryable(key) for key in keys),
             self._session.declare_subscriber(
-                f"{self._keys.values}/@set",
+                self._keys.sets,
                 _direct(self._puts),
                 allowed_origin=zenoh.Locality.REMOTE,
             ),
@@ -137,8 +132,8 @@ class Declarations:
         """Declares the gateway's liveliness token."""
         return [self._session.liveliness().declare_token(self._keys.own)]
 
-    def _queryable(self, key: str, *, complete: bool) -> object:
-        return self._session.declare_queryable(key, _direct(self._queries), complete=complete)
+    def _queryable(self, key: str) -> object:
+        return self._session.declare_queryable(key, _direct(self._queries), complete=False)
 
 
 def _direct(inbox: Callable[[T], None]) -> "zenoh.handlers.Callback[T]":

@@ -1,6 +1,8 @@
 """Tag <-> key expression: the Zenoh keys of values, writes, descriptions and status.
 
-No wildcard matches a chunk that begins with `@`, so each family of keys below is queried by name:
+No wildcard matches a chunk that begins with `@`, so each family of keys below is queried by name.
+Zenoh compares each put with every declaration beside its key, level by level. So nothing is
+declared for a single device, tag or command below `<prefix>/`: the wildcards below serve them all.
 
     <prefix>/<device>/<tag>             the value
     <prefix>/<device>/<tag>/@set        a write
@@ -8,18 +10,21 @@ No wildcard matches a chunk that begins with `@`, so each family of keys below i
     <prefix>/<device>/@run              a command; also @stop, @loopback, @model
     <prefix>/<device>/@block            all tags of the device that changed in one scan
     <prefix>/@gateway/<name>/…          state and statistics, the outcome of every write
+    <prefix>/@gateway/<name>/alive/…    liveliness tokens of its devices
+    <prefix>/@gateway/<name>/claim/…    its claim to its devices: a document, and a token
     <prefix>/@standby/<group>/…         liveliness tokens of the gateways of a standby group
     …/@adv/**                           queries of a Zenoh AdvancedSubscriber that starts late
 """
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import NamedTuple
 
+from gateway.config import parsers
 from gateway.errors import BadValue, ConfigError
 
-_CHUNK = re.compile(r"[\w.\-]+\Z")
 _DURATION = re.compile(r"([0-9]{1,9}(?:\.[0-9]{0,9})?)(ms|s|min|m|h|d|)\Z")
 _SECONDS = {"ms": 0.001, "s": 1.0, "": 1.0, "min": 60.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
 
@@ -73,9 +78,8 @@ class Keys:
     gateway: str
 
     def __post_init__(self) -> None:
-        for chunk in self.prefix.split("/"):
-            _check(chunk, f"the prefix {self.prefix!r}")
-        _check(self.gateway, f"the gateway's name {self.gateway!r}")
+        _check(parsers.prefix, self.prefix, "the prefix")
+        _check(parsers.name, self.gateway, "the gateway's name")
 
     @property
     def values(self) -> str:
@@ -90,6 +94,15 @@ class Keys:
     @property
     def metas(self) -> str:
         return f"{self.prefix}/**/@meta"
+
+    @property
+    def sets(self) -> str:
+        """Every write to any gateway under the prefix."""
+        return f"{self.prefix}/**/@set"
+
+    def commands(self, command: str) -> str:
+        """One command to any device of any gateway under the prefix."""
+        return f"{self.prefix}/*/@{command}"
 
     @property
     def blocks(self) -> str:
@@ -117,13 +130,26 @@ class Keys:
         """The liveliness token of one gateway's role in a standby group."""
         return f"{self.group(group)}/{role}/{gateway}/{session}"
 
+    @property
+    def claims(self) -> str:
+        """The claims of all gateways under the prefix."""
+        return f"{self.prefix}/@gateway/*/claim/*"
+
+    def claim(self, session: str) -> str:
+        """The claim of this gateway: a token, and a document with its devices."""
+        return f"{self.own}/claim/{session}"
+
     def status(self, path: str) -> str:
         """`status`, `lines/<line>` or `devices/<device>` of this gateway."""
         return f"{self.own}/{path}"
 
     def device(self, device: str) -> str:
-        """The liveliness token of a device; its values lie below."""
+        """The values of a device lie below."""
         return f"{self.prefix}/{device}"
+
+    def alive(self, device: str) -> str:
+        """The liveliness token of a device."""
+        return f"{self.own}/alive/{device}"
 
     def value(self, tag: str) -> str:
         """The value's key; `tag` is `device/name`."""
@@ -133,10 +159,6 @@ class Keys:
         """`device/name` of a value's key, the inverse of `value`; None if it lies elsewhere."""
         stem = f"{self.prefix}/"
         return value_key[len(stem) :] if value_key.startswith(stem) else None
-
-    def sets(self, device: str) -> str:
-        """Every write to one device."""
-        return f"{self.prefix}/{device}/**/@set"
 
     def set(self, tag: str) -> str:
         return f"{self.prefix}/{tag}/@set"
@@ -164,9 +186,9 @@ def max_age(text: str) -> float:
     return float(match[1]) * _SECONDS[match[2]]
 
 
-def _check(chunk: str, what: str) -> None:
-    if not _CHUNK.match(chunk):
-        raise ConfigError(
-            f"{what}: each part between slashes is letters, digits, '_', '-' and '.', "
-            f"and {chunk!r} is not"
-        )
+def _check(parse: Callable[[object], str], text: str, what: str) -> None:
+    """The rule of the configuration file, so that `check` and `run` never differ."""
+    try:
+        parse(text)
+    except ConfigError as error:
+        raise ConfigError(f"{what} {error}") from None

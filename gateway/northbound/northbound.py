@@ -12,6 +12,7 @@ import zenoh
 from gateway.config import Config, ZenohConfig, ZenohMode
 from gateway.errors import GatewayError
 from gateway.northbound import secrets
+from gateway.northbound.admission import Admission
 from gateway.northbound.audit import Audit
 from gateway.northbound.inbox import Inbox
 from gateway.northbound.incoming import Declarations, Incoming
@@ -26,7 +27,7 @@ from gateway.northbound.session import (
     off_loop,
     open_session,
 )
-from gateway.northbound.standby import Standby, StandbySettings
+from gateway.northbound.standby import StandbySettings
 from gateway.northbound.status_publisher import StatusPublisher
 from gateway.northbound.tag_index import TagIndex
 from gateway.northbound.writers import Writers
@@ -44,9 +45,10 @@ class Northbound:
     Four events report its progress to the service:
 
     * `exclusive`: no other process runs this gateway; files and lines may be opened.
-    * `active`: this gateway may open its lines. Set from the beginning without `standby`.
+    * `active`: this gateway may open its lines.
     * `opened`: everything is declared, and all current values are queued.
-    * `replaced`: another gateway of the standby group is active; close the lines, then end this.
+    * `replaced`: another gateway is active, or serves one of the devices. Close the lines, end
+      this, and start another `Northbound` that does `withhold` the devices `withheld` here.
 
     Raises `ConfigError` for a bad prefix, name, endpoint, Zenoh file or writers file, and for a
     secret that every user of this machine could read.
@@ -75,9 +77,10 @@ class Northbound:
         if self._is_client:
             self.exclusive.set()  # it takes no endpoint, and may wait for its router for ever
         self._plant = plant
-        self._standby = Standby(standby, self.keys, self._config)
         self._links = LinkMonitor()
         self._index = TagIndex(self.keys, plant.devices())
+        devices = [device.name for device in self._index.devices]
+        self._admission = Admission(standby, self.keys, self._config, devices)
         self._publisher = Publisher(self.keys)
         self._batches = ScanBatches(self._publisher, self._index.devices)
         audit = Audit(
@@ -119,11 +122,20 @@ class Northbound:
 
     @property
     def active(self) -> asyncio.Event:
-        return self._standby.active
+        return self._admission.active
 
     @property
     def replaced(self) -> asyncio.Event:
-        return self._standby.replaced
+        return self._admission.replaced
+
+    @property
+    def withheld(self) -> Mapping[str, str]:
+        """Devices of the file that other gateways serve, with the names of those gateways."""
+        return self._admission.claiming.withheld
+
+    def withhold(self, devices: Mapping[str, str]) -> None:
+        """Notes devices of the file that are not in the plant. Call it before `run`."""
+        self._admission.claiming.withhold(devices)
 
     # -- life --
 
@@ -137,7 +149,11 @@ class Northbound:
         """
         for exposure in secrets.exposures(self._config):
             log.warning("Zenoh session exposed", why=exposure)
-        session = await open_session(self._config, retry=self._is_client)
+        alone = asyncio.create_task(self._admission.run_alone())
+        try:
+            session = await open_session(self._config, retry=self._is_client)
+        finally:
+            alone.cancel()
         self.exclusive.set()
         try:
             await self._serve(session)
@@ -155,10 +171,10 @@ class Northbound:
         links = Inbox(self._links.take, lambda _: None)
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(self._watch_publisher())
-            tasks.create_task(self._standby.run(session))
             self._declared += await off_loop(self._declare_first, session, declarations, links)
+            tasks.create_task(self._admission.run(session))
             tasks.create_task(self._status.run())
-            await self._standby.active.wait()
+            await self._admission.active.wait()
             self._declared += await off_loop(self._declare_plant, declarations)
             republisher = Republisher(self._batches.publish, self._plant, self._index, self._links)
             await republisher.publish_all()
@@ -174,13 +190,13 @@ class Northbound:
         links: Inbox[zenoh.TransportEvent],
     ) -> list[object]:
         """Declares everything that a standby gateway serves too."""
-        token = declarations.token() if self._standby.enabled else []
+        token = declarations.token() if self._admission.standby.enabled else []
         return [self._links.declare(session, links), *declarations.status(), *token]
 
     def _declare_plant(self, declarations: Declarations) -> list[object]:
         """The token comes last: a client that sees it may query at once."""
         plant = declarations.plant()
-        return plant if self._standby.enabled else [*plant, *declarations.token()]
+        return plant if self._admission.standby.enabled else [*plant, *declarations.token()]
 
     async def _close(self, session: zenoh.Session) -> None:
         await self._incoming.close()
@@ -200,12 +216,15 @@ class Northbound:
         raise GatewayError("the publishing thread has ended: nothing would be published any more")
 
     def _collect_status(self) -> Mapping[str, Mapping[str, object]]:
+        documents = dict(self._plant.status())
+        documents["status"] = {**documents["status"], "refused_devices": self.withheld}
         zenoh_document = {**self.counters(), "to": self._links.kinds()}
-        return {**self._plant.status(), "zenoh": zenoh_document, **self._standby.documents()}
+        return {**documents, "zenoh": zenoh_document, **self._admission.documents()}
 
 
 def check(config: Config) -> None:
     """Checks Zenoh settings and files without opening anything. Raises `ConfigError`."""
+    Keys(config.zenoh.prefix, config.name)
     configure(config.zenoh)
     if config.writers_file is not None:
         Writers(config.writers_file)

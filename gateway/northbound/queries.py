@@ -60,13 +60,19 @@ class Queries:
 
     def refuse(self, query: zenoh.Query) -> None:
         """Called on Zenoh's thread when the inbox is full."""
-        self._pool.refuse(query)
+        if self._is_foreign(parse_key(str(query.key_expr))):
+            self._pool.dismiss(query)
+        else:
+            self._pool.refuse(query)
 
     def take(self, query: zenoh.Query) -> None:
         """Starts the answer to one query."""
+        parsed = parse_key(str(query.key_expr))
+        if self._is_foreign(parsed):
+            self._pool.dismiss(query)
+            return
         if not self._pool.admit(query):
             return
-        parsed = parse_key(str(query.key_expr))
         match parsed.family:
             case Family.SET:
                 self._start(self._set(query))
@@ -85,6 +91,14 @@ class Queries:
                 self._pool.answer_wide(query, partial(self._replies.current, parsed))
             case _:
                 self._pool.answer(query, partial(self._replies.current, parsed))
+
+    def _is_foreign(self, parsed: ParsedKey) -> bool:
+        """True for a write or command to a device of another gateway, or of none.
+
+        It gets no answer, not even `busy`: the other gateway may carry it out.
+        """
+        is_request = parsed.family in (Family.SET, Family.COMMAND)
+        return is_request and not parsed.has_wildcard and not self._index.owns(parsed.target)
 
     def _take_fresh(self, query: zenoh.Query, parsed: ParsedKey) -> None:
         if not parsed.has_wildcard:

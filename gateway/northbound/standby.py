@@ -1,11 +1,6 @@
-"""Hot standby on Zenoh: declares and observes the liveliness tokens that `election` decides by.
-
-A router does not pass on messages between two peers, and gateways are peers. So a gateway that
-connects to other sessions declares and observes its tokens in a second session, as a client.
-"""
+"""Hot standby on Zenoh: declares and observes the liveliness tokens that `election` decides by."""
 
 import asyncio
-import json
 import time
 from contextlib import suppress
 from dataclasses import dataclass
@@ -16,7 +11,8 @@ import zenoh
 from gateway.northbound.election import Election, Role, RoleToken, State
 from gateway.northbound.inbox import Inbox
 from gateway.northbound.keys import Keys
-from gateway.northbound.session import as_client, off_loop, open_session
+from gateway.northbound.second_session import SecondSession
+from gateway.northbound.session import off_loop
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 
@@ -40,8 +36,7 @@ class Standby:
     Without settings it is `enabled` false, and active at once and for ever.
     """
 
-    def __init__(self, settings: StandbySettings | None, keys: Keys, config: zenoh.Config) -> None:
-        """`config`: of the gateway's own session."""
+    def __init__(self, settings: StandbySettings | None, keys: Keys) -> None:
         self.enabled = settings is not None
         self.active = asyncio.Event()
         self.replaced = asyncio.Event()
@@ -49,8 +44,6 @@ class Standby:
         if not self.enabled:
             self.active.set()
         self._keys = keys
-        connects = json.loads(config.get_json("connect/endpoints")) not in ([], {}, None)
-        self._config = as_client(config) if connects and self.enabled else None
         self._election: Election | None = None
         self._session: zenoh.Session | None = None  # of the tokens
         self._tokens: dict[Role, zenoh.LivelinessToken] = {}
@@ -65,31 +58,29 @@ class Standby:
         group = self._settings.group
         return {"standby": {"group": group, "stand": state.value, "others_active": others}}
 
-    async def run(self, session: zenoh.Session) -> None:
-        """Runs until cancelled. `session` is the gateway's own. Raises `GatewayError`, `ZError`."""
+    async def run(self, session: zenoh.Session, second: SecondSession) -> None:
+        """Runs until cancelled. `session` is the gateway's own; the tokens are in `second`. Raises
+        `GatewayError`, `ZError`."""
         if not self.enabled:
             return
         election = self._election = Election(
             self._keys.gateway,
             str(session.zid()),
             time.monotonic(),
-            needs_link=self._config is not None,
+            needs_link=second.needed,
             alone=self._settings.alone,
         )
-        opening = asyncio.create_task(self._open(session, election))
+        opening = asyncio.create_task(self._open(second, election))
         try:
             await self._decide(election, opening)
         finally:
             opening.cancel()
             with suppress(asyncio.CancelledError):
                 await opening
-            own = self._session
-            if own is not None and own is not session:
-                await off_loop(own.close)
 
-    async def _open(self, session: zenoh.Session, election: Election) -> None:
-        """Opens the session of the tokens, if it is another one, and observes the group."""
-        found = session if self._config is None else await open_session(self._config, retry=True)
+    async def _open(self, second: SecondSession, election: Election) -> None:
+        """Observes the group as soon as the session of the tokens is open."""
+        found = await second.session()
 
         def token_changed(sample: zenoh.Sample) -> None:
             if token := _parse_token(str(sample.key_expr)):

@@ -46,9 +46,12 @@ class TagIndex:
         return self._by_key.get(value_key)
 
     def owns(self, key: str) -> bool:
-        """True if `key` lies under one of our devices: other gateways may share the prefix."""
+        """True if `key` lies under one of our devices or under our status keys.
+
+        Other gateways may share the prefix.
+        """
         device = (self._keys.tag(key) or "").partition("/")[0]
-        return device in self._names
+        return device in self._names or key.startswith(f"{self._keys.own}/")
 
     def tags_at(self, expression: str) -> list[Tag]:
         """Returns the tags whose value keys intersect `expression`."""

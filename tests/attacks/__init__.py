@@ -1,1 +1,1 @@
-"""Attacks on the running gateway: each test is one fault of a device, a server or a link."""
+"""The real program under attack: hostile peers, broken networks, mistakes of the user."""

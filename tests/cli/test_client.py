@@ -20,6 +20,7 @@ from tests.zenoh_peer import free_endpoint
 TIME = "2026-11-20T12:00:00.123456Z"
 Answer = Callable[[zenoh.Query], None]
 Request = Callable[[Client], object]
+META = "plant/mixer/**/@meta"
 REQUESTS: list[Request] = [
     lambda client: client.write("mixer/speed", 5),
     lambda client: client.control("hall", "mixer", "stop", ""),
@@ -128,6 +129,12 @@ def answering(config: Config, answers: Mapping[str, Answer]) -> Iterator[zenoh.S
         declared = [session.declare_queryable(key, answer) for key, answer in answers.items()]
         yield session
         declared.clear()
+
+
+def described(query: zenoh.Query) -> None:
+    """Replies as the gateway of the device."""
+    with query:
+        query.reply("plant/mixer/speed/@meta", b"{}")
 
 
 def saying(*rows: tuple[str, bytes, Mapping[str, object] | None]) -> Answer:
@@ -292,14 +299,14 @@ def test_a_sendwithout_a_receiver_is_not_sent(config: Config, send: Request) -> 
         with query:
             asked.append(str(query.key_expr))
 
-    answers = {"plant/**": note, "plant/@gateway/**": note, "plant/press/**/@set": note}
+    answers = {"plant/**": note, "plant/**/@set": note, "plant/*/@stop": note, META: note}
     with (
         answering(config, answers),
         connected(config, print) as client,
         pytest.raises(GatewayError, match=r"no gateway accepts plant/mixer/.*: nothing was sent"),
     ):
         send(client)
-    assert asked == ["plant/@gateway/demo/status"]
+    assert asked == [META]
 
 
 @pytest.mark.parametrize("send", REQUESTS, ids=["write", "command"])
@@ -313,7 +320,7 @@ def test_a_sendwithout_a_reply_has_an_unknown_result(
                 query.reply_err(error)
 
     with (
-        answering(config, {"plant/*/*/@set": take, "plant/*/@stop": take}),
+        answering(config, {"plant/**/@set": take, "plant/*/@stop": take, META: described}),
         connected(config, print) as client,
         pytest.raises(GatewayError, match="no reply: it is unknown whether it was done"),
     ):
@@ -328,7 +335,8 @@ def test_any_value_of_a_tag_can_be_sent(config: Config, value: Value) -> None:
             sent = json.loads(query.payload.to_bytes())
             query.reply(query.key_expr, json.dumps({"value": repr(sent)}))
 
-    with answering(config, {"plant/mixer/**/@set": echo}), connected(config, print) as client:
+    answers = {"plant/**/@set": echo, META: described}
+    with answering(config, answers), connected(config, print) as client:
         assert client.write("mixer/speed", value) == {"value": repr(value)}
 
 

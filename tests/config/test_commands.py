@@ -133,7 +133,9 @@ async def test_over_zenoh(served: tuple[str, Path]) -> None:
                 assert refused.json["error"] == error
         [running] = await client.get("plant/oven/@run")
         assert (running.json["error"], running.json["code"]) == ("refused", "18")
-        assert await client.get("plant/vigor/@stop") == []
+        [none] = await client.get("plant/vigor/@stop")
+        assert none.json["error"] == "bad-value"
+        assert await client.get("plant/nobody/@stop") == []
         assert [reply.key for reply in await client.get("plant/**")]  # asks, and commands nothing
         audit = await client.subscribe("plant/@gateway/*/writes")
         [stopped] = await client.get("plant/oven/@stop")

@@ -96,7 +96,7 @@ async def test_the_line_recovers_by_itself(
         )
     )
     async with ZenohPeer("client", connect=[endpoint]) as client:
-        alive = await client.liveliness("plant/mixer")
+        alive = await client.liveliness("plant/@gateway/*/alive/mixer")
         heard = await client.subscribe("plant/mixer/*")
         await heard.until(lambda h: _all(h.latest(), "good"))
 

@@ -65,7 +65,7 @@ def busy_plant(tmp_path: Path) -> Iterator[Plant]:
 async def test_the_gateway_ends_in_time_under_load(busy_plant: Plant, by: signal.Signals) -> None:
     with started(busy_plant.config) as gateway:
         async with ZenohPeer("client", connect=[busy_plant.endpoint]) as client:
-            alive = await client.liveliness("plant/**")
+            alive = await client.liveliness("plant/@gateway/*/alive/**")
             heard = await client.subscribe("plant/**")
             await heard.next(lambda s: s.key == "plant/mixer/speed" and s.json["value"] is not None)
             writing = asyncio.create_task(

@@ -95,7 +95,9 @@ async def test_a_scale_streams_weights(tmp_path: Path, endpoint: str) -> None:
         with started(config):
             async with ZenohPeer("client", connect=[endpoint]) as client:
                 heard = await client.subscribe("plant/scale/**")
-                await client.until_alive("plant/*", ["plant/scale"])
+                await client.until_alive(
+                    "plant/@gateway/*/alive/*", ["plant/@gateway/weighing-room/alive/scale"]
+                )
                 [reply] = await client.get("plant/scale/weight")
                 assert reply.json["value"] == 1234.5
                 scale.streams = OVERLOAD
@@ -109,7 +111,7 @@ async def test_a_scale_streams_weights(tmp_path: Path, endpoint: str) -> None:
                 await heard.next(
                     lambda s: s.key.endswith("weight") and s.json.get("reason") == "no-reply"
                 )
-                await client.until_alive("plant/*", [])
+                await client.until_alive("plant/@gateway/*/alive/*", [])
         assert scale.heard == b""
 
 
@@ -173,7 +175,9 @@ async def test_an_inverter_is_read_and_written_by_ascii_commands(
         with started(config):
             async with ZenohPeer("client", connect=[endpoint]) as client:
                 heard = await client.subscribe("plant/inverter/**")
-                await client.until_alive("plant/*", ["plant/inverter"])
+                await client.until_alive(
+                    "plant/@gateway/*/alive/*", ["plant/@gateway/drives/alive/inverter"]
+                )
                 [reply] = await client.get("plant/inverter/setpoint/@set", b"37.5")
                 assert reply.ok, reply
                 assert reply.json["value"] == 37.5

@@ -4,7 +4,7 @@ import asyncio
 import json
 import signal
 import sys
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
 from contextlib import ExitStack, asynccontextmanager
 from pathlib import Path
 
@@ -59,13 +59,14 @@ async def wire() -> AsyncIterator[tuple[Wire, int]]:
         server.close()
 
 
-def gateway(folder: Path, name: str, router: str, port: int) -> Program:
+def gateway(folder: Path, name: str, router: str, port: int, listen: Sequence[str] = ()) -> Program:
+    """`router`: where it connects to; empty for a gateway that only listens."""
     tags = {"speed": {"address": "D100"}, "run": {"address": "Y20", "write": True}}
     device = {"protocol": "vigor", "station": 1, "tags": tags}
     line = {"port": f"tcp://127.0.0.1:{port}", "baudrate": 19200, "devices": {"mixer": device}}
     text = {
         "gateway": {"name": name, "standby": "hall"},
-        "zenoh": {"listen": [], "connect": [router]},
+        "zenoh": {"listen": list(listen), "connect": [router] if router else []},
         "lines": {"hall-1": line},
     }
     file = folder / f"{name}.yaml"
@@ -119,9 +120,9 @@ async def test_two_gateways_of_a_group_share_one_wire(tmp_path: Path) -> None:
                     assert await asyncio.to_thread(a.end) == 0
 
 
-async def says(program: Program, words: str, after: int = 0) -> int:
+async def says(program: Program, *words: str, after: int = 0) -> int:
     """Returns the number of lines up to the one with the words, after so many."""
-    line = await asyncio.to_thread(program.says, words, after=after)
+    line = await asyncio.to_thread(program.says, *words, after=after)
     return program.lines.index(line, after) + 1
 
 
@@ -147,3 +148,18 @@ async def test_watch_continues_with_the_active_gateway_of_the_group(
             seen = await says(watch, good, after=seen)
             b.end(signal.SIGKILL)
             await says(watch, gone, after=seen)
+
+
+async def test_a_router_that_visited_does_not_disable_the_standby(tmp_path: Path) -> None:
+    """The gateways are linked to each other. A router linked to one of them for a moment."""
+    endpoint, port = free_endpoint(), free_port()
+    with ExitStack() as programs:
+        programs.enter_context(station("tcp", str(port)))
+        b = programs.enter_context(gateway(tmp_path, "b", "", port, [endpoint]))
+        a = programs.enter_context(gateway(tmp_path, "a", endpoint, port))
+        await says(a, "device online")
+        async with ZenohPeer("router", connect=[endpoint]):
+            await says(b, "Zenoh link up", "to=router")
+        await says(b, "Zenoh link down", "to=router")
+        a.end(signal.SIGKILL)
+        await says(b, "device online")

@@ -80,7 +80,7 @@ async def test_history_survives_router_and_gateway_killed_under_load(tmp_path: P
 
         # The gateway, in the middle of writes.
         client = await stack.enter_async_context(ZenohPeer("client", connect=[endpoint]))
-        await client.until_alive("plant/*", ["plant/mixer"])
+        await client.until_alive("plant/@gateway/*/alive/*", ["plant/@gateway/demo/alive/mixer"])
         [done] = await client.get("plant/mixer/last/@set", b"9")
         assert done.ok
         assert plc.tell("get 1 D 500") == "9"

@@ -56,6 +56,23 @@ async def by_itself(plant: PlainPlant, folder: Path) -> AsyncIterator[tuple[Any,
         yield northbound, endpoint
 
 
+async def test_behind_a_router_a_second_gateway_leaves_the_devices_to_the_first(
+    tmp_path: Path,
+) -> None:
+    async with behind_a_router(mixer(), tmp_path) as (_, endpoint):
+        settings = ZenohConfig(
+            connect=(endpoint,), user="gateway", password_file=tmp_path / "password.txt"
+        )
+        second = Northbound(settings, "second", mixer())
+        serves = asyncio.create_task(second.run())
+        async with asyncio.timeout(5):
+            await second.replaced.wait()
+        assert second.withheld == {"mixer": "demo", "oven": "demo"}
+        assert not second.active.is_set()
+        serves.cancel()
+        await asyncio.wait([serves])
+
+
 @pytest.mark.parametrize("guarded", [behind_a_router, by_itself])
 async def test_a_viewer_reads_an_operator_writes_and_strangers_do_neither(
     guarded: Callable[..., Any], tmp_path: Path

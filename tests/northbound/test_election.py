@@ -126,3 +126,31 @@ def test_clients_that_come_and_go_do_not_delay_a_claim() -> None:
         election.link_changed("client", up=step % 2 == 0, router=False, now=step * STEP)
         election.decide(step * STEP)
     assert election.state is State.ACTIVE
+
+
+def test_a_router_that_visits_does_not_delay_a_gateway_that_sees_the_active_one_directly() -> None:
+    election = alone()
+    other = RoleToken(Role.ACTIVE, "b", "s2")
+    election.link_changed("s2", up=True, router=False, now=0.0)
+    election.token_changed(other, True)
+    election.decide(1.0)
+    election.link_changed("visitor", up=True, router=True, now=2.0)
+    election.decide(3.0)
+    election.link_changed("visitor", up=False, router=True, now=4.0)
+    for step in range(int(4.0 / STEP), int(5.0 / STEP)):
+        election.decide(step * STEP)
+    election.token_changed(other, False)
+    election.link_changed("s2", up=False, router=False, now=5.0)
+    assert until(election, State.ACTIVE, 5.0, 8.0) < 7.0
+
+
+def test_a_gateway_that_saw_the_active_one_through_a_router_waits_for_a_router() -> None:
+    election = alone()
+    other = RoleToken(Role.ACTIVE, "b", "s2")
+    election.link_changed("router", up=True, router=True, now=0.0)
+    election.token_changed(other, True)
+    election.decide(1.0)
+    election.token_changed(other, False)
+    election.link_changed("router", up=False, router=True, now=2.0)
+    with pytest.raises(AssertionError, match="still waiting"):
+        until(election, State.CLAIMING, 2.0, 60.0)

@@ -19,6 +19,7 @@ def test_the_keys_of_the_contract() -> None:
     assert KEYS.block("mixer") == "site/plant/mixer/@block"
     assert KEYS.device("mixer") == "site/plant/mixer"
     assert KEYS.own == "site/plant/@gateway/hall-1"
+    assert KEYS.alive("mixer") == "site/plant/@gateway/hall-1/alive/mixer"
     assert KEYS.status("lines/hall-1") == "site/plant/@gateway/hall-1/lines/hall-1"
     assert KEYS.writes == "site/plant/@gateway/hall-1/writes"
 
@@ -71,9 +72,22 @@ def test_a_key_outside_the_prefix_is_no_tag() -> None:
     assert KEYS.tag("site/plant") is None
 
 
-@pytest.mark.parametrize("prefix", ["", "/plant", "plant/", "a//b", "@plant", "pl*nt", "a b", "a#"])
-def test_a_prefix_that_is_no_key_is_refused_with_the_reason(prefix: str) -> None:
-    with pytest.raises(ConfigError, match="letters, digits"):
+@pytest.mark.parametrize(
+    ("prefix", "reason"),
+    [
+        ("", "one `/` separates"),
+        ("/plant", "one `/` separates"),
+        ("plant/", "one `/` separates"),
+        ("a//b", "one `/` separates"),
+        ("@plant", "reserved"),
+        ("pl*nt", "wildcard"),
+        ("a#", "wildcard"),
+        ("a b", "has a space: names are letters and digits"),
+        ("a:b", "has ':': names are letters and digits"),
+    ],
+)
+def test_a_prefix_that_is_no_key_is_refused_with_the_reason(prefix: str, reason: str) -> None:
+    with pytest.raises(ConfigError, match=reason):
         Keys(prefix, "demo")
 
 

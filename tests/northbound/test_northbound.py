@@ -26,14 +26,18 @@ from tests.zenoh_peer import ZenohPeer, free_endpoint
 async def test_liveliness_shows_gateway_and_devices() -> None:
     plant = mixer()
     async with gateway_and_client(plant) as (northbound, client):
-        live = await client.liveliness("plant/**")
+        live = await client.liveliness("plant/@gateway/*/alive/**")
         northbound.set_online("mixer", True)
-        await live.next(lambda token: (token.key, token.kind) == ("plant/mixer", "PUT"))
+        await live.next(
+            lambda token: (token.key, token.kind) == ("plant/@gateway/demo/alive/mixer", "PUT")
+        )
         await client.until_alive("plant/@gateway/*", ["plant/@gateway/demo"])
-        await client.until_alive("plant/*", ["plant/mixer"])
+        await client.until_alive("plant/@gateway/*/alive/*", ["plant/@gateway/demo/alive/mixer"])
         northbound.set_online("mixer", False)
-        await live.next(lambda token: (token.key, token.kind) == ("plant/mixer", "DELETE"))
-        await client.until_alive("plant/*", [])
+        await live.next(
+            lambda token: (token.key, token.kind) == ("plant/@gateway/demo/alive/mixer", "DELETE")
+        )
+        await client.until_alive("plant/@gateway/*/alive/*", [])
 
 
 async def gateway_process(endpoint: str, fails: str = "") -> asyncio.subprocess.Process:

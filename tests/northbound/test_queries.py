@@ -77,11 +77,15 @@ async def test_status_is_answered_and_published() -> None:
     async with gateway_and_client(mixer()) as (_, client):
         keys = {reply.key for reply in await client.get("plant/@gateway/*/**")}
         own = "plant/@gateway/demo"
-        assert keys == {f"{own}/status", f"{own}/lines/hall-1", f"{own}/zenoh"}
+        claim = next(key for key in keys if key is not None and "/claim/" in key)
+        assert keys == {f"{own}/status", f"{own}/lines/hall-1", f"{own}/zenoh", claim}
         [reply] = await client.get(f"{own}/lines/*")
         assert reply.json == {"load": 0.5}
         received = await client.subscribe("plant/@gateway/*/status")
-        assert (await received.next(lambda _: True)).json == {"state": "running"}
+        status = (await received.next(lambda _: True)).json
+        assert status == {"state": "running", "refused_devices": {}}
+        [claimed] = await client.get(claim)
+        assert claimed.json["devices"] == ["mixer", "oven"]
 
 
 async def test_max_age_reads_the_device_unless_the_sample_is_younger() -> None:

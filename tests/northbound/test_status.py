@@ -94,3 +94,14 @@ async def test_a_line_shows_its_forecast(tmp_path: Path) -> None:
     assert expected["load"] == round(load, 4)
     assert expected["requests_per_second"] == 10  # two blocks, five times a second
     assert line.engine.wire.baudrate == 19200
+
+
+async def test_the_uptime_does_not_follow_the_wall_clock(tmp_path: Path) -> None:
+    wall = [1_800_000_000 * 10**9]
+    line = vigor_line("simulator", TAGS)
+    config = load(write_config(tmp_path / "c.yaml", "tcp/127.0.0.1:7447", {"hall": line}))
+    gateway = Gateway(config, wall=lambda: wall[0])
+    wall[0] -= 600 * 10**9
+    up = gateway.status()["status"]["up"]
+    assert isinstance(up, float)
+    assert 0 <= up < 60

@@ -4,6 +4,8 @@ import asyncio
 from collections.abc import Sequence
 from typing import Any
 
+import pytest
+
 from gateway.config import ZenohConfig
 from gateway.errors import (
     BadValue,
@@ -13,6 +15,7 @@ from gateway.errors import (
     NoReply,
     Refused,
 )
+from gateway.northbound import inbox
 from gateway.northbound.writes import MOST_WAITING
 from tests.northbound.plant import (
     gateway_and_client,
@@ -176,3 +179,26 @@ async def test_a_write_that_is_not_acknowledged_when_the_gateway_ends_is_unclear
             await until(lambda: northbound.counters()["queries"] == 1)
         [reply] = await asking
         assert reply.json["error"] == "unclear"
+
+
+async def test_a_write_to_a_device_of_another_gateway_gets_no_reply_even_when_busy(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A reply such as `busy` would say that nothing was done, but the other one may do it."""
+    plant = mixer()
+    plant.known_commands = {"oven": frozenset({"run"})}
+    keys = ["plant/press/recipe/@set", "plant/press/@run"]
+    async with gateway_and_client(plant) as (northbound, client):
+        for key in keys:
+            assert await client.get(key, b"7", timeout=60) == []
+            await client.put(key, b"7")
+        [reply] = await client.get("plant/mixer/nothing/@set", b"7")
+        assert reply.json["error"] == "unknown-tag"
+        monkeypatch.setattr(inbox, "LIMIT", 0)
+        [reply] = await client.get("plant/mixer/recipe/@set", b"7")
+        assert reply.json["error"] == "busy"
+        for key in keys:
+            assert await client.get(key, b"7", timeout=60) == []
+        assert northbound.counters()["refused"] == 1
+    assert plant.written == []
+    assert plant.commanded == []

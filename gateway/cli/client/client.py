@@ -104,13 +104,20 @@ class Client:
         Raises `GatewayError` when no gateway accepts the write, or none replies.
         """
         # Not orjson: it refuses integers beyond 64 bits, which a float tag accepts.
-        return self._request(self._keys.set(tag), json.dumps(value).encode())
+        device = tag.partition("/")[0]
+        return self._request(self._keys.set(tag), json.dumps(value).encode(), self._tags_of(device))
 
     def control(self, line: str, device: str, command: str, argument: str) -> dict[str, object]:
         """Returns the outcome of a command: `answer ...` or `error ...`. Raises as `write`."""
-        to_all = command == TO_ALL
-        key = self._keys.to_all(line) if to_all else self._keys.command(device, command)
-        return self._request(key, argument.encode())
+        if command == TO_ALL:
+            status = self._keys.status("status")
+            return self._request(self._keys.to_all(line), argument.encode(), status)
+        key = self._keys.command(device, command)
+        return self._request(key, argument.encode(), self._tags_of(device))
+
+    def _tags_of(self, device: str) -> str:
+        """The descriptions of a device: only its gateway replies."""
+        return self._keys.meta(f"{device}/**")
 
     def follow(self, wanted: list[str]) -> Generator[Row, None, None]:
         """Yields the current values, then every change, without end.
@@ -212,16 +219,18 @@ class Client:
         except zenoh.ZError as error:
             raise GatewayError(f"{selector}: {error}") from None
 
-    def _request(self, key: str, payload: bytes) -> dict[str, object]:
+    def _request(self, key: str, payload: bytes, documents: str) -> dict[str, object]:
         """Sends a write or a command if a gateway accepts it. Returns the decoded reply.
 
-        A query for the status comes first. Zenoh keeps messages in order, so after its reply the
-        session knows the receivers of the request. And a gateway that hangs does not get a request
-        that it would execute later, after the client has given up.
+        A query for `documents` comes first: only the gateway of the receiver replies to it. Every
+        gateway under the prefix gets the request, and is silent when the receiver is not its own.
+        A gateway that hangs does not get a request that it would execute later, after the client
+        has given up. And Zenoh keeps messages in order, so after the reply the session knows
+        whether a gateway may get the request.
         """
         with self._session.declare_querier(key, timeout=REPLY_TIMEOUT) as querier:
-            self._query(self._keys.status("status"))
-            if not querier.matching_status.matching:  # type: ignore[attr-defined]  # no bool
+            served = any(reply.ok is not None for reply in self._query(documents))
+            if not (served and querier.matching_status.matching):  # type: ignore[attr-defined]
                 may = f"may {self._user} do this, and " if self._user else ""
                 raise GatewayError(f"no gateway accepts {key}: nothing was sent; {may}{_CHANGED}")
             for reply in querier.get(payload=payload, attachment=os.environ.get(TOKEN_VARIABLE)):

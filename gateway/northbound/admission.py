@@ -1,0 +1,51 @@
+"""Decides when this gateway may serve its plant, and which of its devices."""
+
+import asyncio
+from collections.abc import Iterable, Mapping
+
+import zenoh
+
+from gateway.northbound.claiming import NETWORK_WITHIN, Claiming
+from gateway.northbound.keys import Keys
+from gateway.northbound.second_session import SecondSession
+from gateway.northbound.standby import Standby, StandbySettings
+
+
+class Admission:
+    """The election of a standby group first, then the claims of all gateways under the prefix.
+
+    Sets `active` when the gateway may open its lines, `replaced` when it must close them and start
+    over: as standby, or with other devices `withheld`.
+    """
+
+    def __init__(
+        self,
+        standby: StandbySettings | None,
+        keys: Keys,
+        config: zenoh.Config,
+        devices: Iterable[str],
+    ) -> None:
+        """`config`: of the gateway's own session."""
+        self.active = asyncio.Event()
+        self.standby = Standby(standby, keys)
+        self.replaced = self.standby.replaced
+        group = None if standby is None else standby.group
+        self.claiming = Claiming(keys, group, devices, self.active, self.replaced)
+        self._second = SecondSession(config)
+
+    def documents(self) -> Mapping[str, Mapping[str, object]]:
+        return self.standby.documents() | self.claiming.documents()
+
+    async def run_alone(self) -> None:
+        """Lets the gateway serve while a client waits for its router, unless it has a group."""
+        await asyncio.sleep(NETWORK_WITHIN)
+        if not self.standby.enabled:
+            self.active.set()
+
+    async def run(self, session: zenoh.Session) -> None:
+        """Runs until cancelled. `session` is the gateway's own. Raises `GatewayError`, `ZError`."""
+        async with asyncio.TaskGroup() as tasks:
+            tasks.create_task(self._second.run(session))
+            tasks.create_task(self.standby.run(session, self._second))
+            await self.standby.active.wait()
+            await self.claiming.run(session, self._second)

@@ -1,0 +1,174 @@
+"""Two gateways that are configured by mistake with the same device: only one serves it."""
+
+import asyncio
+import json
+import os
+import signal
+from collections.abc import AsyncIterator
+from contextlib import ExitStack, asynccontextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+from tests.e2e.processes import Program, free_port, gateway, plc_gateway, station
+from tests.zenoh_peer import ZenohPeer, free_endpoint
+
+RECIPE = "plant/mixer/recipe/@set"
+
+
+class Plant(NamedTuple):
+    router: str
+    client: ZenohPeer
+    folder: Path
+    programs: ExitStack
+
+    def file(self, name: str, devices: dict[str, int], copy: str = "") -> Path:
+        """Writes the configuration of a gateway with a wire of its own.
+
+        `copy` tells two files of one name apart.
+        """
+        port = free_port()
+        self.programs.enter_context(station("tcp", str(port), stations=(1, 2)))
+        tags = {"recipe": {"address": "D500", "write": True}}
+        line = {
+            "port": f"tcp://127.0.0.1:{port}",
+            "baudrate": 19200,
+            "devices": {
+                device: {"protocol": "vigor", "station": number, "tags": tags}
+                for device, number in devices.items()
+            },
+        }
+        text = {
+            "gateway": {"name": name},
+            "zenoh": {"listen": [], "connect": [self.router]},
+            "lines": {"hall": line},
+        }
+        file = self.folder / f"{name}{copy}.yaml"
+        file.write_text(json.dumps(text))
+        return file
+
+    def run(self, file: Path) -> Program:
+        return self.programs.enter_context(gateway("run", file))
+
+    async def until_alive(self, *tokens: str) -> None:
+        keys = [f"plant/@gateway/{token}" for token in tokens]
+        await self.client.until_alive("plant/@gateway/*/alive/*", keys)
+
+
+@asynccontextmanager
+async def plant(folder: Path) -> AsyncIterator[Plant]:
+    router = free_endpoint()
+    with ExitStack() as programs:
+        async with (
+            ZenohPeer("router", listen=[router]),
+            ZenohPeer("client", connect=[router]) as client,
+        ):
+            yield Plant(router, client, folder, programs)
+
+
+def writes(program: Program) -> int:
+    return sum("tag written" in line for line in program.lines)
+
+
+async def test_the_second_gateway_leaves_the_device_to_the_first(tmp_path: Path) -> None:
+    async with plant(tmp_path) as p:
+        left = p.file("left", {"mixer": 1})
+        right = p.file("right", {"mixer": 1, "oven": 2})
+        a = p.run(left)
+        await p.until_alive("left/alive/mixer")
+        b = p.run(right)
+        await asyncio.to_thread(b.says, "device refused", "mixer", "gateway left serves it")
+        await p.until_alive("left/alive/mixer", "right/alive/oven")
+        [status] = await p.client.get("plant/@gateway/right/status")
+        assert status.json["refused_devices"] == {"mixer": "left"}
+        assert list(status.json["devices"]) == ["oven"]
+
+        # One gateway writes, and one answers; that of another device is silent.
+        for target in ("BEST_MATCHING", "ALL"):
+            for key in (RECIPE, "plant/oven/recipe/@set"):
+                [reply] = await p.client.get(key, b"7", target=target)
+                assert reply.ok
+        [unknown] = await p.client.get("plant/oven/nothing/@set", b"7")
+        assert unknown.json["error"] == "unknown-tag"
+        outcomes = await p.client.subscribe("plant/@gateway/*/writes")
+        await p.client.put(RECIPE, b"8")
+        await outcomes.next(lambda s: s.key == "plant/@gateway/left/writes")
+        assert (writes(a), writes(b)) == (3, 2)
+
+        # No gateway has the device: no answer, at once, and a clear error from our own client.
+        assert await p.client.get("plant/press/recipe/@set", b"7", timeout=60) == []
+        nobody = p.file("right", {"press": 2}, copy="-changed")
+        done = await asyncio.to_thread(plc_gateway, "write", nobody, "press/recipe", "7")
+        assert done.code == 1
+        assert "no gateway accepts plant/press/recipe/@set: nothing was sent" in done.err
+
+
+async def test_the_same_file_started_twice_serves_once(tmp_path: Path) -> None:
+    """The second one ends with the reason."""
+    async with plant(tmp_path) as p:
+        a = p.run(p.file("demo", {"mixer": 1}))
+        await p.until_alive("demo/alive/mixer")
+        b = p.run(p.file("demo", {"mixer": 1}, copy="-copy"))
+        assert await asyncio.to_thread(b.ended) == 1
+        assert b.has_said("gateway demo serves every device of this file already")
+        assert not b.has_said("device online")
+        [reply] = await p.client.get(RECIPE, b"7", target="ALL")
+        assert reply.ok
+        assert a.running
+
+
+async def test_of_two_that_start_at_once_one_serves(tmp_path: Path) -> None:
+    async with plant(tmp_path) as p:
+        files = [p.file(name, {"mixer": 1}) for name in ("left", "right")]
+        both = [p.run(file) for file in files]
+        ends = [asyncio.create_task(asyncio.to_thread(one.ended)) for one in both]
+        await asyncio.wait(ends, return_when=asyncio.FIRST_COMPLETED)
+        [stays] = [one for one in both if one.running]
+        [ended] = [one for one in both if one is not stays]
+        assert ended.has_said("serves every device of this file already")
+        await asyncio.to_thread(stays.says, "device online")
+        [reply] = await p.client.get(RECIPE, b"7", target="ALL")
+        assert reply.ok
+        stays.end()
+        await asyncio.gather(*ends)
+
+
+async def test_two_that_started_without_a_network_share_out_when_it_is_there(
+    tmp_path: Path,
+) -> None:
+    """The one that was there first stays."""
+    router = free_endpoint()
+    with ExitStack() as programs:
+        async with ZenohPeer("peer") as nobody:
+            p = Plant(router, nobody, tmp_path, programs)
+            a = p.run(p.file("right", {"mixer": 1, "oven": 2}))
+            await asyncio.to_thread(a.says, "device online", "mixer")
+            b = p.run(p.file("left", {"mixer": 1}))
+            await asyncio.to_thread(b.says, "device online", "mixer")
+        async with (
+            ZenohPeer("router", listen=[router]),
+            ZenohPeer("client", connect=[router]) as client,
+        ):
+            assert await asyncio.to_thread(b.ended) == 1
+            assert b.has_said("gateway right serves every device of this file already")
+            await client.until_alive(
+                "plant/@gateway/*/alive/*",
+                ["plant/@gateway/right/alive/mixer", "plant/@gateway/right/alive/oven"],
+            )
+            [reply] = await client.get(RECIPE, b"7", target="ALL")
+            assert reply.ok
+            assert not a.has_said("starts over")
+
+
+async def test_a_gateway_that_was_frozen_keeps_its_device_when_it_wakes(tmp_path: Path) -> None:
+    async with plant(tmp_path) as p:
+        a = p.run(p.file("left", {"mixer": 1}))
+        await p.until_alive("left/alive/mixer")
+        os.kill(a.pid, signal.SIGSTOP)
+        b = p.run(p.file("right", {"mixer": 1}))
+        await asyncio.to_thread(b.says, "device online")
+        os.kill(a.pid, signal.SIGCONT)
+        assert await asyncio.to_thread(b.ended) == 1
+        assert b.has_said("gateway left serves every device of this file already")
+        await p.until_alive("left/alive/mixer")
+        [reply] = await p.client.get(RECIPE, b"7", target="ALL")
+        assert reply.ok
