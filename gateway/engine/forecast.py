@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from gateway.engine.ages import load_of, polled_blocks, worst_ages
 from gateway.engine.device import Device
 from gateway.engine.probes import seen_within
+from gateway.engine.reply_shapes import MARK_LONGEST
 from gateway.planning.planner import Block, plan
 from gateway.planning.wire_timing import WireTiming
 from gateway.protocols.unsolicited import Unsolicited
@@ -60,7 +61,7 @@ class LineForecast:
 def forecast(name: str, devices: Sequence[Device], wire: WireTiming) -> LineForecast:
     """Calculates the forecast of a line from the plans of its devices."""
     blocks = polled_blocks(devices)
-    load = load_of(blocks)
+    load = load_of(blocks) + sum(map(_marks, devices))
     longest = max((_longest(device, block) for device, block, _ in blocks), default=0.0)
     write = max((_longest_write(device) for device in devices), default=0.0)
     silence = max((device.longest_reply for device in devices), default=0.0)
@@ -85,6 +86,12 @@ def forecast(name: str, devices: Sequence[Device], wire: WireTiming) -> LineFore
         shortest=sum(_round(device) for device in devices) if load > 1 else cycle,
         unsolicited=tuple((device, tags) for device, tags in unsolicited if tags),
     )
+
+
+def _marks(device: Device) -> float:
+    """Returns the share of the wire time of the resyncs on a wire that is never quiet."""
+    shortest = min((device.seconds(block.cost) for block in device.blocks), default=0.0)
+    return 0.0 if device.shapes is None else shortest / MARK_LONGEST
 
 
 def _longest(device: Device, block: Block) -> float:

@@ -15,6 +15,7 @@ from gateway.app import forecasts
 from gateway.config import load
 from gateway.engine.device import Device
 from gateway.engine.forecast import LineForecast, forecast
+from gateway.engine.reply_shapes import MARK_LONGEST
 from gateway.planning.wire_timing import WireTiming
 from tests.e2e.processes import vigor_line, write_config
 from tests.sim.plant import device, words
@@ -46,7 +47,8 @@ def test_one_block_of_two_words(tmp_path: Path) -> None:
     [block] = line.blocks
     assert tuple(block.block.cost) == (LENGTH["vigor-003"], LENGTH["vigor-004"])
     assert block.seconds == pytest.approx(seconds_of(READ_D1_D2))
-    assert line.load == pytest.approx(seconds_of(READ_D1_D2))
+    mark = seconds_of(READ_D1_D2) / MARK_LONGEST
+    assert line.load == pytest.approx(seconds_of(READ_D1_D2) + mark)
     assert line.cycle == pytest.approx(seconds_of(READ_D1_D2))
     assert (line.requests, line.characters) == (1, READ_D1_D2)
     assert not line.overloaded
@@ -58,7 +60,7 @@ def test_the_load_counts_each_interval(tmp_path: Path) -> None:
     tags["e"] = {"address": "D2", "every": "250ms"}
     line = forecast_of(tmp_path, tags)
     words, bits = seconds_of(READ_D1_D2), seconds_of(READ_M8_M15)
-    assert line.load == pytest.approx(4 * words + bits / 2)
+    assert line.load == pytest.approx(4 * words + bits / 2 + bits / MARK_LONGEST)
     assert line.requests == pytest.approx(4.5)
     assert line.characters == pytest.approx(4 * READ_D1_D2 + READ_M8_M15 / 2)
     assert line.cycle == pytest.approx(words + bits)
@@ -101,7 +103,7 @@ def test_on_an_overloaded_line_every_interval_is_stretched(tmp_path: Path) -> No
     tags = {name: {**tag, "every": "20ms"} for name, tag in TWO_WORDS.items()}
     line = forecast_of(tmp_path, tags)
     words = seconds_of(READ_D1_D2)
-    assert line.load == pytest.approx(words / 0.02)
+    assert line.load == pytest.approx(words / 0.02, rel=1e-4)
     assert line.overloaded
     assert line.blocks[0].worst_age == pytest.approx(2 * 0.02 + words + words)
     assert line.advice() == (
@@ -146,7 +148,7 @@ def test_a_line_that_is_exactly_full_is_not_overloaded(tmp_path: Path) -> None:
     [block] = device.blocks
     device.blocks = (replace(block, every=device.seconds(block.cost)),)
     line = forecast("hall", [device], section.wire)
-    assert line.load == pytest.approx(1)
+    assert line.load == pytest.approx(1, rel=1e-4)
     assert not math.isinf(line.blocks[0].worst_age)
 
 
