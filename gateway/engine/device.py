@@ -116,7 +116,9 @@ class Device:
         self.health = Health(answerable=not self.broadcast)
         self.window = driver.window if isinstance(driver, Windowed) else 1
         self.silence = self.wire.silence(self.timing)
-        self.shapes = None if self.broadcast else reply_shapes(driver, self.polled_tags)
+        self.shapes = (
+            None if self.broadcast else reply_shapes(driver, self.polled_tags, self.bad_addresses)
+        )
         self.plan()
 
     @property

@@ -9,6 +9,7 @@ addresses more. An extra reply then arrives as a stray frame.
 from collections import Counter
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 
+from gateway.planning.bad_addresses import BadAddresses
 from gateway.planning.planner import Block
 from gateway.protocols.driver import AnyDriver, Cost, Span, UnnumberedReplies
 from gateway.tags import Tag
@@ -30,6 +31,7 @@ class ReplyShapes:
 
     __slots__ = (
         "_acked",
+        "_bad",
         "_choices",
         "_driver",
         "_hull",
@@ -46,7 +48,12 @@ class ReplyShapes:
         "span",
     )
 
-    def __init__(self, driver: UnnumberedReplies, tags: Mapping[str, tuple[int, int]]) -> None:
+    def __init__(
+        self,
+        driver: UnnumberedReplies,
+        tags: Mapping[str, tuple[int, int]],
+        bad: BadAddresses,
+    ) -> None:
         """`tags`: the first and last address of the tags, by area."""
         self.last: Hashable = None  # shape of the reply to the last request
         self._used: dict[Hashable, float] = {}  # when a reply of each shape was expected last
@@ -60,6 +67,7 @@ class ReplyShapes:
         self._mark = MARK_FIRST
         self._driver = driver
         self._hull = tags
+        self._bad = bad
         self._choices: dict[Span, list[Choice]] = {}
         self._shapes: Counter[Hashable] = Counter()  # of the planned blocks
         self.failed: dict[Span, int] = {}  # reads of longer spans in a row without a reply
@@ -189,12 +197,15 @@ class ReplyShapes:
         both = [Span(area, start, size + n) for n in steps]
         both += [Span(area, start - n, size + n) for n in steps if start >= n]
         among = [s for s in both if first <= s.start and s.start + s.size - 1 <= last]
+        cuts = [place for name, place in self._bad.cuts if name == area]
         for longer in [*among, *both]:
-            if self._driver.cost(longer) is not None:
+            end = longer.start + longer.size
+            crosses = any(longer.start < place < end for place in cuts)
+            if not crosses and self._driver.cost(longer) is not None:
                 yield longer
 
 
-def reply_shapes(driver: AnyDriver, tags: list[Tag]) -> ReplyShapes | None:
+def reply_shapes(driver: AnyDriver, tags: Sequence[Tag], bad: BadAddresses) -> ReplyShapes | None:
     """Returns the shapes of a device's replies; None where replies carry a number."""
     if not isinstance(driver, UnnumberedReplies) or not driver.unnumbered:
         return None
@@ -203,4 +214,4 @@ def reply_shapes(driver: AnyDriver, tags: list[Tag]) -> ReplyShapes | None:
         area, start, size = tag.span
         first, last = hull.get(area, (start, start))
         hull[area] = (min(first, start), max(last, start + size - 1))
-    return ReplyShapes(driver, hull)
+    return ReplyShapes(driver, hull, bad)

@@ -5,7 +5,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from gateway.stations.modbus import ModbusStation
-from tests.e2e.processes import free_port, started
+from tests.e2e.processes import PATIENCE, free_port, started
 from tests.zenoh_peer import ZenohPeer, free_endpoint
 
 NUMBERS = (100, 200, 300, 400, 500)
@@ -68,7 +68,7 @@ async def test_a_device_server_that_repeats_replies_moves_no_value(tmp_path: Pat
         with program:
             async with ZenohPeer("client", connect=[zenoh]) as client:
                 values = await client.subscribe("plant/**")
-                await values.next(lambda _: server.replies >= 1500)
+                await values.next(lambda _: server.replies >= 600, timeout=PATIENCE)
                 good = [s for s in values.samples if s.json["quality"] == "good"]
                 assert len(good) > 20
                 held = {(s.key, s.json["value"]) for s in good}

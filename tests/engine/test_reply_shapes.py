@@ -100,7 +100,7 @@ def test_reads_of_the_same_shape_have_the_same_reply_length(driver: AnyDriver) -
 
 
 def test_numbered_replies_need_no_shapes() -> None:
-    assert reply_shapes(ModbusTcp(station=1), []) is None
+    assert reply_shapes(ModbusTcp(station=1), [], tcp_device().bad_addresses) is None
     assert tcp_device().shapes is None
 
 

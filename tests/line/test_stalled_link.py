@@ -276,7 +276,7 @@ async def test_writes_refused_together_end_at_their_expiry() -> None:
     tags = [make_tag(f"D{n}", driver, device="plc", write=WriteRule()) for n in (100, 200, 300)]
     server = DeviceServer()
     line, dev, _ = behind(server, driver, *tags, reply_timeout=15.0)
-    refuse = b"\x1501FF06"
+    refuse = b"\x1501FF03"  # a code that says nothing was done
     hear = line.stations[0].hear
 
     def refusing(data: bytes, now: float) -> list[bytes]:
