@@ -203,13 +203,13 @@ class Device:
         self.blocks = blocks
         bad.changed.clear()
         if self.shapes is not None:
-            self.shapes.planned(blocks)
+            self.shapes.longer.planned(blocks)
 
     def poll_seconds(self, block: Block) -> Sequence[float]:
         """Returns the seconds of one poll of the block: of each span that may be read for it."""
         if self.shapes is None:
             return [self.seconds(block.cost)]
-        return [self.seconds(cost) for cost in self.shapes.costs(block)]
+        return [self.seconds(cost) for cost in self.shapes.longer.costs(block)]
 
     def plan_changes(self) -> float:
         """Plans again around the addresses that turned bad, returned or are split no longer.
@@ -236,7 +236,7 @@ class Device:
         found = plan(tags, self.driver, self.seconds, bad.cuts)
         self.blocks = tuple(sorted((*kept, *found), key=lambda block: block.span))
         if self.shapes is not None:
-            self.shapes.planned(self.blocks)
+            self.shapes.longer.planned(self.blocks)
         return self.planning_seconds(tags)
 
     @property

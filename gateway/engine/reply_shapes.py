@@ -6,24 +6,20 @@ succession to one device do not expect replies of one shape: where they would, o
 addresses more. An extra reply then arrives as a stray frame.
 """
 
-from collections import Counter
-from collections.abc import Hashable, Iterator, Mapping, Sequence
+from collections.abc import Hashable, Sequence
 
+from gateway.engine.longer_reads import MOST_CHOICES, LongerReads
 from gateway.planning.bad_addresses import BadAddresses
 from gateway.planning.planner import Block
-from gateway.protocols.driver import AnyDriver, Cost, Span, UnnumberedReplies
+from gateway.protocols.driver import AnyDriver, Span, UnnumberedReplies
 from gateway.tags import Tag
 
 QUIET = 0.25  # seconds after a reply in which an extra reply would have arrived
+WARY = 1.5  # the same after an extra reply: others may be as late
+WARY_FOR = 600.0  # seconds
 MARK_FIRST, MARK_LONGEST = 60.0, 600.0  # seconds between two resyncs on a wire that is never quiet
 SHOWN = 60.0  # seconds for which an extra reply explains the state of the device
-LONGEST_STEP = 16  # addresses by which a read may grow, to reach the next byte of bits
-MOST_CHOICES = 3  # shapes of one block: an extra reply that is late by two requests is noticed
-MOST_FAILED = 3  # reads in a row of the longer span without a reply
 NEVER = float("inf")
-
-
-Choice = tuple[Span, Hashable]  # a span to read, and the shape of its reply
 
 
 class ReplyShapes:
@@ -31,34 +27,27 @@ class ReplyShapes:
 
     __slots__ = (
         "_acked",
-        "_bad",
-        "_choices",
         "_driver",
-        "_hull",
         "_mark",
         "_refused",
-        "_shapes",
         "_used",
         "at",
         "extra_at",
-        "failed",
         "last",
+        "longer",
         "mark_due",
         "proven",
+        "quiet",
         "span",
     )
 
-    def __init__(
-        self,
-        driver: UnnumberedReplies,
-        tags: Mapping[str, tuple[int, int]],
-        bad: BadAddresses,
-    ) -> None:
-        """`tags`: the first and last address of the tags, by area."""
+    def __init__(self, driver: UnnumberedReplies, longer: LongerReads) -> None:
+        self.longer = longer
         self.last: Hashable = None  # shape of the reply to the last request
-        self._used: dict[Hashable, float] = {}  # when a reply of each shape was expected last
+        self._used: dict[Hashable, float] = {}  # when a read with each shape was sent last
         self.span: Span | None = None  # of the last read
         self.at = -NEVER  # when the last transaction ended
+        self.quiet = QUIET
         self.proven = 0.0  # values read before are no extra replies
         self.mark_due = 0.0  # when a resync must show the order, if the wire is not quiet before
         self.extra_at = -NEVER  # when an extra reply arrived
@@ -66,11 +55,6 @@ class ReplyShapes:
         self._acked: tuple[Hashable, float] = (None, -NEVER)  # the last acknowledgement, and when
         self._mark = MARK_FIRST
         self._driver = driver
-        self._hull = tags
-        self._bad = bad
-        self._choices: dict[Span, list[Choice]] = {}
-        self._shapes: Counter[Hashable] = Counter()  # of the planned blocks
-        self.failed: dict[Span, int] = {}  # reads of longer spans in a row without a reply
 
     def polled(self, block: Block, now: float) -> Span:
         """Returns the span to read for the block: its own, or a longer one around it."""
@@ -78,15 +62,14 @@ class ReplyShapes:
         if block.listed:
             self.sent(block.cost.reply, now)
             return span
-        choices = self._choices.get(span)
-        if choices is None:
-            choices = self._choices[span] = self._choose(span)
+        choices = self.longer.by_span.get(span) or self.longer.choices(span)
         used = self._used
         shape, read = choices[0][1], span  # the caller tells the block's own span by identity
-        if now - self.at >= QUIET:
+        if now - self.at >= self.quiet:
             self._prove(now)
-        elif now - used.get(shape, -NEVER) < QUIET:
-            best = min(choices, key=lambda choice: used.get(choice[1], -NEVER))
+        elif now - used.get(shape, -NEVER) < self.quiet:
+            some = choices if self.quiet == WARY else choices[:MOST_CHOICES]
+            best = min(some, key=lambda choice: used.get(choice[1], -NEVER))
             if best is not choices[0]:
                 read, shape = best
         used[shape] = now
@@ -94,11 +77,14 @@ class ReplyShapes:
         return read
 
     def sent(self, shape: Hashable, now: float) -> None:
-        """Notes a request that is no poll, and the shape of its last reply."""
-        if now - self.at >= QUIET:
+        """Notes a read that is no poll, or a command, and the shape of its reply."""
+        self._used[shape] = now
+        self._sent(shape, now)
+
+    def _sent(self, shape: Hashable, now: float) -> None:
+        if now - self.at >= self.quiet:
             self._prove(now)
         self.last = shape
-        self._used[shape] = now
 
     def written(self, tag: Tag, units: Sequence[int], now: float) -> tuple[bool, bool]:
         """Notes a write. Returns True where a resync must precede it, and follow it.
@@ -109,10 +95,12 @@ class ReplyShapes:
         replies = self._driver.write_shapes(tag.span, units)
         if tag.address.bit is not None:  # the word is read first
             replies = (self._driver.reply_shape(tag.span), None)
-        used = self._used.get(replies[0], -NEVER)
-        before, after = now - used < QUIET, self.may_be_extra(replies[-1], now)
-        self.sent(replies[-1], now)
-        return before and len(replies) > 1, after
+        before, after = False, self.may_be_extra(replies[-1], now)
+        for shape in replies[:-1]:
+            before = now - self._used.get(shape, -NEVER) < self.quiet
+            self._used[shape] = now
+        self._sent(replies[-1], now)
+        return before, after
 
     def may_be_extra(self, shape: Hashable, now: float) -> bool:
         """Returns True if an earlier reply to a write, or a refusal, may arrive once more.
@@ -121,7 +109,7 @@ class ReplyShapes:
         """
         acked, at = self._acked
         alike = shape == acked or shape is None or acked is None
-        return (alike and now - at < QUIET) or now - self._refused < QUIET
+        return (alike and now - at < self.quiet) or now - self._refused < self.quiet
 
     def acknowledged(self, now: float) -> None:
         """Notes that the last request, a write or command, was acknowledged."""
@@ -138,71 +126,18 @@ class ReplyShapes:
 
     def _prove(self, now: float) -> None:
         self.proven, self.mark_due = now, now + self._mark
+        if now - self.extra_at >= WARY_FOR:
+            self.quiet = QUIET
 
     def extra_arrived(self, now: float) -> None:
         """Notes an extra reply."""
-        self.extra_at = now
+        self.extra_at, self.quiet = now, WARY
         self._mark = MARK_FIRST
 
     @property
     def answers_twice(self) -> bool:
         """True if an extra reply arrived recently."""
         return self.at - self.extra_at < SHOWN
-
-    # Forecast
-
-    def planned(self, blocks: Sequence[Block]) -> None:
-        """Notes the blocks of a new plan."""
-        self._shapes = Counter(self._driver.reply_shape(block.span) for block in blocks)
-
-    def costs(self, block: Block) -> list[Cost]:
-        """Returns the costs of the spans that are read for the block."""
-        alone = block.listed or self._shapes[self._driver.reply_shape(block.span)] < 2
-        spans = [] if alone else [span for span, _ in self._choose(block.span)]
-        return [cost for span in spans if (cost := self._driver.cost(span))] or [block.cost]
-
-    # The longer span
-
-    def refused_longer(self, span: Span) -> None:
-        """Reads the span alone from now on: the addresses beside it do not exist."""
-        self._choices[span] = self._choices[span][:1]
-
-    def read_longer(self, span: Span, *, replied: bool) -> None:
-        """Counts reads of the longer span without a reply. Some stations refuse by silence."""
-        failed = self.failed.pop(span, 0) + 1
-        if not replied:
-            self.failed[span] = failed
-            if failed >= MOST_FAILED:
-                self.refused_longer(span)
-
-    def restart(self) -> None:
-        """Starts again after the device came online: it may have other addresses now."""
-        self._choices.clear()
-        self.failed.clear()
-
-    def _choose(self, span: Span) -> list[Choice]:
-        """Returns the span, and longer ones whose replies have other shapes."""
-        found: dict[Hashable, Span] = {self._driver.reply_shape(span): span}
-        for longer in self._longer(span):
-            found.setdefault(self._driver.reply_shape(longer), longer)
-            if len(found) == MOST_CHOICES:
-                break
-        return [(read, shape) for shape, read in found.items()]
-
-    def _longer(self, span: Span) -> Iterator[Span]:
-        """Yields spans around `span` that one request reads, those among the tags first."""
-        area, start, size = span
-        first, last = self._hull.get(area, (start, start))
-        steps = range(1, LONGEST_STEP + 1)
-        both = [Span(area, start, size + n) for n in steps]
-        both += [Span(area, start - n, size + n) for n in steps if start >= n]
-        among = [s for s in both if first <= s.start and s.start + s.size - 1 <= last]
-        cuts = [place for name, place in self._bad.cuts if name == area]
-        for longer in [*among, *both]:
-            end = longer.start + longer.size
-            crosses = any(longer.start < place < end for place in cuts)
-            if not crosses and self._driver.cost(longer) is not None:
-                yield longer
 
 
 def reply_shapes(driver: AnyDriver, tags: Sequence[Tag], bad: BadAddresses) -> ReplyShapes | None:
@@ -214,4 +149,4 @@ def reply_shapes(driver: AnyDriver, tags: Sequence[Tag], bad: BadAddresses) -> R
         area, start, size = tag.span
         first, last = hull.get(area, (start, start))
         hull[area] = (min(first, start), max(last, start + size - 1))
-    return ReplyShapes(driver, hull, bad)
+    return ReplyShapes(driver, LongerReads(driver, hull, bad))

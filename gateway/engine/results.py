@@ -9,7 +9,6 @@ from gateway.engine.effects import Effects, Samples
 from gateway.engine.health import State
 from gateway.engine.jobs import Poll
 from gateway.engine.plans import Plans
-from gateway.engine.reply_shapes import QUIET
 from gateway.engine.schedule import Schedule
 from gateway.engine.staleness import Staleness
 from gateway.errors import (
@@ -54,7 +53,7 @@ class Results:
             return
         if health.answered(resynced=resynced):
             if device.shapes is not None:
-                device.shapes.restart()
+                device.shapes.longer.restart()
             self._effects.online(device, True)
             self._effects.info("device online", line=self._line, device=device.name)
             device.bad_addresses.abandon()
@@ -68,8 +67,8 @@ class Results:
         if health.needs_resync or health.state is not State.ONLINE:
             self.answered(device, now, time)
         shapes = device.shapes
-        if poll.span is not block.span and shapes is not None and shapes.failed:
-            shapes.read_longer(block.span, replied=True)
+        if poll.span is not block.span and shapes is not None and shapes.longer.failed:
+            shapes.longer.answered(block.span)
         counts = poll.counts
         if last.at is not None:
             gap = now - last.at
@@ -183,7 +182,7 @@ class Results:
         shapes.refused(now)
         if poll.span is poll.block.span or error.refusal in (Refusal.DAMAGED, Refusal.BUSY):
             return False
-        shapes.refused_longer(poll.block.span)
+        shapes.longer.refused(poll.block.span)
         self._schedule.again(poll, counted=False)
         return True
 
@@ -304,7 +303,7 @@ class Results:
         device, bad = poll.device, poll.device.bad_addresses
         health, retries = device.health, device.timing.retries
         if poll.span is not poll.block.span and device.shapes is not None:
-            device.shapes.read_longer(poll.block.span, replied=False)
+            device.shapes.longer.unanswered(poll.block.span)
         if health.state is State.OFFLINE:
             return
         known, half = poll.block.span in bad.bad, bad.is_half(poll.block)
@@ -328,13 +327,14 @@ class Results:
         if shapes is None or health.needs_resync or not health.online:
             return  # the reply to an older request, which the resync expects
         known, why = shapes.answers_twice, ANSWERS_TWICE.format(station=device.driver.station)
+        suspect = now - shapes.at < shapes.quiet
         shapes.extra_arrived(now)
         health.answered_twice(shapes.span, now)
         log = self._effects.debug if known else self._effects.warning
         log("device answers twice", line=self._line, device=device.name, why=why)
         for poll in self._schedule.polls(device):
             at = poll.last.at
-            if at is not None and at >= shapes.proven and now - shapes.at < QUIET:
+            if suspect and at is not None and at >= shapes.proven:
                 poll.forget(now)
                 self._effects.bad(poll.block.tags, Reason.GARBLED, time, why)
                 self._schedule.expedite(poll)

@@ -8,7 +8,6 @@ from gateway.engine.health import PAUSE_LONGEST, State
 from gateway.engine.jobs import EXPEDITED, NOT_QUEUED, Idle, LastRead, Poll, Probe
 from gateway.engine.poll_queue import PollQueue
 from gateway.engine.probe_schedule import ProbeSchedule
-from gateway.engine.reply_shapes import QUIET
 from gateway.engine.requests import Request, RequestQueue
 from gateway.engine.unanswered import Unanswered
 from gateway.planning.planner import Block
@@ -186,7 +185,7 @@ class Schedule:
         if expedited or poll is None:
             poll = queue.expedited[0]
         shapes = poll.device.shapes
-        if shapes is not None and shapes.mark_due <= now < shapes.at + QUIET:
+        if shapes is not None and shapes.mark_due <= now < shapes.at + shapes.quiet:
             poll.device.health.left_outstanding(shapes.span, now)
         if poll.device.health.needs_resync:
             other = self._first_without_resync() if now < self._probes.failing_lane else None

@@ -5,16 +5,19 @@ import pytest
 from gateway.engine.device import Device
 from gateway.engine.health import State
 from gateway.engine.jobs import Poll, Probe, Resynced, Sent
+from gateway.engine.longer_reads import MOST_FAILED, MOST_WARY
 from gateway.engine.reply_shapes import (
     MARK_FIRST,
     MARK_LONGEST,
-    MOST_FAILED,
     QUIET,
+    WARY,
+    WARY_FOR,
     ReplyShapes,
     reply_shapes,
 )
 from gateway.engine.requests import Write
 from gateway.errors import Refusal, Refused
+from gateway.planning.bad_addresses import BadAddresses
 from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.computer_link.codec import Ack, Enquiry, Text
 from gateway.protocols.driver import AnyDriver, Span
@@ -22,9 +25,9 @@ from gateway.protocols.modbus import ModbusAscii, ModbusRtu, ModbusTcp
 from gateway.protocols.modbus.frame import Frame
 from gateway.protocols.vigor import Vigor
 from gateway.protocols.vigor.codec import READ, Reply, Request
-from gateway.tags import Quality, Reason
+from gateway.tags import Quality, Reason, WriteRule
 from tests.engine.rig import REPLIED, Rig, link_device, tcp_device
-from tests.sim.plant import device, words
+from tests.sim.plant import device, make_tag, words
 
 SERIAL = [ModbusRtu(station=1), ModbusAscii(station=1), Vigor(station=1), ComputerLink(station=1)]
 
@@ -71,7 +74,7 @@ def test_a_longer_span_that_was_refused_is_not_read_again() -> None:
     dev = single()
     shapes = shapes_of(dev)
     read(shapes, dev, 0.0)
-    shapes.refused_longer(dev.blocks[0].span)
+    shapes.longer.refused(dev.blocks[0].span)
     assert read(shapes, dev, 0.02).size == 10
 
 
@@ -80,14 +83,14 @@ def test_a_longer_span_without_replies_is_given_up() -> None:
     shapes, span = shapes_of(dev), dev.blocks[0].span
     read(shapes, dev, 0.0)
     for _ in range(MOST_FAILED - 1):
-        shapes.read_longer(span, replied=False)
-    shapes.read_longer(span, replied=True)
+        shapes.longer.unanswered(span)
+    shapes.longer.answered(span)
     for _ in range(MOST_FAILED - 1):
-        shapes.read_longer(span, replied=False)
+        shapes.longer.unanswered(span)
     assert read(shapes, dev, 0.02).size == 11
-    shapes.read_longer(span, replied=False)
+    shapes.longer.unanswered(span)
     assert read(shapes, dev, 0.04).size == 10
-    shapes.restart()
+    shapes.longer.restart()
     assert read(shapes, dev, 0.06).size != 10
 
 
@@ -97,6 +100,26 @@ def test_reads_of_the_same_shape_have_the_same_reply_length(driver: AnyDriver) -
     found = {driver.reply_shape(Span(area, 0, size)): size for size in range(1, 20)}  # type: ignore[attr-defined]
     assert len(found) == 19
     assert driver.reply_shape(Span(area, 7, 3)) == driver.reply_shape(Span(area, 0, 3))  # type: ignore[attr-defined]
+
+
+def test_after_an_extra_reply_more_shapes_are_used_for_longer() -> None:
+    dev = single()
+    shapes = shapes_of(dev)
+    shapes.extra_arrived(0.0)
+    spans = {read(shapes, dev, 0.9 * WARY / MOST_WARY * n) for n in range(MOST_WARY)}
+    assert len(spans) == MOST_WARY
+    read(shapes, dev, WARY_FOR)
+    assert [read(shapes, dev, WARY_FOR + QUIET * n).size for n in (1, 2)] == [10, 10]
+
+
+def test_writes_of_many_values_are_not_remembered_one_by_one() -> None:
+    driver = ModbusRtu(station=1)
+    tag = make_tag("holding:5", driver, type="uint16", write=WriteRule())
+    shapes = reply_shapes(driver, [tag], BadAddresses(driver.cost))
+    assert shapes is not None
+    for value in range(100):
+        shapes.written(tag, [value], float(value))
+    assert len(shapes._used) == 0
 
 
 def test_numbered_replies_need_no_shapes() -> None:

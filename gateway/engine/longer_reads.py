@@ -1,0 +1,95 @@
+"""Chooses longer spans to read for a block, so that its replies differ in shape."""
+
+from collections import Counter
+from collections.abc import Hashable, Iterator, Mapping, Sequence
+
+from gateway.planning.bad_addresses import BadAddresses
+from gateway.planning.planner import Block
+from gateway.protocols.driver import Cost, Span, UnnumberedReplies
+
+LONGEST_STEP = 16  # addresses by which a read may grow, to reach the next byte of bits
+MOST_CHOICES = 3  # shapes of one block: an extra reply that is late by two requests is noticed
+MOST_WARY = 8  # shapes of one block while the device answers twice
+MOST_FAILED = 3  # reads in a row of the longer span without a reply
+
+Choice = tuple[Span, Hashable]  # a span to read, and the shape of its reply
+
+
+class LongerReads:
+    """The spans that may be read for each block of one device."""
+
+    __slots__ = ("_bad", "_driver", "_hull", "_shapes", "by_span", "failed")
+
+    def __init__(
+        self,
+        driver: UnnumberedReplies,
+        tags: Mapping[str, tuple[int, int]],
+        bad: BadAddresses,
+    ) -> None:
+        """`tags`: the first and last address of the tags, by area."""
+        self._driver = driver
+        self._hull = tags
+        self._bad = bad
+        self.by_span: dict[Span, list[Choice]] = {}
+        self._shapes: Counter[Hashable] = Counter()  # of the planned blocks
+        self.failed: dict[Span, int] = {}  # reads of longer spans in a row without a reply
+
+    def choices(self, span: Span) -> list[Choice]:
+        """Returns the span itself, then longer ones whose replies have other shapes."""
+        found = self.by_span.get(span)
+        if found is None:
+            found = self.by_span[span] = self._choose(span)
+        return found
+
+    def planned(self, blocks: Sequence[Block]) -> None:
+        """Notes the blocks of a new plan."""
+        self._shapes = Counter(self._driver.reply_shape(block.span) for block in blocks)
+
+    def costs(self, block: Block) -> list[Cost]:
+        """Returns the costs of the spans that are usually read for the block."""
+        alone = block.listed or self._shapes[self._driver.reply_shape(block.span)] < 2
+        choices = [] if alone else self._choose(block.span)[:MOST_CHOICES]
+        return [cost for span, _ in choices if (cost := self._driver.cost(span))] or [block.cost]
+
+    def refused(self, span: Span) -> None:
+        """Reads the span alone from now on: the addresses beside it do not exist."""
+        self.by_span[span] = self.choices(span)[:1]
+
+    def unanswered(self, span: Span) -> None:
+        """Counts a read of a longer span without a reply: some stations refuse by silence."""
+        self.failed[span] = self.failed.get(span, 0) + 1
+        if self.failed[span] >= MOST_FAILED:
+            self.refused(span)
+
+    def answered(self, span: Span) -> None:
+        """Notes a reply to a read of a longer span."""
+        self.failed.pop(span, None)
+
+    def restart(self) -> None:
+        """Starts again after the device came online: it may have other addresses now."""
+        self.by_span.clear()
+        self.failed.clear()
+
+    def _choose(self, span: Span) -> list[Choice]:
+        """Returns the span, and longer ones whose replies have other shapes."""
+        found: dict[Hashable, Span] = {self._driver.reply_shape(span): span}
+        for longer in self._longer(span):
+            found.setdefault(self._driver.reply_shape(longer), longer)
+            if len(found) == MOST_WARY:
+                break
+        return [(read, shape) for shape, read in found.items()]
+
+    def _longer(self, span: Span) -> Iterator[Span]:
+        """Yields spans around `span` that one request reads, those among the tags first."""
+        area, start, size = span
+        first, last = self._hull.get(area, (start, start))
+        steps = range(1, LONGEST_STEP + 1)
+        both = [Span(area, start, size + n) for n in steps]
+        both += [Span(area, start - n, size + n) for n in steps if start >= n]
+        among = [s for s in both if first <= s.start and s.start + s.size - 1 <= last]
+        cuts = [place for name, place in self._bad.cuts if name == area]
+        for longer in [*among, *both]:
+            end = longer.start + longer.size
+            crosses = any(longer.start < place < end for place in cuts)
+            if not crosses and self._driver.cost(longer) is not None:
+                yield longer
