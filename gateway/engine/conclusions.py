@@ -157,9 +157,13 @@ class Conclusions:
         short = _is_short(after)
         late = result.late if isinstance(result, Settled) and not short else None
         took = now - self._in_flight.begun
-        self._results.settled(device, settle.before, took, late, now, time, short=short)
+        results, alone = self._results, len(settle.failed) == 1
+        suspect = alone and isinstance(after, Poll) and device.bad_addresses.is_suspect(after.block)
+        results.settled(
+            *(device, settle.before, took, late, now, time), short=short, suspect=suspect
+        )
         for poll, error in settle.failed:
-            self._results.unread(poll, error, now, time)
+            results.unread(poll, error, now, time, alone=alone)
         if not isinstance(after, Poll | Probe):
             self._in_flight.continuation = self._requests.settled(settle, now)
 

@@ -267,6 +267,7 @@ class Traffic:
     exchanges: int = 0  # requests with a reply
     turnaround: float = 0.0  # seconds of the station for them, without the characters
     extra: int = 0  # frames of the station that answered no request
+    told: bool = False  # the last request gets no reply, from any station
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,6 +1,6 @@
 """Line silence: decides that a port through which no reply comes is opened again."""
 
-from gateway.engine.jobs import Reopen, Result, Settled
+from gateway.engine.jobs import Reopen, Result, Sent, Settled
 from gateway.errors import (
     BadValue,
     DeviceError,
@@ -44,11 +44,13 @@ class LineSilence:
                 self.heard()
 
     def concluded(self, result: Result | Exception) -> None:
-        """Takes the result of a job: any reply is a sign of life."""
+        """Takes the result of a job: any reply is a sign of life, a broadcast has none."""
         match result:
             case Unsteady():
                 self.heard()
-            case Settled(late=None) | Unclear() | LineDown() | BadValue() | None:
+            case Settled(late=None) | Sent(acknowledged=False):
+                pass
+            case Unclear() | LineDown() | BadValue() | None:
                 pass
             case _:
                 self.heard()

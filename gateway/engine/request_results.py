@@ -184,12 +184,12 @@ class RequestResults:
         if isinstance(result, Refused):
             self._refused(device, result, now, time)
         elif isinstance(result, str):
-            if traffic.exchanges:
+            if traffic.told:  # a resync with a reply may have preceded it
+                self._pause(device)
+            else:
                 self._results.answered(device, now, time)
                 if device.shapes is not None:
                     device.shapes.acknowledged(now)
-            else:
-                self._pause(device)
         if not isinstance(result, str | Exception):
             raise TypeError(f"{result!r} is no result of a command")
         self._end(command, result, now)

@@ -260,11 +260,14 @@ class Results:
         time: int,
         *,
         short: bool = False,
+        suspect: bool = False,
     ) -> None:
         """Applies an unclear transaction after the line has settled; it took `took` seconds.
 
         `late`: seconds from the time-out to the late reply, if it arrived. `short`: it was a short
         probe. A device that starts is offline only after a patient one, unless it was before.
+        `suspect`: a poll of addresses about which the device may be silent. The device is offline
+        only if it does not reply to the next request either, also with `retries: 0`.
         """
         health = device.health
         if late is not None:
@@ -275,7 +278,8 @@ class Results:
         if before is not State.OFFLINE:
             self._schedule.failed(now, took)
         unknown = before in (State.STARTING, State.OFFLINE)
-        if not unknown and health.consecutive_failures <= device.timing.retries:
+        retries = max(device.timing.retries, suspect)
+        if not unknown and health.consecutive_failures <= retries:
             return
         if short and before is State.STARTING and health.heard is not False:
             return
@@ -294,19 +298,25 @@ class Results:
         for request in self._schedule.requests.withdraw(device):
             self._effects.ended(request, offline(device))
 
-    def unread(self, poll: Poll, error: DeviceError, now: float, time: int) -> None:
+    def unread(
+        self, poll: Poll, error: DeviceError, now: float, time: int, *, alone: bool = True
+    ) -> None:
         """Applies an unclear poll: polls again, halves the block, or turns its tags bad.
 
         A block that stays without a reply while the device replies to other requests may hold an
-        address about which the device is silent, or be too long for it.
+        address about which the device is silent, or be too long for it. `alone`: no other request
+        failed beside it.
         """
         device, bad = poll.device, poll.device.bad_addresses
         health, retries = device.health, device.timing.retries
         if poll.span is not poll.block.span and device.shapes is not None:
             device.shapes.longer.unanswered(poll.block.span)
         if health.state is State.OFFLINE:
+            if alone and health.consecutive_failures <= 1:  # it replied to the request before
+                bad.went_silent(poll.block)
             return
-        known, half = poll.block.span in bad.bad, bad.is_half(poll.block)
+        suspect, half = bad.is_suspect(poll.block), bad.is_half(poll.block)
+        known = suspect and not half
         if not known and not poll.missed and poll.tries < (min(1, retries) if half else retries):
             self._schedule.again(poll)
             return

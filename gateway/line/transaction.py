@@ -102,6 +102,7 @@ class Transaction:
         self.has_sent = True
         channel.send(data)
         self.traffic.sent += len(data)
+        self.traffic.told = True
         # No reply follows; the wire is busy until the last character is out.
         channel.pause(len(data) * channel.wire.character)
 

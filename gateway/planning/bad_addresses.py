@@ -96,6 +96,7 @@ class BadAddresses:
     splits: set[Cut] = field(default_factory=set)
     searches: list[_Node] = field(default_factory=list)  # failed blocks, not yet settled
     changed: set[Span] = field(default_factory=set)  # to be planned again
+    silenced: Span | None = None  # asked when a device went offline that had just replied
     clear: bool = True  # no address is bad, no block is split: a good read changes nothing
     _leaves: dict[Span, _Node] = field(default_factory=dict)
     _suspected: set[Cut] = field(default_factory=set)  # splits unless the whole block is read
@@ -115,9 +116,18 @@ class BadAddresses:
         """Returns True while a search waits for this block."""
         return block.span in self._leaves
 
+    def is_suspect(self, block: Block) -> bool:
+        """Returns True if the device may be silent about an address of the block."""
+        span = block.span
+        return span == self.silenced or span in self.bad or span in self._leaves
+
+    def went_silent(self, block: Block) -> None:
+        """Notes the request after which a device went offline that had just replied."""
+        self.silenced, self.clear = block.span, False
+
     def refused(self, block: Block, now: int, code: str) -> tuple[Block, ...]:
         """Returns the two halves to read instead of `block`; empty when it is the bad address."""
-        self.clear = False
+        self.clear, self.silenced = False, None
         node = self._leaves.pop(block.span, None)
         if (known := self.bad.get(block.span)) is not None:
             self.bad[block.span] = replace(known, refusals=known.refusals + 1, code=code)
@@ -142,6 +152,8 @@ class BadAddresses:
         node = self._leaves.pop(block.span, None)
         if node is not None:
             node.good = True
+        if block.span == self.silenced:
+            self.silenced = None
         if self._suspected:  # the whole block is read: its halves were no cure
             area, start, size = block.span
             self._suspected -= {(area, n) for n in range(start + 1, start + size)}
@@ -193,7 +205,8 @@ class BadAddresses:
         self._look()
 
     def _look(self) -> None:
-        self.clear = not (self.bad or self.searches or self.splits or self._suspected)
+        kept = self.bad or self.searches or self.splits or self._suspected
+        self.clear = not (kept or self.silenced)
 
     def known(self) -> KnownBad:
         refused = tuple((bad.span, bad.since, bad.code) for bad in self.bad.values())

@@ -74,7 +74,7 @@ ADDRESS, DAMAGED, BUSY, OTHER = (
 UNITS = [1, 2, 3, 4, 5, 6]
 HELD, OLD = [7], [0]  # units that are read back: as written, as before
 NOTHING_SENT = Traffic()
-TOLD_TO_ALL = Traffic(sent=17)
+TOLD_TO_ALL = Traffic(sent=17, told=True)
 
 # By name: a result, and the traffic where it is not the usual.
 RESULTS: dict[str, tuple[Result, Traffic | None]] = {

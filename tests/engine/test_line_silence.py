@@ -3,10 +3,11 @@
 from dataclasses import replace
 
 from gateway.engine.device import Device
-from gateway.engine.jobs import Idle, Poll, Probe, Reopen, Resynced, Settle, Settled
+from gateway.engine.jobs import Idle, Poll, Probe, Reopen, Resynced, Sent, Settle, Settled
 from gateway.engine.line_silence import FIRST, LONGEST
+from gateway.engine.requests import Write
 from gateway.errors import Evidence, Garbled, Refused
-from tests.engine.rig import LOST, SILENCE, Rig, link_device
+from tests.engine.rig import LOST, SILENCE, Rig, broadcast_device, link_device
 from tests.sim.bench import WIRE
 from tests.sim.plant import words
 
@@ -127,6 +128,23 @@ def test_bytes_count_as_life_only_where_a_device_sends_by_itself() -> None:
         rig.note(rig.engine.received(b"\x00", rig.now, rig.time))
         if isinstance(job, Idle):
             rig.now = job.until
+        else:
+            rig.fail(job)
+    assert isinstance(job, Reopen)
+
+
+def test_a_broadcast_that_was_sent_is_no_sign_of_life() -> None:
+    """A line whose clients write to all stations every few seconds was never opened again."""
+    rig = Rig(broadcast_device(), link_device())
+    told = 0.0
+    while not isinstance(job := rig.next(), Reopen) and rig.now < 200.0:
+        if rig.now >= told + 3.0:
+            told = rig.now
+            rig.write("holding:1")
+        if isinstance(job, Idle):
+            rig.now = min(job.until, told + 3.0)
+        elif isinstance(job, Write):
+            rig.conclude(job, Sent(acknowledged=False))
         else:
             rig.fail(job)
     assert isinstance(job, Reopen)

@@ -370,3 +370,28 @@ def test_a_measured_turnaround_that_changes_the_optimum_plans_again_and_is_logge
     assert events(rig) == ["plan updated"]
     assert len(rig.device.blocks) < 4
     assert {poll.block for poll in rig.engine.schedule.polls(rig.device)} == set(rig.device.blocks)
+
+
+def test_a_silent_address_is_found_also_where_one_failure_makes_the_device_offline() -> None:
+    """With `retries: 0` the device went offline at every try, and was never read."""
+    rig = online(retries=0)
+    serve(rig, 100.0, lambda span: span.start <= 2 < span.start + span.size)
+    [bad] = rig.device.bad_addresses.bad.values()
+    assert (bad.span.start, bad.span.size, bad.code) == (2, 1, SILENT)
+    assert good_now(rig) == {"D0", "D1", "D3", "D4", "D5"}
+    assert events(rig).count("device offline") == 1
+
+
+def test_a_device_that_died_twice_at_one_block_has_no_bad_address() -> None:
+    rig = online(retries=0)
+    for begin in (20.0, 100.0):
+        serve(rig, begin)
+        while rig.device.state is not State.OFFLINE:
+            job = rig.next()
+            if isinstance(job, Idle):
+                rig.now = job.until
+            else:
+                rig.fail(job)
+    serve(rig, 200.0)
+    assert rig.device.bad_addresses.clear
+    assert len(good_now(rig)) == 6

@@ -183,7 +183,7 @@ MUTANTS = (
     Mutant(
         "a dead device is polled for ever",
         "engine/results.py",
-        "        if not unknown and health.consecutive_failures <= device.timing.retries:\n",
+        "        if not unknown and health.consecutive_failures <= retries:\n",
         "        if not unknown:\n",
         "tests/line/test_mute_stations.py tests/line/test_late_replies.py",
     ),
