@@ -6,7 +6,7 @@ import pytest
 
 from gateway.engine.device import LEARN_EVERY, SILENT_SHARE
 from gateway.engine.health import State
-from gateway.engine.jobs import Idle, Poll, Probe, Resynced, Settle, Settled, Traffic
+from gateway.engine.jobs import Idle, Poll, Probe, Reopen, Resynced, Settle, Settled, Traffic
 from gateway.engine.reply_shapes import QUIET
 from gateway.engine.results import BUSY_PAUSE
 from gateway.errors import DeviceError, Garbled, Refusal, Refused, Unsteady
@@ -391,6 +391,7 @@ def test_a_device_that_died_twice_at_one_block_has_no_bad_address() -> None:
             if isinstance(job, Idle):
                 rig.now = job.until
             else:
+                assert not isinstance(job, Reopen)
                 rig.fail(job)
     serve(rig, 200.0)
     assert rig.device.bad_addresses.clear
