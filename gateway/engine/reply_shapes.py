@@ -14,6 +14,7 @@ from gateway.protocols.driver import AnyDriver, Cost, Span, UnnumberedReplies
 from gateway.tags import Tag
 
 QUIET = 0.25  # seconds after a reply in which an extra reply would have arrived
+LATE = 1.0  # the same, for a device that is known to answer twice
 MARK_FIRST, MARK_LONGEST = 60.0, 600.0  # seconds between two resyncs on a wire that is never quiet
 SHOWN = 60.0  # seconds for which an extra reply explains the state of the device
 LONGEST_STEP = 16  # addresses by which a read may grow, to reach the next byte of bits
@@ -33,6 +34,7 @@ class ReplyShapes:
         "_choices",
         "_driver",
         "_hull",
+        "_lacking",
         "_mark",
         "_refused",
         "_shapes",
@@ -61,6 +63,7 @@ class ReplyShapes:
         self._driver = driver
         self._hull = tags
         self._choices: dict[Span, list[Choice]] = {}
+        self._lacking: dict[Span, list[Span]] = {}  # by block: longer spans that were refused
         self._shapes: Counter[Hashable] = Counter()  # of the planned blocks
         self.failed: dict[Span, int] = {}  # reads of longer spans in a row without a reply
 
@@ -109,11 +112,12 @@ class ReplyShapes:
     def may_be_extra(self, shape: Hashable, now: float) -> bool:
         """Returns True if an earlier reply to a write, or a refusal, may arrive once more.
 
-        `shape` of the expected reply; None: unknown.
+        `shape` of the expected reply; None: unknown. A device that answers twice may do so late.
         """
         acked, at = self._acked
         alike = shape == acked or shape is None or acked is None
-        return (alike and now - at < QUIET) or now - self._refused < QUIET
+        within = LATE if self.answers_twice else QUIET
+        return (alike and now - at < within) or now - self._refused < within
 
     def acknowledged(self, now: float) -> None:
         """Notes that the last request, a write or command, was acknowledged."""
@@ -155,27 +159,38 @@ class ReplyShapes:
 
     # The longer span
 
-    def refused_longer(self, span: Span) -> None:
-        """Reads the span alone from now on: the addresses beside it do not exist."""
-        self._choices[span] = self._choices[span][:1]
+    def refused_longer(self, span: Span, longer: Span) -> None:
+        """Notes that addresses beside the span do not exist. Those on its other side may."""
+        self._lacking.setdefault(span, []).append(longer)
+        self._choices.pop(span, None)
 
-    def read_longer(self, span: Span, *, replied: bool) -> None:
+    def refused_alone(self, span: Span) -> None:
+        """Notes that the span is refused too: so the addresses beside it may exist."""
+        if self._lacking.pop(span, None) is not None:
+            self._choices.pop(span, None)
+
+    def read_longer(self, span: Span, longer: Span, *, replied: bool) -> None:
         """Counts reads of the longer span without a reply. Some stations refuse by silence."""
         failed = self.failed.pop(span, 0) + 1
         if not replied:
             self.failed[span] = failed
             if failed >= MOST_FAILED:
-                self.refused_longer(span)
+                self.refused_longer(span, longer)
+                del self.failed[span]
 
     def restart(self) -> None:
         """Starts again after the device came online: it may have other addresses now."""
         self._choices.clear()
+        self._lacking.clear()
         self.failed.clear()
 
     def _choose(self, span: Span) -> list[Choice]:
         """Returns the span, and longer ones whose replies have other shapes."""
         found: dict[Hashable, Span] = {self._driver.reply_shape(span): span}
+        lacking = self._lacking.get(span, ())
         for longer in self._longer(span):
+            if any(_inside(refused, longer) for refused in lacking):
+                continue
             found.setdefault(self._driver.reply_shape(longer), longer)
             if len(found) == MOST_CHOICES:
                 break
@@ -192,6 +207,12 @@ class ReplyShapes:
         for longer in [*among, *both]:
             if self._driver.cost(longer) is not None:
                 yield longer
+
+
+def _inside(inner: Span, outer: Span) -> bool:
+    """Returns True if the outer span has all addresses of the inner one."""
+    end = inner.start + inner.size
+    return outer.start <= inner.start and end <= outer.start + outer.size
 
 
 def reply_shapes(driver: AnyDriver, tags: list[Tag]) -> ReplyShapes | None:

@@ -69,7 +69,7 @@ class Results:
             self.answered(device, now, time)
         shapes = device.shapes
         if poll.span is not block.span and shapes is not None and shapes.failed:
-            shapes.read_longer(block.span, replied=True)
+            shapes.read_longer(block.span, poll.span, replied=True)
         counts = poll.counts
         if last.at is not None:
             gap = now - last.at
@@ -181,9 +181,12 @@ class Results:
         if shapes is None:
             return False
         shapes.refused(now)
-        if poll.span is poll.block.span or error.refusal in (Refusal.DAMAGED, Refusal.BUSY):
+        if poll.span is poll.block.span:
+            shapes.refused_alone(poll.block.span)
             return False
-        shapes.refused_longer(poll.block.span)
+        if error.refusal in (Refusal.DAMAGED, Refusal.BUSY):
+            return False
+        shapes.refused_longer(poll.block.span, poll.span)
         self._schedule.again(poll, counted=False)
         return True
 
@@ -311,7 +314,7 @@ class Results:
         device, bad = poll.device, poll.device.bad_addresses
         health, retries = device.health, device.timing.retries
         if poll.span is not poll.block.span and device.shapes is not None:
-            device.shapes.read_longer(poll.block.span, replied=False)
+            device.shapes.read_longer(poll.block.span, poll.span, replied=False)
         if health.state is State.OFFLINE:
             if alone and health.consecutive_failures <= 1:  # it replied to the request before
                 bad.went_silent(poll.block)
