@@ -54,8 +54,8 @@ class Foreign:
 
     def answered_other(self, request: bytes, reply: bytes, now: float, *, unknown: bool) -> None:
         """A reply to another master arrived; `unknown`: of an unknown station to the gateway."""
+        self.second_at = now
         if unknown:
-            self.second_at = now
             self._own.append((request, reply))
             if request != self.asked:
                 return
