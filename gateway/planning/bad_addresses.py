@@ -142,6 +142,8 @@ class BadAddresses:
         if not halves:
             node.good = False
             self.bad[block.span] = BadRange(block.span, now, code, block.tags)
+        elif block.span in self.silenced:  # the search may be dropped if it goes offline again
+            self.splits.add((block.span.area, halves[1].span.start))
         return halves
 
     def read(self, block: Block) -> bool:

@@ -672,7 +672,7 @@ MUTANTS = (
     Mutant(
         "a device that takes one request at a time gets several",
         "engine/together.py",
-        "now < window.apart_until or poll in window.suspects",
+        "now < window.apart_until or poll.block.span in window.suspects",
         "False",
         "tests/engine/test_together.py tests/attacks/test_one_at_a_time.py",
     ),
