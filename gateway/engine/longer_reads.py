@@ -18,7 +18,7 @@ Choice = tuple[Span, Hashable]  # a span to read, and the shape of its reply
 class LongerReads:
     """The spans that may be read for each block of one device."""
 
-    __slots__ = ("_bad", "_driver", "_hull", "_shapes", "by_span", "failed")
+    __slots__ = ("_bad", "_driver", "_hull", "_lacking", "_shapes", "by_span", "failed")
 
     def __init__(
         self,
@@ -31,6 +31,7 @@ class LongerReads:
         self._hull = tags
         self._bad = bad
         self.by_span: dict[Span, list[Choice]] = {}
+        self._lacking: dict[Span, list[Span]] = {}  # by block: longer spans that were refused
         self._shapes: Counter[Hashable] = Counter()  # of the planned blocks
         self.failed: dict[Span, int] = {}  # reads of longer spans in a row without a reply
 
@@ -51,15 +52,22 @@ class LongerReads:
         choices = [] if alone else self._choose(block.span)[:MOST_CHOICES]
         return [cost for span, _ in choices if (cost := self._driver.cost(span))] or [block.cost]
 
-    def refused(self, span: Span) -> None:
-        """Reads the span alone from now on: the addresses beside it do not exist."""
-        self.by_span[span] = self.choices(span)[:1]
+    def refused(self, span: Span, longer: Span) -> None:
+        """Notes that addresses beside the span do not exist. Those on its other side may."""
+        self._lacking.setdefault(span, []).append(longer)
+        self.by_span.pop(span, None)
 
-    def unanswered(self, span: Span) -> None:
+    def refused_alone(self, span: Span) -> None:
+        """Notes that the span is refused too: so the addresses beside it may exist."""
+        if self._lacking.pop(span, None) is not None:
+            self.by_span.pop(span, None)
+
+    def unanswered(self, span: Span, longer: Span) -> None:
         """Counts a read of a longer span without a reply: some stations refuse by silence."""
         self.failed[span] = self.failed.get(span, 0) + 1
         if self.failed[span] >= MOST_FAILED:
-            self.refused(span)
+            self.refused(span, longer)
+            del self.failed[span]
 
     def answered(self, span: Span) -> None:
         """Notes a reply to a read of a longer span."""
@@ -68,12 +76,16 @@ class LongerReads:
     def restart(self) -> None:
         """Starts again after the device came online: it may have other addresses now."""
         self.by_span.clear()
+        self._lacking.clear()
         self.failed.clear()
 
     def _choose(self, span: Span) -> list[Choice]:
         """Returns the span, and longer ones whose replies have other shapes."""
         found: dict[Hashable, Span] = {self._driver.reply_shape(span): span}
+        lacking = self._lacking.get(span, ())
         for longer in self._longer(span):
+            if any(_inside(refused, longer) for refused in lacking):
+                continue
             found.setdefault(self._driver.reply_shape(longer), longer)
             if len(found) == MOST_WARY:
                 break
@@ -93,3 +105,9 @@ class LongerReads:
             crosses = any(longer.start < place < end for place in cuts)
             if not crosses and self._driver.cost(longer) is not None:
                 yield longer
+
+
+def _inside(inner: Span, outer: Span) -> bool:
+    """Returns True if the outer span has all addresses of the inner one."""
+    end = inner.start + inner.size
+    return outer.start <= inner.start and end <= outer.start + outer.size

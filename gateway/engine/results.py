@@ -180,9 +180,12 @@ class Results:
         if shapes is None:
             return False
         shapes.refused(now)
-        if poll.span is poll.block.span or error.refusal in (Refusal.DAMAGED, Refusal.BUSY):
+        if poll.span is poll.block.span:
+            shapes.longer.refused_alone(poll.block.span)
             return False
-        shapes.longer.refused(poll.block.span)
+        if error.refusal in (Refusal.DAMAGED, Refusal.BUSY):
+            return False
+        shapes.longer.refused(poll.block.span, poll.span)
         self._schedule.again(poll, counted=False)
         return True
 
@@ -310,7 +313,7 @@ class Results:
         device, bad = poll.device, poll.device.bad_addresses
         health, retries = device.health, device.timing.retries
         if poll.span is not poll.block.span and device.shapes is not None:
-            device.shapes.longer.unanswered(poll.block.span)
+            device.shapes.longer.unanswered(poll.block.span, poll.span)
         if health.state is State.OFFLINE:
             if alone and health.consecutive_failures <= 1:  # it replied to the request before
                 bad.went_silent(poll.block)

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from gateway.engine.device import Device
 from gateway.engine.effects import Effects
 from gateway.engine.jobs import Poll
+from gateway.protocols.driver import Span
 
 PROOFS = 3  # requests that were answered alone and not beside others
 LOST = "requests that are sent together stay unanswered: now one at a time; set window: 1"
@@ -15,7 +16,7 @@ TRY_AGAIN = 3600.0  # seconds; a device may have been busy
 class _Window:
     """The evidence of one device."""
 
-    suspects: list[Poll] = field(default_factory=list)  # unanswered beside others, not yet alone
+    suspects: list[Span] = field(default_factory=list)  # unanswered beside others, not yet alone
     proofs: int = 0
     apart_until: float = 0.0
 
@@ -34,7 +35,7 @@ class Together:
     def others(self, poll: Poll, now: float) -> int:
         """Returns how many polls may be sent beside this one."""
         window = self._windows.get(poll.device)
-        if window is not None and (now < window.apart_until or poll in window.suspects):
+        if window is not None and (now < window.apart_until or poll.block.span in window.suspects):
             return 0
         return poll.device.window - 1
 
@@ -45,12 +46,12 @@ class Together:
         if window is None:
             window = self._windows[device] = _Window()
         if count > 1:
-            window.suspects = failed
+            window.suspects = [each.block.span for each in failed]  # another plan has other polls
             if not failed:
                 window.proofs = 0
                 device.takes_one_at_a_time(False)
-        elif poll in window.suspects:
-            window.suspects.remove(poll)
+        elif poll.block.span in window.suspects:
+            window.suspects.remove(poll.block.span)
             if not failed:
                 window.suspects = []
                 window.proofs += 1

@@ -256,10 +256,13 @@ class Transaction:
             return
         is_echo = self.may_echo and any(frame == request.frame for request in self._open)
         station = self._device.settings.driver.station
-        foreign = getattr(frame, "station", station) != station
+        number = getattr(frame, "transaction", 0)
+        old = bool(number) and all(request.number != number for request in self._open)
+        # A reply with an old number is repeated or late: it tells nothing of this station.
+        foreign = not old and getattr(frame, "station", station) != station
         if self._stray is not Evidence.STATION:
             self._stray = Evidence.STATION if foreign else Evidence.SHAPE
-        if not is_echo and not foreign:
+        if not is_echo and not foreign and not old:
             self.traffic.extra += 1
         if self._on_unmatched_frame is not None:
             self._on_unmatched_frame(self._device, frame, is_echo)

@@ -96,7 +96,7 @@ class BadAddresses:
     splits: set[Cut] = field(default_factory=set)
     searches: list[_Node] = field(default_factory=list)  # failed blocks, not yet settled
     changed: set[Span] = field(default_factory=set)  # to be planned again
-    silenced: Span | None = None  # asked when a device went offline that had just replied
+    silenced: set[Span] = field(default_factory=set)  # it went offline at these, after a reply
     clear: bool = True  # no address is bad, no block is split: a good read changes nothing
     _leaves: dict[Span, _Node] = field(default_factory=dict)
     _suspected: set[Cut] = field(default_factory=set)  # splits unless the whole block is read
@@ -119,15 +119,16 @@ class BadAddresses:
     def is_suspect(self, block: Block) -> bool:
         """Returns True if the device may be silent about an address of the block."""
         span = block.span
-        return span == self.silenced or span in self.bad or span in self._leaves
+        return span in self.silenced or span in self.bad or span in self._leaves
 
     def went_silent(self, block: Block) -> None:
         """Notes the request after which a device went offline that had just replied."""
-        self.silenced, self.clear = block.span, False
+        self.silenced.add(block.span)
+        self.clear = False
 
     def refused(self, block: Block, now: int, code: str) -> tuple[Block, ...]:
         """Returns the two halves to read instead of `block`; empty when it is the bad address."""
-        self.clear, self.silenced = False, None
+        self.clear = False
         node = self._leaves.pop(block.span, None)
         if (known := self.bad.get(block.span)) is not None:
             self.bad[block.span] = replace(known, refusals=known.refusals + 1, code=code)
@@ -141,6 +142,8 @@ class BadAddresses:
         if not halves:
             node.good = False
             self.bad[block.span] = BadRange(block.span, now, code, block.tags)
+        elif block.span in self.silenced:  # the search may be dropped if it goes offline again
+            self.splits.add((block.span.area, halves[1].span.start))
         return halves
 
     def read(self, block: Block) -> bool:
@@ -152,8 +155,7 @@ class BadAddresses:
         node = self._leaves.pop(block.span, None)
         if node is not None:
             node.good = True
-        if block.span == self.silenced:
-            self.silenced = None
+        self.silenced.discard(block.span)
         if self._suspected:  # the whole block is read: its halves were no cure
             area, start, size = block.span
             self._suspected -= {(area, n) for n in range(start + 1, start + size)}
@@ -176,6 +178,7 @@ class BadAddresses:
             return False
         for root in self.searches:
             self.changed.add(root.span)
+            self.silenced.discard(root.span)
             splits = root.splits()
             if proven := splits & self._suspected:
                 self.splits |= proven

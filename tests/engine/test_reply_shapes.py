@@ -74,24 +74,53 @@ def test_a_longer_span_that_was_refused_is_not_read_again() -> None:
     dev = single()
     shapes = shapes_of(dev)
     read(shapes, dev, 0.0)
-    shapes.longer.refused(dev.blocks[0].span)
-    assert read(shapes, dev, 0.02).size == 10
+    span = dev.blocks[0].span
+    after = read(shapes, dev, 0.02)
+    assert after.start == span.start
+    shapes.longer.refused(span, after)
+    before = read(shapes, dev, 0.04)
+    assert before.start + before.size == span.start + span.size  # those before it may exist
+    shapes.longer.refused(span, span._replace(start=span.start - 1, size=11))
+    assert read(shapes, dev, 0.06) == span
+
+
+def test_a_longer_span_is_read_again_if_the_block_alone_was_refused_too() -> None:
+    """A device that refuses everything for a second kept one shape for ever."""
+    dev = single()
+    shapes, span = shapes_of(dev), dev.blocks[0].span
+    read(shapes, dev, 0.0)
+    shapes.longer.refused(span, read(shapes, dev, 0.02))
+    shapes.longer.refused_alone(span)
+    assert read(shapes, dev, 0.04) == span._replace(size=12)
+
+
+def test_an_acknowledgement_may_be_repeated_later_by_a_device_that_answers_twice() -> None:
+    """A second station replied 0.3 s late, and acknowledged the next write."""
+    shapes = shapes_of(single())
+    shapes.sent("written", 5.0)
+    shapes.acknowledged(5.0)
+    assert not shapes.may_be_extra("written", 5.3)
+    shapes.at = 5.0
+    shapes.extra_arrived(5.0)
+    assert shapes.may_be_extra("written", 5.3)
+    assert not shapes.may_be_extra("written", 6.6)
 
 
 def test_a_longer_span_without_replies_is_given_up() -> None:
     dev = single()
     shapes, span = shapes_of(dev), dev.blocks[0].span
+    longer = span._replace(size=11)
     read(shapes, dev, 0.0)
     for _ in range(MOST_FAILED - 1):
-        shapes.longer.unanswered(span)
+        shapes.longer.unanswered(span, longer)
     shapes.longer.answered(span)
     for _ in range(MOST_FAILED - 1):
-        shapes.longer.unanswered(span)
-    assert read(shapes, dev, 0.02).size == 11
-    shapes.longer.unanswered(span)
-    assert read(shapes, dev, 0.04).size == 10
+        shapes.longer.unanswered(span, longer)
+    assert read(shapes, dev, 0.02) == longer
+    shapes.longer.unanswered(span, longer)
+    assert read(shapes, dev, 0.04).start < span.start
     shapes.longer.restart()
-    assert read(shapes, dev, 0.06).size != 10
+    assert longer in [read(shapes, dev, now) for now in (0.06, 0.08)]
 
 
 @pytest.mark.parametrize("driver", SERIAL, ids=lambda driver: driver.protocol)

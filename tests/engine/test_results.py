@@ -1,6 +1,7 @@
 """Results of polls and probes: what follows for the values, the plan, the log and the record."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 
@@ -12,10 +13,12 @@ from gateway.engine.results import BUSY_PAUSE
 from gateway.errors import DeviceError, Garbled, Refusal, Refused, Unsteady
 from gateway.planning.bad_addresses import RETRIES, SILENT, SPLIT_FIRST
 from gateway.planning.planner import plan
+from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.driver import Span
 from gateway.tags import Quality, Reason
 from tests.engine.rig import REPLIED, SILENCE, Rig, link_device, tcp_device
-from tests.sim.plant import device, make_tag
+from tests.sim.bench import WIRE
+from tests.sim.plant import device, made_device, make_tag
 
 UNITS = [1, 2, 3, 4, 5, 6]
 ADDRESS = Refused("no such address", code="06", refusal=Refusal.ADDRESS)
@@ -153,7 +156,7 @@ def serve(rig: Rig, until: float, silent: Callable[[Span], bool] = lambda _: Fal
                 rig.fail(job)
             case Poll(block=block):
                 start, size = block.span.start, block.span.size
-                rig.conclude(job, UNITS[start : start + size])
+                rig.conclude(job, (UNITS * 200)[start : start + size])
 
 
 def good_now(rig: Rig) -> set[str]:
@@ -396,3 +399,17 @@ def test_a_device_that_died_twice_at_one_block_has_no_bad_address() -> None:
     serve(rig, 200.0)
     assert rig.device.bad_addresses.clear
     assert len(good_now(rig)) == 6
+
+
+def test_two_silent_blocks_are_found_where_one_failure_makes_the_device_offline() -> None:
+    """They took turns: each made the device offline, and the search for the other was dropped."""
+    driver = ComputerLink(station=1, monitor=False)
+    timing = replace(driver.timing, retries=0)
+    starts = (0, 500, 1000)  # three blocks of two words
+    tags = [make_tag(f"D{start + n}", driver) for start in starts for n in (0, 1)]
+    rig = Rig(made_device("plc1", driver, WIRE, timing, tags))
+    bad = {1, 501}
+    serve(rig, 200.0, lambda span: any(span.start <= n < span.start + span.size for n in bad))
+    assert {span.start for span in rig.device.bad_addresses.bad} == bad
+    assert good_now(rig) == {"D0", "D500", "D1000", "D1001"}
+    assert events(rig).count("device offline") == 2

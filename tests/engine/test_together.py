@@ -99,3 +99,29 @@ def test_single_losses_cost_no_window() -> None:
     sizes = transactions(rig, 20.0, seldom)
     assert reduced(rig) == 0
     assert max(sizes[-50:]) == 4
+
+
+def test_requests_lost_together_are_sent_alone_also_after_the_device_was_offline() -> None:
+    """Behind a bridge with a time-out of its own each burst made the device offline again."""
+    plain = busy_device().settings
+    rig = Rig(Device(replace(plain, timing=replace(plain.timing, retries=0)), WIRE))
+    sizes: list[int] = []
+    while rig.now < 60.0:
+        job = rig.next()
+        match job:
+            case Idle(until=until):
+                rig.now = until
+            case Probe():
+                rig.conclude(job, Resynced(1000))
+            case Settle():
+                rig.conclude(job, Settled(None))
+            case Poll():
+                polls = [job, *rig.engine.alongside(job, rig.now)]
+                sizes.append(len(polls))
+                for poll in polls:
+                    alone = len(polls) == 1
+                    traffic = REPLIED if poll is polls[-1] else Traffic()
+                    units = (0,) * poll.block.span.size if alone else SILENCE
+                    rig.conclude(poll, units, traffic, took=0.002)
+    assert sum(size > 1 for size in sizes) <= 2 * PROOFS
+    assert reduced(rig) == 1

@@ -7,7 +7,7 @@ import pytest
 
 from gateway.errors import Evidence, Garbled, LineDown, NoReply, Refused
 from gateway.protocols.driver import Span
-from gateway.protocols.modbus import ModbusRtu
+from gateway.protocols.modbus import ModbusRtu, ModbusTcp
 from gateway.protocols.vigor import Vigor
 from gateway.stations.modbus import ModbusStation
 from gateway.stations.vigor import VigorStation
@@ -193,6 +193,27 @@ async def test_the_evidence_of_a_time_out_is_what_was_heard(heard: str, evidence
     talk.received(
         {"station": frame, "shape": frame, "noise": b"\xffU\x00", "echo": port.sent[0][1]}[heard]
     )
+    with pytest.raises(Garbled) as caught:
+        await asking
+    assert caught.value.evidence is evidence
+
+
+@pytest.mark.parametrize(
+    ("number", "evidence"), [(b"\x0d\xb6", Evidence.SHAPE), (b"\x00\x01", Evidence.STATION)]
+)
+@on_virtual_time
+async def test_a_repeated_numbered_reply_of_another_unit_is_no_evidence_against_this_one(
+    number: bytes, evidence: Evidence
+) -> None:
+    """Behind one connection a unit replied twice. The other one "had a wrong number"."""
+    port = FakePort()
+    port.after = lambda _: None
+    driver = ModbusTcp(station=1)
+    talk = opened(port, driver)
+    asking = asyncio.create_task(driver.read(talk, Span("holding", 0, 1)))
+    await asyncio.sleep(0.01)
+    assert port.sent[0][1][:2] == b"\x00\x01"
+    talk.received(number + b"\x00\x00\x00\x05\x02\x03\x02\x53\x8a")
     with pytest.raises(Garbled) as caught:
         await asking
     assert caught.value.evidence is evidence

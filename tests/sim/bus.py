@@ -108,7 +108,7 @@ class Bus:
             return
         self.asked = named[0]
         health = self.asked.health
-        self.foreign.sent(data, resync=health.needs_resync or not health.online)
+        self.foreign.sent(data, start, resync=health.needs_resync or not health.online)
         self.writes[number] += is_write(protocol, data)
         self.commands[number] += is_command(protocol, data)
         if is_registration(protocol, data):
@@ -159,6 +159,9 @@ class Bus:
 
     def answered(self, request: bytes, reply: bytes) -> None:
         self.foreign.answered(request, reply)
+
+    def repeated(self) -> None:
+        self.foreign.repeated(self.now())
 
     def answered_other(self, station: Speaker, request: bytes, reply: bytes) -> None:
         self.story.counts["foreign replies"] += 1

@@ -1,10 +1,13 @@
 """Replies that are not for the gateway, and the theory of which nobody can tell."""
 
 import asyncio
+import math
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+APART = 0.25  # seconds between two questions, after which an older answer cannot be told
+SECONDS_APART = 3.0  # between a second answer and the last answer that it displaced
 Shape = tuple[object, ...]
 
 
@@ -19,6 +22,11 @@ class Foreign:
     this number to this very question. All else can be told, and breaks a rule: an answer of
     another shape, one that arrived before the question, and the answer to an older question of
     the gateway, also if another master's answer had ended that one.
+
+    An older answer, one that was given twice or whose place a second answer had taken, can be told
+    only by its shape. So the gateway keeps the shapes of its questions apart where the station has
+    addresses for it: `shapes` of them, three at most. Nobody can tell an older answer if as many
+    other questions lie between the two as there are other shapes, or a quarter of a second.
     """
 
     shape_of: Callable[[bytes], Shape | None]  # of a request
@@ -27,11 +35,14 @@ class Foreign:
     asks: asyncio.Event = field(default_factory=asyncio.Event)  # the gateway has just asked
     unknown_at: float = -1.0  # when an unknown station answered the open question last
     _others: list[tuple[bytes, bytes]] = field(default_factory=list)  # since then, with replies
+    second_at: float = -math.inf  # when a second answer to a question was given last
     _own: deque[tuple[bytes, bytes]] = field(default_factory=lambda: deque(maxlen=64))
+    _asked: deque[tuple[float, bytes]] = field(default_factory=lambda: deque(maxlen=64))
 
-    def sent(self, request: bytes, *, resync: bool) -> None:
+    def sent(self, request: bytes, now: float, *, resync: bool) -> None:
         """The gateway asks. Other masters do not repeat its resyncs."""
         self.asked = request
+        self._asked.append((now, request))
         self.asks.set()
         self._others.clear()
         if not resync and request not in self.reads and self.shape_of(request):
@@ -43,11 +54,35 @@ class Foreign:
 
     def answered_other(self, request: bytes, reply: bytes, now: float, *, unknown: bool) -> None:
         """A reply to another master arrived; `unknown`: of an unknown station to the gateway."""
-        if unknown and request != self.asked:
-            return
+        self.second_at = now
+        if unknown:
+            self._own.append((request, reply))
+            if request != self.asked:
+                return
         self._others.append((request, reply))
         if unknown:
             self.unknown_at = now
+
+    def repeated(self, now: float) -> None:
+        """A reply to the gateway will arrive a second time."""
+        self.second_at = now
+
+    def took_older(self, heard: bytes, shapes: int, now: float) -> bool:
+        """The open question was ended by an answer to an older one that nobody can tell.
+
+        `shapes`: of which the gateway can choose for the open question.
+        """
+        shape = self.shape_of(self.asked)
+        if shape is None or now - self.second_at > SECONDS_APART:
+            return False
+        older = [request for request, reply in self._own if reply in heard]
+        older = [request for request in older if self.shape_of(request) == shape]
+        asked = list(self._asked)
+        since, _ = asked.pop()
+        for between, (at, request) in enumerate(reversed(asked)):
+            if request in older and (between >= shapes - 1 or since - at >= APART):
+                return True
+        return False
 
     def took(self, heard: bytes) -> bool:
         """The open question, after which this arrived, was ended by an answer that nobody can tell.

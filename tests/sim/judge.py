@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from gateway.app import Gateway
+from gateway.protocols.driver import Span, UnnumberedReplies
 from gateway.protocols.frames import FrameDriver
 from gateway.protocols.frames.driver import LISTENED
 from gateway.tags import Quality, Reason, Sample, Tag
@@ -16,6 +17,7 @@ from tests.sim.story import Story
 from tests.sim.wire import SimWire
 
 SPOKEN = 0.45  # seconds: the longest request and reply of a seed, with an echo and a gap
+LONGEST_STEP = 16  # addresses by which the gateway reads more, to change the shape
 MOST_TROUBLES = 20  # recorded in one run
 
 
@@ -92,11 +94,27 @@ class Judge:
         elif bus.foreign.took(bus.heard):
             self.story.counts["foreign answers"] += 1
             self.foreign_at[tag] = self.now
+        elif bus.foreign.took_older(bus.heard, self._shapes(tag, bus), self.now):
+            self.story.counts["older answers"] += 1
+            self.foreign_at[tag] = self.now
         else:
             self.broke(
                 f"{tag.key} is told as good {value!r}, which was not in the PLC since "
                 f"{since - self.began:.3f}: heard {bus.heard!r}"
             )
+
+    def _shapes(self, tag: Tag, bus: Bus) -> int:
+        """Counts the shapes of which the gateway can choose to read the tag: three at most."""
+        device = next(d for d in bus.line.engine.devices if d.name == tag.device)
+        block = next((block for block in device.blocks if tag in block.tags), None)
+        driver, station = device.driver, self.stations[tag.device]
+        if block is None or block.listed or not isinstance(driver, UnnumberedReplies):
+            return 1
+        area, start, size = block.span
+        longer = [Span(area, start, size + n) for n in range(1, LONGEST_STEP + 1)]
+        longer += [Span(area, start - n, size + n) for n in range(1, min(LONGEST_STEP, start) + 1)]
+        there = [span for span in longer if driver.cost(span) and station.has(span)]
+        return min(3, len({driver.reply_shape(span) for span in [block.span, *there]}))
 
     def _judge_time(self, tag: Tag, bus: Bus, took: float) -> None:
         """A reply that came after its time-out counts for nothing, also after a frozen loop."""

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import takewhile
 
-from gateway.protocols.driver import AnyDriver, Unit
+from gateway.protocols.driver import AnyDriver, Span, Unit
 from gateway.protocols.frames import FrameDriver
 from gateway.simulator.plant import station_for
 from gateway.stations.station import Memory, Station
@@ -173,6 +173,15 @@ class Troubled:
             self.missing.discard(where)
             self.absent[where][-1][1] = _now()
         set_holes(self.inner, self.missing, self.outside)
+
+    def has(self, span: Span) -> bool:
+        """The station has all addresses of the span."""
+        area, start, size = span
+        return not any(
+            (area, n) in self.missing
+            or any(area == name and first <= n <= last for name, first, last in self.outside)
+            for n in range(start, start + size)
+        )
 
     def lacks(self, tag: Tag) -> bool:
         return not self.missing.isdisjoint(_places(tag))

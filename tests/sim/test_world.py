@@ -14,7 +14,7 @@ from tests.sim.draw import Drawn, draw
 from tests.sim.world import run
 
 ROOT = Path(__file__).parents[2]
-LEAN, BUSY = range(6), range(100, 103)
+LEAN, BUSY, HOSTILE = range(6), range(100, 103), (100_000, 100_001)
 
 
 def test_the_seeds_contain_every_protocol_setting_and_fault() -> None:
@@ -46,6 +46,12 @@ def test_an_hour_of_faults_breaks_no_rule(seed: int) -> None:
 @pytest.mark.parametrize("seed", BUSY)
 def test_five_minutes_on_full_wires_break_no_rule(seed: int) -> None:
     story = run(seed, 1 / 12, "busy")
+    assert not story.broken, "\n".join([story.replay(), *story.broken])
+
+
+@pytest.mark.parametrize("seed", HOSTILE)
+def test_other_parties_on_the_line_break_no_rule(seed: int) -> None:
+    story = run(seed, 0.3, "hostile")
     assert not story.broken, "\n".join([story.replay(), *story.broken])
 
 

@@ -55,6 +55,9 @@ class Watch(Protocol):
     def answered(self, request: bytes, reply: bytes) -> None:
         """A station replies to the gateway."""
 
+    def repeated(self) -> None:
+        """A reply will arrive a second time."""
+
     def answered_other(self, station: Speaker, request: bytes, reply: bytes) -> None:
         """A reply arrived that another master asked for, or that an unknown station sent."""
 
@@ -205,6 +208,7 @@ class SimWire:
             self.watch.answered(data, said[0])
         self._say(said[0], end + said[1], station, request)
         for after, on_wire in station.copies():
+            self.watch.repeated()
             start = end + said[1] + len(said[0]) * self.wire.character + after
             if on_wire:
                 self._say(said[0], start, station)
