@@ -246,7 +246,7 @@ def resync_around(job: Transacted, shapes: ReplyShapes, now: float) -> None:
             write.resyncs = Resyncs(token() if before else None, token() if after else None)
             return
         case Command():
-            before = shapes.may_be_extra(None, now)
+            before = not job.broadcast and shapes.may_be_extra(None, now)
             job.resyncs = Resyncs(before=token() if before else None)
         case Probe(outstanding=outstanding, token=marked):
             last = driver.resync_shape(outstanding, marked, device.probe_spans)

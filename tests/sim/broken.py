@@ -795,4 +795,18 @@ MUTANTS = (
         "            self._queue.put(text)\n",
         "tests/cli/test_logs.py",
     ),
+    Mutant(
+        "a broadcast command is taken for an answered one",
+        "engine/requests.py",
+        "isinstance(driver, Controllable) and self.name in driver.broadcast_commands",
+        "False",
+        "tests/engine/test_reply_shapes.py",
+    ),
+    Mutant(
+        "a request whose late reply arrived is still expected",
+        "engine/health.py",
+        "            self.outstanding = None\n            self._unanswered.clear()\n        self.trouble",
+        "            self._unanswered.clear()\n        self.trouble",
+        "tests/engine/test_health.py",
+    ),
 )
