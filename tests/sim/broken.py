@@ -805,7 +805,8 @@ MUTANTS = (
     Mutant(
         "a request whose late reply arrived is still expected",
         "engine/health.py",
-        "            self.outstanding = None\n            self._unanswered.clear()\n        self.trouble",
+        "            self.outstanding = None\n"
+        "            self._unanswered.clear()\n        self.trouble",
         "            self._unanswered.clear()\n        self.trouble",
         "tests/engine/test_health.py",
     ),
