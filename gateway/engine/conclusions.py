@@ -121,7 +121,7 @@ class Conclusions:
     def _requested(
         self, job: RequestJob, result: Result, traffic: Traffic, now: float, time: int
     ) -> None:
-        match self._requests.conclude(job, result, traffic, now, time):
+        match self._requests.conclude(job, result, now, time):
             case Unclear() as error:
                 self.unclear(job, error, traffic, now, time)
             case ReadBack() | Repeat() as following:

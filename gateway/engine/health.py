@@ -143,6 +143,7 @@ class Health:
         """
         if last and not self._extra:
             self.needs_resync = False
+            self.outstanding = None
             self._unanswered.clear()
         self.trouble = Garbled(
             f"it took {took:.2f} s, reply_timeout is {reply_timeout:g} s", evidence=Evidence.SLOW

@@ -246,7 +246,7 @@ def resync_around(job: Transacted, shapes: ReplyShapes, now: float) -> None:
             write.resyncs = Resyncs(token() if before else None, token() if after else None)
             return
         case Command():
-            before = shapes.may_be_extra(None, now)
+            before = not job.broadcast and shapes.may_be_extra(None, now)
             job.resyncs = Resyncs(before=token() if before else None)
         case Probe(outstanding=outstanding, token=marked):
             last = driver.resync_shape(outstanding, marked, device.probe_spans)
@@ -267,7 +267,6 @@ class Traffic:
     exchanges: int = 0  # requests with a reply
     turnaround: float = 0.0  # seconds of the station for them, without the characters
     extra: int = 0  # frames of the station that answered no request
-    told: bool = False  # the last request gets no reply, from any station
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,6 @@ from gateway.engine.jobs import (
     Result,
     Sent,
     Settle,
-    Traffic,
     Transacted,
     WriteTogether,
     requests_of,
@@ -42,7 +41,7 @@ class RequestResults:
         self._effects = effects
 
     def conclude(
-        self, job: RequestJob, result: Result, traffic: Traffic, now: float, time: int
+        self, job: RequestJob, result: Result, now: float, time: int
     ) -> Unclear | ReadBack | Repeat | None:
         """Returns the next step: settle after an unclear end, read back, or write again."""
         if isinstance(result, Unclear):
@@ -54,7 +53,7 @@ class RequestResults:
             case Confirm():
                 return self._confirmed(job, result, now, time)
             case Command():
-                self._commanded(job, result, traffic, now, time)
+                self._commanded(job, result, now, time)
             case WriteTogether():
                 return self._written_together(job, result, now, time)
             case ReadBack():
@@ -177,14 +176,12 @@ class RequestResults:
         self._end(write, outcome, now)
         return None
 
-    def _commanded(
-        self, command: Command, result: Result, traffic: Traffic, now: float, time: int
-    ) -> None:
+    def _commanded(self, command: Command, result: Result, now: float, time: int) -> None:
         device = command.device
         if isinstance(result, Refused):
             self._refused(device, result, now, time)
         elif isinstance(result, str):
-            if traffic.told:  # a resync with a reply may have preceded it
+            if command.broadcast:
                 self._pause(device)
             else:
                 self._results.answered(device, now, time)

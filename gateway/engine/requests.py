@@ -96,6 +96,12 @@ class Command:
     resyncs: Resyncs = NO_RESYNCS
 
     @property
+    def broadcast(self) -> bool:
+        """True if it goes to all stations, and none replies."""
+        driver = self.device.driver
+        return isinstance(driver, Controllable) and self.name in driver.broadcast_commands
+
+    @property
     def expires(self) -> float:
         """The time after which it is not sent, because the client no longer waits."""
         return self.submitted + WRITE_EXPIRY

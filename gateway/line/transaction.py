@@ -102,7 +102,6 @@ class Transaction:
         self.has_sent = True
         channel.send(data)
         self.traffic.sent += len(data)
-        self.traffic.told = True
         # No reply follows; the wire is busy until the last character is out.
         channel.pause(len(data) * channel.wire.character)
 

@@ -310,6 +310,10 @@ class Controllable(Protocol[F]):
     @property
     def controls(self) -> frozenset[str]: ...
 
+    @property
+    def broadcast_commands(self) -> frozenset[str]:
+        """The commands that go to all stations of the line, and get no reply."""
+
     async def control(self, talk: Talk[F], command: str, argument: str) -> str:
         """Returns the reply of the device. Raises `BadValue` for an argument it cannot send."""
 

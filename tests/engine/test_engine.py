@@ -74,7 +74,7 @@ ADDRESS, DAMAGED, BUSY, OTHER = (
 UNITS = [1, 2, 3, 4, 5, 6]
 HELD, OLD = [7], [0]  # units that are read back: as written, as before
 NOTHING_SENT = Traffic()
-TOLD_TO_ALL = Traffic(sent=17, told=True)
+TOLD_TO_ALL = Traffic(sent=17)
 
 # By name: a result, and the traffic where it is not the usual.
 RESULTS: dict[str, tuple[Result, Traffic | None]] = {
@@ -118,7 +118,8 @@ RESULTS_OF = {
     "WriteVerified": ["held", "differs", "refused-back", "to-all", *FAILURES, "not-sent"],
     "WriteTogether": ["sent", *FAILURES, "not-sent"],
     "ReadBack": ["held-both", "held-first", *UNCLEAR, "lost"],
-    "Command": ["obeyed", "obeyed-by-all", "bad-value", *FAILURES, "not-sent"],
+    "Command": ["obeyed", "bad-value", *FAILURES, "not-sent"],
+    "CommandToAll": ["obeyed-by-all"],
     "Confirm": ["sent", *FAILURES],
     "ConfirmVerify": ["held", "differs", *FAILURES],
     "ConfirmBoth": ["held", "differs", *FAILURES],
@@ -188,9 +189,12 @@ def read_back(rig: Rig) -> Transacted:
     return rig.transacted()
 
 
-def command(rig: Rig) -> Transacted:
-    rig.command()
-    return rig.transacted()
+def command(name: str = "stop") -> Setup:
+    def setup(rig: Rig) -> Transacted:
+        rig.command(name)
+        return rig.transacted()
+
+    return setup
 
 
 def settle(before: Setup, traffic: Traffic | None = None) -> Setup:
@@ -238,12 +242,14 @@ SITUATIONS: dict[str, tuple[State, Setup]] = {
     "online WriteVerified": (S.ONLINE, write("D2")),
     "online WriteTogether": (S.ONLINE, write_together),
     "online ReadBack": (S.ONLINE, read_back),
-    "online Command": (S.ONLINE, command),
+    "online Command": (S.ONLINE, command()),
+    "online CommandToAll": (S.ONLINE, command("global")),
     "failing Poll": (S.FAILING, first),
     "failing Write": (S.FAILING, write("D0")),
     "failing WriteVerified": (S.FAILING, write("D2")),
     "failing WriteTogether": (S.FAILING, write_together),
-    "failing Command": (S.FAILING, command),
+    "failing Command": (S.FAILING, command()),
+    "failing CommandToAll": (S.FAILING, command("global")),
     "failing Probe": (S.ONLINE, after_failed_poll),
     "failing Settle/Ambiguous": (S.ONLINE, ambiguous(after_failed_poll)),
     "failing ProbeAgain": (S.ONLINE, probe_again(after_failed_poll)),
@@ -256,13 +262,13 @@ SITUATIONS: dict[str, tuple[State, Setup]] = {
     "failing Settle/WriteVerified": (S.ONLINE, settle(write("D2"))),
     "failing Settle/WriteTogether": (S.ONLINE, settle(write_together)),
     "failing Settle/ReadBack": (S.ONLINE, settle(read_back)),
-    "failing Settle/Command": (S.ONLINE, settle(command)),
+    "failing Settle/Command": (S.ONLINE, settle(command())),
     "failing Settle/NotSent": (S.ONLINE, settle(write("D2"), NOTHING_SENT)),
     "failing Settle/LastPoll": (S.FAILING, settle(first)),
     "failing Settle/LastWrite": (S.FAILING, settle(write("D0"))),
     "failing Settle/LastVerified": (S.FAILING, settle(write("D2"))),
     "failing Settle/LastTogether": (S.FAILING, settle(write_together)),
-    "failing Settle/LastCommand": (S.FAILING, settle(command)),
+    "failing Settle/LastCommand": (S.FAILING, settle(command())),
     "failing Settle/LastProbe": (S.ONLINE, settle(after_failed_poll)),
     "failing Settle/Confirm": (S.ONLINE, settle(after_failed_write("D3"))),
     "failing Settle/Repeat": (S.ONLINE, settle(repeat)),
@@ -273,7 +279,8 @@ SITUATIONS: dict[str, tuple[State, Setup]] = {
     "offline Write": (S.FAILING, after_late_reply(write("D0"))),
     "offline WriteVerified": (S.FAILING, after_late_reply(write("D2"))),
     "offline WriteTogether": (S.FAILING, after_late_reply(write_together)),
-    "offline Command": (S.FAILING, after_late_reply(command)),
+    "offline Command": (S.FAILING, after_late_reply(command())),
+    "offline CommandToAll": (S.FAILING, after_late_reply(command("global"))),
     "offline Confirm": (S.FAILING, after_failed_write("D3")),
     "offline ConfirmVerify": (S.FAILING, after_failed_write("D2")),
     "offline ConfirmBoth": (S.FAILING, after_failed_write("D4")),
@@ -342,7 +349,7 @@ online   ReadBack              held-first    online    verified+Refused         
 online   ReadBack              any-unclear   failing   -                                    Settle
 online   ReadBack              lost          online    Unclear+Unclear                      -
 online   Command               obeyed        online    obeyed                               Poll
-online   Command               obeyed-by-all online    pause+obeyed                         Poll
+online   CommandToAll          obeyed-by-all online    pause+obeyed                         Poll
 online   Command               bad-value     online    BadValue                             Poll
 online   Command               any-refusal   online    Refused                              Poll
 online   Command               any-unclear   failing   -                                    Settle
@@ -377,7 +384,7 @@ failing  WriteTogether         any-unclear   failing   -                        
 failing  WriteTogether         lost          failing   Unclear+Unclear                      -
 failing  WriteTogether         not-sent      failing   -                                    Settle
 failing  Command               obeyed        online    obeyed                               Poll
-failing  Command               obeyed-by-all failing   pause+obeyed                         Poll
+failing  CommandToAll          obeyed-by-all failing   pause+obeyed                         Poll
 failing  Command               bad-value     failing   BadValue                             Poll
 failing  Command               any-refusal   online    Refused                              Poll
 failing  Command               any-unclear   failing   -                                    Settle
@@ -479,7 +486,7 @@ offline  WriteTogether         any-unclear   offline   -                        
 offline  WriteTogether         lost          offline   Unclear+Unclear                      -
 offline  WriteTogether         not-sent      offline   -                                    Settle
 offline  Command               obeyed        online    online+obeyed                        Poll
-offline  Command               obeyed-by-all offline   pause+obeyed                         Idle
+offline  CommandToAll          obeyed-by-all offline   pause+obeyed                         Idle
 offline  Command               bad-value     offline   BadValue                             Idle
 offline  Command               any-refusal   online    online+Refused                       Poll
 offline  Command               any-unclear   offline   -                                    Settle

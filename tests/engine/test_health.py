@@ -170,6 +170,7 @@ def test_the_last_late_reply_completes_the_resync_and_an_earlier_one_does_not(la
     found.replied_late(0.7, 0.5, last=last)
     assert found.state is S.FAILING  # only a reply in time brings it online
     assert found.needs_resync is not last
+    assert found.outstanding == (None if last else SPAN)
     assert found.outstanding_requests(-1.0) == (0 if last else 1)
     assert isinstance(found.trouble, Garbled)
     assert found.trouble.evidence is Evidence.SLOW

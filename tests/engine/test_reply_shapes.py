@@ -26,7 +26,7 @@ from gateway.protocols.modbus.frame import Frame
 from gateway.protocols.vigor import Vigor
 from gateway.protocols.vigor.codec import READ, Reply, Request
 from gateway.tags import Quality, Reason, WriteRule
-from tests.engine.rig import REPLIED, Rig, link_device, tcp_device
+from tests.engine.rig import REPLIED, Rig, kinds, link_device, tcp_device
 from tests.sim.plant import device, make_tag, words
 
 SERIAL = [ModbusRtu(station=1), ModbusAscii(station=1), Vigor(station=1), ComputerLink(station=1)]
@@ -261,6 +261,22 @@ def test_a_write_after_a_refusal_is_followed_by_a_resync() -> None:
     job = rig.next()
     assert isinstance(job, Write)
     assert write.resyncs.after is not None
+
+
+def test_a_broadcast_after_a_write_needs_no_resync_and_is_followed_by_a_pause() -> None:
+    rig, poll = polling(link_device())
+    rig.conclude(poll, [0] * 6)
+    write = rig.write("D0")
+    assert rig.next() is write
+    rig.conclude(write, Sent(), REPLIED)
+    broadcast = rig.command("global", "on")
+    job = rig.next()
+    if isinstance(job, Poll):
+        rig.conclude(job, [0] * 6)
+        job = rig.next()
+    assert job is broadcast
+    assert broadcast.resyncs.before is None
+    assert "pause" in kinds(rig.conclude(broadcast, "sent to all stations", REPLIED))
 
 
 def test_on_a_wire_that_is_never_quiet_a_resync_shows_the_order_from_time_to_time() -> None:

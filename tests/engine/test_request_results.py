@@ -270,14 +270,6 @@ def test_after_a_write_without_acknowledgement_the_line_pauses() -> None:
     assert [effect for effect in effects if isinstance(effect, Pause)] == [Pause(BROADCAST_PAUSE)]
 
 
-def test_the_line_pauses_after_a_command_to_all_also_if_a_resync_preceded_it() -> None:
-    rig = online()
-    rig.command("global", "on")
-    traffic = Traffic(30, 12, exchanges=1, turnaround=0.005, told=True)
-    effects = rig.conclude(rig.transacted(), "sent to all stations", traffic)
-    assert [effect for effect in effects if isinstance(effect, Pause)] == [Pause(BROADCAST_PAUSE)]
-
-
 @pytest.mark.parametrize("text", ["D0", "D2", "D4"])
 @pytest.mark.parametrize("settling", [False, True])
 def test_the_loss_of_the_port_makes_a_sent_write_unclear_whatever_its_rule(

@@ -111,13 +111,14 @@ async def test_a_write_that_ends_in_a_bug_is_unclear_and_the_next_one_works() ->
 async def test_a_thousand_writes_at_once_are_bounded_and_each_is_answered() -> None:
     plant = mixer()
     plant.gate.clear()
-    async with gateway_and_client(plant) as (_, client):
+    async with gateway_and_client(plant) as (northbound, client):
         asking = asyncio.create_task(
             client.many([("plant/mixer/recipe/@set", b"%d" % (10 + n)) for n in range(1000)])
         )
         # Values are read meanwhile: writes that wait hold up nothing else.
         [reply] = await get_with_another_client(client)
         assert reply.ok
+        await until(lambda: northbound.counters()["queries"] == 1000 + 1)
         plant.gate.set()
         answers = await asking
         assert all(len(replies) == 1 for replies in answers)

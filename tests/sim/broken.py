@@ -803,13 +803,6 @@ MUTANTS = (
         "tests/engine/test_line_silence.py",
     ),
     Mutant(
-        "a global after a resync is followed at once",
-        "engine/request_results.py",
-        "            if traffic.told:",
-        "            if not traffic.exchanges:",
-        "tests/engine/test_request_results.py",
-    ),
-    Mutant(
         "a silent address makes a device with no retries offline at each try",
         "engine/results.py",
         "        retries = max(device.timing.retries, suspect)\n",
@@ -818,7 +811,7 @@ MUTANTS = (
     ),
     Mutant(
         "one refused longer read ends all longer reads",
-        "engine/reply_shapes.py",
+        "engine/longer_reads.py",
         "            if any(_inside(refused, longer) for refused in lacking):\n",
         "            if lacking:\n",
         "tests/engine/test_reply_shapes.py",
@@ -829,5 +822,20 @@ MUTANTS = (
         "foreign = not old and ",
         "foreign = ",
         "tests/line/test_transaction.py",
+    ),
+    Mutant(
+        "a broadcast command is taken for an answered one",
+        "engine/requests.py",
+        "isinstance(driver, Controllable) and self.name in driver.broadcast_commands",
+        "False",
+        "tests/engine/test_reply_shapes.py",
+    ),
+    Mutant(
+        "a request whose late reply arrived is still expected",
+        "engine/health.py",
+        "            self.outstanding = None\n"
+        "            self._unanswered.clear()\n        self.trouble",
+        "            self._unanswered.clear()\n        self.trouble",
+        "tests/engine/test_health.py",
     ),
 )

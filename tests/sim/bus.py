@@ -246,6 +246,15 @@ class Bus:
             for e in self.episodes
         )
 
+    def brought_older(self, since: float) -> bool:
+        """A device server brought a station an older request of the gateway since then.
+
+        Its reply fits the open request with the same text, and neither names its request. With a
+        protocol the number of bytes or the token of a resync differs; two texts are too few to
+        tell how many kept requests are still to come.
+        """
+        return isinstance(self.wire, SimWire) and self.wire.behind >= since
+
     def stood_still(self, ago: float) -> float:
         """Returns for how long the loop of the gateway stood still lately, `ago` seconds ago."""
         passed = self.now() - self.began

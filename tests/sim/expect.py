@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from gateway.engine.device import Device
 from gateway.engine.engine import Engine
 from gateway.engine.health import State
+from gateway.engine.unanswered import LONGEST_WAIT
 from gateway.line.line import Line
 from gateway.planning.bad_addresses import RETRIES
 from gateway.protocols.frames import FrameDriver
@@ -207,11 +208,17 @@ class Expectations:
             one_round = sum(
                 d.settings.verify_reads * d.seconds(b.cost) for d in devices for b in d.blocks
             )
+            # While another unit is silent, the gateway waits so long for a reply: a bridge may be
+            # waiting for that unit. A reply that comes again with an old number looks like a late
+            # one, so also without a bridge.
+            bridged = isinstance(bus.wire, SimNet) and len(devices) > 1
+            behind_bridge = LONGEST_WAIT if bridged else 0.0
             for device in devices:
                 for tag in device.polled_tags:
                     if judge.gateway.mirror[tag].quality is not Quality.GOOD:
                         continue
                     limit = 2 * (2 * tag.every + (len(devices) + 1) * one_round) + 2 * longest
+                    limit += behind_bridge
                     age = judge.now - judge.read_at[tag]
                     judge.story.counts["looks at ages"] += 1
                     if age > limit:

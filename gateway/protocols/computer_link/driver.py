@@ -203,6 +203,10 @@ class ComputerLink:
     def controls(self) -> frozenset[str]:
         return frozenset({"run", "stop", "loopback", "model", "global"})
 
+    @property
+    def broadcast_commands(self) -> frozenset[str]:
+        return frozenset({"global"})
+
     async def control(self, talk: LinkTalk, command: str, argument: str) -> str:
         """Sends `run`, `stop`, `model`; `loopback` with a text; `global` with on or off.
 
