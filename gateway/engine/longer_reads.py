@@ -11,6 +11,7 @@ LONGEST_STEP = 16  # addresses by which a read may grow, to reach the next byte 
 MOST_CHOICES = 3  # shapes of one block: an extra reply that is late by two requests is noticed
 MOST_WARY = 8  # shapes of one block while the device answers twice
 MOST_FAILED = 3  # reads in a row of the longer span without a reply
+KNOWN_FOR = 600.0  # seconds for which a device that comes back has the addresses that it had
 
 Choice = tuple[Span, Hashable]  # a span to read, and the shape of its reply
 
@@ -31,7 +32,8 @@ class LongerReads:
         self._hull = tags
         self._bad = bad
         self.by_span: dict[Span, list[Choice]] = {}
-        self._lacking: dict[Span, list[Span]] = {}  # by block: longer spans that were refused
+        # By block: when a longer span was refused last, and all that were
+        self._lacking: dict[Span, tuple[float, list[Span]]] = {}
         self._shapes: Counter[Hashable] = Counter()  # of the planned blocks
         self.failed: dict[Span, int] = {}  # reads of longer spans in a row without a reply
 
@@ -52,37 +54,45 @@ class LongerReads:
         choices = [] if alone else self._choose(block.span)[:MOST_CHOICES]
         return [cost for span, _ in choices if (cost := self._driver.cost(span))] or [block.cost]
 
-    def refused(self, span: Span, longer: Span) -> None:
+    def refused(self, span: Span, longer: Span, now: float) -> None:
         """Notes that addresses beside the span do not exist. Those on its other side may."""
-        self._lacking.setdefault(span, []).append(longer)
+        _, lacking = self._lacking.get(span, (now, []))
+        self._lacking[span] = now, [*lacking, longer]
         self.by_span.pop(span, None)
 
-    def refused_alone(self, span: Span) -> None:
-        """Notes that the span is refused too: so the addresses beside it may exist."""
-        if self._lacking.pop(span, None) is not None:
+    def refused_alone(self, span: Span, read: float | None) -> None:
+        """Notes that the span is refused too. If it was not read since, those beside it may exist.
+
+        `read`: when the span was read last.
+        """
+        known = self._lacking.get(span)
+        if known is not None and (read is None or read < known[0]):
+            del self._lacking[span]
             self.by_span.pop(span, None)
 
     def unanswered(self, span: Span, longer: Span) -> None:
         """Counts a read of a longer span without a reply: some stations refuse by silence."""
         self.failed[span] = self.failed.get(span, 0) + 1
         if self.failed[span] >= MOST_FAILED:
-            self.refused(span, longer)
+            self.refused(span, longer, -KNOWN_FOR)  # until it comes back: it may be dead
             del self.failed[span]
 
     def answered(self, span: Span) -> None:
         """Notes a reply to a read of a longer span."""
         self.failed.pop(span, None)
 
-    def restart(self) -> None:
+    def restart(self, now: float) -> None:
         """Starts again after the device came online: it may have other addresses now."""
         self.by_span.clear()
-        self._lacking.clear()
         self.failed.clear()
+        for span, (refused, _) in list(self._lacking.items()):
+            if now - refused >= KNOWN_FOR:
+                del self._lacking[span]
 
     def _choose(self, span: Span) -> list[Choice]:
         """Returns the span, and longer ones whose replies have other shapes."""
         found: dict[Hashable, Span] = {self._driver.reply_shape(span): span}
-        lacking = self._lacking.get(span, ())
+        _, lacking = self._lacking.get(span, (0.0, []))
         for longer in self._longer(span):
             if any(_inside(refused, longer) for refused in lacking):
                 continue

@@ -53,7 +53,7 @@ class Results:
             return
         if health.answered(resynced=resynced):
             if device.shapes is not None:
-                device.shapes.longer.restart()
+                device.shapes.longer.restart(now)
             self._effects.online(device, True)
             self._effects.info("device online", line=self._line, device=device.name)
             device.bad_addresses.abandon()
@@ -181,11 +181,11 @@ class Results:
             return False
         shapes.refused(now)
         if poll.span is poll.block.span:
-            shapes.longer.refused_alone(poll.block.span)
+            shapes.longer.refused_alone(poll.block.span, poll.last.at)
             return False
         if error.refusal in (Refusal.DAMAGED, Refusal.BUSY):
             return False
-        shapes.longer.refused(poll.block.span, poll.span)
+        shapes.longer.refused(poll.block.span, poll.span, now)
         self._schedule.again(poll, counted=False)
         return True
 

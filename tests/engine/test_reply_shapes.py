@@ -5,7 +5,7 @@ import pytest
 from gateway.engine.device import Device
 from gateway.engine.health import State
 from gateway.engine.jobs import Poll, Probe, Resynced, Sent
-from gateway.engine.longer_reads import MOST_FAILED, MOST_WARY
+from gateway.engine.longer_reads import KNOWN_FOR, MOST_FAILED, MOST_WARY
 from gateway.engine.reply_shapes import (
     MARK_FIRST,
     MARK_LONGEST,
@@ -77,10 +77,10 @@ def test_a_longer_span_that_was_refused_is_not_read_again() -> None:
     span = dev.blocks[0].span
     after = read(shapes, dev, 0.02)
     assert after.start == span.start
-    shapes.longer.refused(span, after)
+    shapes.longer.refused(span, after, 0.02)
     before = read(shapes, dev, 0.04)
     assert before.start + before.size == span.start + span.size  # those before it may exist
-    shapes.longer.refused(span, span._replace(start=span.start - 1, size=11))
+    shapes.longer.refused(span, span._replace(start=span.start - 1, size=11), 0.04)
     assert read(shapes, dev, 0.06) == span
 
 
@@ -89,9 +89,23 @@ def test_a_longer_span_is_read_again_if_the_block_alone_was_refused_too() -> Non
     dev = single()
     shapes, span = shapes_of(dev), dev.blocks[0].span
     read(shapes, dev, 0.0)
-    shapes.longer.refused(span, read(shapes, dev, 0.02))
-    shapes.longer.refused_alone(span)
-    assert read(shapes, dev, 0.04) == span._replace(size=12)
+    longer = read(shapes, dev, 0.02)
+    shapes.longer.refused(span, longer, 0.02)
+    shapes.longer.refused_alone(span, 0.03)  # it was read meanwhile: a new refusal
+    assert longer not in [read for read, _ in shapes.longer.choices(span)]
+    shapes.longer.refused_alone(span, 0.01)
+    assert longer in [read for read, _ in shapes.longer.choices(span)]
+
+
+def test_a_device_that_comes_back_has_the_addresses_that_it_had_for_some_time() -> None:
+    dev = single()
+    shapes, span = shapes_of(dev), dev.blocks[0].span
+    longer = read(shapes, dev, 0.0), read(shapes, dev, 0.02)
+    shapes.longer.refused(span, longer[1], 1.0)
+    shapes.longer.restart(KNOWN_FOR)
+    assert longer[1] not in [read for read, _ in shapes.longer.choices(span)]
+    shapes.longer.restart(KNOWN_FOR + 1.0)
+    assert longer[1] in [read for read, _ in shapes.longer.choices(span)]
 
 
 def test_an_acknowledgement_may_be_repeated_later_by_a_device_that_answers_twice() -> None:
@@ -119,7 +133,7 @@ def test_a_longer_span_without_replies_is_given_up() -> None:
     assert read(shapes, dev, 0.02) == longer
     shapes.longer.unanswered(span, longer)
     assert read(shapes, dev, 0.04).start < span.start
-    shapes.longer.restart()
+    shapes.longer.restart(0.05)
     assert longer in [read(shapes, dev, now) for now in (0.06, 0.08)]
 
 
