@@ -312,11 +312,13 @@ class Results:
         """
         device, bad = poll.device, poll.device.bad_addresses
         health, retries = device.health, device.timing.retries
-        if poll.span is not poll.block.span and device.shapes is not None:
-            device.shapes.longer.unanswered(poll.block.span, poll.span)
         if health.state is State.OFFLINE:
             if alone and health.consecutive_failures <= 1:  # it replied to the request before
                 bad.went_silent(poll.block)
+            return
+        if poll.span is not poll.block.span and device.shapes is not None:
+            device.shapes.longer.unanswered(poll.block.span)
+            self._schedule.again(poll, counted=False)
             return
         suspect, half = bad.is_suspect(poll.block), bad.is_half(poll.block)
         known = suspect and not half
