@@ -17,7 +17,8 @@ LINE_KINDS: tuple[str, ...] = ("reset", "reset", "master", "master", "buffering"
 NET_STATION_KINDS: tuple[str, ...] = ("twice", "refusing", "deaf")
 NET_LINE_KINDS: tuple[str, ...] = ("hung",)
 PARTIES = frozenset((*STATION_KINDS, *LINE_KINDS, "frozen"))
-DELAYING = ("stall", "held-requests", "reset", "master", "buffering")  # requests arrive later
+# Requests arrive later.
+DELAYING = ("stall", "hang", "held-requests", "reset", "master", "buffering")
 HUNG = 120.0  # seconds within which a connection without any reply is opened again
 RESETS = 4  # at most, in one episode
 HASTE = {"hostile": 0.1}  # paces with other parties: how short the pauses between them are
