@@ -263,8 +263,6 @@ class Expectations:
         if bus.collides or tag.span.area == LISTENED:
             patience += 20 * every + LONGEST_PAUSE
         if station.manners.unknown == SILENT:  # its blocks are halved by time-outs
-            if isinstance(bus.wire, SimNet) and bus.wire.bridge >= device.longest_reply:
-                return math.inf  # all replies behind such a bridge come too late then
             if device.driver.protocol == "vigor":  # every second resync reads M0, which it lacks
                 return math.inf
             patience *= 3
