@@ -17,6 +17,7 @@ from gateway.errors import GatewayError
 from gateway.history import Historian
 from gateway.history.state_file import StateFile
 from gateway.line.arrival import ArrivalClock
+from gateway.line.duty import Duty
 from gateway.northbound import Northbound, StandbySettings
 from gateway.tags import Sample
 
@@ -69,7 +70,8 @@ async def _serve(
     """
     config = file.without(withheld)
     clock = ArrivalClock()
-    gateway = Gateway(config, clock)
+    duty = Duty(clock.released, shared=config.standby is not None)
+    gateway = Gateway(config, clock, duty=duty)
     gc.collect()
     gc.freeze()  # tags live as long as the gateway: each collection skips them
     history = _history(config)

@@ -104,7 +104,7 @@ class Claiming:
             await asyncio.sleep(0.05)
 
     async def _observe(self, view: zenoh.Session, claims: Claims) -> None:
-        def token_changed(sample: zenoh.Sample) -> None:
+        def token_changed(sample: zenoh.Sample, _at: float) -> None:
             key = str(sample.key_expr)
             if claims.own is not None and key == self._keys.claim(claims.own.session):
                 return

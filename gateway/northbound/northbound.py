@@ -12,6 +12,7 @@ import zenoh
 from gateway.config import Config, ZenohConfig, ZenohMode
 from gateway.errors import GatewayError
 from gateway.northbound import secrets
+from gateway.northbound.acceptance import Acceptance
 from gateway.northbound.admission import Admission
 from gateway.northbound.audit import Audit
 from gateway.northbound.inbox import Inbox
@@ -80,7 +81,7 @@ class Northbound:
         self._links = LinkMonitor()
         self._index = TagIndex(self.keys, plant.devices())
         devices = [device.name for device in self._index.devices]
-        self._admission = Admission(standby, self.keys, self._config, devices)
+        self._admission = Admission(standby, self.keys, self._config, devices, plant.duty)
         self._publisher = Publisher(self.keys)
         self._batches = ScanBatches(self._publisher, self._index.devices)
         audit = Audit(
@@ -97,7 +98,7 @@ class Northbound:
             audit,
             self._status.documents,
             history,
-            known_writers,
+            Acceptance(plant.duty, known_writers),
         )
         self._declared: list[object] = []  # Zenoh undeclares an object without a reference
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import structlog
 import zenoh
 
+from gateway.line.duty import Duty
 from gateway.northbound.election import Election, Role, RoleToken, State
 from gateway.northbound.inbox import Inbox
 from gateway.northbound.keys import Keys
@@ -36,7 +37,8 @@ class Standby:
     Without settings it is `enabled` false, and active at once and for ever.
     """
 
-    def __init__(self, settings: StandbySettings | None, keys: Keys) -> None:
+    def __init__(self, settings: StandbySettings | None, keys: Keys, duty: Duty) -> None:
+        """`duty` gets the proof that this gateway is active, again and again."""
         self.enabled = settings is not None
         self.active = asyncio.Event()
         self.replaced = asyncio.Event()
@@ -44,6 +46,7 @@ class Standby:
         if not self.enabled:
             self.active.set()
         self._keys = keys
+        self._duty = duty
         self._election: Election | None = None
         self._session: zenoh.Session | None = None  # of the tokens
         self._tokens: dict[Role, zenoh.LivelinessToken] = {}
@@ -82,11 +85,11 @@ class Standby:
         """Observes the group as soon as the session of the tokens is open."""
         found = await second.session()
 
-        def token_changed(sample: zenoh.Sample) -> None:
+        def token_changed(sample: zenoh.Sample, _at: float) -> None:
             if token := _parse_token(str(sample.key_expr)):
                 election.token_changed(token, sample.kind == zenoh.SampleKind.PUT)
 
-        def link_changed(event: zenoh.TransportEvent) -> None:
+        def link_changed(event: zenoh.TransportEvent, _at: float) -> None:
             linked, kind = str(event.transport.zid), str(event.transport.whatami)
             is_up = event.kind != zenoh.SampleKind.DELETE
             election.link_changed(linked, is_up, kind == "router", time.monotonic())
@@ -104,7 +107,7 @@ class Standby:
         self._declared = await off_loop(declare)
 
     async def _decide(self, election: Election, opening: asyncio.Task[None]) -> None:
-        def token_found(reply: zenoh.Reply) -> None:
+        def token_found(reply: zenoh.Reply, _at: float) -> None:
             if reply.ok and (token := _parse_token(str(reply.ok.key_expr))):
                 election.token_found(token, time.monotonic())
 
@@ -118,6 +121,7 @@ class Standby:
                 log.info("standby state changed", group=self._settings.group, state=state.value)
             await self._update_tokens(election, state)
             if state is State.ACTIVE:
+                self._duty.prove(asyncio.get_running_loop().time())
                 self.active.set()
             if state is State.REPLACED and not self.replaced.is_set():
                 log.error("gateway replaced", why="another gateway of the group may be active")

@@ -29,13 +29,6 @@ class NotAllowed(GatewayError):
     """The token is missing or unknown; nothing was done."""
 
 
-class Sender(NamedTuple):
-    """The client that sent a query or put."""
-
-    session: str | None = None  # Zenoh's id, if the client sends it
-    token: bytes | None = None
-
-
 class _Writer(NamedTuple):
     name: str
     salt: bytes
