@@ -560,7 +560,7 @@ def test_a_program_prints_what_the_page_shows(
 ) -> None:
     text = snippet.program.text
     assert text.count(ENDPOINT) == 1
-    assert _imported(text) <= {"json", "zenoh"}
+    assert _imported(text) <= {"datetime", "hashlib", "hmac", "json", "secrets", "zenoh"}
     path = tmp_path / "program.py"
     path.write_text(text.replace(ENDPOINT, endpoint), encoding="utf-8")
     shown = [line for line in snippet.shown if line != "…"]

@@ -192,6 +192,10 @@ class ZenohPeer:
         await self.get(BARRIER)
         return subscription
 
+    async def queryable(self, key: str) -> Subscription:
+        """Receives queries, as samples, and answers none."""
+        return await self._subscribe("queryable", key=key)
+
     async def liveliness(self, key: str) -> Subscription:
         """Observes tokens: declared (PUT, also before) and undeclared (DELETE)."""
         return await self._subscribe("liveliness", key=key)
@@ -314,6 +318,17 @@ def _forward(n: int) -> Callable[[zenoh.Sample], None]:
     return lambda sample: _send({"received": n, "sample": _flat(sample)})
 
 
+def _overhear(n: int) -> Callable[[zenoh.Query], None]:
+    def taken(query: zenoh.Query) -> None:
+        with query:
+            data, attached = query.payload, query.attachment
+            texts = [_text(b"" if found is None else bytes(found)) for found in (data, attached)]
+            flat = [str(query.key_expr), "QUERY", texts[0], "", None, texts[1]]
+            _send({"received": n, "sample": flat})
+
+    return taken
+
+
 def _flat(sample: zenoh.Sample) -> list[Any]:
     stamp = sample.timestamp
     return [
@@ -370,6 +385,8 @@ def _execute(session: zenoh.Session, kept: list[object], request: dict[str, Any]
         case {"do": "subscribe", "n": n, "key": key}:
             history = ext.HistoryConfig(max_samples=1)
             kept.append(ext.declare_advanced_subscriber(session, key, _forward(n), history=history))
+        case {"do": "queryable", "n": n, "key": key}:
+            kept.append(session.declare_queryable(key, _overhear(n), complete=False))
         case {"do": "liveliness", "n": n, "key": key}:
             live = session.liveliness()
             kept.append(live.declare_subscriber(key, _forward(n), history=True))

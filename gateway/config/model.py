@@ -126,10 +126,10 @@ class ZenohSection(Section):
 
 
 class WritersSection(Section):
-    """The clients that may write, by their tokens."""
+    """The clients that may write, by their secrets."""
 
     file: FilePath
-    """One line `name:salt:hash` for each client; see docs/security.md."""
+    """One line `name:secret` for each client; see docs/security.md."""
 
 
 class HistorySection(Section):

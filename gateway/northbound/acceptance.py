@@ -12,7 +12,8 @@ import zenoh
 from gateway.engine.requests import WRITE_EXPIRY
 from gateway.errors import Busy
 from gateway.line.duty import Duty
-from gateway.northbound.writers import LONGEST_TOKEN, Writers
+from gateway.northbound.signatures import LONGEST
+from gateway.northbound.writers import Writers
 
 
 class Sender(NamedTuple):
@@ -41,12 +42,20 @@ class Acceptance:
         self._writers = writers
         self._wall = wall
 
-    def accept(self, sender: Sender) -> Accepted:
-        """Raises `NotAllowed`, and `Busy` for a request of the past."""
-        by = sender.session if self._writers is None else self._writers.owner(sender.attachment)
+    def begin(self) -> None:
+        """Call it when the gateway becomes active."""
+        if self._writers is not None:
+            self._writers.begin()
+
+    def accept(self, key: str, data: bytes | None, sender: Sender) -> Accepted:
+        """`key` and `data` as received. Raises `NotAllowed`, `Repeated`, and `Busy` for a request
+        of the past."""
         now = asyncio.get_running_loop().time()
         if why := self._duty.why_not(sender.arrived, now):
             raise Busy(why)
+        by = sender.session
+        if self._writers is not None:
+            by = self._writers.writer(key, data or b"", sender.attachment)
         waited = now - sender.arrived
         if (made := _time_of(sender.attachment)) is not None:
             waited = max(waited, self._wall() / 1e9 - made)
@@ -60,7 +69,7 @@ def sender(message: zenoh.Query | zenoh.Sample, arrived: float) -> Sender:
     source, attached = message.source_info, message.attachment
     return Sender(
         None if source is None else str(source.source_id.zid),
-        None if attached is None or len(attached) > LONGEST_TOKEN else attached.to_bytes(),
+        None if attached is None or len(attached) > LONGEST else attached.to_bytes(),
         arrived,
     )
 

@@ -19,7 +19,7 @@ from gateway.northbound.acceptance import Acceptance, Sender
 from gateway.northbound.interfaces import Plant
 from gateway.northbound.keys import Keys
 from gateway.northbound.payload import Failure, Problem, WriteOutcome
-from gateway.northbound.writers import NotAllowed
+from gateway.northbound.writers import NotAllowed, Repeated
 from gateway.northbound.writes import ANSWER_WITHIN
 from gateway.tags.timestamps import rfc3339
 
@@ -50,9 +50,10 @@ class Commands:
         """`key` is as received, wildcards included; `data` is the argument as text."""
         by, argument = sender.session, ""
         started = time.monotonic()
+        refused: Failure | None = None  # instead of `result` in the audit
         result: CommandResult | Failure = Failure(Problem.UNCLEAR, "the gateway is ending")
         try:
-            by, within = self._acceptance.accept(sender)
+            by, within = self._acceptance.accept(key, data, sender)
             argument = _argument(data)
             device, command = self._target(key)
             async with asyncio.timeout(ANSWER_WITHIN):
@@ -62,6 +63,9 @@ class Commands:
             result = Failure(Problem.UNCLEAR, reason)
         except NotAllowed as error:
             result = Failure(Problem.NOT_ALLOWED, str(error))
+        except Repeated as error:
+            result = Failure(Problem.UNCLEAR, str(error))
+            refused = Failure(Problem.NOT_ALLOWED, str(error))
         except NotControlled as error:
             result = Failure(Problem.NOT_WRITABLE, str(error))
         except GatewayError as error:
@@ -69,7 +73,8 @@ class Commands:
         finally:
             took = time.monotonic() - started
             value = argument or None
-            self._audit(WriteOutcome(key, value, result, time.time_ns(), took, by, command=True))
+            told = refused or result
+            self._audit(WriteOutcome(key, value, told, time.time_ns(), took, by, command=True))
         return result
 
     def reply(self, result: CommandResult | Failure, query: zenoh.Query) -> None:

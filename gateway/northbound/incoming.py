@@ -66,6 +66,10 @@ class Incoming:
         puts = Inbox(self._puts.take, self._puts.refuse)
         return Declarations(session, self._keys, self._commands(), self._index, queries, puts)
 
+    def begin(self) -> None:
+        """Call it when the gateway becomes active, before it takes queries for the plant."""
+        self._acceptance.begin()
+
     async def close(self) -> None:
         """Ends what waits for devices; replies that are on their way get half a second."""
         if self._puts is not None:

@@ -75,6 +75,7 @@ class Northbound:
         self._config = configure(settings)
         self._is_client = settings.mode is ZenohMode.CLIENT
         known_writers = None if writers is None else Writers(writers)
+        self._exposures = _exposures(self._config, writers)
         if self._is_client:
             self.exclusive.set()  # it takes no endpoint, and may wait for its router for ever
         self._plant = plant
@@ -148,7 +149,7 @@ class Northbound:
         a later failure. The open session sets `exclusive`: a second process with the same
         configuration fails here, because the endpoint is in use.
         """
-        for exposure in secrets.exposures(self._config):
+        for exposure in self._exposures:
             log.warning("Zenoh session exposed", why=exposure)
         alone = asyncio.create_task(self._admission.run_alone())
         try:
@@ -176,6 +177,7 @@ class Northbound:
             tasks.create_task(self._admission.run(session))
             tasks.create_task(self._status.run())
             await self._admission.active.wait()
+            self._incoming.begin()
             self._declared += await off_loop(self._declare_plant, declarations)
             republisher = Republisher(self._batches.publish, self._plant, self._index, self._links)
             await republisher.publish_all()
@@ -223,9 +225,15 @@ class Northbound:
         return {**documents, "zenoh": zenoh_document, **self._admission.documents()}
 
 
-def check(config: Config) -> None:
-    """Checks Zenoh settings and files without opening anything. Raises `ConfigError`."""
+def check(config: Config) -> list[str]:
+    """Checks Zenoh settings and files without opening anything. Returns warnings, as sentences.
+    Raises `ConfigError`."""
     Keys(config.zenoh.prefix, config.name)
-    configure(config.zenoh)
+    session = configure(config.zenoh)
     if config.writers_file is not None:
         Writers(config.writers_file)
+    return _exposures(session, config.writers_file)
+
+
+def _exposures(session: zenoh.Config, writers: Path | None) -> list[str]:
+    return secrets.exposures(session) + ([] if writers is None else secrets.unruled(session))

@@ -38,7 +38,7 @@ class Problem(StrEnum):
     NO_REPLY = "no-reply"  # the device is silent; nothing was sent
     BUSY = "busy"  # too many requests are waiting; nothing was done
     UNKNOWN_TAG = "unknown-tag"
-    NOT_ALLOWED = "not-allowed"  # the client's token is missing or unknown
+    NOT_ALLOWED = "not-allowed"  # the client's signature is missing, wrong or too old
     BAD_QUERY = "bad-query"  # a read with parameters that cannot be parsed
     NO_HISTORY = "no-history"  # a read of the past from a gateway without history
 

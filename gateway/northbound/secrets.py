@@ -118,6 +118,18 @@ def exposures(config: zenoh.Config) -> list[str]:
     return warnings
 
 
+def unruled(config: zenoh.Config) -> list[str]:
+    """Returns a warning, as a sentence, if clients connect here and no rules restrict their keys:
+    for a gateway that knows its writers."""
+    if not _endpoints(config) or _setting(config, "access_control/enabled") is True:
+        return []
+    warning = (
+        "`writers` without access_control: any program that connects can answer a write in place "
+        "of the gateway, and publish values; see docs/access-control.md"
+    )
+    return [warning]
+
+
 def _endpoints(config: zenoh.Config) -> list[object]:
     found = _setting(config, "listen/endpoints")
     if isinstance(found, dict):  # by mode

@@ -18,7 +18,7 @@ from gateway.northbound.interfaces import Plant
 from gateway.northbound.keys import parse_key
 from gateway.northbound.payload import Failure, Problem, WriteOutcome
 from gateway.northbound.tag_index import TagIndex
-from gateway.northbound.writers import NotAllowed
+from gateway.northbound.writers import NotAllowed, Repeated
 from gateway.tags import Tag, WriteResult
 from gateway.values import Value
 
@@ -54,9 +54,10 @@ class Writes:
         result: WriteResult | Failure = Failure(
             Problem.UNCLEAR, "the gateway ended before the write"
         )
+        refused: Failure | None = None  # instead of `result` in the audit
         self._waiting += 1
         try:
-            by, within = self._acceptance.accept(sender)
+            by, within = self._acceptance.accept(key, data, sender)
             target = self._target(key)
             if isinstance(target, Failure):
                 result = target
@@ -69,13 +70,16 @@ class Writes:
             )
         except NotAllowed as error:
             result = Failure(Problem.NOT_ALLOWED, str(error))
+        except Repeated as error:
+            result = Failure(Problem.UNCLEAR, str(error))
+            refused = Failure(Problem.NOT_ALLOWED, str(error))
         except GatewayError as error:
             result = payload.failure(error)
         finally:
             self._waiting -= 1
             took = time.monotonic() - started
             value_key = parse_key(key).target
-            self._audit(WriteOutcome(value_key, value, result, time.time_ns(), took, by))
+            self._audit(WriteOutcome(value_key, value, refused or result, time.time_ns(), took, by))
         return result
 
     async def _write_tag(self, tag: Tag, value: Value, within: float) -> WriteResult:

@@ -16,7 +16,7 @@ NOW = 1_790_000_000  # seconds since 1970
 
 async def within(acceptance: Acceptance, waited: float, attachment: bytes | None = None) -> float:
     sender = Sender("session", attachment, time.monotonic() - waited)
-    accepted = acceptance.accept(sender)
+    accepted = acceptance.accept("plant/mixer/recipe/@set", b"7", sender)
     assert accepted.by == "session"
     return accepted.within
 

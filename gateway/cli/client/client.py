@@ -1,7 +1,6 @@
 """The client of a running gateway: reads, writes, follows."""
 
 import json
-import os
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, suppress
@@ -14,6 +13,7 @@ import orjson
 import zenoh
 
 from gateway.cli.client.arguments import matches, parse_value, tags_by_key
+from gateway.cli.client.signing import signature
 from gateway.config import Config
 from gateway.config.commands import TO_ALL
 from gateway.errors import GatewayError
@@ -22,7 +22,6 @@ from gateway.tags import Tag
 from gateway.tags.timestamps import rfc3339
 from gateway.values import Kind, Value
 
-TOKEN_VARIABLE = "PLC_GATEWAY_WRITE_TOKEN"  # noqa: S105  (the name of a variable)
 REPLY_TIMEOUT = 10.0  # seconds
 _CHANGED = "does the gateway run with the current version of this file?"
 _LONGEST_LIST = 10  # tags in one sentence
@@ -233,7 +232,7 @@ class Client:
             if not (served and querier.matching_status.matching):  # type: ignore[attr-defined]
                 may = f"may {self._user} do this, and " if self._user else ""
                 raise GatewayError(f"no gateway accepts {key}: nothing was sent; {may}{_CHANGED}")
-            for reply in querier.get(payload=payload, attachment=os.environ.get(TOKEN_VARIABLE)):
+            for reply in querier.get(payload=payload, attachment=signature(key, payload)):
                 answer = reply.ok or reply.err
                 with suppress(orjson.JSONDecodeError):  # Zenoh's own `Timeout` is not JSON
                     if answer is not None:
