@@ -18,7 +18,7 @@ from gateway.history import Historian
 from gateway.history.state_file import StateFile
 from gateway.line.arrival import ArrivalClock
 from gateway.line.duty import Duty
-from gateway.northbound import Northbound, StandbySettings
+from gateway.northbound import Northbound, standby_settings
 from gateway.tags import Sample
 
 log = structlog.get_logger("gateway")
@@ -121,14 +121,13 @@ async def _first(*tasks: asyncio.Task[Any]) -> None:
 
 
 def _northbound(config: Config, gateway: Gateway, history: Historian | None) -> Northbound:
-    group = config.standby
     return Northbound(
         config.zenoh,
         config.name,
         gateway,
         history=history,
         writers=config.writers_file,
-        standby=None if group is None else StandbySettings(group, config.standby_alone),
+        standby=standby_settings(config),
     )
 
 

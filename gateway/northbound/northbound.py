@@ -75,7 +75,7 @@ class Northbound:
         self._config = configure(settings)
         self._is_client = settings.mode is ZenohMode.CLIENT
         known_writers = None if writers is None else Writers(writers)
-        self._exposures = _exposures(self._config, writers)
+        self._exposures = _exposures(self._config, writers, standby)
         if self._is_client:
             self.exclusive.set()  # it takes no endpoint, and may wait for its router for ever
         self._plant = plant
@@ -232,8 +232,25 @@ def check(config: Config) -> list[str]:
     session = configure(config.zenoh)
     if config.writers_file is not None:
         Writers(config.writers_file)
-    return _exposures(session, config.writers_file)
+    standby = standby_settings(config)
+    if standby is not None:
+        secrets.group_secret(standby.secret_file)
+    return _exposures(session, config.writers_file, standby)
 
 
-def _exposures(session: zenoh.Config, writers: Path | None) -> list[str]:
-    return secrets.exposures(session) + ([] if writers is None else secrets.unruled(session))
+def standby_settings(config: Config) -> StandbySettings | None:
+    """Returns None for a gateway without a standby group."""
+    if config.standby is None:
+        return None
+    return StandbySettings(config.standby, config.standby_alone, config.standby_secret_file)
+
+
+def _exposures(
+    session: zenoh.Config, writers: Path | None, standby: StandbySettings | None
+) -> list[str]:
+    found = secrets.exposures(session)
+    if writers is not None:
+        found += secrets.unruled(session)
+    if standby is not None and standby.secret_file is None:
+        found += secrets.unsigned()
+    return found

@@ -118,6 +118,10 @@ async def test_the_woken_gateway_of_a_group_does_not_write_over_the_new_active_o
 ) -> None:
     router, plc = free_endpoint(), Plc()
     (tmp_path / "zenoh.json5").write_text("{transport: {link: {tx: {lease: 1000}}}}")
+    secret = tmp_path / "hall.txt"
+    secret.write_text("a secret of twenty or more")
+    secret.chmod(0o600)
+    group = {"standby": "hall", "standby_secret_file": str(secret)}
     tags = {"recipe": {"address": "holding:7", "type": "uint16", "write": True}}
     device = {"protocol": "modbus-tcp", "station": 1, "reply_timeout": "20s", "tags": tags}
     with ExitStack() as programs:
@@ -129,7 +133,7 @@ async def test_the_woken_gateway_of_a_group_does_not_write_over_the_new_active_o
                         tmp_path / f"{name}.yaml",
                         router,
                         {"net": {"port": f"tcp://127.0.0.1:{port}", "devices": {"mixer": device}}},
-                        gateway={"name": name, "standby": "hall"},
+                        gateway={"name": name, **group},
                         zenoh={"listen": [], "connect": [router], "config_file": "zenoh.json5"},
                     )
                     for name in "ab"

@@ -915,4 +915,18 @@ MUTANTS = (
         "        pass\n",
         "tests/northbound/test_writers.py",
     ),
+    Mutant(
+        "a forged standby token counts",
+        "northbound/group_tokens.py",
+        "                if self._secret is None and len(signature) <= 1:\n",
+        "                if len(signature) <= 1:\n",
+        "tests/northbound/test_group_tokens.py",
+    ),
+    Mutant(
+        "a standby signature is good for every role",
+        "northbound/group_tokens.py",
+        '_signature(self._secret, key)}"',
+        '_signature(self._secret, token.session)}"',
+        "tests/northbound/test_group_tokens.py",
+    ),
 )
