@@ -929,4 +929,25 @@ MUTANTS = (
         '_signature(self._secret, token.session)}"',
         "tests/northbound/test_group_tokens.py",
     ),
+    Mutant(
+        "a block is published in one message whatever its size",
+        "northbound/blocks.py",
+        "        if size > left:\n",
+        "        if not parts:\n",
+        "tests/northbound/test_blocks.py",
+    ),
+    Mutant(
+        "our own client drops long messages",
+        "cli/client/connection.py",
+        '"transport/link/rx/max_message_size": 2**30,',
+        '"transport/link/rx/max_message_size": 2**18,',
+        "tests/cli/test_client.py",
+    ),
+    Mutant(
+        "watch overlooks that a device went offline",
+        "cli/client/client.py",
+        "                self._will_query = True\n                put(True)\n",
+        "                self._will_query = True\n",
+        "tests/cli/test_client.py",
+    ),
 )

@@ -56,6 +56,7 @@ class Client:
         self._tell = tell
         self._user = user
         self._duplicated: set[str] = set()  # devices of several gateways, reported once
+        self._will_query = False  # because a device went online or offline
 
     @property
     def no_reply(self) -> str:
@@ -144,6 +145,7 @@ class Client:
                 if present and isinstance(event, Row):
                     rows = [event]
                     continue
+                self._will_query = False
                 # A value without a gateway is late, or from a gateway that became active: only the
                 # latter replies to a query. Values that arrive meanwhile are newer and follow it.
                 try:
@@ -191,10 +193,16 @@ class Client:
         """Returns watchers of the gateway: they put True to query again, False when it is lost.
 
         In a standby group the start or end of any member may change the active one: query again.
+        So it is with a device: its values may be lost on the way.
         """
         key = self._keys.own
         if self._has_standby:
             key = f"{key.rpartition('/')[0]}/*"
+
+        def device(_: zenoh.Sample) -> None:
+            if not self._will_query:  # one query serves all devices
+                self._will_query = True
+                put(True)
 
         def token(sample: zenoh.Sample) -> None:
             put(self._has_standby or sample.kind == zenoh.SampleKind.PUT)
@@ -205,6 +213,7 @@ class Client:
 
         return (
             self._session.liveliness().declare_subscriber(key, token),
+            self._session.liveliness().declare_subscriber(f"{key}/alive/*", device),
             self._session.info.declare_transport_events_listener(link),
         )
 
