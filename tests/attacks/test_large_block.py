@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 from tests.attacks.tcp_peer import peer, tcp_reply
-from tests.e2e.processes import Program, started, write_config
+from tests.e2e.processes import Program, started, until, write_config
 from tests.zenoh_peer import free_endpoint
 
 TAGS = 4000
@@ -41,17 +41,13 @@ async def test_watch_shows_a_dead_device_as_bad_however_large_it_is(tmp_path: Pa
             command = (sys.executable, "-m", "gateway", "watch", config, "--json")
             with Program(*command) as watch:
 
-                def shown() -> dict[str, str]:
-                    """The quality of each tag."""
+                def all_are(quality: str) -> bool:
                     rows = (json.loads(line) for line in list(watch.lines))
-                    return {row["tag"]: row["quality"] for row in rows}
+                    shown = {row["tag"]: row["quality"] for row in rows}
+                    return list(shown.values()).count(quality) == TAGS
 
-                async def until_all(quality: str) -> None:
-                    async with asyncio.timeout(20):
-                        while list(shown().values()).count(quality) < TAGS:
-                            await asyncio.sleep(0.1)
-
-                await until_all("good")
+                await asyncio.to_thread(until, lambda: all_are("good"), "every value is good")
                 alive = False
-                await until_all("bad")
+                await asyncio.to_thread(gateway.says, "device offline")
+                await asyncio.to_thread(until, lambda: all_are("bad"), "every value is bad")
                 watch.lines.clear()
