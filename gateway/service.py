@@ -113,6 +113,11 @@ async def _serve(
         if opened.done():
             started()
         await _first(zenoh, stopping, replaced, *lines)
+    if northbound.namesake:
+        raise GatewayError(
+            f"another gateway named {config.name} serves under {config.zenoh.prefix} already: "
+            "`gateway.name` must differ, and a file runs once"
+        )
     return northbound.withheld if northbound.replaced.is_set() and not stop.is_set() else None
 
 

@@ -20,6 +20,7 @@ from gateway.northbound.incoming import Declarations, Incoming
 from gateway.northbound.interfaces import History, Plant
 from gateway.northbound.keys import Keys
 from gateway.northbound.link_monitor import LinkMonitor
+from gateway.northbound.one_process import only_process
 from gateway.northbound.publisher import Publisher, ScanBatches
 from gateway.northbound.republish import Republisher
 from gateway.northbound.session import (
@@ -76,8 +77,6 @@ class Northbound:
         self._is_client = settings.mode is ZenohMode.CLIENT
         known_writers = None if writers is None else Writers(writers)
         self._exposures = _exposures(self._config, writers, standby)
-        if self._is_client:
-            self.exclusive.set()  # it takes no endpoint, and may wait for its router for ever
         self._plant = plant
         self._links = LinkMonitor()
         self._index = TagIndex(self.keys, plant.devices())
@@ -131,6 +130,11 @@ class Northbound:
         return self._admission.replaced
 
     @property
+    def namesake(self) -> bool:
+        """True if another gateway with this name serves already: this one must end."""
+        return self._admission.claiming.namesake
+
+    @property
     def withheld(self) -> Mapping[str, str]:
         """Devices of the file that other gateways serve, with the names of those gateways."""
         return self._admission.claiming.withheld
@@ -145,12 +149,19 @@ class Northbound:
         """Serves until cancelled; closes the session in every case, within 2 s.
 
         Call it once only: another session needs another `Northbound`. Raises `GatewayError` when
-        the session cannot be opened (a client waits for its router), and an `ExceptionGroup` with
-        a later failure. The open session sets `exclusive`: a second process with the same
-        configuration fails here, because the endpoint is in use.
+        the session cannot be opened (a client waits for its router) or this gateway has another
+        process, and an `ExceptionGroup` with a later failure. The open session sets `exclusive`: a
+        second process with the same endpoint fails here.
         """
         for exposure in self._exposures:
             log.warning("Zenoh session exposed", why=exposure)
+        places = (self._config.get_json(f"{side}/endpoints") for side in ("listen", "connect"))
+        with only_process(self.keys.own, *places):
+            await self._run()
+
+    async def _run(self) -> None:
+        if self._is_client:
+            self.exclusive.set()  # it takes no endpoint, and may wait for its router for ever
         alone = asyncio.create_task(self._admission.run_alone())
         try:
             session = await open_session(self._config, retry=self._is_client)

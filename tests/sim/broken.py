@@ -950,4 +950,18 @@ MUTANTS = (
         "                self._will_query = True\n",
         "tests/cli/test_client.py",
     ),
+    Mutant(
+        "a second gateway of the same name serves",
+        "northbound/claims.py",
+        "            other.name == self._name and (self.own is None or other < self.own)\n",
+        "            False\n",
+        "tests/northbound/test_claims.py",
+    ),
+    Mutant(
+        "a second process of a gateway runs",
+        "northbound/one_process.py",
+        "            if error.errno == errno.EADDRINUSE:\n",
+        "            if False:\n",
+        "tests/northbound/test_one_process.py",
+    ),
 )
