@@ -86,5 +86,6 @@ class History(Protocol):
     def writes(self, time_range: str, limit: int | None, now: int) -> Iterator[str]:
         """Outcomes of writes and commands, as on the `writes` key. Raises like `samples`."""
 
-    def record_write(self, time: int, outcome: str) -> None:
-        """Records one outcome, as on the `writes` key; `time`: ns since 1970. Never blocks."""
+    def record_write(self, time: int, outcome: str, *, refused: bool) -> None:
+        """Records one outcome, as on the `writes` key; `time`: ns since 1970. `refused`: nothing
+        was sent. Never blocks."""

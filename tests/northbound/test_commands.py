@@ -52,7 +52,7 @@ def execute(
     published: list[bytes] = []
     recorded: list[str] = []
     with capture_logs() as logs:
-        audit = Audit(published.append, lambda _, text: recorded.append(text))
+        audit = Audit(published.append, lambda _, text, *, refused: recorded.append(text))
         commands = Commands(KEYS, plant, no_stamp, audit, Acceptance(plant.duty, None))
         sender = Sender("client", None, time.monotonic())
         result = asyncio.run(commands.execute(key, data, sender))

@@ -39,7 +39,7 @@ class RecordedWrites:
     def writes(self, time_range: str, limit: int | None, now: int) -> Iterator[str]:
         raise NotImplementedError
 
-    def record_write(self, time: int, outcome: str) -> None:
+    def record_write(self, time: int, outcome: str, *, refused: bool) -> None:
         self.recorded.append(json.loads(outcome))
 
 

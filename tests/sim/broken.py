@@ -964,4 +964,18 @@ MUTANTS = (
         "            if False:\n",
         "tests/northbound/test_one_process.py",
     ),
+    Mutant(
+        "refusals push out writes",
+        "history/historian.py",
+        "        (self._refused if refused else self._written).add(time, outcome)\n",
+        "        self._written.add(time, outcome)\n",
+        "tests/history/test_outcomes.py",
+    ),
+    Mutant(
+        "suppressed refusals leave no record",
+        "northbound/audit.py",
+        "            self._tell(now, payload.document(summary), refused=True)\n",
+        "            pass\n",
+        "tests/northbound/test_audit.py",
+    ),
 )
