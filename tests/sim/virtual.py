@@ -12,7 +12,7 @@ P = ParamSpec("P")
 T = TypeVar("T")
 LOOKS_APART = 256  # passes between two looks at real file descriptors (signals, if anything)
 BUSY_PASSES = 8  # passes of the loop without progress of the clock: some task polls it
-TICK = 5e-4
+TICK = 1e-4
 
 
 class Deadlock(RuntimeError):
