@@ -810,6 +810,20 @@ MUTANTS = (
         "tests/engine/test_results.py",
     ),
     Mutant(
+        "a longer read without a reply makes the device offline",
+        "engine/conclusions.py",
+        "    return longer or ",
+        "    return ",
+        "tests/engine/test_reply_shapes.py",
+    ),
+    Mutant(
+        "splits found again are dropped at once",
+        "planning/bad_addresses.py",
+        "        self.splits.clear()\n        self._rejoin_at = None\n",
+        "        self.splits.clear()\n",
+        "tests/planning/test_bad_addresses.py",
+    ),
+    Mutant(
         "one refused longer read ends all longer reads",
         "engine/longer_reads.py",
         "            if any(_inside(refused, longer) for refused in lacking):\n",
