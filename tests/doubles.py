@@ -50,7 +50,7 @@ class Script:
             raise Garbled("no answer among what was heard", heard)
         raise NoReply("no answer")
 
-    def guard(self, since: float) -> None:
+    def guard(self, since: float | None) -> None:
         """Nothing is refused here."""
 
     def done(self) -> None:
@@ -79,7 +79,7 @@ class Wire:
         self.received: list[bytes] = []
         self.replies: list[int] = []  # the reply lengths the driver announced
 
-    def guard(self, since: float) -> None:
+    def guard(self, since: float | None) -> None:
         """Nothing is refused here."""
 
     @property

@@ -10,7 +10,7 @@ log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 
 PERIOD = 0.1  # seconds between two measurements: no stamp is newer by more than this
 NEVER = float("inf")
-HELD = 1.0  # seconds; a loop that is later by this much was held with its process
+HELD = 1.5  # seconds; a loop that is later by this much was held with its process
 
 
 class ArrivalClock:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 import structlog
 
 from gateway.engine.unanswered import Unanswered
-from gateway.errors import Garbled, LineDown
+from gateway.errors import Busy, Garbled, LineDown
 from gateway.line.wire_log import WireLog
 from gateway.planning.wire_timing import WireTiming
 from gateway.transport import Port
@@ -132,11 +132,12 @@ class Channel:
     """An open port, and the last time when its wire was busy."""
 
     __slots__ = (
+        "_may_not_send",
         "_port",
         "alarm",
         "echo",
+        "guarded",
         "lost_by",
-        "may_not_send",
         "now",
         "quiet_since",
         "unanswered",
@@ -144,7 +145,16 @@ class Channel:
         "wire_log",
     )
 
-    def __init__(self, port: Port, wire: WireTiming, wire_log: WireLog, echo: Echo) -> None:
+    def __init__(
+        self,
+        port: Port,
+        wire: WireTiming,
+        wire_log: WireLog,
+        echo: Echo,
+        *,
+        may_not_send: Callable[[float, float], str] = lambda _since, _now: "",
+    ) -> None:
+        """`may_not_send`: returns the reason to refuse a write of this time, now."""
         self.wire = wire
         self.wire_log = wire_log
         self.echo = echo
@@ -153,9 +163,16 @@ class Channel:
         self.quiet_since = 0.0  # the last time when the wire was busy
         self.alarm = Alarm()  # for the time-outs of its transactions
         self.lost_by: LineDown | None = None
-        self.may_not_send: Callable[[float, float], str] = lambda _since, _now: ""
+        self.guarded: float | None = None  # the next frame is a write of this time
+        self._may_not_send = may_not_send
         self.unanswered = Unanswered()  # the numbered requests of this connection that timed out
         self._port = port
+
+    def check_duty(self) -> None:
+        """Raises `Busy` if the next frame is a write that must not be sent now."""
+        since, self.guarded = self.guarded, None
+        if since is not None and (why := self._may_not_send(since, self.now())):
+            raise Busy(why)
 
     def send(self, data: bytes) -> None:
         """Sends the bytes. Raises `LineDown`."""

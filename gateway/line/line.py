@@ -57,9 +57,8 @@ class Line:
         self.engine = engine
         self._open_port = open_port
         self._sink = sink
-        self._echo = Echo(engine.name, echo)
+        self._new_channel = _channels(engine, echo, duty or Duty())
         self._wall = wall
-        self._duty = duty or Duty()
         self._random = random.Random(seed)  # noqa: S311  (jitter, not a secret)
         self._channel: Channel | None = None
         self._transaction: Transaction | None = None
@@ -155,8 +154,7 @@ class Line:
         name, self._lost = self.engine.name, None
         try:
             port = await self._open_port(self)
-            self._channel = Channel(port, self.engine.wire, WireLog(name), self._echo)
-            self._channel.may_not_send = self._duty.why_not
+            self._channel = self._new_channel(port)
             self._channel.unanswered = self.engine.schedule.unanswered
             log.info("line open", line=name)
             self._deliver(self.engine.opened(_now()))
@@ -257,6 +255,14 @@ class Line:
         self._deliver(self.engine.expire(_now(), self._wall()))
         self._wake.set()
         return self.engine.deadline
+
+
+def _channels(engine: Engine, echo: bool | None, duty: Duty) -> Callable[[Port], Channel]:
+    """Returns a function that makes the channel of an open port."""
+    known = Echo(engine.name, echo)  # what is learned of the adapter stays
+    return lambda port: Channel(
+        port, engine.wire, WireLog(engine.name), known, may_not_send=duty.why_not
+    )
 
 
 def _now() -> float:

@@ -100,7 +100,10 @@ async def _perform(job: Transacted, transaction: Transaction) -> Result:
                 spans = job.device.probe_spans
                 await job.device.driver.resync(transaction, None, job.resyncs.before, spans)
             transaction.guard(job.submitted)
-            return await driver.control(transaction, name, argument)
+            try:
+                return await driver.control(transaction, name, argument)
+            finally:
+                transaction.guard(None)
         case Answer(frame=frame):
             await transaction.tell(frame)
             return None
@@ -169,6 +172,8 @@ async def _only_reply(sending: Awaitable[bool], write: Write, talk: Transaction)
         acknowledged = await sending
     except Refused as error:
         refused, acknowledged = error, False
+    finally:
+        talk.guard(None)
     if write.resyncs.after is not None:
         try:
             device = write.device

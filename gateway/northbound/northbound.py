@@ -76,7 +76,8 @@ class Northbound:
         self._config = configure(settings)
         self._is_client = settings.mode is ZenohMode.CLIENT
         known_writers = None if writers is None else Writers(writers)
-        self._exposures = _exposures(self._config, writers, standby)
+        for exposure in _exposures(self._config, writers, standby):
+            log.warning("Zenoh session exposed", why=exposure)
         self._plant = plant
         self._links = LinkMonitor()
         self._index = TagIndex(self.keys, plant.devices())
@@ -153,8 +154,6 @@ class Northbound:
         process, and an `ExceptionGroup` with a later failure. The open session sets `exclusive`: a
         second process with the same endpoint fails here.
         """
-        for exposure in self._exposures:
-            log.warning("Zenoh session exposed", why=exposure)
         places = (self._config.get_json(f"{side}/endpoints") for side in ("listen", "connect"))
         with only_process(self.keys.own, *places):
             await self._run()

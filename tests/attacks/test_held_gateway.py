@@ -19,7 +19,7 @@ HOLD = HELD + 0.3  # seconds
 # The command itself; the waits of the election are shorter, so that the suite is.
 RUN = """
 import gateway.northbound.election as election
-election.SETTLE_TIME = 0.5
+election.SETTLE_TIME, election.CLAIM_TIME = 0.3, 0.8
 from gateway.cli.main import main
 main()
 """

@@ -16,9 +16,9 @@ from gateway.config import load
 
 made = []
 
-def make(*arguments):
+def make(*arguments, **named):
     print("alive", sum(one() is not None for one in made), "of", len(made), flush=True)
-    gateway = Gateway(*arguments)
+    gateway = Gateway(*arguments, **named)
     made.append(weakref.ref(gateway))
     return gateway
 

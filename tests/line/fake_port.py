@@ -65,9 +65,9 @@ def opened(
     device = made_device("plc", driver, wire, timing, ())
     if not needs_resync:
         device.health.answered()
-    channel = Channel(port, wire, WireLog("test"), Echo("test", echo))
+    may_not_send = (duty or Duty()).why_not
+    channel = Channel(port, wire, WireLog("test"), Echo("test", echo), may_not_send=may_not_send)
     channel.quiet_since = quiet_since
-    channel.may_not_send = (duty or Duty()).why_not
     frames = [] if unmatched is None else unmatched
     port.talk = Transaction(channel, device, lambda _, frame, echo: frames.append(frame))
     return port.talk

@@ -868,8 +868,8 @@ MUTANTS = (
     ),
     Mutant(
         "the duty is not proven when the frame goes out",
-        "line/transaction.py",
-        "        since, self._guarded = self._guarded, None\n",
+        "line/channel.py",
+        "        since, self.guarded = self.guarded, None\n",
         "        since = None\n",
         "tests/line/test_duty.py",
     ),
