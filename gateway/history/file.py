@@ -16,6 +16,7 @@ from pathlib import Path
 
 import structlog
 
+from gateway.history import sections
 from gateway.history.lock import locked
 from gateway.history.outcomes import Outcome
 from gateway.history.recent import Extent, Identity, SortedRun
@@ -83,7 +84,7 @@ class HistoryFile:
             pages = max(16, self.log_limit // (2 * 4096))
             self._database.execute(f"PRAGMA wal_autocheckpoint = {pages}")
             self._database.execute(f"PRAGMA journal_size_limit = {self.log_limit}")
-            self._tags = dict(self._database.execute("SELECT key, id FROM tag"))
+            self._tags = dict(self._database.execute("SELECT key, id FROM tag ORDER BY id"))
             self.identity = identity(self._database, path)
             self._resources = undo.pop_all()
 
@@ -115,7 +116,7 @@ class HistoryFile:
     def _tag(self, key: str) -> int:
         number = self._tags.get(key)
         if number is None:
-            number = self._tags[key] = len(self._tags) + 1
+            number = self._tags[key] = 1 + next(reversed(self._tags.values()), 0)
             self._database.execute("INSERT INTO tag VALUES (?, ?)", (number, key))
         return number
 
@@ -151,12 +152,14 @@ class HistoryFile:
                 (run, first, last, count, now),
             )
             self._database.execute("DELETE FROM recent WHERE run = ?", (run,))
+            sections.write(self._database, run)
             [row] = self._database.execute("SELECT * FROM run WHERE run = ?", (run,))
         return SortedRun(*row)
 
     def drop(self, run: int) -> None:
         with self._transaction():
             self._database.execute("DELETE FROM sample WHERE run = ?", (run,))
+            sections.drop(self._database, run)
             self._database.execute("DELETE FROM run WHERE run = ?", (run,))
 
     def drop_writes(self, before: int) -> None:
@@ -281,6 +284,7 @@ def _prepare(database: sqlite3.Connection, path: Path) -> None:
         )
     elif not database.execute("SELECT 1 FROM sqlite_schema WHERE name = 'file'").fetchall():
         database.executescript(f"BEGIN IMMEDIATE; {_MARK} COMMIT;")  # older files had none
+    database.execute(sections.TABLE)
 
 
 def move_aside(path: Path, why: str) -> None:

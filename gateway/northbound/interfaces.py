@@ -1,9 +1,10 @@
 """The parts of the gateway that the Zenoh side uses: its plant and its history."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Literal, Protocol
 
 from gateway.engine.requests import CommandResult
+from gateway.errors import Damaged
 from gateway.tags import Sample, Tag, WriteResult
 from gateway.values import Value
 
@@ -73,7 +74,22 @@ class History(Protocol):
         """The first `limit` samples in the order of time; called from an answering thread.
 
         Raises `BadValue` for a range that cannot be parsed, and `Busy`, also in the middle, when
-        the file cannot be read now.
+        the file cannot be read now, and `Damaged` at the end when a part of it was left out.
+        """
+
+    def as_recorded(
+        self,
+        tags: Mapping[str, Tag],
+        time_range: str,
+        after: str | None,
+        now: int,
+        pause: Callable[[], None],
+    ) -> Iterator[tuple[Sample | Damaged | None, str | None]]:
+        """The samples of tags (by `device/name`) in the order of recording, each with its cursor.
+
+        Starts after the cursor `after`. `Damaged` stands for samples that are lost; the last pair
+        has None. A sample without a cursor is not stored yet: it is found again later. Calls
+        `pause` at least every few milliseconds. Raises `BadValue`, `Busy`.
         """
 
     def writes(self, time_range: str, limit: int | None, now: int) -> Iterator[str]:

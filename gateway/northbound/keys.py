@@ -122,6 +122,11 @@ class Keys:
         """The outcome of every write."""
         return f"{self.own}/writes"
 
+    @property
+    def page(self) -> str:
+        """The last reply to a query with `page`."""
+        return f"{self.own}/page"
+
     def group(self, group: str) -> str:
         """The liveliness tokens of one standby group lie below."""
         return f"{self.prefix}/@standby/{group}"
