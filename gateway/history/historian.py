@@ -14,7 +14,7 @@ from gateway.history.outcomes import Outcomes
 from gateway.history.reader import Reader
 from gateway.history.recent import Recent
 from gateway.history.retention import Retention
-from gateway.history.search import Search, cursor
+from gateway.history.search import Place, Search
 from gateway.history.timerange import TimeRange, time_range
 from gateway.history.transfer import Transfer
 from gateway.history.writer import Writer
@@ -107,17 +107,15 @@ class Historian:
         self,
         tags: Mapping[str, Tag],
         time_range: str,
-        after: str | None,
+        after: Place | None,
+        page: int | None,
         now: int,
         pause: Callable[[], None],
-    ) -> Iterator[tuple[Sample | Damaged | None, str | None]]:
+    ) -> Iterator[tuple[Sample | Damaged | bool, Place | None]]:
         """Yields the samples of tags (by `device/name`) in the order of recording, each with its
-        cursor; see `Search.as_recorded`. `after` is an earlier cursor. Raises `BadValue`, `Busy`.
-        """
+        place, as `Search.as_recorded` does. Raises `BadValue`, `Busy`."""
         period = self._range(time_range, None, now)
-        place = None if after is None else cursor(after)
-        found = self._search.as_recorded(tags, period, place, pause)
-        return ((sample, at and str(at)) for sample, at in _readable(found))
+        return _readable(self._search.as_recorded(tags, period, after, page, pause))
 
     def writes(
         self, time_range: str, limit: int | None = None, now: int | None = None

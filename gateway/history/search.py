@@ -1,41 +1,23 @@
 """Finds samples in the file and in memory: of one tag by time, or of many as they were recorded."""
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Container, Iterable, Iterator, Mapping, Sequence
 from functools import partial
-from typing import NamedTuple
 
-from gateway.errors import BadValue, Busy, Damaged
+from gateway.errors import Busy, Damaged
 from gateway.history import sections
 from gateway.history.damage import Damage
 from gateway.history.reader import Part, Reader, in_order
 from gateway.history.recent import Identity, Recent, SortedRun
 from gateway.history.rows import Stored, from_row
 from gateway.history.sections import FullRow
-from gateway.history.timerange import TimeRange
+from gateway.history.timerange import EARLIEST, TimeRange
 from gateway.tags import Sample, Tag
 from gateway.tags.timestamps import rfc3339
 
+# The place of a sample in the order of recording: the file, the run, and the number in the run.
+Place = tuple[str, int, int]
 _MANY = 2048  # samples in memory between two pauses
 _Placed = tuple[int, Tag, int, Stored, int | None, str | None]  # a row with its number and tag
-
-
-class Cursor(NamedTuple):
-    """The place of a sample in the order of recording: a run of one file, and the number in it."""
-
-    file: str
-    run: int
-    n: int
-
-    def __str__(self) -> str:
-        return f"{self.file}-{self.run}-{self.n}"
-
-
-def cursor(text: str) -> Cursor:
-    """Parses the text of a cursor. Raises `BadValue`."""
-    match text.split("-"):
-        case [file, run, n] if run.isdecimal() and n.isdecimal() and len(run + n) < 30:
-            return Cursor(file, int(run), int(n))
-    raise BadValue(f"{text[:60]!r} is no `next` of an earlier answer")
 
 
 class Search:
@@ -77,43 +59,48 @@ class Search:
         self,
         tags: Mapping[str, Tag],
         period: TimeRange,
-        after: Cursor | None,
+        after: Place | None,
+        page: int | None,
         pause: Callable[[], None],
-    ) -> Iterator[tuple[Sample | Damaged | None, Cursor | None]]:
+    ) -> Iterator[tuple[Sample | Damaged | bool, Place | None]]:
         """Yields the samples of many tags in the order of recording, each with its cursor.
 
         `Damaged` is yielded after the rest of a damaged run. Samples without a place in the file
-        come last, without a cursor: a later search finds them again. The last pair has None.
-        Raises `Busy`; calls `pause` at least every few milliseconds of reading.
+        come last, without a place: a later search finds them again. The last pair has True, or
+        False before a run that would pass `page` samples: it is not read twice then. Raises `Busy`;
+        calls `pause` at least every few milliseconds of reading.
         """
         file, sorted_runs, newest = self._recent.content()
         mark = _mark(file)
-        place = after if after is not None and after.file == mark else Cursor(mark, 0, -1)
+        (_, begin, first), period = _start(after, mark, period)
         stored = _Stored(self._reader, self.damage, file, period)
-        runs = [run for run in sorted_runs if run.number >= place.run]
+        runs = [run for run in sorted_runs if run.number >= begin]
         numbers = stored.numbers(tags, stored.of(runs))
-        begun = False
+        place, found, of_last_run = (mark, begin, first - 1), 0, 0
         for run in runs:
-            first = place.n + 1 if run.number == place.run else 0
-            if stored.of([run]) and first < run.samples:
+            if page is not None and 0 < found > page - of_last_run:
+                yield False, place
+                return
+            skipped = first if run.number == begin else 0
+            if skipped < run.samples and stored.of([run]):
                 placed = stored.placed(run, numbers, pause)
-                if placed is None and begun:
+                if placed is None and found:
                     raise Busy("the next samples were dropped meanwhile: ask again")
-                for row in filter(None, (placed or [])[first:]):
-                    begun = True
-                    yield from_row(*row[1:]), Cursor(mark, run.number, row[0])
-            place = Cursor(mark, run.number, max(first, run.samples) - 1)
+                rows = [row for row in (placed or [])[skipped:] if row is not None]
+                of_last_run = len(rows)
+                found += of_last_run
+                for row in rows:
+                    yield from_row(*row[1:]), (mark, run.number, row[0])
+            place = mark, run.number, max(skipped, run.samples) - 1
             if (lost := stored.lost()) is not None:
                 yield lost, place
         for number, samples, count in newest:
-            for n in range(place.n + 1 if number == place.run else 0, count):
-                sample = samples[n]
-                place = Cursor(mark, number, n) if number else place
-                if sample.tag.key in tags and period.first <= sample.time <= period.last:
-                    yield sample, place if number else None
-                elif n % _MANY == 0:
-                    pause()
-        yield None, place
+            skipped = first if number == begin else 0
+            for n, sample in _found(samples, range(skipped, count), tags, period, pause):
+                yield sample, (mark, number, n) if number else None
+            if number:
+                place = mark, number, max(skipped, count) - 1
+        yield True, place
 
 
 class _Stored:
@@ -198,9 +185,33 @@ class _Stored:
         self._damaged.append(run)
 
 
+def _found(
+    samples: Sequence[Sample],
+    numbers: Iterable[int],
+    tags: Container[str],
+    period: TimeRange,
+    pause: Callable[[], None],
+) -> Iterator[tuple[int, Sample]]:
+    """Yields the samples of a run in memory, with their numbers."""
+    for n in numbers:
+        sample = samples[n]
+        if sample.tag.key in tags and period.first <= sample.time <= period.last:
+            yield n, sample
+        elif n % _MANY == 0:
+            pause()
+
+
 def _mark(file: Identity | None) -> str:
     """A copy of a file has another mark here: it may get other samples in runs of one number."""
     return "" if file is None else f"{file.inode:x}.{file.mark[:4].hex()}"
+
+
+def _start(after: Place | None, mark: str, period: TimeRange) -> tuple[Place, TimeRange]:
+    """Returns the first place and the period of a search. The clock may have been set back since
+    `after`."""
+    if after is None or after[0] != mark:
+        return (mark, 0, 0), period
+    return (mark, after[1], after[2] + 1), TimeRange(EARLIEST, period.last)
 
 
 def _part_of(run: list[Sample], period: TimeRange) -> Part:

@@ -67,6 +67,10 @@ class Plant(Protocol):
         """Documents by path: `status`, `lines/<line>`, `devices/<device>`."""
 
 
+# Of a recorded sample: the file, the run, and the number in the run.
+Place = tuple[str, int, int]
+
+
 class History(Protocol):
     """Recorded samples, found by Zenoh's time ranges. `now`: ns since 1970, when the query came."""
 
@@ -81,15 +85,17 @@ class History(Protocol):
         self,
         tags: Mapping[str, Tag],
         time_range: str,
-        after: str | None,
+        after: Place | None,
+        page: int | None,
         now: int,
         pause: Callable[[], None],
-    ) -> Iterator[tuple[Sample | Damaged | None, str | None]]:
-        """The samples of tags (by `device/name`) in the order of recording, each with its cursor.
+    ) -> Iterator[tuple[Sample | Damaged | bool, Place | None]]:
+        """The samples of tags (by `device/name`) in the order of recording, each with its place.
 
-        Starts after the cursor `after`. `Damaged` stands for samples that are lost; the last pair
-        has None. A sample without a cursor is not stored yet: it is found again later. Calls
-        `pause` at least every few milliseconds. Raises `BadValue`, `Busy`.
+        Starts after the place `after`, and may end after fewer samples than `page`. `Damaged`
+        stands for samples that are lost; the last pair has True if this was all. A sample without
+        a place is not stored yet: it is found again later. Calls `pause` at least every few
+        milliseconds. Raises `BadValue`, `Busy`.
         """
 
     def writes(self, time_range: str, limit: int | None, now: int) -> Iterator[str]:

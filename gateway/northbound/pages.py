@@ -12,6 +12,7 @@ import orjson
 import zenoh
 
 from gateway.errors import BadValue, Damaged
+from gateway.northbound.interfaces import Place
 from gateway.tags import Tag
 
 LARGEST = 100_000  # replies
@@ -43,6 +44,16 @@ def page(query: zenoh.Query, gateway: str) -> Page | None:
     return Page(int(size), places.get(gateway))
 
 
+def recorded_place(after: str | None) -> Place | None:
+    """Parses the place of a recorded sample. Raises `BadValue`."""
+    match (after or "").split("-"):
+        case [""]:
+            return None
+        case [file, run, n] if run.isdecimal() and n.isdecimal() and len(run + n) < 30:
+            return file, int(run), int(n)
+    raise BadValue(f"after={after!r:.60}: this is no `next` of an earlier page")
+
+
 def rest(tags: Sequence[Tag], after: str | None) -> Sequence[Tag]:
     """Returns the tags after the tag of this key. Raises `BadValue` if it is not among them."""
     if after is None:
@@ -53,8 +64,16 @@ def rest(tags: Sequence[Tag], after: str | None) -> Sequence[Tag]:
     raise BadValue(f"after={after[:60]}: the tags are others now. Begin with the first page")
 
 
-def end(gateway: str, count: int, place: str, *, complete: bool, lost: Damaged | None) -> bytes:
-    """Returns the last document of a page."""
+def end(
+    gateway: str,
+    count: int,
+    last: str | Place,
+    *,
+    complete: bool,
+    lost: Damaged | None,
+) -> bytes:
+    """Returns the last document of a page; `last`: the tag or the place of its last reply."""
+    place = last if isinstance(last, str) else "-".join(map(str, last))
     document: dict[str, object] = {
         "samples": count,
         "complete": complete,

@@ -8,7 +8,7 @@ import zenoh
 
 from gateway.errors import BadValue, Busy, Damaged, GatewayError
 from gateway.northbound import encoding, pages, payload
-from gateway.northbound.interfaces import History, Plant
+from gateway.northbound.interfaces import History, Place, Plant
 from gateway.northbound.keys import Family, Keys, ParsedKey
 from gateway.northbound.payload import Failure, Problem
 from gateway.northbound.tag_index import TagIndex
@@ -120,8 +120,9 @@ class Replies:
                     self._samples(query, chain.from_iterable(by_tag), pause)
                 elif tags:
                     wanted = {tag.key: tag for tag in tags}
-                    after = None if page is None else page.after
-                    found = self._history.as_recorded(wanted, time_range, after, now, pause)
+                    size, after = page or (None, None)
+                    place = pages.recorded_place(after)
+                    found = self._history.as_recorded(wanted, time_range, place, size, now, pause)
                     self._as_recorded(query, found, page, pause)
         except GatewayError as error:
             self._failed(error, query)
@@ -129,35 +130,41 @@ class Replies:
     def _samples(self, query: zenoh.Query, found: Iterable[Sample], pause: Pause) -> None:
         until = self._clock() + ANSWER_WITHIN
         for sample in found:
+            self._recorded(query, sample)
             self._go_on(until)
-            encoding.reply(query, self._keys.value(sample.tag.key), sample, self._stamp())
             pause()
 
     def _as_recorded(
         self,
         query: zenoh.Query,
-        found: Iterable[tuple[Sample | Damaged | None, str | None]],
+        found: Iterable[tuple[Sample | Damaged | bool, Place | None]],
         page: pages.Page | None,
         pause: Pause,
     ) -> None:
         until = self._clock() + (ANSWER_WITHIN if page is None else PAGE_WITHIN)
-        count, last, lost, sample = 0, "", None, None
+        last: Place = ("", 0, 0)
+        count, lost, complete = 0, None, False
         for sample, place in found:
             if isinstance(sample, Damaged):
                 lost = sample
-            elif sample is not None:
-                encoding.reply(query, self._keys.value(sample.tag.key), sample, self._stamp())
+            elif isinstance(sample, bool):
+                complete = sample
+            else:
+                self._recorded(query, sample)
                 count += 1
-            pause()
             last = place or last
             if page is None or self._ended:
                 self._go_on(until)
-            elif place and (count >= page.size or self._clock() > until):
+            elif place is not None and (count >= page.size or self._clock() > until):
                 break
+            pause()
         if page is not None:
-            self._end_page(query, count, last, complete=sample is None, lost=lost)
+            self._end_page(query, count, last, complete=complete, lost=lost)
         elif lost is not None:
             raise lost
+
+    def _recorded(self, query: zenoh.Query, sample: Sample) -> None:
+        encoding.reply(query, self._keys.value(sample.tag.key), sample, self._stamp())
 
     def _go_on(self, until: float) -> None:
         if self._ended:
@@ -169,7 +176,7 @@ class Replies:
         self,
         query: zenoh.Query,
         count: int,
-        place: str,
+        place: str | Place,
         *,
         complete: bool,
         lost: Damaged | None = None,

@@ -16,7 +16,7 @@ from gateway.engine.requests import CommandResult
 from gateway.errors import Damaged
 from gateway.history import Historian
 from gateway.northbound import Northbound, payload
-from gateway.northbound.interfaces import History
+from gateway.northbound.interfaces import History, Place
 from gateway.northbound.payload import Failure, Problem, WriteOutcome
 from gateway.tags import Reason, Sample, Tag, WriteResult, bad, good
 from tests.e2e.processes import Program
@@ -121,11 +121,12 @@ class SlowHistory:
         self,
         tags: Mapping[str, Tag],
         time_range: str,
-        after: str | None,
+        after: Place | None,
+        page: int | None,
         now: int,
         pause: Callable[[], None],
-    ) -> Iterator[tuple[Sample | Damaged | None, str | None]]:
-        return self._answer(time_range, now, [(None, "0-0-0")])
+    ) -> Iterator[tuple[Sample | Damaged | bool, Place | None]]:
+        return self._answer(time_range, now, [(True, ("0", 0, 0))])
 
     def writes(self, time_range: str, limit: int | None, now: int) -> Iterator[str]:
         return self._answer(time_range, now, ["{}"])
