@@ -76,7 +76,7 @@ class Search:
         stored = _Stored(self._reader, self.damage, file, period)
         runs = [run for run in sorted_runs if run.number >= begin]
         numbers = stored.numbers(tags, stored.of(runs))
-        place, found, of_last_run = (mark, begin, first - 1), 0, 0
+        place, found, of_last_run = (mark, begin, max(first - 1, 0)), 0, 0
         for run in runs:
             if page is not None and 0 < found > page - of_last_run:
                 yield False, place

@@ -42,7 +42,7 @@ class PacedLink:
             task.add_done_callback(self._tasks.discard)
 
     async def _connect(self, client: socket.socket) -> None:
-        with client, _small(socket.socket()) as server:
+        with suppress(ConnectionRefusedError), client, _small(socket.socket()) as server:
             await asyncio.get_running_loop().sock_connect(server, self.target)
             client.setblocking(False)
             done, rest = await asyncio.wait(
@@ -85,6 +85,11 @@ class PacedLink:
                 if (wait := at - loop.time()) > 0:
                     await asyncio.sleep(wait)
                 await loop.sock_sendall(sink, data)
+
+    @property
+    def is_busy(self) -> bool:
+        """True once more than the greetings of two sessions went to the client."""
+        return self.carried > 20_000
 
     async def cut(self) -> None:
         """Ends all connections."""
