@@ -10,11 +10,12 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
 import structlog
 import zenoh
+
+from gateway.northbound.workers import Workers
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 
@@ -49,9 +50,9 @@ class AnswerPool:
         self._open_wide = threading.Semaphore(WIDE_LIMIT)
         self._open_history = threading.Semaphore(HISTORY_LIMIT)
         self._refusals = threading.Semaphore(REFUSALS_LIMIT)
-        self._narrow = ThreadPoolExecutor(_NARROW_THREADS, "zenoh answers")
-        self._wide = ThreadPoolExecutor(WIDE_LIMIT, "zenoh snapshots")
-        self._history = ThreadPoolExecutor(HISTORY_LIMIT, "zenoh history")
+        self._narrow = Workers(_NARROW_THREADS, "zenoh answers")
+        self._wide = Workers(WIDE_LIMIT, "zenoh snapshots")
+        self._history = Workers(HISTORY_LIMIT, "zenoh history")
         self._batch: deque[tuple[zenoh.Query, Answer]] = deque()
         self._closing = False
         self._ended = False
@@ -87,26 +88,15 @@ class AnswerPool:
     def answer_wide(self, query: zenoh.Query, answer: Answer) -> None:
         """Answers an admitted query with a wildcard, if there is room."""
         if self.admit_wide(query):
-            self._submit(self._wide, self._open_wide, query, answer)
+            self._wide.submit(self._finish, query, answer, self._open_wide)
 
     def answer_history(self, query: zenoh.Query, answer: Answer) -> None:
         """Answers an admitted query of the past, if there is room."""
         if self._open_history.acquire(blocking=False):
-            self._submit(self._history, self._open_history, query, answer)
+            self._history.submit(self._finish, query, answer, self._open_history)
             return
         self._open.release()
         self.refuse(query)
-
-    def _submit(
-        self,
-        pool: ThreadPoolExecutor,
-        room: threading.Semaphore,
-        query: zenoh.Query,
-        answer: Answer,
-    ) -> None:
-        future = pool.submit(self._finish, query, answer)
-        future.add_done_callback(lambda _: room.release())
-        future.add_done_callback(_report)
 
     def close(self) -> None:
         """Refuses every query from now on."""
@@ -125,7 +115,7 @@ class AnswerPool:
         """Ends the threads, after the session is closed."""
         self._ended = True
         for pool in (self._narrow, self._wide, self._history):
-            pool.shutdown(wait=False, cancel_futures=True)
+            pool.end()
 
     def _flush(self) -> None:
         batch, self._batch = self._batch, deque()
@@ -134,7 +124,7 @@ class AnswerPool:
     def _go_on(self, batch: deque[tuple[zenoh.Query, Answer]]) -> None:
         """Starts a thread with the batch, and later others, if its replies wait for a client."""
         if batch and not self._ended:
-            self._narrow.submit(self._finish_all, batch).add_done_callback(_report)
+            self._narrow.submit(self._finish_all, batch)
             if len(batch) > 1:
                 loop = asyncio.get_running_loop()
                 loop.call_later(_WAIT_OF_BATCH, self._go_on, batch)
@@ -148,14 +138,14 @@ class AnswerPool:
             self.counters.unanswered += 1
             query.drop()  # type: ignore[no-untyped-call]  # Zenoh's stub lacks it
             return
-        self._narrow.submit(self._refuse, query, self._reply_busy).add_done_callback(_report)
+        self._narrow.submit(self._refuse, query, self._reply_busy)
 
     def dismiss(self, query: zenoh.Query) -> None:
         """Ends a query without a reply: it is for another gateway."""
         if self._closing or not self._refusals.acquire(blocking=False):
             query.drop()  # type: ignore[no-untyped-call]  # Zenoh's stub lacks it
             return
-        self._narrow.submit(self._refuse, query, _no_reply).add_done_callback(_report)
+        self._narrow.submit(self._refuse, query, _no_reply)
 
     # -- answering threads --
 
@@ -174,7 +164,9 @@ class AnswerPool:
                 return
             self._finish(query, answer)
 
-    def _finish(self, query: zenoh.Query, answer: Answer) -> None:
+    def _finish(
+        self, query: zenoh.Query, answer: Answer, room: threading.Semaphore | None = None
+    ) -> None:
         try:
             with query:
                 answer(query)
@@ -182,12 +174,9 @@ class AnswerPool:
             log.debug("reply failed", error=str(error))
         finally:
             self._open.release()
+            if room is not None:
+                room.release()
 
 
 def _no_reply(_: zenoh.Query) -> None:
     pass
-
-
-def _report(future: Future[None]) -> None:
-    if not future.cancelled() and (error := future.exception()):
-        log.error("answer crashed", exc_info=error)

@@ -40,7 +40,7 @@ async def everything(client: ZenohPeer) -> list[Reply]:
 @asynccontextmanager
 async def asking(slow: ZenohPeer, link: PacedLink) -> AsyncIterator[asyncio.Task[Any]]:
     """Long answers are on their way over the link."""
-    answers = asyncio.create_task(slow.many([("plant/**", None)] * 4, 25))
+    answers = asyncio.create_task(slow.many([("plant/**", None)] * 16, 25))
     try:
         async with asyncio.timeout(10):
             while not link.is_busy:
