@@ -6,15 +6,16 @@ import re
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from gateway.config import ZenohConfig
-from gateway.errors import ConfigError
+from gateway.errors import ConfigError, Damaged
 from gateway.northbound import Northbound
+from gateway.northbound.interfaces import Place
 from gateway.northbound.writers import NotAllowed, Writers
 from gateway.tags import Sample, Tag
 from tests.northbound.access import PAGE, secret
@@ -37,6 +38,17 @@ class RecordedWrites:
         self.recorded: list[Any] = []
 
     def samples(self, tag: Tag, time_range: str, limit: int | None, now: int) -> Iterator[Sample]:
+        raise NotImplementedError
+
+    def as_recorded(
+        self,
+        tags: Mapping[str, Tag],
+        time_range: str,
+        after: Place | None,
+        page: int | None,
+        now: int,
+        pause: Callable[[], None],
+    ) -> Iterator[tuple[Sample | Damaged | bool, Place | None]]:
         raise NotImplementedError
 
     def writes(self, time_range: str, limit: int | None, now: int) -> Iterator[str]:
