@@ -17,7 +17,7 @@ from pathlib import Path
 import structlog
 
 from gateway.history import sections
-from gateway.history.lock import locked
+from gateway.history.lock import close_to_others, locked
 from gateway.history.outcomes import Outcome
 from gateway.history.recent import Extent, Identity, SortedRun
 from gateway.history.rows import to_row
@@ -79,12 +79,13 @@ class HistoryFile:
         self.log_limit = max(256 * 1024, min(4 * 1024 * 1024, max_size // 16))
         with ExitStack() as undo:
             undo.callback(os.close, locked(path))
+            close_to_others(path)  # SQLite gives its log the same mode
             self._database = _opened(path)
             undo.callback(self._database.close)
             pages = max(16, self.log_limit // (2 * 4096))
             self._database.execute(f"PRAGMA wal_autocheckpoint = {pages}")
             self._database.execute(f"PRAGMA journal_size_limit = {self.log_limit}")
-            self._tags = dict(self._database.execute("SELECT key, id FROM tag ORDER BY id"))
+            self._tags, self._last_tag, _ = sections.tags(self._database, 0)
             self.identity = identity(self._database, path)
             self._resources = undo.pop_all()
 
@@ -116,8 +117,9 @@ class HistoryFile:
     def _tag(self, key: str) -> int:
         number = self._tags.get(key)
         if number is None:
-            number = self._tags[key] = 1 + next(reversed(self._tags.values()), 0)
-            self._database.execute("INSERT INTO tag VALUES (?, ?)", (number, key))
+            number = self._tags[key] = self._last_tag = self._last_tag + 1
+            self._database.execute("INSERT OR REPLACE INTO tag VALUES (?, ?)", (number, key))
+            sections.write_tag(self._database, number, key)
         return number
 
     def store_writes(self, outcomes: Sequence[Outcome], most: int) -> int:
@@ -188,7 +190,7 @@ class HistoryFile:
     # -- content --
 
     def sorted_runs(self) -> list[SortedRun]:
-        return [SortedRun(*row) for row in self._database.execute("SELECT * FROM run ORDER BY run")]
+        return sections.runs(self._database)
 
     def unsorted_runs(self) -> dict[int, Extent]:
         """Returns the extent of each run in `recent`."""
@@ -285,6 +287,7 @@ def _prepare(database: sqlite3.Connection, path: Path) -> None:
     elif not database.execute("SELECT 1 FROM sqlite_schema WHERE name = 'file'").fetchall():
         database.executescript(f"BEGIN IMMEDIATE; {_MARK} COMMIT;")  # older files had none
     database.execute(sections.TABLE)
+    sections.adopt_tags(database)
 
 
 def move_aside(path: Path, why: str) -> None:

@@ -67,22 +67,23 @@ class Reader:
         self._lock = threading.Lock()
         self._idle: list[sqlite3.Connection] = []
         self._generation = 0  # connections of an older one are not used again
-        self._tags: tuple[Identity | None, dict[str, int]] = (None, {})
+        # Of a file: its tags, the highest number, whether names are damaged.
+        self._tags: tuple[Identity | None, dict[str, int], int, bool] = (None, {}, 0, False)
         self._sections: dict[tuple[Identity | None, SortedRun], list[Section]] = {}
 
-    def tags(self, file: Identity | None) -> Mapping[str, int]:
-        """Returns the number of each tag in the file. Raises `Damaged`."""
+    def tags(self, file: Identity | None) -> tuple[Mapping[str, int], bool]:
+        """Returns the number of each tag in the file, and whether names are damaged. Raises
+        `Damaged`."""
         with self._lock:
-            known_of, known = self._tags
-        known = dict(known) if known_of == file else {}
-        last = next(reversed(known.values()), 0)
+            known_of, known, last, lack = self._tags
+        if known_of != file:
+            known, last, lack = {}, 0, False
         with self._connection(file) as database:
-            added = sections.tags(database, last)
-        if added or known_of != file:
-            known.update(added)
-            with self._lock:
-                self._tags = file, known
-        return known
+            added, last, more_lack = sections.tags(database, last)
+        known, lack = {**known, **added} if added else known, lack or more_lack
+        with self._lock:
+            self._tags = file, known, last, lack
+        return known, lack
 
     def sections(self, file: Identity | None, run: SortedRun) -> list[Section]:
         """Returns the sections of a run. Raises `Damaged`."""

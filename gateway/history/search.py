@@ -125,11 +125,12 @@ class _Stored:
         if not runs:
             return {}
         try:
-            known = self._reader.tags(self._file)
-        except Damaged as error:
+            known, lack = self._reader.tags(self._file)
+        except Damaged:
+            known, lack = {}, True
+        if lack and not tags.keys() <= known.keys():
             for run in runs:
-                self._note(run, error)
-            return {}
+                self._note(run, Damaged("the name of a tag is damaged"))
         return {known[key]: tag for key, tag in tags.items() if key in known}
 
     def rows(self, run: SortedRun, numbers: Collection[int]) -> Iterator[list[FullRow] | None]:

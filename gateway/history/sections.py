@@ -2,19 +2,22 @@
 
 A sorted run is divided into sections of consecutive samples. Table `section` has the first sample
 of each, the number of samples and their checksum. Section -1 has the checksum of the run's own row
-and of this list. A run that an older gateway has sorted has no sections and cannot be checked.
+and of this list. A run that an older gateway has sorted has no sections and cannot be checked. Run
+0 has the checksums of the names of the tags.
 """
 
 import marshal
 import sqlite3
 from bisect import bisect_right
 from collections.abc import Collection, Sequence
+from itertools import chain
 from typing import Any, NamedTuple
 from zlib import crc32
 
 from gateway.errors import Damaged
+from gateway.history.recent import SortedRun
 from gateway.history.rows import Stored
-from gateway.history.timerange import TimeRange
+from gateway.history.timerange import LATEST, TimeRange
 
 SECTION = 128  # samples
 _GROUP = 2048  # samples that are read at once
@@ -24,6 +27,7 @@ CREATE TABLE IF NOT EXISTS section (
     samples INTEGER, sum INTEGER, PRIMARY KEY (run, number)
 ) WITHOUT ROWID
 """
+_ERRORS = (sqlite3.Error, UnicodeDecodeError)  # the latter: SQLite quotes damaged text
 _END = (2**62, 0, 0)  # after the place of every sample
 
 # The columns `tag, time, n, value, kind, bad`; the first three are the place in the run.
@@ -72,11 +76,11 @@ def read(database: sqlite3.Connection, run: int) -> list[Section]:
             (run,),
         ).fetchall()
         row = _row_of(database, run)
-    except sqlite3.Error as error:
+    except _ERRORS as error:
         raise _damaged(error) from error
-    if not listed:
+    if not listed and all(isinstance(value, int) for value in chain(*row)):
         return [Section((-1, 0, 0), _END, 0, None)]
-    (*_, head), *found = listed
+    (*_, head), *found = listed or [(None,)]
     if head != checksum((row, found)):
         raise Damaged(f"the list of run {run} is damaged")
     ends = [*(first for _, *first, _, _ in found[1:]), _END]
@@ -84,6 +88,23 @@ def read(database: sqlite3.Connection, run: int) -> list[Section]:
         Section((tag, time, n), (end[0], end[1], end[2]), samples, expected)
         for (_, tag, time, n, samples, expected), end in zip(found, ends, strict=True)
     ]
+
+
+def runs(database: sqlite3.Connection) -> list[SortedRun]:
+    """Returns all sorted runs in their order. One whose row is damaged or lost may have samples of
+    any time: so every query finds the damage. Raises `Damaged` if the table has no numbers."""
+    known = {row[0]: row for row in database.execute("SELECT * FROM run")}
+    if not all(isinstance(run, int) for run in known):
+        raise Damaged("the table of runs is damaged")
+    heads = database.execute("SELECT run FROM section WHERE number = -1")
+    found = []
+    for run in sorted({*known, *(run for (run,) in heads if isinstance(run, int) and run > 0)}):
+        try:
+            read(database, run)
+            found.append(SortedRun(*known[run]))
+        except (Damaged, KeyError):
+            found.append(SortedRun(run, 0, LATEST, 1, 0))
+    return found
 
 
 def groups(
@@ -116,7 +137,7 @@ def rows(database: sqlite3.Connection, run: int, sections: Sequence[Section]) ->
     """Returns the checked rows of neighbouring sections. Raises `Damaged`."""
     try:
         found = _rows(database, run, sections[0].first, sections[-1].end)
-    except sqlite3.Error as error:
+    except _ERRORS as error:
         raise _damaged(error) from error
     if sections[0].sum is None:
         return found
@@ -131,16 +152,41 @@ def rows(database: sqlite3.Connection, run: int, sections: Sequence[Section]) ->
     return found
 
 
-def tags(database: sqlite3.Connection, after: int) -> dict[str, int]:
-    """Returns the tags with higher numbers than `after`, in their order. Raises `Damaged`."""
+def write_tag(database: sqlite3.Connection, number: int, key: str) -> None:
+    """Writes the checksum of a tag's name."""
+    database.execute(
+        "INSERT OR REPLACE INTO section VALUES (0, ?, 0, 0, 0, 0, ?)", (number, checksum([key]))
+    )
+
+
+def tags(database: sqlite3.Connection, after: int) -> tuple[dict[str, int], int, bool]:
+    """Returns the tags with higher numbers than `after`, in their order, the highest number, and
+    whether some names are damaged: they are left out."""
     try:
-        return dict(
+        sums = dict(
             database.execute(
-                "SELECT key, id FROM tag WHERE id > ? ORDER BY id", (after,)
+                "SELECT number, sum FROM section WHERE run = 0 AND number > ?", (after,)
             ).fetchall()
         )
-    except sqlite3.Error as error:
+        stored = database.execute(
+            "SELECT id, key FROM tag WHERE id > ? ORDER BY id", (after,)
+        ).fetchall()
+    except _ERRORS as error:
         raise _damaged(error) from error
+    found = {key: number for number, key in stored if sums.get(number) == checksum([key])}
+    last = max([after, *sums, *(number for number, _ in stored)])
+    return found, last, len(found) != len(sums) or len(found) != len(stored)
+
+
+def adopt_tags(database: sqlite3.Connection) -> None:
+    """Writes the checksums of all names, for a file of an older gateway."""
+    if database.execute("SELECT 1 FROM section WHERE run = 0 LIMIT 1").fetchall():
+        return
+    stored = database.execute("SELECT id, key FROM tag").fetchall()
+    database.execute("BEGIN IMMEDIATE")
+    for number, key in stored:
+        write_tag(database, number, key)
+    database.execute("COMMIT")
 
 
 def _rows(database: sqlite3.Connection, run: int, first: Place, end: Place) -> list[FullRow]:
@@ -155,7 +201,7 @@ def _row_of(database: sqlite3.Connection, run: int) -> list[tuple[int, ...]]:
     return database.execute("SELECT * FROM run WHERE run = ?", (run,)).fetchall()
 
 
-def _damaged(error: sqlite3.Error) -> Exception:
+def _damaged(error: Exception) -> Exception:
     """Translates an error of a damaged file. Text that is no UTF-8 has no code of its own."""
     name = getattr(error, "sqlite_errorname", "")
     if name.startswith(("SQLITE_CORRUPT", "SQLITE_NOTADB")) or not name:
