@@ -16,6 +16,7 @@ from gateway.engine.requests import CommandResult
 from gateway.errors import Damaged
 from gateway.history import Historian
 from gateway.northbound import Northbound, payload
+from gateway.northbound.answers import HISTORY_LIMIT
 from gateway.northbound.interfaces import History, Place
 from gateway.northbound.payload import Failure, Problem, WriteOutcome
 from gateway.tags import Reason, Sample, Tag, WriteResult, bad, good
@@ -159,6 +160,27 @@ async def test_now_is_the_time_at_which_the_query_arrived_for_all_its_tags() -> 
     for nows in slow.asked.values():
         assert begun <= nows[0] <= taken
         assert set(nows) == {nows[0]}
+
+
+async def test_current_values_are_answered_while_all_threads_of_history_wait() -> None:
+    endpoint, slow = free_endpoint(), SlowHistory()
+    async with (
+        serving(plant(), slow, endpoint, listen=True) as northbound,
+        ZenohPeer("client", connect=[endpoint]) as historian,
+        ZenohPeer("client", connect=[endpoint]) as client,
+    ):
+        count = HISTORY_LIMIT + 2
+        queries = northbound.counters()["queries"] + count
+        answers = asyncio.create_task(
+            historian.many([(f"plant/**?_time=[now(-{n}s)..]", None) for n in range(count)])
+        )
+        while northbound.counters()["queries"] < queries and not answers.done():
+            await asyncio.sleep(0.01)
+        assert len(await client.get("plant/**")) == 3
+        assert len(await client.get("plant/mixer/speed")) == 1
+        slow.go.set()
+        ends = [[reply.json["error"] for reply in replies] for replies in await answers]
+    assert sorted(ends) == [[]] * HISTORY_LIMIT + [["busy"]] * 2
 
 
 async def test_the_queries_that_the_page_shows_are_answered(tmp_path: Path) -> None:
