@@ -11,7 +11,7 @@ declared for a single device, tag or command below `<prefix>/`: the wildcards be
     <prefix>/<device>/@block            all tags of the device that changed in one scan
     <prefix>/@gateway/<name>/…          state and statistics, the outcome of every write
     <prefix>/@gateway/<name>/alive/…    liveliness tokens of its devices
-    <prefix>/@gateway/<name>/page      the last reply to a query with `page`
+    <prefix>/@gateway/<name>/page     the last reply to a query with `page`
     <prefix>/@gateway/<name>/claim/…    its claim to its devices: a document, and a token
     <prefix>/@standby/<group>/…         liveliness tokens of the gateways of a standby group
     …/@adv/**                           queries of a Zenoh AdvancedSubscriber that starts late

@@ -103,6 +103,27 @@ def test_a_flipped_bit_is_told_or_harmless(tmp_path: Path) -> None:
     assert told_of > FLIPS / 4
 
 
+@pytest.mark.parametrize(
+    "damage",
+    [
+        "UPDATE run SET last = first WHERE run = 2",
+        "DELETE FROM run WHERE run = 2",
+        "DELETE FROM section WHERE run = 2 AND number = 1",
+        "DELETE FROM sample WHERE run = 2 AND n = 7",
+        "UPDATE tag SET key = 'mixer/other' WHERE id = 3",
+        "DELETE FROM tag WHERE id = 7",
+    ],
+)
+def test_a_lost_or_changed_row_of_any_table_is_told(tmp_path: Path, damage: str) -> None:
+    path = tmp_path / "h.db"
+    expected = recorded(path)
+    with closing(sqlite3.connect(path)) as database, database:
+        database.execute(damage)
+    for found, told in answers(path):
+        assert told
+        assert found < expected
+
+
 def test_a_page_that_cannot_be_read_costs_only_its_samples(tmp_path: Path) -> None:
     path = tmp_path / "h.db"
     with history(path, max_size=5_000_000) as historian:

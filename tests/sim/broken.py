@@ -881,13 +881,6 @@ MUTANTS = (
         "tests/attacks/test_slow_links.py",
     ),
     Mutant(
-        "the end waits for replies",
-        "northbound/workers.py",
-        "name=self._name, daemon=True)",
-        "name=self._name, daemon=False)",
-        "tests/attacks/test_slow_links.py",
-    ),
-    Mutant(
         "a page says that it is the last",
         "northbound/pages.py",
         '        "complete": complete,\n',
