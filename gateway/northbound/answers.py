@@ -123,9 +123,10 @@ class AnswerPool:
 
     def _go_on(self, batch: deque[tuple[zenoh.Query, Answer]]) -> None:
         """Starts a thread with the batch, and later others, if its replies wait for a client."""
-        if batch and not self._ended:
+        size = len(batch)
+        if size and not self._ended:
             self._narrow.submit(self._finish_all, batch)
-            if len(batch) > 1:
+            if size > 1:
                 loop = asyncio.get_running_loop()
                 loop.call_later(_WAIT_OF_BATCH, self._go_on, batch)
 

@@ -936,4 +936,11 @@ MUTANTS = (
         "        if False:\n",
         "tests/attacks/test_own_files.py",
     ),
+    Mutant(
+        "a batch of short answers waits for its first client",
+        "northbound/answers.py",
+        "            if size > 1:\n",
+        "            if False:\n",
+        "tests/northbound/test_answers.py",
+    ),
 )
