@@ -29,6 +29,7 @@ from typing import Any, NamedTuple
 import zenoh
 
 CHECK_EVERY = 60.0  # seconds between two checks without a known gap
+FIRST_PAGE = 1000  # samples, so that the first ones arrive soon
 PAGE = 40_000  # samples; over a slow link take fewer, so that a page arrives in time
 ANSWER_WITHIN = 30.0  # seconds for a page
 RETRY_EVERY = 0.5  # seconds until an incomplete check is repeated
@@ -134,23 +135,23 @@ class CatchUp:
                 if due - time.monotonic() <= RETRY_EVERY:
                     # A check is due: this sample is in history too, and arrives in its place.
                     continue
-                yield from self._new([_sample(arrived)], may_return=True)
+                yield from self._new([_sample(str(arrived.key_expr), arrived)], may_return=True)
 
     def _missed(self) -> Iterator[Page]:
         """Yields every sample since the last complete page, in pages. Raises `Gap` if some may
         lack."""
         links = self._links
-        answer = self._query()
+        answer = self._query(FIRST_PAGE)
         while True:
             page = self._page(answer, links)
             if not page.is_last:
-                answer = self._query()  # it arrives while this page is delivered
+                answer = self._query(PAGE)  # it arrives while this page is delivered
             yield page
             if page.is_last:
                 return
 
-    def _query(self) -> Answer:
-        selector = f"{self._prefix}/**?_time=[{self._begin}..];page={PAGE}"
+    def _query(self, size: int) -> Answer:
+        selector = f"{self._prefix}/**?_time=[{self._begin}..];page={size}"
         if self._places:
             selector += f";after={','.join(self._places.values())}"
         return Answer(self._session, selector)
@@ -162,13 +163,14 @@ class CatchUp:
                 raise Gap
         samples, ends = list[Sample](), dict[str, Any]()
         for reply in answer.replies:
-            if reply.ok is not None and str(reply.ok.key_expr).endswith("/page"):
-                gateway = str(reply.ok.key_expr).removesuffix("/page")
-                ends[gateway] = json.loads(reply.ok.payload.to_bytes())
-            elif reply.ok is not None:
-                samples.append(_sample(reply.ok))
-            else:
+            received = reply.ok
+            if received is None:
                 raise Gap(reply.err)
+            key = str(received.key_expr)
+            if key.endswith("/page") and "/@gateway/" in key:
+                ends[key.removesuffix("/page")] = json.loads(received.payload.to_bytes())
+            else:
+                samples.append(_sample(key, received))
         silent = self._gateways - ends.keys()  # in a standby group only one answers
         if not ends or not all(map(self._is_there, silent)) or links != self._links:
             raise Gap
@@ -197,7 +199,7 @@ class CatchUp:
             late = last is not None and sample.time < last.time
             if not late:
                 self._last[sample.key] = sample
-            yield sample._replace(late=late)
+            yield sample._replace(late=True) if late else sample
 
     def _advance(self) -> None:
         """A check was complete: samples that were delivered before the last one cannot return."""
@@ -208,13 +210,13 @@ class CatchUp:
             self.since = max(self.since, since)
 
 
-def _sample(received: zenoh.Sample) -> Sample:
+def _sample(key: str, received: zenoh.Sample) -> Sample:
     """Reads a sample. With `payload: raw` quality and time are in the attachment."""
     payload, about = received.payload.to_string(), received.attachment
     if about is not None:
         known = payload if received.kind == zenoh.SampleKind.PUT else None
         payload = json.dumps({"value": known, **json.loads(about.to_string())})
-    return Sample(json.loads(payload)["time"], str(received.key_expr), payload)
+    return Sample(json.loads(payload)["time"], key, payload)
 
 
 def main() -> None:
