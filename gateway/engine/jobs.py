@@ -10,7 +10,7 @@ from gateway.engine.health import PAUSE_FIRST, PAUSE_LONGEST, State
 from gateway.engine.records import PollRecord
 from gateway.engine.reply_shapes import ReplyShapes
 from gateway.engine.requests import Command, Request, Resyncs, Write
-from gateway.errors import BadValue, DeviceError, LineDown, Refused, Unclear
+from gateway.errors import BadValue, Busy, DeviceError, LineDown, Refused, Unclear
 from gateway.planning.planner import Block
 from gateway.protocols.driver import Span, UnnumberedReplies
 from gateway.tags import Sample
@@ -300,4 +300,4 @@ class Settled:
 
 
 Success = Sequence[int] | Resynced | Sent | HeldTogether | Settled | str | None
-Result = Success | DeviceError | BadValue | LineDown
+Result = Success | DeviceError | BadValue | LineDown | Busy

@@ -18,44 +18,15 @@ import structlog
 
 from gateway.history import sections
 from gateway.history.lock import close_to_others, locked
-from gateway.history.outcomes import Outcome
+from gateway.history.outcomes import Outcome, Ring
 from gateway.history.recent import Extent, Identity, SortedRun
 from gateway.history.rows import to_row
+from gateway.history.schema import prepare
 from gateway.tags import Sample
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 
-APPLICATION = 0x706C6368  # "plch", in the file's header
-SCHEMA_VERSION = 1
 BUSY_WITHIN = 1.0  # seconds another program may hold the file
-
-_SCHEMA = """
-CREATE TABLE tag (id INTEGER PRIMARY KEY, key TEXT NOT NULL UNIQUE);
-CREATE TABLE recent (
-    run INTEGER, n INTEGER, tag INTEGER, time INTEGER, value, kind INTEGER, bad TEXT,
-    PRIMARY KEY (run, n)
-) WITHOUT ROWID;
-CREATE TABLE sample (
-    run INTEGER, tag INTEGER, time INTEGER, n INTEGER, value, kind INTEGER, bad TEXT,
-    PRIMARY KEY (run, tag, time, n)
-) WITHOUT ROWID;
-CREATE TABLE run (
-    run INTEGER PRIMARY KEY, first INTEGER, last INTEGER, samples INTEGER, closed INTEGER
-);
-CREATE TABLE written (id INTEGER PRIMARY KEY, time INTEGER, outcome TEXT);
-CREATE INDEX written_time ON written (time);
-CREATE VIEW history AS
-    SELECT key, datetime(time / 1000000000, 'unixepoch') AS utc, time, value, bad
-    FROM sample JOIN tag ON tag.id = sample.tag
-    UNION ALL
-    SELECT key, datetime(time / 1000000000, 'unixepoch'), time, value, bad
-    FROM recent JOIN tag ON tag.id = recent.tag;
-"""
-
-_MARK = """
-CREATE TABLE file (mark BLOB);
-INSERT INTO file VALUES (randomblob(16));
-"""
 
 # Many rows in one statement: SQLite releases the interpreter lock for each statement, and taking it
 # again takes long when the event loop is busy.
@@ -122,16 +93,19 @@ class HistoryFile:
             sections.write_tag(self._database, number, key)
         return number
 
-    def store_writes(self, outcomes: Sequence[Outcome], most: int) -> int:
-        """Stores outcomes and keeps the newest `most`. Returns the number of the last."""
+    def store_writes(self, ring: Ring, outcomes: Sequence[Outcome], most: int) -> int:
+        """Stores outcomes and keeps the newest `most` of the ring. Returns the number of the
+        last."""
         with self._transaction():
             self._database.executemany(
-                "INSERT INTO written (time, outcome) VALUES (?, ?)", outcomes
+                f"INSERT INTO {ring} (time, outcome) VALUES (?, ?)",  # noqa: S608  (our own name)
+                outcomes,
             )
             self._database.execute(
-                "DELETE FROM written WHERE id <= (SELECT max(id) FROM written) - ?", (most,)
+                f"DELETE FROM {ring} WHERE id <= (SELECT max(id) FROM {ring}) - ?",  # noqa: S608
+                (most,),
             )
-            return self.last_write()
+            return self.last_write(ring)
 
     def sort(self, run: int, now: int) -> SortedRun | None:
         """Moves a run from `recent` to `sample`, which may hold its beginning already. Returns None
@@ -167,11 +141,12 @@ class HistoryFile:
     def drop_writes(self, before: int) -> None:
         """Drops some outcomes from before this time, if there are any."""
         with self._transaction():
-            self._database.execute(
-                "DELETE FROM written WHERE id IN"
-                " (SELECT id FROM written WHERE time < ? ORDER BY time LIMIT 256)",
-                (before,),
-            )
+            for ring in Ring:
+                self._database.execute(
+                    f"DELETE FROM {ring} WHERE id IN"  # noqa: S608  (our own name)
+                    f" (SELECT id FROM {ring} WHERE time < ? ORDER BY time LIMIT 256)",
+                    (before,),
+                )
 
     def set_sync(self, full: bool) -> None:
         """`full`: the next transactions wait until they are safe from a power cut."""
@@ -199,9 +174,9 @@ class HistoryFile:
         )
         return {run: Extent(*extent) for run, *extent in rows}
 
-    def last_write(self) -> int:
-        """Returns the number of the last outcome of a write, 0 if there is none."""
-        [(number,)] = self._database.execute("SELECT ifnull(max(id), 0) FROM written")
+    def last_write(self, ring: Ring) -> int:
+        """Returns the number of the last outcome of the ring, 0 if there is none."""
+        [(number,)] = self._database.execute(f"SELECT ifnull(max(id), 0) FROM {ring}")  # noqa: S608
         return int(number)
 
     def size(self) -> int:
@@ -258,36 +233,9 @@ def _opened(path: Path) -> sqlite3.Connection:
     )
     with ExitStack() as undo:
         undo.callback(database.close)
-        _prepare(database, path)
+        prepare(database, path)
         undo.pop_all()
     return database
-
-
-class ForeignFile(Exception):
-    """A database, but no history that this version can use."""
-
-
-def _prepare(database: sqlite3.Connection, path: Path) -> None:
-    [(application,)] = database.execute("PRAGMA application_id")
-    [(version,)] = database.execute("PRAGMA user_version")
-    [(tables,)] = database.execute("SELECT count(*) FROM sqlite_schema")
-    if tables and application != APPLICATION:
-        raise ForeignFile(f"{path} is a database of another program")
-    if tables and version != SCHEMA_VERSION:
-        raise ForeignFile(f"{path} has format {version}, and this gateway writes {SCHEMA_VERSION}")
-    database.execute("PRAGMA page_size = 4096")
-    database.execute("PRAGMA auto_vacuum = INCREMENTAL")
-    database.execute("PRAGMA journal_mode = WAL")
-    database.execute("PRAGMA cache_size = -4000")
-    if not tables:
-        database.executescript(
-            f"BEGIN IMMEDIATE; PRAGMA application_id = {APPLICATION};"
-            f" PRAGMA user_version = {SCHEMA_VERSION}; {_SCHEMA} {_MARK} COMMIT;"
-        )
-    elif not database.execute("SELECT 1 FROM sqlite_schema WHERE name = 'file'").fetchall():
-        database.executescript(f"BEGIN IMMEDIATE; {_MARK} COMMIT;")  # older files had none
-    database.execute(sections.TABLE)
-    sections.adopt_tags(database)
 
 
 def move_aside(path: Path, why: str) -> None:

@@ -11,8 +11,9 @@ from pathlib import Path
 import structlog
 
 from gateway.errors import Damaged
-from gateway.history.file import ForeignFile, HistoryFile, is_damage, move_aside
+from gateway.history.file import HistoryFile, is_damage, move_aside
 from gateway.history.reader import Reader
+from gateway.history.schema import ForeignFile
 from gateway.history.transfer import Transfer
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)

@@ -10,9 +10,10 @@ import pytest
 
 from gateway.errors import Busy, Damaged
 from gateway.history import TimeRange
-from gateway.history.file import ForeignFile, HistoryFile
+from gateway.history.file import HistoryFile
 from gateway.history.reader import Reader
 from gateway.history.recent import Recent
+from gateway.history.schema import ForeignFile
 from gateway.history.search import Search
 from gateway.history.timerange import EARLIEST, LATEST
 from gateway.tags import Sample, Tag, good
