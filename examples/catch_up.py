@@ -8,27 +8,31 @@ It works in three steps:
 
 1. It subscribes first and queries history afterwards, so that it loses nothing in between.
 2. It checks for missed samples after every change of a link or a gateway, and once a minute,
-   because an overloaded network may also drop samples. A check holds back new samples, queries
-   everything since the last complete answer, sorts it, and leaves out known samples.
-3. An answer is complete if it has a sample and no error, if every gateway is still there
-   afterwards, and if no link changed meanwhile. Otherwise the check is repeated.
+   because an overloaded network may also drop samples. A check holds back new samples, queries page
+   by page everything that was recorded since the last complete page, and leaves out known samples.
+3. A page is complete if it has as many samples as the gateways counted and no error, if every
+   gateway is still there afterwards, and if no link changed meanwhile. Otherwise the check is
+   repeated from the last complete page.
 """
 
 import argparse
 import json
 import queue
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import suppress
 from datetime import UTC, datetime, timedelta
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import zenoh
 
 CHECK_EVERY = 60.0  # seconds between two checks without a known gap
-ANSWER_WITHIN = 60.0  # seconds for the whole answer to a check
-RETRY_EVERY = 1.0  # seconds until an incomplete check is repeated
+FIRST_PAGE = 1000  # samples, so that the first ones arrive soon
+PAGE = 40_000  # samples; over a slow link take fewer, so that a page arrives in time
+ANSWER_WITHIN = 30.0  # seconds for a page
+RETRY_EVERY = 0.5  # seconds until an incomplete check is repeated
 # Samples of different lines may be recorded a moment after their time.
 MARGIN = timedelta(seconds=5)
 MISSED = object()  # in the queue: samples may be missing
@@ -51,17 +55,37 @@ class Gap(Exception):
     """The answer was not complete."""
 
 
+class Page(NamedTuple):
+    """The complete answer to one query."""
+
+    samples: list[Sample]
+    is_last: bool
+
+
+class Answer:
+    """One query on its way: the replies arrive while the page before is delivered."""
+
+    def __init__(self, session: zenoh.Session, selector: str) -> None:
+        self.ended = threading.Event()
+        self.replies: list[zenoh.Reply] = []
+        handler = zenoh.handlers.Callback(self.replies.append, self.ended.set, indirect=False)
+        session.get(selector, handler, timeout=ANSWER_WITHIN, accept_replies=zenoh.ReplyKeyExpr.ANY)
+
+
 class CatchUp:
     """All samples under a prefix, each once. `since`: RFC 3339, the time of the first sample."""
 
     def __init__(self, session: zenoh.Session, prefix: str, since: str) -> None:
         self.since = since  # everything before is delivered: keep it to continue after a restart
+        self._begin = since
         self._session = session
         self._prefix = prefix
         self._arrived: queue.Queue[object] = queue.Queue()
         self._gateways: set[str] = set()
         self._links = 0  # changes so far
-        self._known: set[Sample] = set()  # delivered, and not older than `since`
+        self._places: dict[str, str] = {}  # of each gateway: the end of the last complete page
+        # Delivered during the present check and after it, and before that.
+        self._known: tuple[set[Sample], set[Sample]] = set(), set()
         self._last: dict[str, Sample] = {}  # the last delivered sample of each key
         self._declared = [
             session.declare_subscriber(f"{prefix}/**", self._arrived.put),
@@ -90,11 +114,12 @@ class CatchUp:
 
     def samples(self) -> Iterator[Sample]:
         """Yields samples for ever."""
-        due = time.monotonic()
+        due = time.monotonic() + RETRY_EVERY  # the network tells its links and gateways first
         while True:
             if time.monotonic() >= due:
                 try:
-                    yield from self._new(self._missed())
+                    for page in self._missed():
+                        yield from self._new(sorted(page.samples), may_return=page.is_last)
                 except Gap:
                     due = time.monotonic() + RETRY_EVERY
                 else:
@@ -110,64 +135,88 @@ class CatchUp:
                 if due - time.monotonic() <= RETRY_EVERY:
                     # A check is due: this sample is in history too, and arrives in its place.
                     continue
-                yield from self._new([_sample(arrived)])
+                yield from self._new([_sample(str(arrived.key_expr), arrived)], may_return=True)
 
-    def _missed(self) -> list[Sample]:
-        """Returns every sample since the last complete check. Raises `Gap` if some may lack."""
-        links, gateways = self._links, set(self._gateways)
-        selector = f"{self._prefix}/**?_time=[{self.since}..]"
-        found = [_sample(answer) for answer in self._answers(selector, links)]
-        # The number of samples is unknown. A gateway that is still there did not end in the middle
-        # of its answer.
-        for gateway in gateways:
-            if not any(self._answers(f"{gateway}/status", links)):
-                raise Gap(gateway)
-        if not found or not gateways or links != self._links:
-            raise Gap
-        return sorted(found)
-
-    def _answers(self, selector: str, links: int) -> Iterator[zenoh.Sample]:
-        """Yields the replies. Raises `Gap` when a link changes: replies may be lost then."""
-        answers: queue.Queue[zenoh.Reply | None] = queue.Queue()
-        handler = zenoh.handlers.Callback(answers.put, lambda: answers.put(None), indirect=False)
-        self._session.get(selector, handler, timeout=ANSWER_WITHIN)
-        while links == self._links:
-            try:
-                reply = answers.get(timeout=0.1)
-            except queue.Empty:
-                continue
-            if reply is None:
+    def _missed(self) -> Iterator[Page]:
+        """Yields every sample since the last complete page, in pages. Raises `Gap` if some may
+        lack."""
+        links = self._links
+        answer = self._query(FIRST_PAGE)
+        while True:
+            page = self._page(answer, links)
+            if not page.is_last:
+                answer = self._query(PAGE)  # it arrives while this page is delivered
+            yield page
+            if page.is_last:
                 return
-            if reply.ok is None:
-                raise Gap(reply.err)
-            yield reply.ok
-        raise Gap
 
-    def _new(self, samples: list[Sample]) -> Iterator[Sample]:
+    def _query(self, size: int) -> Answer:
+        selector = f"{self._prefix}/**?_time=[{self._begin}..];page={size}"
+        if self._places:
+            selector += f";after={','.join(self._places.values())}"
+        return Answer(self._session, selector)
+
+    def _page(self, answer: Answer, links: int) -> Page:
+        """Waits for a page and notes its end. Raises `Gap` when a link changes, or replies lack."""
+        while not answer.ended.wait(0.1):
+            if links != self._links:
+                raise Gap
+        samples, ends = list[Sample](), dict[str, Any]()
+        for reply in answer.replies:
+            received = reply.ok
+            if received is None:
+                raise Gap(reply.err)
+            key = str(received.key_expr)
+            if key.endswith("/page") and "/@gateway/" in key:
+                ends[key.removesuffix("/page")] = json.loads(received.payload.to_bytes())
+            else:
+                samples.append(_sample(key, received))
+        silent = self._gateways - ends.keys()  # in a standby group only one answers
+        if not ends or not all(map(self._is_there, silent)) or links != self._links:
+            raise Gap
+        if len(samples) != sum(end["samples"] for end in ends.values()):
+            raise Gap
+        for gateway, end in ends.items():
+            self._places[gateway] = end["next"]
+            if "damaged" in end:
+                print(f"{gateway}: {end['damaged']}", file=sys.stderr)
+        return Page(samples, all(end["complete"] for end in ends.values()))
+
+    def _is_there(self, gateway: str) -> bool:
+        """A gateway that is still there did not end in the middle of its answer."""
+        replies = self._session.get(f"{gateway}/status", timeout=ANSWER_WITHIN)
+        return any(reply.ok is not None for reply in replies)
+
+    def _new(self, samples: list[Sample], *, may_return: bool) -> Iterator[Sample]:
+        """`may_return`: a later page may have the samples too."""
+        known, before = self._known
         for sample in samples:
             last = self._last.get(sample.key)
-            if sample in self._known or sample == last:
+            if sample in known or sample in before or sample == last:
                 continue
-            self._known.add(sample)
+            if may_return:
+                known.add(sample)
             late = last is not None and sample.time < last.time
             if not late:
                 self._last[sample.key] = sample
-            yield sample._replace(late=late)
+            yield sample._replace(late=True) if late else sample
 
     def _advance(self) -> None:
-        newest = datetime.fromisoformat(max(sample.time for sample in self._last.values()))
-        since = (newest - MARGIN).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
-        self.since = max(self.since, since)
-        self._known = {sample for sample in self._known if sample.time >= self.since}
+        """A check was complete: samples that were delivered before the last one cannot return."""
+        self._known = set(), self._known[0]
+        if self._last:
+            newest = datetime.fromisoformat(max(sample.time for sample in self._last.values()))
+            since = (newest - MARGIN).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
+            self.since = max(self.since, since)
 
 
-def _sample(received: zenoh.Sample) -> Sample:
+def _sample(key: str, received: zenoh.Sample) -> Sample:
     """Reads a sample. With `payload: raw` quality and time are in the attachment."""
     payload, about = received.payload.to_string(), received.attachment
     if about is not None:
         known = payload if received.kind == zenoh.SampleKind.PUT else None
         payload = json.dumps({"value": known, **json.loads(about.to_string())})
-    return Sample(json.loads(payload)["time"], str(received.key_expr), payload)
+    return Sample(json.loads(payload)["time"], key, payload)
 
 
 def main() -> None:

@@ -4,6 +4,7 @@ GatewayError
 ├── ConfigError          fix the file; nothing has been sent
 ├── BadValue             refuse the write; nothing has been sent
 ├── Busy                 try again later; nothing has been sent
+├── Damaged              a part of the history file is lost; the rest can be read
 ├── Offline              the device is offline; nothing has been sent
 ├── LineDown             reopen the port; pending writes fail at once
 └── DeviceError          one device, one transaction
@@ -30,6 +31,10 @@ class BadValue(GatewayError, ValueError):
 
 class Busy(GatewayError):
     """A request that could not be sent in time; nothing has been sent."""
+
+
+class Damaged(GatewayError):
+    """A part of the history file that cannot be read, or does not fit its checksum."""
 
 
 class Offline(GatewayError):

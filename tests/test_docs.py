@@ -56,7 +56,7 @@ FENCED = re.compile(r"^( *)```(\w+)\n(.*?)^\1```$", re.DOTALL | re.MULTILINE)
 # The blocks of this page are single devices: complete files are in examples/.
 OF_DEVICES = "no-protocol.md"
 # The pages whose Python programs run here against the example gateway.
-OF_PROGRAMS = ("read-values.md", "write-values.md", "browse.md")
+OF_PROGRAMS = ("read-values.md", "slow-links.md", "write-values.md", "browse.md")
 # The tutorial's programs run in tests/e2e/test_story.py; the replay is a test of tests/cases; the
 # loop in architecture.md is pseudo code.
 RUN_ELSEWHERE = ("scada.md", "wire-log-to-test.md", "architecture.md")
@@ -495,7 +495,7 @@ def _example_keys() -> set[str]:
         *(keys.status(f"devices/{name}") for name in devices),
         *(keys.status(f"lines/{line.name}") for line in config.lines),
         *(keys.alive(name) for name in devices),
-        *(keys.own, keys.status("status"), keys.writes),
+        *(keys.own, keys.status("status"), keys.writes, keys.page),
         *(
             keys.command(name, command)
             for name, commands in every_command(config).items()

@@ -223,7 +223,8 @@ class ZenohPeer:
         attachment: bytes | None = None,
         **options: str,
     ) -> list[Reply]:
-        """Sends one query. `options`: `target="ALL"`, `consolidation="NONE"`."""
+        """Sends one query. `options`: `target="ALL"`, `consolidation="NONE"`,
+        `accept_replies="ANY"`."""
         if attachment is not None:
             options["attachment"] = base64.b64encode(attachment).decode()
         [replies] = await self.many([(selector, payload)], timeout, **options)
@@ -367,6 +368,8 @@ def _get(
         options["target"] = getattr(zenoh.QueryTarget, extra["target"])
     if "consolidation" in extra:
         options["consolidation"] = getattr(zenoh.ConsolidationMode, extra["consolidation"])
+    if "accept_replies" in extra:
+        options["accept_replies"] = getattr(zenoh.ReplyKeyExpr, extra["accept_replies"])
     if "attachment" in extra:
         options["attachment"] = _bytes_of(extra["attachment"])
     found: list[list[zenoh.Reply]] = [[] for _ in queries]

@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from gateway.config.build import Builder
+from gateway.config.file_rules import check_files
 from gateway.config.messages import ConfigErrors
 from gateway.config.records import (
     Config,
@@ -44,6 +45,8 @@ def load(path: str | Path) -> Config:
     with _without_gc():
         file, mistakes = read_yaml(Path(path), _TEXTS)
         config = Builder(mistakes, Path(path).parent).config(file.data)
+        if config is not None:
+            check_files(config, Path(path), mistakes)
     mistakes.raise_all()
     if config is None:
         raise AssertionError(f"{path}: no configuration, and no mistake either")

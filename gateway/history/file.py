@@ -16,53 +16,17 @@ from pathlib import Path
 
 import structlog
 
-from gateway.history.lock import locked
+from gateway.history import sections
+from gateway.history.lock import close_to_others, locked
 from gateway.history.outcomes import Outcome, Ring
 from gateway.history.recent import Extent, Identity, SortedRun
 from gateway.history.rows import to_row
+from gateway.history.schema import prepare
 from gateway.tags import Sample
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 
-APPLICATION = 0x706C6368  # "plch", in the file's header
-SCHEMA_VERSION = 1
 BUSY_WITHIN = 1.0  # seconds another program may hold the file
-
-_SCHEMA = """
-CREATE TABLE tag (id INTEGER PRIMARY KEY, key TEXT NOT NULL UNIQUE);
-CREATE TABLE recent (
-    run INTEGER, n INTEGER, tag INTEGER, time INTEGER, value, kind INTEGER, bad TEXT,
-    PRIMARY KEY (run, n)
-) WITHOUT ROWID;
-CREATE TABLE sample (
-    run INTEGER, tag INTEGER, time INTEGER, n INTEGER, value, kind INTEGER, bad TEXT,
-    PRIMARY KEY (run, tag, time, n)
-) WITHOUT ROWID;
-CREATE TABLE run (
-    run INTEGER PRIMARY KEY, first INTEGER, last INTEGER, samples INTEGER, closed INTEGER
-);
-CREATE TABLE written (id INTEGER PRIMARY KEY, time INTEGER, outcome TEXT);
-CREATE INDEX written_time ON written (time);
-CREATE VIEW history AS
-    SELECT key, datetime(time / 1000000000, 'unixepoch') AS utc, time, value, bad
-    FROM sample JOIN tag ON tag.id = sample.tag
-    UNION ALL
-    SELECT key, datetime(time / 1000000000, 'unixepoch'), time, value, bad
-    FROM recent JOIN tag ON tag.id = recent.tag;
-"""
-
-# Older files have none.
-_REFUSED = """
-BEGIN IMMEDIATE;
-CREATE TABLE IF NOT EXISTS refused (id INTEGER PRIMARY KEY, time INTEGER, outcome TEXT);
-CREATE INDEX IF NOT EXISTS refused_time ON refused (time);
-COMMIT;
-"""
-
-_MARK = """
-CREATE TABLE file (mark BLOB);
-INSERT INTO file VALUES (randomblob(16));
-"""
 
 # Many rows in one statement: SQLite releases the interpreter lock for each statement, and taking it
 # again takes long when the event loop is busy.
@@ -86,12 +50,13 @@ class HistoryFile:
         self.log_limit = max(256 * 1024, min(4 * 1024 * 1024, max_size // 16))
         with ExitStack() as undo:
             undo.callback(os.close, locked(path))
+            close_to_others(path)  # SQLite gives its log the same mode
             self._database = _opened(path)
             undo.callback(self._database.close)
             pages = max(16, self.log_limit // (2 * 4096))
             self._database.execute(f"PRAGMA wal_autocheckpoint = {pages}")
             self._database.execute(f"PRAGMA journal_size_limit = {self.log_limit}")
-            self._tags = dict(self._database.execute("SELECT key, id FROM tag"))
+            self._tags, self._last_tag, _ = sections.tags(self._database, 0)
             self.identity = identity(self._database, path)
             self._resources = undo.pop_all()
 
@@ -123,8 +88,9 @@ class HistoryFile:
     def _tag(self, key: str) -> int:
         number = self._tags.get(key)
         if number is None:
-            number = self._tags[key] = len(self._tags) + 1
-            self._database.execute("INSERT INTO tag VALUES (?, ?)", (number, key))
+            number = self._tags[key] = self._last_tag = self._last_tag + 1
+            self._database.execute("INSERT OR REPLACE INTO tag VALUES (?, ?)", (number, key))
+            sections.write_tag(self._database, number, key)
         return number
 
     def store_writes(self, ring: Ring, outcomes: Sequence[Outcome], most: int) -> int:
@@ -162,12 +128,14 @@ class HistoryFile:
                 (run, first, last, count, now),
             )
             self._database.execute("DELETE FROM recent WHERE run = ?", (run,))
+            sections.write(self._database, run)
             [row] = self._database.execute("SELECT * FROM run WHERE run = ?", (run,))
         return SortedRun(*row)
 
     def drop(self, run: int) -> None:
         with self._transaction():
             self._database.execute("DELETE FROM sample WHERE run = ?", (run,))
+            sections.drop(self._database, run)
             self._database.execute("DELETE FROM run WHERE run = ?", (run,))
 
     def drop_writes(self, before: int) -> None:
@@ -197,7 +165,7 @@ class HistoryFile:
     # -- content --
 
     def sorted_runs(self) -> list[SortedRun]:
-        return [SortedRun(*row) for row in self._database.execute("SELECT * FROM run ORDER BY run")]
+        return sections.runs(self._database)
 
     def unsorted_runs(self) -> dict[int, Extent]:
         """Returns the extent of each run in `recent`."""
@@ -265,36 +233,9 @@ def _opened(path: Path) -> sqlite3.Connection:
     )
     with ExitStack() as undo:
         undo.callback(database.close)
-        _prepare(database, path)
+        prepare(database, path)
         undo.pop_all()
     return database
-
-
-class ForeignFile(Exception):
-    """A database, but no history that this version can use."""
-
-
-def _prepare(database: sqlite3.Connection, path: Path) -> None:
-    [(application,)] = database.execute("PRAGMA application_id")
-    [(version,)] = database.execute("PRAGMA user_version")
-    [(tables,)] = database.execute("SELECT count(*) FROM sqlite_schema")
-    if tables and application != APPLICATION:
-        raise ForeignFile(f"{path} is a database of another program")
-    if tables and version != SCHEMA_VERSION:
-        raise ForeignFile(f"{path} has format {version}, and this gateway writes {SCHEMA_VERSION}")
-    database.execute("PRAGMA page_size = 4096")
-    database.execute("PRAGMA auto_vacuum = INCREMENTAL")
-    database.execute("PRAGMA journal_mode = WAL")
-    database.execute("PRAGMA cache_size = -4000")
-    if not tables:
-        database.executescript(
-            f"BEGIN IMMEDIATE; PRAGMA application_id = {APPLICATION};"
-            f" PRAGMA user_version = {SCHEMA_VERSION}; {_SCHEMA} {_MARK} COMMIT;"
-        )
-    elif not database.execute("SELECT 1 FROM sqlite_schema WHERE name = 'file'").fetchall():
-        database.executescript(f"BEGIN IMMEDIATE; {_MARK} COMMIT;")  # older files had none
-    if not database.execute("SELECT 1 FROM sqlite_schema WHERE name = 'refused'").fetchall():
-        database.executescript(_REFUSED)
 
 
 def move_aside(path: Path, why: str) -> None:

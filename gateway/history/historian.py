@@ -3,23 +3,25 @@
 import sqlite3
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from functools import partial
 from heapq import merge
 from itertools import islice
 from os.path import realpath
 from pathlib import Path
+from typing import TypeVar
 
-from gateway.errors import BadValue, Busy
+from gateway.errors import BadValue, Busy, Damaged
 from gateway.history.outcomes import Outcome, Outcomes, Ring
-from gateway.history.reader import Part, Reader, in_order
-from gateway.history.recent import Recent, SortedRun
+from gateway.history.reader import Reader
+from gateway.history.recent import Recent
 from gateway.history.retention import Retention
+from gateway.history.search import Place, Search
 from gateway.history.timerange import TimeRange, time_range
 from gateway.history.transfer import Transfer
 from gateway.history.writer import Writer
 from gateway.tags import Sample, Tag
 from gateway.tags.timestamps import rfc3339
 
+T = TypeVar("T")
 LONGEST_RUN = 32_768  # samples
 OLDEST_RUN = 600.0  # seconds
 HIGHEST_LIMIT = 1_000_000_000  # samples
@@ -42,6 +44,7 @@ class Historian:
         self._recent = Recent(longest, min(OLDEST_RUN, keep / 20))
         self._written, self._refused = rings = Outcomes(Ring.WRITTEN), Outcomes(Ring.REFUSED)
         self._reader = Reader(path)
+        self._search = Search(self._recent, self._reader)
         self._retention = Retention(keep, max_size, self._recent, wall)
         self._transfer = Transfer(self._recent, rings, self._retention, wall)
         self._writer = Writer(path, max_size, self._transfer, self._reader)
@@ -72,7 +75,9 @@ class Historian:
         recent = self._recent
         oldest = min((run.first for run in recent.sorted_runs), default=None)
         return {
-            "state": self._writer.trouble or "ok",
+            "state": self._writer.trouble
+            or self._search.damage.sentence(recent.file, recent.sorted_runs)
+            or "ok",
             "recorded": recent.recorded,
             "stored": self._transfer.stored,
             "waiting": recent.waiting,
@@ -95,10 +100,25 @@ class Historian:
         `now` is the `now()` of the range, in ns since 1970. `limit` ends the answer early; another
         query from the last sample's time returns the rest.
         Raises `BadValue` for a bad range or limit, and `Busy`, also in the middle, when the file
-        cannot be read now or the next samples were dropped: the answer is then incomplete.
+        cannot be read now or the next samples were dropped: the answer is then incomplete. Raises
+        `Damaged` at the end when a part of the file was left out.
         """
         period = self._range(time_range, limit, now)
-        return islice(self._samples(tag, period, limit), limit)
+        return islice(_readable(self._search.by_time(tag, period)), limit)
+
+    def as_recorded(
+        self,
+        tags: Mapping[str, Tag],
+        time_range: str,
+        after: Place | None,
+        page: int | None,
+        now: int,
+        pause: Callable[[], None],
+    ) -> Iterator[tuple[Sample | Damaged | bool, Place | None]]:
+        """Yields the samples of tags (by `device/name`) in the order of recording, each with its
+        place, as `Search.as_recorded` does. Raises `BadValue`, `Busy`."""
+        period = self._range(time_range, None, now)
+        return _readable(self._search.as_recorded(tags, period, after, page, pause))
 
     def writes(
         self, time_range: str, limit: int | None = None, now: int | None = None
@@ -122,34 +142,12 @@ class Historian:
             pending = outcomes.pending(period)
             stored = self._reader.writes(outcomes.ring, pending.file, pending.last, period)
             found += (stored, pending.outcomes)
-        try:
-            for outcome in merge(*found, key=lambda outcome: outcome.time):
-                yield outcome.text
-        except (sqlite3.Error, OSError) as error:
-            raise Busy(f"history cannot be read: {error}") from error
-
-    def _samples(self, tag: Tag, period: TimeRange, limit: int | None) -> Iterator[Sample]:
-        file, sorted_runs, newest = self._recent.find(tag.key)
-        runs = [run for run in sorted_runs if run.first <= period.last and run.last >= period.first]
-        begun = False
-
-        def read(run: SortedRun) -> list[Sample]:
-            samples = self._reader.samples(file, tag, run, period, limit)
-            if samples is None and begun:
-                raise Busy("the next samples were dropped meanwhile: ask again")
-            return samples or []  # dropped before the first sample: as if queried a moment later
-
-        parts = [Part(run.first, partial(read, run)) for run in runs]
-        parts += [_part_of(run, period) for run in newest]
-        try:
-            for sample in in_order(parts):
-                begun = True
-                yield sample
-        except (sqlite3.Error, OSError) as error:
-            raise Busy(f"history cannot be read: {error}") from error
+        for outcome in _readable(merge(*found, key=lambda outcome: outcome.time)):
+            yield outcome.text
 
 
-def _part_of(run: list[Sample], period: TimeRange) -> Part:
-    found = [sample for sample in run if period.first <= sample.time <= period.last]
-    found.sort(key=lambda sample: sample.time)
-    return Part(found[0].time if found else period.first, lambda: found)
+def _readable(found: Iterator[T]) -> Iterator[T]:
+    try:
+        yield from found
+    except (sqlite3.Error, OSError) as error:
+        raise Busy(f"history cannot be read: {error}") from error

@@ -2,7 +2,9 @@
 
 import errno
 import os
+import stat
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import structlog
@@ -33,7 +35,7 @@ def locked(path: Path) -> int:
     process ends, however it ends. Raises `OSError`, of type `BlockingIOError` if another process
     has the lock.
     """
-    lock_path = f"{path}.lock"
+    lock_path = Path(f"{path}.lock")
     try:
         file = _opened(lock_path)
     except OSError as error:
@@ -51,9 +53,24 @@ def locked(path: Path) -> int:
     return file
 
 
-def _opened(path: str) -> int:
+def close_to_others(path: Path) -> None:
+    """Creates a file that only owner and group can open, or takes the rights of others away.
+
+    Who can open the lock file can hold the lock. Opens no existing file: closing it would end
+    SQLite's locks.
+    """
+    with suppress(OSError):  # it exists; or who opens it reports the error
+        os.close(os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o660))
+    with suppress(OSError):  # the file of another user, shared on purpose; or a read-only disk
+        mode = stat.S_IMODE(path.stat().st_mode)
+        if mode & stat.S_IRWXO:
+            path.chmod(mode & ~stat.S_IRWXO)
+
+
+def _opened(path: Path) -> int:
     """Opens for writing where permitted: over NFS a lock needs that."""
+    close_to_others(path)
     try:
-        return os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        return os.open(path, os.O_RDWR)
     except PermissionError:
-        return os.open(path, os.O_RDONLY | os.O_CREAT, 0o666)
+        return os.open(path, os.O_RDONLY)

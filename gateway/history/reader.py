@@ -3,19 +3,22 @@
 import sqlite3
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from heapq import heappop, heappush
 from pathlib import Path
 from typing import NamedTuple
 
 from gateway.errors import Busy
+from gateway.history import sections
 from gateway.history.file import identity
 from gateway.history.outcomes import Outcome, Ring
 from gateway.history.recent import Identity, SortedRun
-from gateway.history.rows import from_row
+from gateway.history.sections import FullRow, Section
 from gateway.history.timerange import TimeRange
-from gateway.tags import Sample, Tag
+from gateway.tags import Sample
+
+_MOST_LISTS = 400  # lists of sections in memory, of 50 kB
 
 
 class Part(NamedTuple):
@@ -64,23 +67,48 @@ class Reader:
         self._lock = threading.Lock()
         self._idle: list[sqlite3.Connection] = []
         self._generation = 0  # connections of an older one are not used again
+        # Of a file: its tags, the highest number, whether names are damaged.
+        self._tags: tuple[Identity | None, dict[str, int], int, bool] = (None, {}, 0, False)
+        self._sections: dict[tuple[Identity | None, SortedRun], list[Section]] = {}
 
-    def samples(
-        self, file: Identity | None, tag: Tag, run: SortedRun, period: TimeRange, limit: int | None
-    ) -> list[Sample] | None:
-        """Returns the first `limit` samples of a tag in one run. None if the run was dropped."""
+    def tags(self, file: Identity | None) -> tuple[Mapping[str, int], bool]:
+        """Returns the number of each tag in the file, and whether names are damaged. Raises
+        `Damaged`."""
+        with self._lock:
+            known_of, known, last, lack = self._tags
+        if known_of != file:
+            known, last, lack = {}, 0, False
         with self._connection(file) as database:
-            rows = database.execute(
-                "SELECT time, value, kind, bad FROM sample"
-                " WHERE run = ? AND tag = (SELECT id FROM tag WHERE key = ?)"
-                " AND time BETWEEN ? AND ? ORDER BY time, n LIMIT ?",
-                (run.number, tag.key, *period, -1 if limit is None else limit),
-            ).fetchall()
+            added, last, more_lack = sections.tags(database, last)
+        known, lack = {**known, **added} if added else known, lack or more_lack
+        with self._lock:
+            self._tags = file, known, last, lack
+        return known, lack
+
+    def sections(self, file: Identity | None, run: SortedRun) -> list[Section]:
+        """Returns the sections of a run. Raises `Damaged`."""
+        with self._lock:
+            known = self._sections.get((file, run))
+        if known is None:
+            with self._connection(file) as database:
+                known = sections.read(database, run.number)
+            with self._lock:
+                if len(self._sections) >= _MOST_LISTS:
+                    self._sections.clear()
+                self._sections[file, run] = known
+        return known
+
+    def rows(
+        self, file: Identity | None, run: SortedRun, group: Sequence[Section]
+    ) -> list[FullRow] | None:
+        """Returns the rows of neighbouring sections. None if the run was dropped. Raises
+        `Damaged`."""
+        with self._connection(file) as database:
             # A dropped run leaves its number to another one, with another time.
             is_same = database.execute(
                 "SELECT 1 FROM run WHERE run = ? AND closed = ?", (run.number, run.closed)
-            ).fetchall()
-        return [from_row(tag, row) for row in rows] if is_same else None
+            )
+            return sections.rows(database, run.number, group) if is_same.fetchall() else None
 
     def writes(
         self, ring: Ring, file: Identity | None, last: int, period: TimeRange
@@ -126,9 +154,11 @@ class Reader:
             )
         with ExitStack() as undo:
             undo.callback(database.close)
+            database.execute("BEGIN")  # one state of the file for all statements
             if identity(database, self._path) != file:
                 raise Busy("history cannot be read: another file has taken its place")
             yield database
+            database.execute("COMMIT")
             undo.pop_all()
         with self._lock:
             if generation == self._generation:

@@ -71,6 +71,14 @@ class Run:
         return self.closed and len(self.samples) == extent.samples and self.begins_with(extent)
 
 
+class Content(NamedTuple):
+    """The runs at one moment. Lists of samples grow at the end: the count says how many belong."""
+
+    file: Identity | None  # of the sorted runs
+    sorted_runs: tuple[SortedRun, ...]
+    newest: list[tuple[int, list[Sample], int]]  # number or 0, samples, their count
+
+
 class Recent:
     """The runs in memory, and the list of the runs that are sorted on disk.
 
@@ -116,6 +124,15 @@ class Recent:
         with self._lock:
             newest = [list(run.by_tag[tag]) for run in self._runs if tag in run.by_tag]
             return self.file, self.sorted_runs, newest
+
+    def content(self) -> "Content":
+        """Returns everything that is recorded at this moment."""
+        with self._lock:
+            return Content(
+                self.file,
+                self.sorted_runs,
+                [(run.number, run.samples, len(run.samples)) for run in self._runs],
+            )
 
     @property
     def waiting(self) -> int:

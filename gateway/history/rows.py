@@ -38,8 +38,7 @@ def to_row(sample: Sample) -> Row:
     return Row(sample.time, value, kind, None if bad is None else str(bad))
 
 
-def from_row(tag: Tag, row: tuple[int, Stored, int | None, str | None]) -> Sample:
-    time, stored, kind, bad = row
+def from_row(tag: Tag, time: int, stored: Stored, kind: int | None, bad: str | None) -> Sample:
     value = _value(stored, kind)
     if bad is None:
         return Sample(tag, value, Quality.GOOD, time)

@@ -10,8 +10,10 @@ from pathlib import Path
 
 import structlog
 
-from gateway.history.file import ForeignFile, HistoryFile, is_damage, move_aside
+from gateway.errors import Damaged
+from gateway.history.file import HistoryFile, is_damage, move_aside
 from gateway.history.reader import Reader
+from gateway.history.schema import ForeignFile
 from gateway.history.transfer import Transfer
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
@@ -93,7 +95,7 @@ class Writer:
                 self._reader.renew()
                 self.readable = True
             self._store(self._file)
-        except ForeignFile as error:
+        except (ForeignFile, Damaged, UnicodeDecodeError) as error:  # SQLite quotes damaged text
             self._damaged(str(error))
         except sqlite3.Error as error:
             if is_damage(error):

@@ -1,26 +1,31 @@
 """The threads that send replies, and the room for queries.
 
 A reply blocks while its client does not receive, so no reply is sent on the event loop. Queries
-for one key are answered on `narrow` threads; wildcards and history, on `wide` threads, must not
-delay them.
+for one key, wildcards and history have threads of their own, and each kind has enough of them that
+a few clients on slow links do not keep the others waiting.
 """
 
 import asyncio
 import threading
 import time
-from collections.abc import Callable, Iterable
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import structlog
 import zenoh
+
+from gateway.northbound.workers import Workers
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 
 Answer = Callable[[zenoh.Query], None]
 
 OPEN_LIMIT = 1024  # queries taken and not finished
-WIDE_LIMIT = 64  # of these, wildcards and history
+WIDE_LIMIT = 64  # of these, wildcards
+HISTORY_LIMIT = 16  # of these, history
+_NARROW_THREADS = 32
+_WAIT_OF_BATCH = 0.05  # seconds until another thread goes on with a batch
 REFUSALS_LIMIT = 256  # error replies in progress; beyond, a query ends without a reply
 CLOSE_TIMEOUT = 0.5  # seconds for the replies in progress when the gateway ends
 
@@ -43,11 +48,14 @@ class AnswerPool:
         self._reply_busy = refuse
         self._open = threading.Semaphore(OPEN_LIMIT)
         self._open_wide = threading.Semaphore(WIDE_LIMIT)
+        self._open_history = threading.Semaphore(HISTORY_LIMIT)
         self._refusals = threading.Semaphore(REFUSALS_LIMIT)
-        self._narrow = ThreadPoolExecutor(3, "zenoh answers")
-        self._wide = ThreadPoolExecutor(2, "zenoh snapshots")
-        self._batch: list[tuple[zenoh.Query, Answer]] = []
+        self._narrow = Workers(_NARROW_THREADS, "zenoh answers")
+        self._wide = Workers(WIDE_LIMIT, "zenoh snapshots")
+        self._history = Workers(HISTORY_LIMIT, "zenoh history")
+        self._batch: deque[tuple[zenoh.Query, Answer]] = deque()
         self._closing = False
+        self._ended = False
 
     # -- event loop --
 
@@ -78,12 +86,17 @@ class AnswerPool:
             asyncio.get_running_loop().call_soon(self._flush)
 
     def answer_wide(self, query: zenoh.Query, answer: Answer) -> None:
-        """Answers an admitted query on a thread for wide ones, if there is room."""
-        if not self.admit_wide(query):
+        """Answers an admitted query with a wildcard, if there is room."""
+        if self.admit_wide(query):
+            self._wide.submit(self._finish, query, answer, self._open_wide)
+
+    def answer_history(self, query: zenoh.Query, answer: Answer) -> None:
+        """Answers an admitted query of the past, if there is room."""
+        if self._open_history.acquire(blocking=False):
+            self._history.submit(self._finish, query, answer, self._open_history)
             return
-        future = self._wide.submit(self._finish, query, answer)
-        future.add_done_callback(lambda _: self._open_wide.release())
-        future.add_done_callback(_report)
+        self._open.release()
+        self.refuse(query)
 
     def close(self) -> None:
         """Refuses every query from now on."""
@@ -100,12 +113,22 @@ class AnswerPool:
 
     def end(self) -> None:
         """Ends the threads, after the session is closed."""
-        self._narrow.shutdown(wait=False, cancel_futures=True)
-        self._wide.shutdown(wait=False, cancel_futures=True)
+        self._ended = True
+        for pool in (self._narrow, self._wide, self._history):
+            pool.end()
 
     def _flush(self) -> None:
-        batch, self._batch = self._batch, []
-        self._narrow.submit(self._finish_all, batch).add_done_callback(_report)
+        batch, self._batch = self._batch, deque()
+        self._go_on(batch)
+
+    def _go_on(self, batch: deque[tuple[zenoh.Query, Answer]]) -> None:
+        """Starts a thread with the batch, and later others, if its replies wait for a client."""
+        size = len(batch)
+        if size and not self._ended:
+            self._narrow.submit(self._finish_all, batch)
+            if size > 1:
+                loop = asyncio.get_running_loop()
+                loop.call_later(_WAIT_OF_BATCH, self._go_on, batch)
 
     # -- any thread --
 
@@ -116,14 +139,14 @@ class AnswerPool:
             self.counters.unanswered += 1
             query.drop()  # type: ignore[no-untyped-call]  # Zenoh's stub lacks it
             return
-        self._narrow.submit(self._refuse, query, self._reply_busy).add_done_callback(_report)
+        self._narrow.submit(self._refuse, query, self._reply_busy)
 
     def dismiss(self, query: zenoh.Query) -> None:
         """Ends a query without a reply: it is for another gateway."""
         if self._closing or not self._refusals.acquire(blocking=False):
             query.drop()  # type: ignore[no-untyped-call]  # Zenoh's stub lacks it
             return
-        self._narrow.submit(self._refuse, query, _no_reply).add_done_callback(_report)
+        self._narrow.submit(self._refuse, query, _no_reply)
 
     # -- answering threads --
 
@@ -134,11 +157,17 @@ class AnswerPool:
         finally:
             self._refusals.release()
 
-    def _finish_all(self, batch: Iterable[tuple[zenoh.Query, Answer]]) -> None:
-        for query, answer in batch:
+    def _finish_all(self, batch: deque[tuple[zenoh.Query, Answer]]) -> None:
+        while True:
+            try:
+                query, answer = batch.popleft()
+            except IndexError:  # another thread may have taken the last one
+                return
             self._finish(query, answer)
 
-    def _finish(self, query: zenoh.Query, answer: Answer) -> None:
+    def _finish(
+        self, query: zenoh.Query, answer: Answer, room: threading.Semaphore | None = None
+    ) -> None:
         try:
             with query:
                 answer(query)
@@ -146,12 +175,9 @@ class AnswerPool:
             log.debug("reply failed", error=str(error))
         finally:
             self._open.release()
+            if room is not None:
+                room.release()
 
 
 def _no_reply(_: zenoh.Query) -> None:
     pass
-
-
-def _report(future: Future[None]) -> None:
-    if not future.cancelled() and (error := future.exception()):
-        log.error("answer crashed", exc_info=error)

@@ -11,6 +11,9 @@ from gateway.northbound import payload
 from gateway.tags import Form, Sample
 
 _DROP = zenoh.CongestionControl.DROP
+# Below the priority of answers. A long answer over a slow link waits for room in the queue of its
+# priority, and Zenoh makes everybody wait who sends in that priority: the publisher, for all links.
+_LOW = zenoh.Priority.DATA_LOW
 _JSON = zenoh.Encoding.APPLICATION_JSON
 _TEXT = zenoh.Encoding.TEXT_PLAIN
 _JSON_FORM = Form.JSON  # looking up a member of an enumeration takes 0.2 µs
@@ -20,17 +23,24 @@ def put(session: zenoh.Session, key: str, sample: Sample, stamp: zenoh.Timestamp
     """Raises `ZError`."""
     if sample.tag.payload is _JSON_FORM:
         data = payload.value(sample)
-        session.put(key, data, encoding=_JSON, congestion_control=_DROP, timestamp=stamp)
+        put_json(session, key, data, stamp)
         return
     text, attachment = payload.value_text(sample), payload.attachment(sample)
     if text is None:
-        session.delete(key, congestion_control=_DROP, timestamp=stamp, attachment=attachment)
+        session.delete(
+            key,
+            congestion_control=_DROP,
+            priority=_LOW,
+            timestamp=stamp,
+            attachment=attachment,
+        )
         return
     session.put(
         key,
         text,
         encoding=_TEXT,
         congestion_control=_DROP,
+        priority=_LOW,
         timestamp=stamp,
         attachment=attachment,
     )
@@ -38,7 +48,7 @@ def put(session: zenoh.Session, key: str, sample: Sample, stamp: zenoh.Timestamp
 
 def put_json(session: zenoh.Session, key: str, data: bytes, stamp: zenoh.Timestamp | None) -> None:
     """Raises `ZError`."""
-    session.put(key, data, encoding=_JSON, congestion_control=_DROP, timestamp=stamp)
+    session.put(key, data, encoding=_JSON, congestion_control=_DROP, priority=_LOW, timestamp=stamp)
 
 
 def reply(query: zenoh.Query, key: str, sample: Sample, stamp: zenoh.Timestamp) -> None:

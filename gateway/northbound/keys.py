@@ -11,6 +11,7 @@ declared for a single device, tag or command below `<prefix>/`: the wildcards be
     <prefix>/<device>/@block            all tags of the device that changed in one scan
     <prefix>/@gateway/<name>/…          state and statistics, the outcome of every write
     <prefix>/@gateway/<name>/alive/…    liveliness tokens of its devices
+    <prefix>/@gateway/<name>/page     the last reply to a query with `page`
     <prefix>/@gateway/<name>/claim/…    its claim to its devices: a document, and a token
     <prefix>/@standby/<group>/…         liveliness tokens of the gateways of a standby group
     …/@adv/**                           queries of a Zenoh AdvancedSubscriber that starts late
@@ -121,6 +122,11 @@ class Keys:
     def writes(self) -> str:
         """The outcome of every write."""
         return f"{self.own}/writes"
+
+    @property
+    def page(self) -> str:
+        """The last reply to a query with `page`."""
+        return f"{self.own}/page"
 
     def group(self, group: str) -> str:
         """The liveliness tokens of one standby group lie below."""

@@ -17,7 +17,7 @@ from typing import Never
 import orjson
 
 from gateway.engine.requests import CommandResult
-from gateway.errors import BadValue, Busy, GatewayError, LineDown, Offline, Refused
+from gateway.errors import BadValue, Busy, Damaged, GatewayError, LineDown, Offline, Refused
 from gateway.tags import Quality, Reason, Sample, Tag, WriteResult
 from gateway.tags.timestamps import rfc3339
 from gateway.values import Value, parse_decimal
@@ -40,6 +40,7 @@ class Problem(StrEnum):
     UNKNOWN_TAG = "unknown-tag"
     NOT_ALLOWED = "not-allowed"  # the client's signature is missing, wrong or too old
     BAD_QUERY = "bad-query"  # a read with parameters that cannot be parsed
+    DAMAGED = "damaged"  # a part of the history file is lost; all the rest was answered
     NO_HISTORY = "no-history"  # a read of the past from a gateway without history
 
 
@@ -85,6 +86,8 @@ def failure(error: GatewayError) -> Failure:
             return Failure(Problem.BUSY, reason)
         case Offline():
             return Failure(Problem.NO_REPLY, reason)
+        case Damaged():
+            return Failure(Problem.DAMAGED, reason)
         case _:
             return Failure(Problem.UNCLEAR, reason)
 

@@ -80,12 +80,12 @@ class Queries:
             case Family.COMMAND:
                 self._start(self._command(query, at))
             case Family.STATUS if query.parameters.get("_time") is not None:
-                self._pool.answer_wide(query, partial(self._replies.writes, time.time_ns()))
+                self._pool.answer_history(query, partial(self._replies.writes, time.time_ns()))
             case Family.STATUS:
                 self._start(self._status(query))
             case Family.VALUE if query.parameters.get("_time") is not None:
                 history = partial(self._replies.history, parsed, time.time_ns())
-                self._pool.answer_wide(query, history)
+                self._pool.answer_history(query, history)
             case Family.VALUE if query.parameters.get("max_age") is not None:
                 self._take_fresh(query, parsed)
             case _ if parsed.has_wildcard or parsed.family is Family.BLOCK:

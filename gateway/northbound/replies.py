@@ -1,17 +1,23 @@
 """Replies to queries, made on an answering thread: values, descriptions, status, outcomes."""
 
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Iterable, Sequence
+from itertools import chain
 
 import zenoh
 
-from gateway.errors import BadValue, Busy, GatewayError
-from gateway.northbound import encoding, payload
-from gateway.northbound.interfaces import History, Plant
+from gateway.errors import BadValue, Busy, Damaged, GatewayError
+from gateway.northbound import encoding, pages, payload
+from gateway.northbound.interfaces import History, Place, Plant
 from gateway.northbound.keys import Family, Keys, ParsedKey
 from gateway.northbound.payload import Failure, Problem
 from gateway.northbound.tag_index import TagIndex
-from gateway.tags import Tag, WriteResult
+from gateway.northbound.turns import Pause, Rank, Turns
+from gateway.tags import Sample, Tag, WriteResult
 
+ANSWER_WITHIN = 60.0  # seconds for a whole answer of history; its client has gone after that
+PAGE_WITHIN = 5.0  # seconds for a page
+_TOO_LONG = f"this is not all: an answer ends after {ANSWER_WITHIN:g} s. Query in pages"
 _INCOMPLETE = "the gateway is ending: this is not all"
 _NO_HISTORY = Failure(Problem.NO_HISTORY, "no history is kept here: ask without _time")
 
@@ -37,6 +43,8 @@ class Replies:
         self._stamp = stamp
         self._history = history
         self._ended = False
+        self._turns = Turns()
+        self._clock = time.monotonic
         self._only_blocks = {d.name for d in index.devices if d.blocks == "only"}
 
     def end(self) -> None:
@@ -51,15 +59,33 @@ class Replies:
                     block = payload.block(self._plant.sample(tag) for tag in device.tags)
                     self._reply(query, self._keys.block(device.name), block, stamp)
             return
-        for tag in self._index.tags_at(parsed.target):
-            if self._ended:
-                return
-            if parsed.family is Family.LAST and tag.device in self._only_blocks:
-                continue  # a subscriber would wait for this key, which is never put
-            if parsed.family is Family.META:
-                self._reply(query, self._keys.meta(tag.key), payload.meta(tag), self._stamp())
-            else:
-                self._value(query, tag)
+        tags: Sequence[Tag] = self._index.tags_at(parsed.target)
+        if len(tags) == 1 and not pages.is_paged(query):
+            self._current(parsed.family, query, tags[0])
+            return
+        try:
+            page = pages.page(query, self._keys.gateway)
+            if page is not None:
+                tags = pages.rest(tags, page.after)
+            rest = None if page is None else tags[page.size :]
+            with self._turns.turn(Rank.CURRENT) as pause:
+                for tag in tags if page is None else tags[: page.size]:
+                    if self._ended:
+                        raise Busy(_INCOMPLETE)
+                    self._current(parsed.family, query, tag)
+                    pause()
+            if page is not None and tags:
+                sent = tags[: page.size]
+                self._end_page(query, len(sent), sent[-1].key, complete=not rest)
+        except GatewayError as error:
+            self._failed(error, query)
+
+    def _current(self, family: Family, query: zenoh.Query, tag: Tag) -> None:
+        if family is Family.META:
+            self._reply(query, self._keys.meta(tag.key), payload.meta(tag), self._stamp())
+        elif family is not Family.LAST or tag.device not in self._only_blocks:
+            # An AdvancedSubscriber would keep a value whose key is never put.
+            self._value(query, tag)
 
     def _value(self, query: zenoh.Query, tag: Tag) -> None:
         # Stamped before the look-up: a newer value that is put meanwhile has the newer stamp.
@@ -85,18 +111,83 @@ class Replies:
                 self.outcome(_NO_HISTORY, query)
             return
         try:
+            page = pages.page(query, self._keys.gateway)
             limit = _limit(query.parameters.get("limit"))
             time_range = query.parameters.get("_time") or ""
-            for tag in tags:
-                key = self._keys.value(tag.key)
-                for sample in self._history.samples(tag, time_range, limit, now):
-                    if self._ended:
-                        raise Busy(_INCOMPLETE)
-                    encoding.reply(query, key, sample, self._stamp())
-        except BadValue as error:
-            self.outcome(Failure(Problem.BAD_QUERY, str(error)), query)
+            with self._turns.turn(Rank.HISTORY) as pause:
+                if page is None and (limit is not None or len(tags) == 1):
+                    by_tag = (self._history.samples(tag, time_range, limit, now) for tag in tags)
+                    self._samples(query, chain.from_iterable(by_tag), pause)
+                elif tags:
+                    wanted = {tag.key: tag for tag in tags}
+                    size, after = page or (None, None)
+                    place = pages.recorded_place(after)
+                    found = self._history.as_recorded(wanted, time_range, place, size, now, pause)
+                    self._as_recorded(query, found, page, pause)
         except GatewayError as error:
-            self.outcome(payload.failure(error), query)
+            self._failed(error, query)
+
+    def _samples(self, query: zenoh.Query, found: Iterable[Sample], pause: Pause) -> None:
+        until = self._clock() + ANSWER_WITHIN
+        for sample in found:
+            self._recorded(query, sample)
+            self._go_on(until)
+            pause()
+
+    def _as_recorded(
+        self,
+        query: zenoh.Query,
+        found: Iterable[tuple[Sample | Damaged | bool, Place | None]],
+        page: pages.Page | None,
+        pause: Pause,
+    ) -> None:
+        until = self._clock() + (ANSWER_WITHIN if page is None else PAGE_WITHIN)
+        last: Place = ("", 0, 0)
+        count, lost, complete = 0, None, False
+        for sample, place in found:
+            if isinstance(sample, Damaged):
+                lost = sample
+            elif isinstance(sample, bool):
+                complete = sample
+            else:
+                self._recorded(query, sample)
+                count += 1
+            last = place or last
+            if page is None or self._ended:
+                self._go_on(until)
+            elif place is not None and (count >= page.size or self._clock() > until):
+                break
+            pause()
+        if page is not None:
+            self._end_page(query, count, last, complete=complete, lost=lost)
+        elif lost is not None:
+            raise lost
+
+    def _recorded(self, query: zenoh.Query, sample: Sample) -> None:
+        encoding.reply(query, self._keys.value(sample.tag.key), sample, self._stamp())
+
+    def _go_on(self, until: float) -> None:
+        if self._ended:
+            raise Busy(_INCOMPLETE)
+        if self._clock() > until:
+            raise Busy(_TOO_LONG)
+
+    def _end_page(
+        self,
+        query: zenoh.Query,
+        count: int,
+        place: str | Place,
+        *,
+        complete: bool,
+        lost: Damaged | None = None,
+    ) -> None:
+        end = pages.end(self._keys.gateway, count, place, complete=complete, lost=lost)
+        self._reply(query, self._keys.page, end, self._stamp())
+
+    def _failed(self, error: GatewayError, query: zenoh.Query) -> None:
+        is_query = isinstance(error, BadValue)
+        bad = Failure(Problem.BAD_QUERY, str(error))
+        self.outcome(bad if is_query else payload.failure(error), query)
 
     def writes(self, now: int, query: zenoh.Query) -> None:
         """Replies with recorded outcomes, on the key of their publication. `now` as in
@@ -113,10 +204,8 @@ class Replies:
                 if self._ended:
                     raise Busy(_INCOMPLETE)
                 self._reply(query, self._keys.writes, outcome.encode(), self._stamp())
-        except BadValue as error:
-            self.outcome(Failure(Problem.BAD_QUERY, str(error)), query)
         except GatewayError as error:
-            self.outcome(payload.failure(error), query)
+            self._failed(error, query)
 
     def status(self, documents: dict[str, bytes], query: zenoh.Query) -> None:
         for key, document in documents.items():

@@ -35,8 +35,17 @@ _DEFAULTS: dict[str, object] = {
     "transport/link/tx/lease": 3000,  # ms until the tokens of a frozen gateway end
     # µs. The default of 1 ms silently loses a part of every burst.
     "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 50_000,
-    # µs that a frozen client may hold an answering thread before its link is closed.
-    "transport/link/tx/queue/congestion_control/block/wait_before_close": 1_000_000,
+    # µs without progress that a client may hold an answering thread before its link is closed: the
+    # client closes it too after the lease.
+    "transport/link/tx/queue/congestion_control/block/wait_before_close": 3_000_000,
+    # A link ends when nothing arrives for the lease, and only a whole batch counts as arrived.
+    # Zenoh's default of 64 kB takes 8 s at 64 kbit/s; this takes 1 s.
+    "transport/link/tx/batch_size": 8192,
+    # Puts and declarations come in bursts. A write that was done shall not wait behind much of a
+    # long answer.
+    "transport/link/tx/queue/size/control": 16,
+    "transport/link/tx/queue/size/data": 4,
+    "transport/link/tx/queue/size/data_low": 16,
 }
 # A router forwards the messages of others; any other gateway receives only writes, which are short.
 _LONGEST_MESSAGE = {"transport/link/rx/max_message_size": 256 * 1024}

@@ -6,16 +6,18 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
 from gateway.config import ZenohConfig, ZenohMode
 from gateway.engine.requests import CommandResult
+from gateway.errors import Damaged
 from gateway.history import Historian
 from gateway.northbound import Northbound, payload
-from gateway.northbound.interfaces import History
+from gateway.northbound.answers import HISTORY_LIMIT
+from gateway.northbound.interfaces import History, Place
 from gateway.northbound.payload import Failure, Problem, WriteOutcome
 from gateway.tags import Reason, Sample, Tag, WriteResult, bad, good
 from tests.e2e.processes import Program
@@ -116,6 +118,17 @@ class SlowHistory:
     def samples(self, tag: Tag, time_range: str, limit: int | None, now: int) -> Iterator[Sample]:
         return self._answer(time_range, now, [good(tag, 1, PAST)])
 
+    def as_recorded(
+        self,
+        tags: Mapping[str, Tag],
+        time_range: str,
+        after: Place | None,
+        page: int | None,
+        now: int,
+        pause: Callable[[], None],
+    ) -> Iterator[tuple[Sample | Damaged | bool, Place | None]]:
+        return self._answer(time_range, now, [(True, ("0", 0, 0))])
+
     def writes(self, time_range: str, limit: int | None, now: int) -> Iterator[str]:
         return self._answer(time_range, now, ["{}"])
 
@@ -143,10 +156,31 @@ async def test_now_is_the_time_at_which_the_query_arrived_for_all_its_tags() -> 
         taken = time.time_ns()
         slow.go.set()
         await answers
-    assert sorted(len(nows) for nows in slow.asked.values()) == [1, *(3 for _ in values)]
+    assert [len(nows) for nows in slow.asked.values()] == [1] * len(selectors)
     for nows in slow.asked.values():
         assert begun <= nows[0] <= taken
         assert set(nows) == {nows[0]}
+
+
+async def test_current_values_are_answered_while_all_threads_of_history_wait() -> None:
+    endpoint, slow = free_endpoint(), SlowHistory()
+    async with (
+        serving(plant(), slow, endpoint, listen=True) as northbound,
+        ZenohPeer("client", connect=[endpoint]) as historian,
+        ZenohPeer("client", connect=[endpoint]) as client,
+    ):
+        count = HISTORY_LIMIT + 2
+        queries = northbound.counters()["queries"] + count
+        answers = asyncio.create_task(
+            historian.many([(f"plant/**?_time=[now(-{n}s)..]", None) for n in range(count)])
+        )
+        while northbound.counters()["queries"] < queries and not answers.done():
+            await asyncio.sleep(0.01)
+        assert len(await client.get("plant/**")) == 3
+        assert len(await client.get("plant/mixer/speed")) == 1
+        slow.go.set()
+        ends = [[reply.json["error"] for reply in replies] for replies in await answers]
+    assert sorted(ends) == [[]] * HISTORY_LIMIT + [["busy"]] * 2
 
 
 async def test_the_queries_that_the_page_shows_are_answered(tmp_path: Path) -> None:

@@ -13,7 +13,8 @@ import pytest
 from gateway.errors import BadValue, Busy
 from gateway.history import Historian
 from gateway.history.reader import Reader
-from gateway.tags import Reason, Sample, bad, good
+from gateway.history.sections import FullRow
+from gateway.tags import Reason, bad, good
 from gateway.values import Value
 from tests.history.recorded import (
     DOOR,
@@ -189,19 +190,20 @@ def test_an_answer_whose_next_samples_are_dropped_ends_with_an_error(tmp_path: P
 def test_an_answer_begins_with_the_oldest_sample_that_is_left(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    at_once = Reader.samples
+    at_once = Reader.rows
 
-    def late(reader: Reader, *arguments: Any) -> list[Sample] | None:
+    def late(reader: Reader, *arguments: Any) -> list[FullRow] | None:
         monkeypatch.undo()
         first = historian.document()["oldest"]
         for start in range(20_000, 60_000, 1000):
             if historian.document()["oldest"] == first:
                 flooded(historian, start, start + 1000)
-        return at_once(reader, *arguments)
+        rows: list[FullRow] | None = at_once(reader, *arguments)
+        return rows
 
     with history(tmp_path / "h.db", max_size=SMALL) as historian:
         flooded(historian, 0, 20_000)
-        monkeypatch.setattr(Reader, "samples", late)
+        monkeypatch.setattr(Reader, "rows", late)
         found = values(historian)
         assert isinstance(found[0], int)
         assert found[0] > 0

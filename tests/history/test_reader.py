@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.errors import Busy
+from gateway.errors import Busy, Damaged
 from gateway.history import Historian, TimeRange
 from gateway.history.file import HistoryFile
 from gateway.history.outcomes import Outcome, Ring
@@ -58,10 +58,10 @@ def test_a_run_with_the_number_of_a_dropped_run_is_another_run(tmp_path: Path) -
         after = file.sort(1, NOON + SECOND)
         assert before is not None
         assert after is not None
-        everything = TimeRange(EARLIEST, LATEST)
         reader = Reader(path)
-        assert reader.samples(file.identity, SPEED, before, everything, None) is None
-        assert reader.samples(file.identity, SPEED, after, everything, None)
+        listed = reader.sections(file.identity, after)
+        assert reader.rows(file.identity, before, listed) is None
+        assert reader.rows(file.identity, after, listed)
 
 
 def test_writes_that_are_dropped_during_an_answer_end_it_with_an_error(tmp_path: Path) -> None:
@@ -111,19 +111,20 @@ def test_a_file_that_has_just_been_replaced_answers_no_query(
         run = file.sort(1, NOON)
         assert run is not None
         reader = Reader(path)
-        assert len(reader.samples(file.identity, SPEED, run, everything, None) or []) == 10
+        listed = reader.sections(file.identity, run)
+        assert len(reader.rows(file.identity, run, listed) or []) == 10
         another = Identity(file.identity.inode, b"another")
         with pytest.raises(Busy, match="another file"):
-            reader.samples(another, SPEED, run, everything, None)
+            reader.rows(another, run, listed)
         with pytest.raises(Busy, match="another file"):
             next(reader.writes(Ring.WRITTEN, another, 1, everything))
         shutil.copy(path, tmp_path / "copy.db")
         (tmp_path / "copy.db").replace(path)
         with pytest.raises(Busy, match="another file"):
-            reader.samples(file.identity, SPEED, run, everything, None)
+            reader.rows(file.identity, run, listed)
 
 
-def test_a_page_that_cannot_be_read_is_an_error_not_an_empty_answer(tmp_path: Path) -> None:
+def test_pages_that_cannot_be_read_are_an_error_not_an_empty_answer(tmp_path: Path) -> None:
     path = tmp_path / "h.db"
     with history(path, max_size=5_000_000) as historian:
         historian.record(numbered(30_000))
@@ -137,6 +138,7 @@ def test_a_page_that_cannot_be_read_is_an_error_not_an_empty_answer(tmp_path: Pa
     historian = Historian(path, WEEK, 5_000_000)
     historian.start()
     until(historian, state="ok")
-    with pytest.raises(Busy, match="cannot be read"):
+    with pytest.raises(Damaged, match="are lost"):
         values(historian)
+    assert "damaged" in str(historian.document()["state"])
     assert historian.close()

@@ -1,10 +1,12 @@
 """The limits of the file: size, age, and the runs in memory."""
 
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
+from gateway.errors import Busy
 from gateway.history import Historian, time_range
 from gateway.history.outcomes import MOST_WAITING
 from gateway.history.recent import MOST_RUNS
@@ -74,7 +76,11 @@ def test_a_smaller_limit_shrinks_the_file(tmp_path: Path) -> None:
             if int(str(historian.document()["bytes"])) <= 2_000_000:
                 break
             time.sleep(0.01)
-        assert values(historian)[-1] == 199_999
+        last = None
+        while last is None:
+            with suppress(Busy):  # runs are still dropped
+                last = values(historian)[-1]
+        assert last == 199_999
     assert path.stat().st_size <= 2_000_000
 
 

@@ -26,7 +26,7 @@ any_value = st.one_of(
 def test_a_value_comes_back_from_sqlite_unchanged(value: Value, time: int) -> None:
     with closing(sqlite3.connect(":memory:")) as database:
         row = database.execute("SELECT ?, ?, ?, ?", to_row(good(SPEED, value, time))).fetchone()
-    sample = from_row(SPEED, row)
+    sample = from_row(SPEED, *row)
     assert type(sample.value) is type(value)
     assert repr(sample.value) == repr(value)
     assert sample._replace(value=None) == Sample(SPEED, None, Quality.GOOD, time)
@@ -35,4 +35,4 @@ def test_a_value_comes_back_from_sqlite_unchanged(value: Value, time: int) -> No
 @pytest.mark.parametrize("reason", [*Reason, None])
 def test_bad_samples_keep_their_reason(reason: Reason | None) -> None:
     sample = Sample(SPEED, None, Quality.BAD, NOON, reason)
-    assert from_row(SPEED, to_row(sample)) == sample
+    assert from_row(SPEED, *to_row(sample)) == sample

@@ -5,15 +5,16 @@ import re
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from gateway.config import ZenohConfig
-from gateway.errors import ConfigError
+from gateway.errors import ConfigError, Damaged
 from gateway.northbound import Northbound
+from gateway.northbound.interfaces import Place
 from gateway.northbound.signatures import sign
 from gateway.northbound.writers import EARLIEST, LATEST, NotAllowed, Repeated, Writers
 from gateway.tags import Sample, Tag
@@ -34,6 +35,17 @@ class RecordedWrites:
         self.recorded: list[Any] = []
 
     def samples(self, tag: Tag, time_range: str, limit: int | None, now: int) -> Iterator[Sample]:
+        raise NotImplementedError
+
+    def as_recorded(
+        self,
+        tags: Mapping[str, Tag],
+        time_range: str,
+        after: Place | None,
+        page: int | None,
+        now: int,
+        pause: Callable[[], None],
+    ) -> Iterator[tuple[Sample | Damaged | bool, Place | None]]:
         raise NotImplementedError
 
     def writes(self, time_range: str, limit: int | None, now: int) -> Iterator[str]:

@@ -1,0 +1,60 @@
+"""The files that the gateway writes are no other file of it: it would move that file aside."""
+
+from collections.abc import Iterator
+from os.path import realpath
+from pathlib import Path as FilePath
+
+from gateway.config.messages import Mistakes, Path
+from gateway.config.records import Config
+
+_HISTORY = ("", "-wal", "-shm", "-journal", ".lock")  # SQLite's files, and the lock
+_STATE = ("", ".new", ".bad")
+
+
+def check_files(config: Config, own: FilePath, mistakes: Mistakes) -> None:
+    """`own`: the configuration file."""
+    for path, file, tails in _written(config):
+        others = [*_read(config, own)]
+        if path == ("gateway", "state") and config.history is not None:
+            others += [
+                ("a file of the history", FilePath(f"{config.history.path}{tail}"))
+                for tail in _HISTORY[1:]
+            ]
+        for what, other in others:
+            if any(_same(FilePath(f"{file}{tail}"), other) for tail in tails):
+                mistakes.add(
+                    path, f"{file.name} is {what}: name another file, such as {_MEANT[path]}"
+                )
+
+
+_MEANT: dict[Path, str] = {("history", "path"): "history.db", ("gateway", "state"): "state.json"}
+
+
+def _written(config: Config) -> Iterator[tuple[Path, FilePath, tuple[str, ...]]]:
+    if config.history is not None:
+        yield ("history", "path"), config.history.path, _HISTORY
+    if config.state_file is not None:
+        yield ("gateway", "state"), config.state_file, _STATE
+
+
+def _read(config: Config, own: FilePath) -> Iterator[tuple[str, FilePath]]:
+    zenoh, tls = config.zenoh, config.zenoh.tls
+    files = {
+        "the configuration file": own,
+        "zenoh.config_file": zenoh.config_file,
+        "zenoh.password_file": zenoh.password_file,
+        "zenoh.users_file": zenoh.users_file,
+        "writers.file": config.writers_file,
+        "gateway.standby_secret_file": config.standby_secret_file,
+    }
+    if tls is not None:
+        files |= {"zenoh.tls.ca": tls.ca, "zenoh.tls.key": tls.key}
+        files |= {"zenoh.tls.certificate": tls.certificate}
+    yield from ((what, file) for what, file in files.items() if file is not None)
+
+
+def _same(file: FilePath, other: FilePath) -> bool:
+    """True for one file with two names too."""
+    if realpath(file) == realpath(other):
+        return True
+    return file.exists() and other.exists() and file.samefile(other)

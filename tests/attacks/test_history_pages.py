@@ -1,0 +1,130 @@
+"""History in pages: whole, each sample once, over any link, and while others ask for it all."""
+
+import asyncio
+import json
+import sqlite3
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, closing
+from pathlib import Path
+from typing import Any
+
+from gateway.history.file import HistoryFile
+from gateway.history.sections import SECTION
+from gateway.tags import good
+from tests.e2e.paced_link import paced_link
+from tests.e2e.processes import Program, started, write_config
+from tests.history.recorded import NOON, SECOND
+from tests.history_writer import tag
+from tests.zenoh_peer import Reply, ZenohPeer, free_endpoint
+
+TAGS = [tag(f"t{n}") for n in range(20)]
+RUNS, IN_RUN = 5, 400
+EVERYTHING = {f"{TAGS[n % 20].key} {n}" for n in range(RUNS * IN_RUN)}
+
+
+def recorded(path: Path) -> None:
+    """Five sorted runs."""
+    with closing(HistoryFile(path, 10**8)) as file:
+        for run in range(1, RUNS + 1):
+            numbers = range((run - 1) * IN_RUN, run * IN_RUN)
+            file.store(run, 0, [good(TAGS[n % 20], n, NOON + n * SECOND) for n in numbers])
+            file.sort(run, NOON + run)
+
+
+def config(folder: Path, endpoint: str) -> Path:
+    tags = {tag.name: {"address": f"D{n}", "history": True} for n, tag in enumerate(TAGS)}
+    device = {"protocol": "vigor", "station": 1, "enabled": False, "tags": tags}
+    return write_config(
+        folder / "c.yaml",
+        endpoint,
+        {"hall": {"port": "simulator", "devices": {"mixer": device}}},
+        history={"path": "h.db", "keep": "3650d"},
+    )
+
+
+@asynccontextmanager
+async def serving(folder: Path, endpoint: str) -> AsyncIterator[Program]:
+    with await asyncio.to_thread(started, config(folder, endpoint)) as program:
+        await asyncio.to_thread(program.says, "history ready")
+        yield program
+
+
+def shown(replies: list[Reply]) -> list[str]:
+    """Returns the good samples: the start of the gateway is in history too."""
+    return [
+        f"{reply.key.removeprefix('plant/')} {reply.json['value']}"
+        for reply in replies
+        if reply.key and reply.json.get("quality") == "good"
+    ]
+
+
+async def page(client: ZenohPeer, selector: str) -> tuple[list[str], dict[str, Any]]:
+    """Returns the good samples of a page and its end."""
+    replies = await client.get(selector, accept_replies="ANY")
+    [end] = [reply for reply in replies if reply.key == "plant/@gateway/demo/page"]
+    replies.remove(end)
+    assert end.json["samples"] == len(replies)
+    return shown(replies), end.json
+
+
+async def pages(client: ZenohPeer, selector: str, end: dict[str, Any] | None = None) -> list[str]:
+    """Reads to the end; notes it in `end`."""
+    found, after = list[str](), ""
+    while True:
+        samples, last = await page(client, selector + after)
+        found += samples
+        after = f";after={last['next']}"
+        if last["complete"]:
+            if end is not None:
+                end.update(last)
+            return found
+
+
+async def test_pages_have_each_sample_once_over_a_slow_link_too(tmp_path: Path) -> None:
+    endpoint = free_endpoint()
+    recorded(tmp_path / "h.db")
+    async with (
+        serving(tmp_path, endpoint),
+        paced_link(endpoint, rate=1_000_000, delay=0.1) as link,
+        ZenohPeer("client", connect=[endpoint]) as near,
+        ZenohPeer("client", connect=[link.endpoint]) as far,
+    ):
+        for client, size in ((near, 70), (near, 100_000), (far, 700)):
+            end: dict[str, Any] = {}
+            found = await pages(client, f"plant/**?_time=[..];page={size}", end)
+            assert len(found) == len(EVERYTHING)
+            assert set(found) == EVERYTHING
+        rest = await page(near, f"plant/**?_time=[..];page=9;after={end['next']}")
+        assert rest == ([], {**end, "samples": 0})
+        one = await pages(near, "plant/mixer/t3?_time=[2026-11-21T12:10:00Z..];page=11")
+        assert one == [f"mixer/t3 {n}" for n in range(603, RUNS * IN_RUN, 20)]
+        assert set(shown(await near.get("plant/**?_time=[..]"))) == EVERYTHING
+        current = await pages(near, "plant/**?page=7")
+        assert current == []  # no value is good
+        for wrong in ("page=0", "page=9;after=demo:x", "page=many"):
+            [reply] = await near.get(f"plant/**?_time=[..];{wrong}", accept_replies="ANY")
+            assert reply.json["error"] == "bad-query"
+        [reply] = await near.get("plant/**?_time=[..];page=9")
+        assert "accept_replies" in reply.json["reason"]
+
+
+async def test_damage_is_told_and_the_rest_is_answered(tmp_path: Path) -> None:
+    endpoint, path = free_endpoint(), tmp_path / "h.db"
+    recorded(path)
+    with closing(sqlite3.connect(path)) as database, database:  # as a flipped bit would do it
+        database.execute("UPDATE sample SET value = 1235 WHERE value = 1234")
+    async with (
+        serving(tmp_path, endpoint) as program,
+        ZenohPeer("client", connect=[endpoint]) as client,
+    ):
+        *samples, error = await client.get("plant/**?_time=[..]")
+        assert not error.ok
+        assert error.json["error"] == "damaged"
+        found = set(shown(samples))
+        assert found < EVERYTHING
+        assert len(found) >= len(EVERYTHING) - SECTION
+        end: dict[str, Any] = {}
+        assert set(await pages(client, "plant/**?_time=[..];page=150", end)) == found
+        await asyncio.to_thread(program.says, "history damaged")
+        [status] = await client.get("plant/@gateway/demo/history")
+        assert "damaged" in json.loads(status.payload)["state"]

@@ -1,0 +1,160 @@
+"""Flipped bits in the file: no wrong value, and no hole that nobody is told of."""
+
+import random
+import sqlite3
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from gateway.errors import Busy, Damaged
+from gateway.history import TimeRange
+from gateway.history.file import HistoryFile
+from gateway.history.reader import Reader
+from gateway.history.recent import Recent
+from gateway.history.schema import ForeignFile
+from gateway.history.search import Search
+from gateway.history.timerange import EARLIEST, LATEST
+from gateway.tags import Sample, Tag, good
+from gateway.values import Value
+from tests.history.recorded import NOON, SECOND, history, numbered, values
+from tests.history_writer import tag
+
+ALWAYS = TimeRange(EARLIEST, LATEST)
+TAGS = [tag(f"t{n}") for n in range(7)]
+BY_KEY = {tag.key: tag for tag in TAGS}
+FLIPS = 60
+CONTENT: list[Value] = [1, 2.5, "text", True, 2**63, -7]
+
+Answer = tuple[set[tuple[str, int, Value | None]], bool]  # samples, and whether damage was told
+
+
+def recorded(path: Path) -> set[tuple[str, int, Value | None]]:
+    samples = [good(TAGS[n % 7], CONTENT[n % 6], NOON + n * SECOND) for n in range(1200)]
+    with closing(HistoryFile(path, 10**8)) as file:
+        for run in (1, 2, 3):
+            file.store(run, 0, samples[(run - 1) * 400 : run * 400])
+            file.sort(run, NOON + run)
+        file.empty_log()
+    return set(map(_shown, samples))
+
+
+def _shown(sample: Sample) -> tuple[str, int, Value | None]:
+    return sample.tag.key, sample.time, sample.value
+
+
+def answers(path: Path) -> Iterator[Answer]:
+    """Opens the file as a gateway does. Yields the answers to a query for all tags and for each."""
+    with closing(HistoryFile(path, 10**8)) as file:
+        recent = Recent(1000, 600)
+        recent.opened(file.identity, file.sorted_runs(), {})
+        reader = Reader(path)
+        search = Search(recent, reader)
+        try:
+            yield _all(search)
+            yield _one_by_one(search)
+        finally:
+            reader.renew()
+
+
+def _all(search: Search) -> Answer:
+    found, told = set[tuple[str, int, Value | None]](), False
+    for sample, _ in search.as_recorded(BY_KEY, ALWAYS, None, None, lambda: None):
+        if isinstance(sample, Damaged):
+            told = True
+        elif not isinstance(sample, bool):
+            found.add(_shown(sample))
+    return found, told
+
+
+def _one_by_one(search: Search) -> Answer:
+    found, told = set[tuple[str, int, Value | None]](), False
+
+    def one(tag: Tag) -> Iterator[Sample]:
+        nonlocal told
+        try:
+            yield from search.by_time(tag, ALWAYS)
+        except Damaged:
+            told = True
+
+    for each in TAGS:
+        found.update(map(_shown, one(each)))
+    return found, told
+
+
+def test_a_flipped_bit_is_told_or_harmless(tmp_path: Path) -> None:
+    path, chance = tmp_path / "h.db", random.Random(11)
+    expected = recorded(path)
+    whole = path.read_bytes()
+    assert list(answers(path)) == [(expected, False)] * 2
+    told_of = 0
+    for _ in range(FLIPS):
+        place, bit = chance.randrange(len(whole)), 1 << chance.randrange(8)
+        path.write_bytes(whole[:place] + bytes([whole[place] ^ bit]) + whole[place + 1 :])
+        for tail in ("-wal", "-shm"):
+            Path(f"{path}{tail}").unlink(missing_ok=True)
+        try:
+            for found, told in answers(path):
+                assert found <= expected, place
+                assert told or found == expected, place
+                told_of += told
+        except (sqlite3.Error, UnicodeDecodeError, ForeignFile, Busy, Damaged):
+            continue  # the file is moved aside, or the answer is an error
+    assert told_of > FLIPS / 4
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        "UPDATE run SET last = first WHERE run = 2",
+        "DELETE FROM run WHERE run = 2",
+        "DELETE FROM section WHERE run = 2 AND number = 1",
+        "DELETE FROM sample WHERE run = 2 AND n = 7",
+        "UPDATE tag SET key = 'mixer/other' WHERE id = 3",
+        "DELETE FROM tag WHERE id = 7",
+    ],
+)
+def test_a_lost_or_changed_row_of_any_table_is_told(tmp_path: Path, damage: str) -> None:
+    path = tmp_path / "h.db"
+    expected = recorded(path)
+    with closing(sqlite3.connect(path)) as database, database:
+        database.execute(damage)
+    for found, told in answers(path):
+        assert told
+        assert found < expected
+
+
+def test_a_page_that_cannot_be_read_costs_only_its_samples(tmp_path: Path) -> None:
+    path = tmp_path / "h.db"
+    with history(path, max_size=5_000_000) as historian:
+        historian.record(numbered(30_000))
+    with history(path, max_size=5_000_000):
+        pass  # all runs are sorted now
+    with closing(sqlite3.connect(path)) as database:
+        database.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+        [(page,)] = database.execute(
+            "SELECT pageno FROM dbstat WHERE name = 'sample' AND pagetype = 'leaf'"
+            " ORDER BY path LIMIT 1 OFFSET 50"
+        )
+    with path.open("r+b") as file:
+        file.seek((page - 1) * 4096)
+        file.write(b"\xa5" * 4096)
+    with history(path, max_size=5_000_000) as historian:
+        found = list[Value | None]()
+        with pytest.raises(Damaged, match="are lost"):
+            found.extend(s.value for s in historian.samples(numbered(1)[0].tag, "[..]", None))
+        assert found == sorted(set(range(30_000)) & set(found))
+        assert 29_000 < len(found) < 30_000
+        assert "damaged" in str(historian.document()["state"])
+
+
+def test_a_run_of_an_older_gateway_is_read_without_a_check(tmp_path: Path) -> None:
+    path = tmp_path / "h.db"
+    with closing(HistoryFile(path, 10**8)) as file:
+        file.store(1, 0, numbered(500))
+        file.sort(1, NOON)
+    with closing(sqlite3.connect(path)) as database, database:
+        database.execute("DROP TABLE section")
+    with history(path) as historian:
+        assert values(historian) == list(range(500))
