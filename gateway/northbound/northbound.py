@@ -2,7 +2,6 @@
 
 import asyncio
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
@@ -19,11 +18,13 @@ from gateway.northbound.incoming import Declarations, Incoming
 from gateway.northbound.interfaces import History, Plant
 from gateway.northbound.keys import Keys
 from gateway.northbound.link_monitor import LinkMonitor
+from gateway.northbound.losses import Losses
 from gateway.northbound.publisher import Publisher, ScanBatches
 from gateway.northbound.republish import Republisher
 from gateway.northbound.session import (
     CLOSE_WITHIN,
     configure,
+    drop_limit,
     off_loop,
     open_session,
 )
@@ -78,11 +79,15 @@ class Northbound:
             self.exclusive.set()  # it takes no endpoint, and may wait for its router for ever
         self._plant = plant
         self._links = LinkMonitor()
-        self._index = TagIndex(self.keys, plant.devices())
-        devices = [device.name for device in self._index.devices]
+        index = TagIndex(self.keys, plant.devices())
+        devices = [device.name for device in index.devices]
         self._admission = Admission(standby, self.keys, self._config, devices)
-        self._publisher = Publisher(self.keys)
-        self._batches = ScanBatches(self._publisher, self._index.devices)
+        losses = Losses(drop_limit(self._config))
+        self._publisher = Publisher(self.keys, losses)
+        self._batches = ScanBatches(self._publisher, index.devices)
+        self._republisher = Republisher(
+            self._batches.publish, plant, index, self._links, losses, settings.refresh
+        )
         audit = Audit(
             partial(self._publisher.document, self.keys.writes),
             None if history is None else history.record_write,
@@ -93,7 +98,7 @@ class Northbound:
         self._incoming = Incoming(
             self.keys,
             plant,
-            self._index,
+            index,
             audit,
             self._status.documents,
             history,
@@ -117,7 +122,7 @@ class Northbound:
 
     def counters(self) -> dict[str, int]:
         """Messages out, in and dropped since the start."""
-        outgoing = asdict(self._publisher.counters) | {"links": len(self._links)}
+        outgoing = self._publisher.counts() | {"links": len(self._links)}
         return outgoing | self._incoming.counters()
 
     @property
@@ -176,12 +181,11 @@ class Northbound:
             tasks.create_task(self._status.run())
             await self._admission.active.wait()
             self._declared += await off_loop(self._declare_plant, declarations)
-            republisher = Republisher(self._batches.publish, self._plant, self._index, self._links)
-            await republisher.publish_all()
+            await self._republisher.publish_all()
             self._status.publish()
             self.opened.set()
             log.info("Zenoh session ready", prefix=self.keys.prefix, id=str(session.zid()))
-            tasks.create_task(republisher.run())
+            tasks.create_task(self._republisher.run())
 
     def _declare_first(
         self,
