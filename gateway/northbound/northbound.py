@@ -31,6 +31,7 @@ from gateway.northbound.session import (
 from gateway.northbound.standby import StandbySettings
 from gateway.northbound.status_publisher import StatusPublisher
 from gateway.northbound.tag_index import TagIndex
+from gateway.northbound.watchdog import Watchdog
 from gateway.northbound.writers import Writers
 from gateway.tags import Sample
 
@@ -48,8 +49,9 @@ class Northbound:
     * `exclusive`: no other process runs this gateway; files and lines may be opened.
     * `active`: this gateway may open its lines.
     * `opened`: everything is declared, and all current values are queued.
-    * `replaced`: another gateway is active, or serves one of the devices. Close the lines, end
-      this, and start another `Northbound` that does `withhold` the devices `withheld` here.
+    * `replaced`: another gateway is active, or serves one of the devices, or the event loop stood
+      still. Close the lines, end this, and start another `Northbound` that does `withhold` the
+      devices `withheld` here.
 
     Raises `ConfigError` for a bad prefix, name, endpoint, Zenoh file or writers file, and for a
     secret that every user of this machine could read.
@@ -161,7 +163,7 @@ class Northbound:
             alone.cancel()
         self.exclusive.set()
         try:
-            await self._serve(session)
+            await self._serve_watched(session)
         finally:
             closing = asyncio.ensure_future(self._close(session))
             try:
@@ -169,6 +171,17 @@ class Northbound:
             except asyncio.CancelledError:
                 await asyncio.wait([closing])  # a second cancellation must not leave it half closed
                 raise
+
+    async def _serve_watched(self, session: zenoh.Session) -> None:
+        replaced = self.replaced.set
+        watchdog = Watchdog(lambda: [session, *self._admission.sessions()], replaced)
+        with watchdog.watching():
+            try:
+                await self._serve(session)
+            except* (GatewayError, zenoh.ZError):
+                if not watchdog.has_fired:
+                    raise
+                replaced()
 
     async def _serve(self, session: zenoh.Session) -> None:
         self._publisher.start(session)

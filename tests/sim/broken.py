@@ -873,4 +873,18 @@ MUTANTS = (
         "_SETTLE_TIME",
         "tests/northbound/test_republish.py",
     ),
+    Mutant(
+        "a loop that stands still keeps its tokens",
+        "northbound/watchdog.py",
+        "            if missed * _TICK > LIMIT:\n",
+        "            if False:\n",
+        "tests/northbound/test_watchdog.py",
+    ),
+    Mutant(
+        "a gateway whose session the watchdog closed goes on",
+        "northbound/watchdog.py",
+        "        self._on_return()\n",
+        "        pass\n",
+        "tests/northbound/test_watchdog.py",
+    ),
 )
