@@ -41,6 +41,7 @@ class Poll:
     soon: float = math.inf  # an earlier deadline, because its values are bad
     asked: float = 0.0  # when it was handed out last
     expedited: bool = False  # before its time, because a client waits
+    on_demand: bool = False  # expedited for a read of a client, not after a write or a fault
     phased: bool = True  # it has found its place in the period
     live: bool = True  # False after the device was planned again
     ticket: int = NOT_QUEUED  # its one valid place in the queues

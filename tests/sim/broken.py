@@ -887,4 +887,18 @@ MUTANTS = (
         "        pass\n",
         "tests/northbound/test_watchdog.py",
     ),
+    Mutant(
+        "questions of clients take half of the wire",
+        "engine/schedule.py",
+        "            self._on_demand_lane = lane + took / ON_DEMAND_SHARE\n",
+        "            self._on_demand_lane = lane\n",
+        "tests/engine/test_schedule.py",
+    ),
+    Mutant(
+        "a poll that clients ask for waits with their questions",
+        "engine/schedule.py",
+        "            self._queue.return_due(now)\n",
+        "            pass\n",
+        "tests/engine/test_schedule.py",
+    ),
 )
