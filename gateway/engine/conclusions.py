@@ -22,6 +22,7 @@ from gateway.engine.jobs import (
     span_of,
 )
 from gateway.engine.line_silence import LineSilence
+from gateway.engine.poll_results import PollResults
 from gateway.engine.request_results import RequestResults
 from gateway.engine.requests import Command, Write
 from gateway.engine.results import Results
@@ -40,6 +41,7 @@ class Conclusions:
         self,
         in_flight: InFlight,
         results: Results,
+        polls: PollResults,
         requests: RequestResults,
         effects: Effects,
         gap: float,
@@ -49,6 +51,7 @@ class Conclusions:
         self.together = Together(effects)
         self._in_flight = in_flight
         self._results = results
+        self._polls = polls
         self._requests = requests
         self._effects = effects
         self._gap = gap
@@ -61,10 +64,10 @@ class Conclusions:
         match result:
             case Refused():
                 results.answered(device, now, time)
-                results.refused(poll, result, now, time)
+                self._polls.refused(poll, result, now, time)
             case Unsteady():
                 results.answered(device, now, time)
-                results.unsteady(poll, result, now, time)
+                self._polls.unsteady(poll, result, now, time)
             case DeviceError():
                 self._in_flight.failed.append((poll, result))
             case LineDown():
@@ -157,13 +160,13 @@ class Conclusions:
         short = _is_short(after)
         late = result.late if isinstance(result, Settled) and not short else None
         took = now - self._in_flight.begun
-        results, alone = self._results, len(settle.failed) == 1
+        alone = len(settle.failed) == 1
         suspect = alone and isinstance(after, Poll) and device.bad_addresses.is_suspect(after.block)
-        results.settled(
+        self._results.settled(
             *(device, settle.before, took, late, now, time), short=short, suspect=suspect
         )
         for poll, error in settle.failed:
-            results.unread(poll, error, now, time, alone=alone)
+            self._polls.unread(poll, error, now, time, alone=alone)
         if not isinstance(after, Poll | Probe):
             self._in_flight.continuation = self._requests.settled(settle, now)
 

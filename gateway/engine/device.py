@@ -6,8 +6,10 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from gateway.engine.health import Health, State, diagnosis
+from gateway.engine.monitor_list import MonitorList
 from gateway.engine.records import Record
 from gateway.engine.reply_shapes import ReplyShapes, reply_shapes
+from gateway.engine.turnaround import Turnaround
 from gateway.errors import LineDown
 from gateway.planning.bad_addresses import RETRIES, BadAddresses
 from gateway.planning.monitor_lists import with_monitor_list
@@ -16,8 +18,6 @@ from gateway.planning.wire_timing import WireTiming
 from gateway.protocols.driver import AnyDriver, Cost, Monitor, NoReplyCauses, Span, Timing, Windowed
 from gateway.tags import Tag
 
-LEARN_EVERY = 50  # requests between two comparisons with the measured turnaround
-MOST_PATIENCE = 128  # times LEARN_EVERY, between two plans that change nothing
 MOST_PLANNED = 1000  # tags times intervals: planning them takes some tenths of a second
 PLANNING = 2e-4  # seconds for each tag and interval, estimated
 SILENT_SHARE = 0.01  # share of the time for new tries of silent addresses
@@ -46,42 +46,6 @@ class DeviceSettings:
     tags: tuple[Tag, ...] = ()
 
 
-@dataclass(slots=True)
-class Turnaround:
-    """The turnaround of a station that plans and forecasts expect. Seconds."""
-
-    configured: float | None
-    expected: float | None = field(init=False)  # None: the default of the protocol
-    look_at: float = LEARN_EVERY  # number of requests at the next comparison with the measured one
-    plan_from: int = 0  # number of requests from which on it may be planned again
-    _planned: float | None = None  # the one in the last plan; None: the default of the protocol
-    _patience: int = 1
-
-    def __post_init__(self) -> None:
-        self.expected = self.configured
-        if self.configured is not None:
-            self.look_at = math.inf
-
-    def learn(self, record: Record) -> bool:
-        """Expects the measured one from now on. Returns True if the device may be planned again."""
-        if record.turnaround is None:
-            return False
-        self.look_at = record.exchanges + LEARN_EVERY
-        self.expected = record.turnaround
-        return record.exchanges >= self.plan_from
-
-    def change(self, default: float) -> float:
-        """Returns the difference to the one in the last plan. `default`: of the protocol."""
-        planned = default if self._planned is None else self._planned
-        return (default if self.expected is None else self.expected) - planned
-
-    def planned(self, record: Record, *, useful: bool) -> None:
-        """Notes a plan with the expected one. The next waits longer if this one was not useful."""
-        self._planned = self.expected
-        self._patience = 1 if useful else min(2 * self._patience, MOST_PATIENCE)
-        self.plan_from = record.exchanges + LEARN_EVERY * self._patience
-
-
 @dataclass(slots=True, eq=False)
 class Device:
     """The state of one device; it belongs to one line."""
@@ -94,15 +58,11 @@ class Device:
     turnaround: Turnaround = field(init=False)
     blocks: tuple[Block, ...] = ()
     last_read: Span | None = None  # the last block that was read
-    registered: tuple[Span, ...] = ()  # the monitor list that the PLC holds, as far as known
-    broadcast: bool = field(
-        init=False
-    )  # it receives writes or sends unsolicited frames, and never replies
+    monitor: MonitorList = field(default_factory=MonitorList)
     window: int = field(init=False)  # requests that may be outstanding at once
     silence: float = field(init=False)  # seconds before each request
     shapes: ReplyShapes | None = field(init=False)  # None: no reply, or each has a number
     one_at_a_time: bool = False  # it loses requests that are sent together
-    _lists: bool = True  # reads by a monitor list are allowed
     # Its recent use of the wire, to compare with that of other devices: the binary logarithm of
     # the seconds, plus the half-lives until the time of counting. It grows, and never decays.
     use: float = -math.inf
@@ -112,8 +72,7 @@ class Device:
         self.bad_addresses = BadAddresses(driver.cost)
         self.turnaround = Turnaround(self.settings.turnaround)
         used = [driver.areas[tag.span.area] for tag in self.tags] or driver.areas.values()
-        self.broadcast = not any(area.readable for area in used)
-        self.health = Health(answerable=not self.broadcast)
+        self.health = Health(answerable=any(area.readable for area in used))
         self.window = driver.window if isinstance(driver, Windowed) else 1
         self.silence = self.wire.silence(self.timing)
         self.shapes = (
@@ -136,6 +95,11 @@ class Device:
     @property
     def tags(self) -> tuple[Tag, ...]:
         return self.settings.tags
+
+    @property
+    def broadcast(self) -> bool:
+        """True if it receives writes or sends unsolicited frames, and never replies."""
+        return not self.health.answerable
 
     @property
     def state(self) -> State:
@@ -174,7 +138,7 @@ class Device:
     def restart(self, trouble: LineDown | None = None) -> None:
         """Starts again after the line was opened or lost."""
         self.health.restart(trouble)
-        self.forget_list()
+        self.monitor.forget()
 
     # The plan
 
@@ -198,7 +162,7 @@ class Device:
         """Plans the blocks that read the tags, without the bad addresses."""
         bad = self.bad_addresses
         blocks = plan(self.tags, self.driver, self.seconds, bad.cuts)
-        if self._lists:
+        if self.monitor.allowed:
             blocks = with_monitor_list(blocks, self.driver, self.seconds, bad.bad.keys())
         self.blocks = blocks
         bad.changed.clear()
@@ -218,7 +182,7 @@ class Device:
         lines wait meanwhile. `bad_addresses.changed` keeps the rest. Returns the estimated seconds.
         """
         bad = self.bad_addresses
-        if self._lists and self._monitored:  # the list may take tags of any block
+        if self.monitor.allowed and self._monitored:  # the list may take tags of any block
             self.plan()
             return self.planning_seconds(self.tags)
         rates = len({tag.every for tag in self.tags})
@@ -324,20 +288,6 @@ class Device:
         runs = runs_of([tag for tag in tags if tag not in bad] or tags)
         some = runs[:: 1 + len(runs) // MOST_PROBED]
         return some if self.last_read is None else (self.last_read, *some)
-
-    # The monitor list in the PLC
-
-    def expect_list(self, spans: tuple[Span, ...]) -> None:
-        """Notes the list that is registered in the PLC next."""
-        self.registered = spans
-
-    def forget_list(self) -> None:
-        """Forgets the list: the PLC may have restarted, or another master may have changed it."""
-        self.registered = ()
-
-    def allow_lists(self, allowed: bool) -> None:
-        """Allows or forbids a monitor list: a PLC that refuses its list is read without one."""
-        self._lists = allowed
 
     # Its share of the wire
 

@@ -25,13 +25,14 @@ from gateway.engine.jobs import (
     WriteTogether,
     resync_around,
 )
+from gateway.engine.poll_results import PollResults
 from gateway.engine.records import LineRecord
 from gateway.engine.request_results import RequestResults
 from gateway.engine.requests import Request, Write, why_not_commanded
 from gateway.engine.results import Results, offline
 from gateway.engine.schedule import Schedule
 from gateway.engine.staleness import NEVER, Staleness
-from gateway.engine.stray import Stray, is_extra_reply
+from gateway.engine.stray import Stray
 from gateway.engine.unsolicited import UnsolicitedFrames
 from gateway.errors import (
     BadValue,
@@ -59,14 +60,15 @@ class Engine:
         self.wire = wire
         self._effects = Effects()
         self._staleness = Staleness(self.schedule, self._effects)
-        self._results = Results(name, self.schedule, self._staleness, self._effects)
-        self._unsolicited = UnsolicitedFrames(devices, self._results, self._effects)
-        self._stray = Stray(name, devices, self._effects)
+        results = Results(name, self.schedule, self._staleness, self._effects)
+        self._polls = PollResults(self.schedule, results, self._effects)
+        self._unsolicited = UnsolicitedFrames(devices, results, self._effects)
+        self._stray = Stray(name, devices, results, self._effects)
         self._in_flight = InFlight()
         gap = max(GAP, 4 * wire.character)
-        requests = RequestResults(self.schedule, self._results, self._effects)
+        requests = RequestResults(self.schedule, results, self._effects)
         self._conclusions = Conclusions(
-            self._in_flight, self._results, requests, self._effects, gap
+            self._in_flight, results, self._polls, requests, self._effects, gap
         )
 
     # The cycle of the line
@@ -132,7 +134,7 @@ class Engine:
             else:  # units are the only good result of a poll
                 if self._conclusions.silence.noted:
                     self._conclusions.silence.heard()
-                self._results.read(job, cast("Sequence[int]", result), now, time)
+                self._polls.read(job, cast("Sequence[int]", result), now, time)
             if in_flight.open_polls:
                 return self._effects.take()
             if in_flight.failed or device.window > 1:
@@ -198,8 +200,7 @@ class Engine:
     def received(self, data: bytes, now: float, time: int) -> list[Effect]:
         """Takes bytes that arrived outside of a transaction."""
         self.record.unasked += len(data)
-        for device in self._stray.received(data, now):
-            self._results.answered_twice(device, now, time)
+        self._stray.received(data, now, time)
         if self._unsolicited.speakers:
             self._conclusions.silence.heard()
         self._unsolicited.received(data, now, time)
@@ -213,13 +214,9 @@ class Engine:
 
         `echo`: it is equal to the request.
         """
-        device.record.count_stray()
         if not echo:
             self._conclusions.silence.heard()
-        self._stray.frames(device, [frame], now)
-        for each in self.devices:
-            if not echo and is_extra_reply(each, frame):
-                self._results.answered_twice(each, now, time)
+        self._stray.unmatched(device, frame, now, time, echo=echo)
         self._unsolicited.unmatched(device, frame, now, time)
         self._set_deadline()
         return self._effects.take()

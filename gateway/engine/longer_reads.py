@@ -19,7 +19,7 @@ Choice = tuple[Span, Hashable]  # a span to read, and the shape of its reply
 class LongerReads:
     """The spans that may be read for each block of one device."""
 
-    __slots__ = ("_bad", "_driver", "_hull", "_lacking", "_shapes", "by_span", "failed")
+    __slots__ = ("_bad", "_driver", "_hull", "_lacking", "_shapes", "alone", "by_span", "failed")
 
     def __init__(
         self,
@@ -36,6 +36,7 @@ class LongerReads:
         self._lacking: dict[Span, tuple[float, list[Span]]] = {}
         self._shapes: Counter[Hashable] = Counter()  # of the planned blocks
         self.failed: dict[Span, int] = {}  # reads of longer spans in a row without a reply
+        self.alone: set[Span] = set()  # to be read without other addresses once
 
     def choices(self, span: Span) -> list[Choice]:
         """Returns the span itself, then longer ones whose replies have other shapes."""
@@ -70,12 +71,15 @@ class LongerReads:
             del self._lacking[span]
             self.by_span.pop(span, None)
 
-    def unanswered(self, span: Span, longer: Span) -> None:
-        """Counts a read of a longer span without a reply: some stations refuse by silence."""
+    def unanswered(self, span: Span) -> None:
+        """Counts a read of a longer span without a reply: some stations refuse by silence.
+
+        The next read is that of the span itself, and so are all later ones after `MOST_FAILED`.
+        """
+        self.alone.add(span)
         self.failed[span] = self.failed.get(span, 0) + 1
         if self.failed[span] >= MOST_FAILED:
-            self.refused(span, longer, -KNOWN_FOR)  # until it comes back: it may be dead
-            del self.failed[span]
+            self.by_span[span] = self.choices(span)[:1]
 
     def answered(self, span: Span) -> None:
         """Notes a reply to a read of a longer span."""
@@ -85,6 +89,7 @@ class LongerReads:
         """Starts again after the device came online: it may have other addresses now."""
         self.by_span.clear()
         self.failed.clear()
+        self.alone.clear()
         for span, (refused, _) in list(self._lacking.items()):
             if now - refused >= KNOWN_FOR:
                 del self._lacking[span]

@@ -70,7 +70,9 @@ class ReplyShapes:
         elif now - used.get(shape, -NEVER) < self.quiet:
             some = choices if self.quiet == WARY else choices[:MOST_CHOICES]
             best = min(some, key=lambda choice: used.get(choice[1], -NEVER))
-            if best is not choices[0]:
+            if span in self.longer.alone:
+                self.longer.alone.discard(span)
+            elif best is not choices[0]:
                 read, shape = best
         used[shape] = now
         self.last, self.span = shape, read

@@ -236,8 +236,8 @@ class Schedule:
         if shapes is not None:
             poll.span = shapes.polled(poll.block, now)
         if listed:
-            poll.register = poll.device.registered != listed
-            poll.device.expect_list(listed)
+            poll.register = poll.device.monitor.registered != listed
+            poll.device.monitor.expect(listed)
         return poll
 
     def _first_without_resync(self) -> Poll | None:

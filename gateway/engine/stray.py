@@ -1,21 +1,16 @@
-"""Stray frames: counted, and explained in the log by the driver."""
+"""Stray frames: counted, explained in the log by the driver, and taken as extra replies."""
 
 from collections.abc import Iterable, Sequence
 from typing import Any, cast
 
 from gateway.engine.device import Device
 from gateway.engine.effects import Effects
+from gateway.engine.results import Results
 from gateway.errors import Garbled
 from gateway.protocols.driver import Codec, StrayFrames, UnnumberedReplies
 
 LOG_EVERY = 10.0  # seconds for each device; other frames are logged at level debug
 PAUSE = 0.1  # seconds without a byte after which a frame begins
-
-
-def is_extra_reply(device: Device, frame: Any) -> bool:
-    """Returns True for a reply of the device, where replies have no number."""
-    driver = device.driver
-    return device.shapes is not None and cast("UnnumberedReplies", driver).is_reply(frame)
 
 
 class Stray:
@@ -25,9 +20,12 @@ class Stray:
     the list again.
     """
 
-    def __init__(self, line: str, devices: Sequence[Device], effects: Effects) -> None:
+    def __init__(
+        self, line: str, devices: Sequence[Device], results: Results, effects: Effects
+    ) -> None:
         self._line = line
         self._devices = devices
+        self._results = results
         self._effects = effects
         # The devices whose frames are read, by their codecs: equal ones read the bytes once.
         self._readers: dict[object, list[Device]] = {}
@@ -38,29 +36,35 @@ class Stray:
         self._last = float("-inf")
         self._logged: dict[Device, float] = {}
 
-    def received(self, data: bytes, now: float) -> list[Device]:
-        """Takes bytes that arrived outside of a transaction. Returns devices that replied."""
-        replied = []
+    def received(self, data: bytes, now: float, time: int) -> None:
+        """Takes bytes that arrived outside of a transaction."""
         if now - self._last > PAUSE:
             self._codecs.clear()
         self._last = now
         for device in self._devices:
-            device.forget_list()
+            device.monitor.forget()
         for kind, devices in self._readers.items():
             found = self._feed(kind, devices[0], data)
             for device in devices if found else ():
                 station = device.driver.station
                 own = [frame for frame in found if frame.station == station]
                 device.record.count_stray(len(own))
-                self.frames(device, own, now)
-                if any(is_extra_reply(device, frame) for frame in own):
-                    replied.append(device)
-        return replied
+                self._log_frames(device, own, now)
+                if any(_is_extra_reply(device, frame) for frame in own):
+                    self._results.answered_twice(device, now, time)
 
-    def frames(self, device: Device, frames: Iterable[Any], now: float) -> None:
+    def unmatched(self, device: Device, frame: Any, now: float, time: int, *, echo: bool) -> None:
+        """Takes a frame that arrived in a transaction with this device and is not its reply."""
+        device.record.count_stray()
+        self._log_frames(device, [frame], now)
+        for each in self._devices:
+            if not echo and _is_extra_reply(each, frame):
+                self._results.answered_twice(each, now, time)
+
+    def _log_frames(self, device: Device, frames: Iterable[Any], now: float) -> None:
         """Logs complete frames that are already counted."""
         for frame in frames:
-            device.forget_list()
+            device.monitor.forget()
             if not isinstance(device.driver, StrayFrames):
                 continue
             if text := device.driver.describe_stray(frame):
@@ -83,6 +87,12 @@ class Stray:
         log = self._effects.info if due else self._effects.debug
         count = device.record.unasked
         log("stray frame", line=self._line, device=device.name, what=text, count=count)
+
+
+def _is_extra_reply(device: Device, frame: Any) -> bool:
+    """Returns True for a reply of the device, where replies have no number."""
+    driver = device.driver
+    return device.shapes is not None and cast("UnnumberedReplies", driver).is_reply(frame)
 
 
 def _kind(codec: Codec[Any]) -> object:

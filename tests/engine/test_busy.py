@@ -4,7 +4,7 @@ import asyncio
 from dataclasses import dataclass, field, replace
 
 from gateway.engine.health import State
-from gateway.engine.results import BUSY_PAUSE
+from gateway.engine.poll_results import BUSY_PAUSE
 from gateway.protocols.checksums import crc16
 from gateway.protocols.modbus import ModbusRtu
 from gateway.stations.modbus import ModbusStation

@@ -824,10 +824,10 @@ def test_a_reopened_line_probes_every_device_again() -> None:
 def test_bytes_outside_of_a_transaction_are_counted_and_forget_the_monitor_list() -> None:
     rig = Rig()
     rig.bring(State.ONLINE)
-    rig.device.expect_list((rig.device.blocks[0].span,))
+    rig.device.monitor.expect((rig.device.blocks[0].span,))
     rig.note(rig.engine.received(b"noise", rig.now, rig.time))
     assert rig.engine.record.unasked == 5
-    assert rig.device.registered == ()
+    assert rig.device.monitor.registered == ()
 
 
 def test_a_frame_that_is_no_reply_is_counted() -> None:

@@ -126,15 +126,17 @@ def test_a_longer_span_without_replies_is_given_up() -> None:
     longer = span._replace(size=11)
     read(shapes, dev, 0.0)
     for _ in range(MOST_FAILED - 1):
-        shapes.longer.unanswered(span, longer)
+        shapes.longer.unanswered(span)
+        assert read(shapes, dev, 0.01) == span  # alone, once
     shapes.longer.answered(span)
     for _ in range(MOST_FAILED - 1):
-        shapes.longer.unanswered(span, longer)
+        shapes.longer.unanswered(span)
+        read(shapes, dev, 0.01)
     assert read(shapes, dev, 0.02) == longer
-    shapes.longer.unanswered(span, longer)
-    assert read(shapes, dev, 0.04).start < span.start
-    shapes.longer.restart(0.05)
-    assert longer in [read(shapes, dev, now) for now in (0.06, 0.08)]
+    shapes.longer.unanswered(span)
+    assert [read(shapes, dev, now) for now in (0.04, 0.06)] == [span, span]
+    shapes.longer.restart(0.07)
+    assert longer in [read(shapes, dev, now) for now in (0.08, 0.1)]
 
 
 @pytest.mark.parametrize("driver", SERIAL, ids=lambda driver: driver.protocol)

@@ -5,11 +5,12 @@ from dataclasses import replace
 
 import pytest
 
-from gateway.engine.device import LEARN_EVERY, SILENT_SHARE
+from gateway.engine.device import SILENT_SHARE
 from gateway.engine.health import State
 from gateway.engine.jobs import Idle, Poll, Probe, Reopen, Resynced, Settle, Settled, Traffic
+from gateway.engine.poll_results import BUSY_PAUSE
 from gateway.engine.reply_shapes import QUIET
-from gateway.engine.results import BUSY_PAUSE
+from gateway.engine.turnaround import LEARN_EVERY
 from gateway.errors import DeviceError, Garbled, Refusal, Refused, Unsteady
 from gateway.planning.bad_addresses import RETRIES, SILENT, SPLIT_FIRST
 from gateway.planning.planner import plan
@@ -305,9 +306,9 @@ def test_a_failed_probe_of_an_offline_device_is_no_second_warning() -> None:
 
 def test_an_unclear_end_forgets_the_monitor_list() -> None:
     rig = online()
-    rig.device.expect_list((rig.device.blocks[0].span,))
+    rig.device.monitor.expect((rig.device.blocks[0].span,))
     rig.conclude(polled(rig), SILENCE)
-    assert rig.device.registered == ()
+    assert rig.device.monitor.registered == ()
 
 
 def test_the_line_waits_for_late_replies_of_online_devices_alone() -> None:

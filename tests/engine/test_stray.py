@@ -4,6 +4,9 @@ import pytest
 
 from gateway.engine.device import Device
 from gateway.engine.effects import Effects, LogEvent
+from gateway.engine.results import Results
+from gateway.engine.schedule import Schedule
+from gateway.engine.staleness import Staleness
 from gateway.engine.stray import LOG_EVERY, PAUSE, Stray
 from gateway.protocols.computer_link.codec import Ack, Text
 from gateway.protocols.driver import Span
@@ -20,9 +23,12 @@ class StrayLine:
 
     def __init__(self, *devices: Device) -> None:
         self.effects = Effects()
-        self.stray = Stray("line", devices, self.effects)
+        schedule = Schedule(devices, 0.0)
+        staleness = Staleness(schedule, self.effects)
+        results = Results("line", schedule, staleness, self.effects)
+        self.stray = Stray("line", devices, results, self.effects)
         for one in devices:
-            one.expect_list(LIST)
+            one.monitor.expect(LIST)
 
     def log(self) -> list[LogEvent]:
         return [effect for effect in self.effects.take() if isinstance(effect, LogEvent)]
@@ -31,7 +37,7 @@ class StrayLine:
 def test_a_stray_frame_of_the_station_is_counted_and_explained() -> None:
     dev = link_device()
     line = StrayLine(dev)
-    line.stray.received(ON_DEMAND, 0.0)
+    line.stray.received(ON_DEMAND, 0.0, 0)
     fields: dict[str, object] = {
         "line": "line",
         "device": "plc1",
@@ -45,40 +51,40 @@ def test_a_stray_frame_of_the_station_is_counted_and_explained() -> None:
 def test_a_stray_frame_of_another_station_is_neither_counted_nor_logged() -> None:
     dev, other = link_device(station=1), link_device(station=2)
     line = StrayLine(dev, other)
-    line.stray.received(ON_DEMAND, 0.0)
+    line.stray.received(ON_DEMAND, 0.0, 0)
     assert [event.fields["device"] for event in line.log()] == ["plc1"]
     assert (dev.record.unasked, other.record.unasked) == (1, 0)
 
 
 def test_any_stray_byte_forgets_every_monitor_list() -> None:
     devices = link_device(station=1), link_device(station=2), device(words(0, 1), station=3)
-    StrayLine(*devices).stray.received(b"\x00", 0.0)
-    assert [one.registered for one in devices] == [(), (), ()]
+    StrayLine(*devices).stray.received(b"\x00", 0.0, 0)
+    assert [one.monitor.registered for one in devices] == [(), (), ()]
 
 
 def test_a_frame_may_arrive_in_pieces_with_short_pauses() -> None:
     line = StrayLine(link_device())
     for n, byte in enumerate(ON_DEMAND):
-        line.stray.received(bytes([byte]), n * PAUSE / 2)
+        line.stray.received(bytes([byte]), n * PAUSE / 2, 0)
     assert len(line.log()) == 1
 
 
 def test_after_a_pause_a_new_frame_begins() -> None:
     line = StrayLine(link_device())
-    line.stray.received(ON_DEMAND[:5], 0.0)
-    line.stray.received(ON_DEMAND, 1.1 * PAUSE)
+    line.stray.received(ON_DEMAND[:5], 0.0, 0)
+    line.stray.received(ON_DEMAND, 1.1 * PAUSE, 0)
     assert len(line.log()) == 1
-    line.stray.received(ON_DEMAND[:5], 20.0)
-    line.stray.received(ON_DEMAND[5:], 20.0 + 1.1 * PAUSE)
+    line.stray.received(ON_DEMAND[:5], 20.0, 0)
+    line.stray.received(ON_DEMAND[5:], 20.0 + 1.1 * PAUSE, 0)
     assert line.log() == []
 
 
 @pytest.mark.parametrize("damage", [b"\x0201FE12\x0300", b"\x0201FF1E61\x0300"])
 def test_a_damaged_frame_is_skipped_and_the_next_is_read(damage: bytes) -> None:
     line = StrayLine(link_device())
-    line.stray.received(damage, 0.0)
+    line.stray.received(damage, 0.0, 0)
     assert line.log() == []
-    line.stray.received(ON_DEMAND, 1.0)
+    line.stray.received(ON_DEMAND, 1.0, 0)
     assert len(line.log()) == 1
 
 
@@ -86,7 +92,7 @@ def test_frames_are_logged_as_information_only_now_and_then() -> None:
     line = StrayLine(link_device())
     levels = list[str]()
     for now in (0.0, 0.5 * LOG_EVERY, LOG_EVERY - 0.01, LOG_EVERY, 1.5 * LOG_EVERY):
-        line.stray.received(ON_DEMAND, now)
+        line.stray.received(ON_DEMAND, now, 0)
         levels += [event.level for event in line.log()]
     assert levels == ["info", "debug", "debug", "info", "debug"]
 
@@ -94,24 +100,24 @@ def test_frames_are_logged_as_information_only_now_and_then() -> None:
 def test_each_device_has_its_own_log_interval() -> None:
     dev, other = link_device(station=1), link_device(station=2)
     line = StrayLine(dev, other)
-    line.stray.frames(dev, [Text(1, "7", "FE")], 0.0)
-    line.stray.frames(other, [Text(2, "7", "FE")], 0.1)
+    line.stray.unmatched(dev, Text(1, "7", "FE"), 0.0, 0, echo=False)
+    line.stray.unmatched(other, Text(2, "7", "FE"), 0.1, 0, echo=False)
     assert [event.level for event in line.log()] == ["info", "info"]
 
 
 def test_a_frame_within_a_transaction_forgets_the_list_of_its_device_alone() -> None:
     dev, other = link_device(station=1), link_device(station=2)
     line = StrayLine(dev, other)
-    line.stray.frames(dev, [Ack(1)], 0.0)
-    assert (dev.registered, other.registered) == ((), LIST)
+    line.stray.unmatched(dev, Ack(1), 0.0, 0, echo=False)
+    assert (dev.monitor.registered, other.monitor.registered) == ((), LIST)
     assert line.log() == []  # the driver has no explanation
-    assert dev.record.unasked == 0  # the caller counts
+    assert (dev.record.unasked, other.record.unasked) == (1, 0)
 
 
 def test_a_protocol_without_stray_frames_explains_nothing() -> None:
     dev = device(words(0, 1))
     line = StrayLine(dev)
-    line.stray.received(ON_DEMAND, 0.0)
-    line.stray.frames(dev, [object()], 0.0)
+    line.stray.received(ON_DEMAND, 0.0, 0)
+    line.stray.unmatched(dev, object(), 0.0, 0, echo=False)
     assert line.log() == []
-    assert dev.record.unasked == 0
+    assert dev.record.unasked == 1

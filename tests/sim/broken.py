@@ -468,14 +468,14 @@ MUTANTS = (
     ),
     Mutant(
         "silence about one address starts no search",
-        "engine/results.py",
+        "engine/poll_results.py",
         "        lasting = others_answered and (known or half or poll.missed > 0)\n",
         "        lasting = False\n",
         "tests/engine/test_results.py",
     ),
     Mutant(
         "only an address error starts a search",
-        "engine/results.py",
+        "engine/poll_results.py",
         "        lasting = error.refusal in (Refusal.ADDRESS, Refusal.OTHER)\n",
         "        lasting = error.refusal is Refusal.ADDRESS\n",
         "tests/engine/test_results.py",
@@ -517,7 +517,7 @@ MUTANTS = (
     ),
     Mutant(
         "each address that returns is planned at once",
-        "engine/results.py",
+        "engine/poll_results.py",
         "self._plans.want(device, now, TOGETHER if bad.bad else 0.0)",
         "self._plans.want(device, now)",
         "tests/engine/test_plans.py",
@@ -538,7 +538,7 @@ MUTANTS = (
     ),
     Mutant(
         "a plan that changed nothing is made again as soon as before",
-        "engine/device.py",
+        "engine/turnaround.py",
         "1 if useful else min(2 * self._patience, MOST_PATIENCE)",
         "1",
         "tests/engine/test_plans.py",

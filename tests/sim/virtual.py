@@ -11,8 +11,8 @@ from structlog.testing import capture_logs
 P = ParamSpec("P")
 T = TypeVar("T")
 LOOKS_APART = 256  # passes between two looks at real file descriptors (signals, if anything)
-BUSY_PASSES = 20  # passes of the loop without progress of the clock: some task polls it
-TICK = 1e-4
+BUSY_PASSES = 8  # passes of the loop without progress of the clock: some task polls it
+TICK = 5e-4
 
 
 class Deadlock(RuntimeError):
