@@ -15,7 +15,8 @@ from gateway.planning.planner import Block
 from gateway.protocols.driver import Span, UnnumberedReplies
 from gateway.tags import Sample
 
-EXPEDITED, NOT_QUEUED = -1, -2  # tickets of polls that are in no heap
+# Tickets of polls that are in no heap; from EXPEDITED down they go before those.
+NOT_QUEUED, EXPEDITED, ON_DEMAND = -1, -2, -3
 
 
 @dataclass(slots=True)
@@ -41,7 +42,6 @@ class Poll:
     soon: float = math.inf  # an earlier deadline, because its values are bad
     asked: float = 0.0  # when it was handed out last
     expedited: bool = False  # before its time, because a client waits
-    on_demand: bool = False  # expedited for a read of a client, not after a write or a fault
     phased: bool = True  # it has found its place in the period
     live: bool = True  # False after the device was planned again
     ticket: int = NOT_QUEUED  # its one valid place in the queues

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 
 from gateway.engine.device import Device
-from gateway.engine.jobs import EXPEDITED, NOT_QUEUED, Poll
+from gateway.engine.jobs import EXPEDITED, NOT_QUEUED, ON_DEMAND, Poll
 
 ROOM = 16  # entries of a heap in addition to twice the valid ones
 NO_PLACE, LATE = -1, -2  # places of a device: nothing is due; its first poll is late
@@ -73,7 +73,7 @@ class PollQueue:
 
     def push(self, poll: Poll) -> None:
         """Adds a poll that waits until it is due, if its device is online."""
-        if not (poll.live and poll.device.health.online) or poll.ticket == EXPEDITED:
+        if not (poll.live and poll.device.health.online) or poll.ticket <= EXPEDITED:
             return
         poll.ticket = next(self._tickets)
         waiting = self.waiting
@@ -88,15 +88,13 @@ class PollQueue:
 
     def expedite(self, poll: Poll, *, on_demand: bool = False) -> None:
         """Puts the poll before all due polls; on demand behind those that are not."""
-        if poll.ticket == EXPEDITED:
-            if on_demand or not poll.on_demand:
-                return
-            self.expedited.remove(poll)
-        poll.ticket = EXPEDITED
-        poll.on_demand = on_demand
-        if on_demand:
+        if on_demand and poll.ticket > EXPEDITED:
+            poll.ticket = ON_DEMAND
             self.expedited.append(poll)
-        else:
+        elif not on_demand and poll.ticket != EXPEDITED:
+            if poll.ticket == ON_DEMAND:
+                self.expedited.remove(poll)
+            poll.ticket = EXPEDITED
             self.expedited.appendleft(poll)
 
     def return_due(self, now: float) -> None:

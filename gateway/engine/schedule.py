@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 
 from gateway.engine.device import Device
 from gateway.engine.health import PAUSE_LONGEST, State
-from gateway.engine.jobs import EXPEDITED, NOT_QUEUED, Idle, LastRead, Poll, Probe
+from gateway.engine.jobs import EXPEDITED, NOT_QUEUED, ON_DEMAND, Idle, LastRead, Poll, Probe
 from gateway.engine.poll_queue import PollQueue
 from gateway.engine.probe_schedule import ProbeSchedule
 from gateway.engine.requests import Request, RequestQueue
@@ -72,7 +72,7 @@ class Schedule:
         polls = []
         for block in device.blocks:
             known = old.get(block.span)
-            if known is None or known.ticket == EXPEDITED:
+            if known is None or known.ticket <= EXPEDITED:
                 poll = Poll(device, block, now)
             else:
                 poll = Poll(device, block, known.due, missed=known.missed)
@@ -210,14 +210,14 @@ class Schedule:
             poll = other
             expedited = False
         self._expedited = poll.expedited = expedited
-        if expedited and poll.on_demand:
+        if poll.ticket == ON_DEMAND:
             self._on_demand_at = now
         return self._hand_out(poll, now)
 
     def _may_expedite(self, now: float, until: float) -> bool:
         """True if the first expedited poll may be sent; another poll is due at `until`."""
         poll = self._queue.expedited[0]
-        if now >= self._on_demand_lane or not poll.on_demand:
+        if now >= self._on_demand_lane or poll.ticket != ON_DEMAND:
             return True
         return now + poll.device.seconds(poll.block.cost) <= until
 
@@ -226,7 +226,7 @@ class Schedule:
         return [self._hand_out(other, now) for other in self._queue.more(poll.device, most)]
 
     def _hand_out(self, poll: Poll, now: float) -> Poll:
-        if poll.ticket == EXPEDITED:
+        if poll.ticket <= EXPEDITED:
             self._queue.expedited.remove(poll)
         poll.ticket = NOT_QUEUED  # its entry in the heap is stale now
         if poll.due > now:
