@@ -901,4 +901,13 @@ MUTANTS = (
         "            pass\n",
         "tests/engine/test_schedule.py",
     ),
+    Mutant(
+        "pieces of a simulated reply follow their timers",
+        "simulator/port.py",
+        "            self._at(sending.start + end * self._character, deliver_next, now)\n",
+        "            piece = sending.heard(max(0, (end - 1) // chunk * chunk), end)\n"
+        "            due = sending.start + end * self._character\n"
+        "            self._at(due, lambda piece=piece: self._deliver(piece), now)\n",
+        "tests/simulator/test_port.py",
+    ),
 )
