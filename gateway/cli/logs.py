@@ -6,10 +6,13 @@ import queue
 import select
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, MutableMapping
 from enum import StrEnum
+from typing import Any
 
 import structlog
+
+from gateway.cli.terminal import printable
 
 log = structlog.get_logger("gateway.log")
 
@@ -83,6 +86,16 @@ class QueuedHandler(logging.Handler):
                 select.select((), (self._file,), ())
 
 
+def _without_control_characters(
+    _logger: object, _method: str, event: MutableMapping[str, Any]
+) -> MutableMapping[str, Any]:
+    """Keys and values of the network may hold line feeds and control sequences."""
+    for name, value in event.items():
+        if isinstance(value, str):
+            event[name] = printable(value)
+    return event
+
+
 def set_up(form: LogFormat, level: LogLevel) -> Callable[[str], None]:
     """Logs to stderr: text for people, or one JSON document per line for programs.
 
@@ -102,6 +115,7 @@ def set_up(form: LogFormat, level: LogLevel) -> Callable[[str], None]:
             structlog.stdlib.filter_by_level,
             structlog.stdlib.add_log_level,
             structlog.processors.TimeStamper(fmt="iso", utc=True),
+            _without_control_characters,
             structlog.processors.format_exc_info,
             render,
         ],

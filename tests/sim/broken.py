@@ -910,4 +910,32 @@ MUTANTS = (
         "            self._at(due, lambda piece=piece: self._deliver(piece), now)\n",
         "tests/simulator/test_port.py",
     ),
+    Mutant(
+        "control characters of clients reach the log",
+        "cli/logs.py",
+        "            _without_control_characters,\n",
+        "",
+        "tests/attacks/test_terminal.py",
+    ),
+    Mutant(
+        "control characters of devices reach the terminal",
+        "cli/tables.py",
+        "    return printable(str(value))\n",
+        "    return str(value)\n",
+        "tests/attacks/test_terminal.py",
+    ),
+    Mutant(
+        "a full disk is a traceback",
+        "cli/main.py",
+        "if error.errno not in _OUTPUT_FAILED:",
+        "if True:",
+        "tests/attacks/test_terminal.py",
+    ),
+    Mutant(
+        "a locale with ASCII only is a traceback",
+        "cli/main.py",
+        'stream.reconfigure(errors="backslashreplace")',
+        "pass",
+        "tests/attacks/test_terminal.py",
+    ),
 )
