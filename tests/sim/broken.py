@@ -938,4 +938,11 @@ MUTANTS = (
         "pass",
         "tests/attacks/test_terminal.py",
     ),
+    Mutant(
+        "every failure of a bad line is logged",
+        "cli/logs.py",
+        "        if not limit.allows(self._clock()):\n",
+        "        if False:\n",
+        "tests/cli/test_logs.py",
+    ),
 )
