@@ -32,6 +32,9 @@ _DEFAULTS: dict[str, object] = {
     "scouting/gossip/autoconnect": [],  # no links around the router and its access control
     "timestamping/enabled": True,
     "transport/shared_memory/enabled": False,
+    # Connections that say nothing keep new clients out, 100 of them for 10 s by default.
+    "transport/unicast/accept_pending": 400,
+    "transport/unicast/accept_timeout": 3000,  # ms
     "transport/link/tx/lease": 3000,  # ms until the tokens of a frozen gateway end
     # µs. The default of 1 ms silently loses a part of every burst.
     _DROP_LIMIT: 50_000,

@@ -945,4 +945,12 @@ MUTANTS = (
         "        if False:\n",
         "tests/cli/test_logs.py",
     ),
+    Mutant(
+        "silent connections keep new clients out",
+        "northbound/session.py",
+        '    "transport/unicast/accept_pending": 400,\n'
+        '    "transport/unicast/accept_timeout": 3000,  # ms\n',
+        "",
+        "tests/attacks/test_silent_connections.py",
+    ),
 )
