@@ -36,6 +36,7 @@ import zenoh
 
 from gateway.config import ZenohConfig, ZenohMode
 from gateway.engine.requests import CommandResult
+from gateway.line.duty import Duty
 from gateway.northbound import Northbound
 from gateway.northbound.session import configure
 from gateway.protocols.driver import Address, Span, Unit
@@ -61,6 +62,7 @@ class Plant:
 
     made: list[Device]
     mirror: Mirror = field(init=False)
+    duty: Duty = field(default_factory=Duty)
 
     def __post_init__(self) -> None:
         self.tags = [tag for device in self.made for tag in device.tags]
@@ -75,7 +77,7 @@ class Plant:
     def sample(self, tag: Tag) -> Sample:
         return self.mirror[tag]
 
-    async def write(self, tag: Tag, value: Value) -> WriteResult:
+    async def write(self, tag: Tag, value: Value, within: float) -> WriteResult:
         tag.encode(value)
         return WriteResult(value, time.time_ns(), took=0.0)
 
@@ -88,7 +90,9 @@ class Plant:
     def speaker(self, line: str) -> str:
         raise NotImplementedError
 
-    async def control(self, device: str, command: str, argument: str) -> CommandResult:
+    async def control(
+        self, device: str, command: str, argument: str, within: float
+    ) -> CommandResult:
         raise NotImplementedError
 
     def is_fresh(self, tag: Tag, max_age: float) -> bool:

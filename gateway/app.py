@@ -12,8 +12,9 @@ from gateway.engine.device import Device, DeviceSettings
 from gateway.engine.engine import Engine
 from gateway.engine.forecast import LineForecast, forecast
 from gateway.engine.jobs import Poll
-from gateway.engine.requests import CommandResult
+from gateway.engine.requests import WRITE_EXPIRY, CommandResult
 from gateway.errors import Busy, Offline
+from gateway.line.duty import Duty
 from gateway.line.line import Line, SampleSink
 from gateway.northbound.status import Document, device_document, line_document, standing
 from gateway.simulator.plant import station_for
@@ -44,11 +45,12 @@ def line_of(
     open_port: OpenPort | None = None,
     wall: Callable[[], int] = time.time_ns,
     seed: int = 0,
+    duty: Duty | None = None,
 ) -> Line:
     """Makes a line with some or all of its devices. `wall`: ns since 1970."""
     engine = Engine(config.name, [Device(one, config.wire) for one in devices], config.wire, seed)
     opens = open_port or opener(config)
-    return Line(engine, opens, sink, echo=config.echo, wall=wall, seed=seed)
+    return Line(engine, opens, sink, echo=config.echo, wall=wall, seed=seed, duty=duty)
 
 
 def forecasts(config: Config) -> list[LineForecast]:
@@ -86,9 +88,11 @@ class Gateway:
         config: Config,
         wall: Callable[[], int] = time.time_ns,
         open_line: Callable[[LineConfig], OpenPort] = opener,
+        duty: Duty | None = None,
     ) -> None:
         """`wall`: nanoseconds since 1970. `open_line`: returns the opener of a line's port."""
         self.config = config
+        self.duty = duty or Duty()
         self.mirror = Mirror((tag for device in config.devices for tag in device.tags), wall())
         self.lines: list[Line] = []
         self._wall = wall
@@ -107,7 +111,15 @@ class Gateway:
 
     def _add_line(self, config: LineConfig, open_port: OpenPort, seed: int) -> None:
         devices = [device for device in config.devices if device.enabled]
-        line = line_of(config, devices, self, open_port=open_port, wall=self._wall, seed=seed)
+        line = line_of(
+            config,
+            devices,
+            self,
+            open_port=open_port,
+            wall=self._wall,
+            seed=seed,
+            duty=self.duty,
+        )
         self.lines.append(line)
         engine = line.engine
         self._forecasts[config.name] = forecast(config.name, engine.devices, config.wire)
@@ -160,7 +172,7 @@ class Gateway:
         if changed := self.mirror.mark_published(samples):
             self._publish(changed)  # history keeps it too
 
-    async def write(self, tag: Tag, value: Value) -> WriteResult:
+    async def write(self, tag: Tag, value: Value, within: float = WRITE_EXPIRY) -> WriteResult:
         """Returns when the device has acknowledged.
 
         Raises `BadValue` before anything is sent, otherwise a `GatewayError`.
@@ -169,7 +181,7 @@ class Gateway:
             raise Offline(f"device {tag.device} is disabled; nothing was sent")
         units = tag.encode(value)
         line, device = self._places[tag.device]
-        return await line.write(device, tag, units)
+        return await line.write(device, tag, units, within)
 
     def commands(self) -> Mapping[str, frozenset[str]]:
         return every_command(self.config)
@@ -177,7 +189,9 @@ class Gateway:
     def speaker(self, line: str) -> str:
         return speaker(self.config, line)
 
-    async def control(self, device: str, command: str, argument: str = "") -> CommandResult:
+    async def control(
+        self, device: str, command: str, argument: str = "", within: float = WRITE_EXPIRY
+    ) -> CommandResult:
         """Returns the reply of the device.
 
         Raises `BadValue` before anything is sent, otherwise a `GatewayError`.
@@ -186,7 +200,7 @@ class Gateway:
         line, receiver = self._places[device]
         loop = asyncio.get_running_loop()
         started = loop.time()
-        answer = await line.command(receiver, command, argument)
+        answer = await line.command(receiver, command, argument, within)
         return CommandResult(answer, self._wall(), loop.time() - started)
 
     def is_fresh(self, tag: Tag, max_age: float) -> bool:

@@ -17,7 +17,8 @@ from gateway.errors import GatewayError
 from gateway.history import Historian
 from gateway.history.state_file import StateFile
 from gateway.line.arrival import ArrivalClock
-from gateway.northbound import Northbound, StandbySettings
+from gateway.line.duty import Duty
+from gateway.northbound import Northbound, standby_settings
 from gateway.tags import Sample
 
 log = structlog.get_logger("gateway")
@@ -70,7 +71,8 @@ async def _serve(
     """
     config = file.without(withheld)
     clock = ArrivalClock()
-    gateway = Gateway(config, clock)
+    duty = Duty(clock.released, shared=config.standby is not None)
+    gateway = Gateway(config, clock, duty=duty)
     gc.collect()
     gc.freeze()  # tags live as long as the gateway: each collection skips them
     history = _history(config)
@@ -112,6 +114,11 @@ async def _serve(
         if opened.done():
             started()
         await _first(zenoh, stopping, replaced, *lines)
+    if northbound.namesake:
+        raise GatewayError(
+            f"another gateway named {config.name} serves under {config.zenoh.prefix} already: "
+            "`gateway.name` must differ, and a file runs once"
+        )
     return northbound.withheld if northbound.replaced.is_set() and not stop.is_set() else None
 
 
@@ -120,14 +127,13 @@ async def _first(*tasks: asyncio.Task[Any]) -> None:
 
 
 def _northbound(config: Config, gateway: Gateway, history: Historian | None) -> Northbound:
-    group = config.standby
     return Northbound(
         config.zenoh,
         config.name,
         gateway,
         history=history,
         writers=config.writers_file,
-        standby=None if group is None else StandbySettings(group, config.standby_alone),
+        standby=standby_settings(config),
     )
 
 

@@ -50,6 +50,9 @@ class Script:
             raise Garbled("no answer among what was heard", heard)
         raise NoReply("no answer")
 
+    def guard(self, since: float) -> None:
+        """Nothing is refused here."""
+
     def done(self) -> None:
         """The whole script was played."""
         assert not self._lines, f"not played: {self._lines}"
@@ -75,6 +78,9 @@ class Wire:
         self.sent: list[bytes] = []
         self.received: list[bytes] = []
         self.replies: list[int] = []  # the reply lengths the driver announced
+
+    def guard(self, since: float) -> None:
+        """Nothing is refused here."""
 
     @property
     def cost(self) -> Cost:

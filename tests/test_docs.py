@@ -32,6 +32,7 @@ from gateway.config.commands import TO_ALL, every_command
 from gateway.config.yaml_file import read_yaml
 from gateway.engine.device import DeviceSettings
 from gateway.history import Historian
+from gateway.line.duty import Duty
 from gateway.northbound import StandbySettings, payload
 from gateway.northbound.keys import Keys
 from gateway.northbound.payload import Problem
@@ -559,7 +560,7 @@ def test_a_program_prints_what_the_page_shows(
 ) -> None:
     text = snippet.program.text
     assert text.count(ENDPOINT) == 1
-    assert _imported(text) <= {"json", "zenoh"}
+    assert _imported(text) <= {"datetime", "hashlib", "hmac", "json", "secrets", "zenoh"}
     path = tmp_path / "program.py"
     path.write_text(text.replace(ENDPOINT, endpoint), encoding="utf-8")
     shown = [line for line in snippet.shown if line != "…"]
@@ -623,7 +624,7 @@ def test_the_status_documents_have_the_fields_of_the_page(endpoint: str, tmp_pat
         assert asking.ended() == 0
         found = dict(line.split(maxsplit=1) for line in asking.lines)
     known: dict[str, Any] = {"history": Historian(tmp_path / "history.db", 1, 10**8).document()}
-    known |= Standby(StandbySettings("hall"), Keys("plant", "demo")).documents()
+    known |= Standby(StandbySettings("hall"), Keys("plant", "demo"), Duty()).documents()
     for key, text in found.items():
         path_there = re.sub(r"/.*", "/", key.removeprefix("plant/@gateway/demo/"))
         known[path_there] = json.loads(text)

@@ -192,6 +192,13 @@ class ZenohPeer:
         await self.get(BARRIER)
         return subscription
 
+    async def queryable(self, key: str) -> Subscription:
+        """Receives queries, as samples, and answers none."""
+        return await self._subscribe("queryable", key=key)
+
+    async def declare_token(self, key: str) -> None:
+        await self._request("token", key=key)
+
     async def liveliness(self, key: str) -> Subscription:
         """Observes tokens: declared (PUT, also before) and undeclared (DELETE)."""
         return await self._subscribe("liveliness", key=key)
@@ -314,6 +321,17 @@ def _forward(n: int) -> Callable[[zenoh.Sample], None]:
     return lambda sample: _send({"received": n, "sample": _flat(sample)})
 
 
+def _overhear(n: int) -> Callable[[zenoh.Query], None]:
+    def taken(query: zenoh.Query) -> None:
+        with query:
+            data, attached = query.payload, query.attachment
+            texts = [_text(b"" if found is None else bytes(found)) for found in (data, attached)]
+            flat = [str(query.key_expr), "QUERY", texts[0], "", None, texts[1]]
+            _send({"received": n, "sample": flat})
+
+    return taken
+
+
 def _flat(sample: zenoh.Sample) -> list[Any]:
     stamp = sample.timestamp
     return [
@@ -361,18 +379,27 @@ def _get(
     return [[_reply(answer) for answer in replies] for replies in found]
 
 
+def _declare(session: zenoh.Session, request: dict[str, Any]) -> object:
+    live, key, n = session.liveliness(), request["key"], request["n"]
+    match request["do"]:
+        case "queryable":
+            return session.declare_queryable(key, _overhear(n), complete=False)
+        case "token":
+            return live.declare_token(key)
+        case "liveliness":
+            return live.declare_subscriber(key, _forward(n), history=True)
+    if not request["advanced"]:
+        return session.declare_subscriber(key, _forward(n))
+    history = ext.HistoryConfig(max_samples=1)
+    return ext.declare_advanced_subscriber(session, key, _forward(n), history=history)
+
+
 def _execute(session: zenoh.Session, kept: list[object], request: dict[str, Any]) -> Any:
     match request:
         case {"do": "hello"}:
             return str(session.zid())
-        case {"do": "subscribe", "n": n, "key": key, "advanced": False}:
-            kept.append(session.declare_subscriber(key, _forward(n)))
-        case {"do": "subscribe", "n": n, "key": key}:
-            history = ext.HistoryConfig(max_samples=1)
-            kept.append(ext.declare_advanced_subscriber(session, key, _forward(n), history=history))
-        case {"do": "liveliness", "n": n, "key": key}:
-            live = session.liveliness()
-            kept.append(live.declare_subscriber(key, _forward(n), history=True))
+        case {"do": "subscribe" | "queryable" | "token" | "liveliness"}:
+            kept.append(_declare(session, request))
         case {"do": "tokens", "key": key}:
             found = session.liveliness().get(key, timeout=2)
             return sorted(str(answer.ok.key_expr) for answer in found if answer.ok)

@@ -25,7 +25,7 @@ def check(
 ) -> None:
     """Validate the file and print the plan of each line. Sends nothing."""
     loaded = load(config)
-    northbound.check(loaded)
+    warnings = northbound.check(loaded)
     lines = app.forecasts(loaded)
     few = sum(len(line.blocks) for line in lines) <= 100
     out.print(plan(lines, every_block=few if blocks is None else blocks))
@@ -45,6 +45,8 @@ def check(
     for line in lines:
         if line.overloaded:
             err.print(f"warning: {line.advice()}")
+    for warning in warnings:
+        err.print(f"warning: {warning}")
     print(f"{config}: good, {size(loaded)}")
 
 

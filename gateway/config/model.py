@@ -67,11 +67,14 @@ class GatewaySection(Section):
     """A name shared by two gateways of one plant: one is active, the other is the standby."""
     standby_alone: Interval | None = None
     """Become active after this time without any Zenoh link; left out: wait for the network."""
+    standby_secret_file: FilePath | None = None
+    """The file whose first line signs the messages between the gateways of the standby group."""
 
     @model_validator(mode="after")
     def _together(self) -> Self:
-        if self.standby_alone is not None and self.standby is None:
-            raise ValueError("standby_alone has no effect without standby")
+        for name in ("standby_alone", "standby_secret_file"):
+            if getattr(self, name) is not None and self.standby is None:
+                raise ValueError(f"{name} has no effect without standby")
         return self
 
 
@@ -128,10 +131,10 @@ class ZenohSection(Section):
 
 
 class WritersSection(Section):
-    """The clients that may write, by their tokens."""
+    """The clients that may write, by their secrets."""
 
     file: FilePath
-    """One line `name:salt:hash` for each client; see docs/security.md."""
+    """One line `name:secret` for each client; see docs/security.md."""
 
 
 class HistorySection(Section):

@@ -161,7 +161,7 @@ class Conclusions:
         late = result.late if isinstance(result, Settled) and not short else None
         took = now - self._in_flight.begun
         alone = len(settle.failed) == 1
-        suspect = alone and isinstance(after, Poll) and device.bad_addresses.is_suspect(after.block)
+        suspect = alone and isinstance(after, Poll) and _is_suspect(after)
         self._results.settled(
             *(device, settle.before, took, late, now, time), short=short, suspect=suspect
         )
@@ -176,6 +176,12 @@ class Conclusions:
         self._in_flight.clear()
         if job is not None:
             self._requests.abandon(job, error, now)
+
+
+def _is_suspect(poll: Poll) -> bool:
+    """Returns True if the device may be silent about an address of the poll."""
+    longer = poll.span is not poll.block.span
+    return longer or poll.device.bad_addresses.is_suspect(poll.block)
 
 
 def _is_short(job: Unfinished) -> bool:

@@ -276,8 +276,8 @@ class Engine:
 
     def _set_deadline(self) -> None:
         deadline = self._staleness.due
-        if self.schedule.requests.waiting:
-            deadline = min(deadline, self.schedule.requests.first.expires)
+        for request in self.schedule.requests.waiting:
+            deadline = min(deadline, request.expires)
         if self._unsolicited.speakers:
             deadline = min(deadline, self._unsolicited.due)
         self.deadline = deadline

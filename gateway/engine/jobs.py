@@ -10,13 +10,12 @@ from gateway.engine.health import PAUSE_FIRST, PAUSE_LONGEST, State
 from gateway.engine.records import PollRecord
 from gateway.engine.reply_shapes import ReplyShapes
 from gateway.engine.requests import Command, Request, Resyncs, Write
-from gateway.errors import BadValue, DeviceError, LineDown, Refused, Unclear
+from gateway.errors import BadValue, Busy, DeviceError, LineDown, Refused, Unclear
 from gateway.planning.planner import Block
 from gateway.protocols.driver import Span, UnnumberedReplies
 from gateway.tags import Sample
 
-# Tickets of polls that are in no heap; from EXPEDITED down they go before those.
-NOT_QUEUED, EXPEDITED, ON_DEMAND = -1, -2, -3
+NOT_QUEUED, EXPEDITED, ON_DEMAND = -1, -2, -3  # tickets of polls that are in no heap
 
 
 @dataclass(slots=True)
@@ -301,4 +300,4 @@ class Settled:
 
 
 Success = Sequence[int] | Resynced | Sent | HeldTogether | Settled | str | None
-Result = Success | DeviceError | BadValue | LineDown
+Result = Success | DeviceError | BadValue | LineDown | Busy

@@ -71,7 +71,7 @@ class LongerReads:
             del self._lacking[span]
             self.by_span.pop(span, None)
 
-    def unanswered(self, span: Span) -> None:
+    def unanswered(self, span: Span, now: float) -> None:
         """Counts a read of a longer span without a reply: some stations refuse by silence.
 
         The next read is that of the span itself, and so are all later ones after `MOST_FAILED`.
@@ -79,7 +79,7 @@ class LongerReads:
         self.alone.add(span)
         self.failed[span] = self.failed.get(span, 0) + 1
         if self.failed[span] >= MOST_FAILED:
-            self.by_span[span] = self.choices(span)[:1]
+            self.refused(span, span, now)
 
     def answered(self, span: Span) -> None:
         """Notes a reply to a read of a longer span."""
@@ -88,11 +88,11 @@ class LongerReads:
     def restart(self, now: float) -> None:
         """Starts again after the device came online: it may have other addresses now."""
         self.by_span.clear()
-        self.failed.clear()
         self.alone.clear()
         for span, (refused, _) in list(self._lacking.items()):
             if now - refused >= KNOWN_FOR:
                 del self._lacking[span]
+                self.failed.pop(span, None)
 
     def _choose(self, span: Span) -> list[Choice]:
         """Returns the span, and longer ones whose replies have other shapes."""

@@ -220,7 +220,7 @@ class PollResults:
                 bad.went_silent(poll.block)
             return
         if poll.span is not poll.block.span and device.shapes is not None:
-            device.shapes.longer.unanswered(poll.block.span)
+            device.shapes.longer.unanswered(poll.block.span, now)
             self._schedule.again(poll, counted=False)
             return
         suspect, half = bad.is_suspect(poll.block), bad.is_half(poll.block)

@@ -46,10 +46,11 @@ class RequestResults:
         """Returns the next step: settle after an unclear end, read back, or write again."""
         if isinstance(result, Unclear):
             return result
-        if isinstance(result, LineDown):
-            self.abandon(job, result, now)
-            return None
         match job:
+            case _ if isinstance(result, LineDown):
+                self.abandon(job, result, now)
+            case _ if isinstance(result, Busy):
+                self._unsent(job, result, now)
             case Confirm():
                 return self._confirmed(job, result, now, time)
             case Command():
@@ -92,6 +93,11 @@ class RequestResults:
             request.device.health.left_outstanding(span, now)
             unknown = STOPPED if why is None else f"{why}; it is unknown if {what} was done"
             self._end(request, Unclear(unknown), now)
+
+    def _unsent(self, job: RequestJob, why: Busy, now: float) -> None:
+        """Ends the requests of a job that the line did not send."""
+        for request in requests_of(job):  # a repetition says nothing about the first try
+            self._end(request, job.error if isinstance(job, Repeat) else why, now)
 
     def _written(
         self, write: Write, result: Result, first: DeviceError | None, now: float, time: int

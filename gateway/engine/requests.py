@@ -44,6 +44,7 @@ class Write:
     tag: Tag
     units: Sequence[int]
     submitted: float
+    within: float = WRITE_EXPIRY
     alone: bool = False  # refused together with others before any was done: now sent alone
     resyncs: Resyncs = NO_RESYNCS
     value: Value = field(init=False)  # as the device will hold it, rounded to its steps
@@ -55,7 +56,7 @@ class Write:
     @property
     def expires(self) -> float:
         """The time after which it is not sent, because the client no longer waits."""
-        return self.submitted + WRITE_EXPIRY
+        return self.submitted + self.within
 
     @property
     def plain(self) -> bool:
@@ -93,6 +94,7 @@ class Command:
     name: str
     argument: str
     submitted: float
+    within: float = WRITE_EXPIRY
     resyncs: Resyncs = NO_RESYNCS
 
     @property
@@ -104,7 +106,7 @@ class Command:
     @property
     def expires(self) -> float:
         """The time after which it is not sent, because the client no longer waits."""
-        return self.submitted + WRITE_EXPIRY
+        return self.submitted + self.within
 
 
 Request = Write | Command

@@ -17,7 +17,7 @@ from pathlib import Path
 import structlog
 
 from gateway.history.lock import locked
-from gateway.history.outcomes import Outcome
+from gateway.history.outcomes import Outcome, Ring
 from gateway.history.recent import Extent, Identity, SortedRun
 from gateway.history.rows import to_row
 from gateway.tags import Sample
@@ -49,6 +49,14 @@ CREATE VIEW history AS
     UNION ALL
     SELECT key, datetime(time / 1000000000, 'unixepoch'), time, value, bad
     FROM recent JOIN tag ON tag.id = recent.tag;
+"""
+
+# Older files have none.
+_REFUSED = """
+BEGIN IMMEDIATE;
+CREATE TABLE IF NOT EXISTS refused (id INTEGER PRIMARY KEY, time INTEGER, outcome TEXT);
+CREATE INDEX IF NOT EXISTS refused_time ON refused (time);
+COMMIT;
 """
 
 _MARK = """
@@ -119,16 +127,19 @@ class HistoryFile:
             self._database.execute("INSERT INTO tag VALUES (?, ?)", (number, key))
         return number
 
-    def store_writes(self, outcomes: Sequence[Outcome], most: int) -> int:
-        """Stores outcomes and keeps the newest `most`. Returns the number of the last."""
+    def store_writes(self, ring: Ring, outcomes: Sequence[Outcome], most: int) -> int:
+        """Stores outcomes and keeps the newest `most` of the ring. Returns the number of the
+        last."""
         with self._transaction():
             self._database.executemany(
-                "INSERT INTO written (time, outcome) VALUES (?, ?)", outcomes
+                f"INSERT INTO {ring} (time, outcome) VALUES (?, ?)",  # noqa: S608  (our own name)
+                outcomes,
             )
             self._database.execute(
-                "DELETE FROM written WHERE id <= (SELECT max(id) FROM written) - ?", (most,)
+                f"DELETE FROM {ring} WHERE id <= (SELECT max(id) FROM {ring}) - ?",  # noqa: S608
+                (most,),
             )
-            return self.last_write()
+            return self.last_write(ring)
 
     def sort(self, run: int, now: int) -> SortedRun | None:
         """Moves a run from `recent` to `sample`, which may hold its beginning already. Returns None
@@ -162,11 +173,12 @@ class HistoryFile:
     def drop_writes(self, before: int) -> None:
         """Drops some outcomes from before this time, if there are any."""
         with self._transaction():
-            self._database.execute(
-                "DELETE FROM written WHERE id IN"
-                " (SELECT id FROM written WHERE time < ? ORDER BY time LIMIT 256)",
-                (before,),
-            )
+            for ring in Ring:
+                self._database.execute(
+                    f"DELETE FROM {ring} WHERE id IN"  # noqa: S608  (our own name)
+                    f" (SELECT id FROM {ring} WHERE time < ? ORDER BY time LIMIT 256)",
+                    (before,),
+                )
 
     def set_sync(self, full: bool) -> None:
         """`full`: the next transactions wait until they are safe from a power cut."""
@@ -194,9 +206,9 @@ class HistoryFile:
         )
         return {run: Extent(*extent) for run, *extent in rows}
 
-    def last_write(self) -> int:
-        """Returns the number of the last outcome of a write, 0 if there is none."""
-        [(number,)] = self._database.execute("SELECT ifnull(max(id), 0) FROM written")
+    def last_write(self, ring: Ring) -> int:
+        """Returns the number of the last outcome of the ring, 0 if there is none."""
+        [(number,)] = self._database.execute(f"SELECT ifnull(max(id), 0) FROM {ring}")  # noqa: S608
         return int(number)
 
     def size(self) -> int:
@@ -281,6 +293,8 @@ def _prepare(database: sqlite3.Connection, path: Path) -> None:
         )
     elif not database.execute("SELECT 1 FROM sqlite_schema WHERE name = 'file'").fetchall():
         database.executescript(f"BEGIN IMMEDIATE; {_MARK} COMMIT;")  # older files had none
+    if not database.execute("SELECT 1 FROM sqlite_schema WHERE name = 'refused'").fetchall():
+        database.executescript(_REFUSED)
 
 
 def move_aside(path: Path, why: str) -> None:

@@ -10,7 +10,7 @@ from os.path import realpath
 from pathlib import Path
 
 from gateway.errors import BadValue, Busy
-from gateway.history.outcomes import Outcomes
+from gateway.history.outcomes import Outcome, Outcomes, Ring
 from gateway.history.reader import Part, Reader, in_order
 from gateway.history.recent import Recent, SortedRun
 from gateway.history.retention import Retention
@@ -40,10 +40,10 @@ class Historian:
         longest = max(256, min(LONGEST_RUN, max_size // 1024))
         self._wall = wall
         self._recent = Recent(longest, min(OLDEST_RUN, keep / 20))
-        self._outcomes = Outcomes()
+        self._written, self._refused = rings = Outcomes(Ring.WRITTEN), Outcomes(Ring.REFUSED)
         self._reader = Reader(path)
         self._retention = Retention(keep, max_size, self._recent, wall)
-        self._transfer = Transfer(self._recent, self._outcomes, self._retention, wall)
+        self._transfer = Transfer(self._recent, rings, self._retention, wall)
         self._writer = Writer(path, max_size, self._transfer, self._reader)
 
     def start(self) -> None:
@@ -62,9 +62,10 @@ class Historian:
         thread that writes can delay it."""
         self._recent.add(samples)
 
-    def record_write(self, time: int, outcome: str) -> None:
-        """Records the outcome of a write as on the `writes` key; `time`: ns since 1970."""
-        self._outcomes.add(time, outcome)
+    def record_write(self, time: int, outcome: str, *, refused: bool) -> None:
+        """Records the outcome of a write as on the `writes` key; `time`: ns since 1970. `refused`:
+        by the gateway, and nothing was sent."""
+        (self._refused if refused else self._written).add(time, outcome)
 
     def document(self) -> Mapping[str, object]:
         """The status document: `state` is `ok` or one sentence; counts since the start."""
@@ -76,8 +77,10 @@ class Historian:
             "stored": self._transfer.stored,
             "waiting": recent.waiting,
             "lost": recent.lost,
-            "writes_stored": self._outcomes.stored,
-            "writes_lost": self._outcomes.lost,
+            "writes_stored": self._written.stored,
+            "writes_lost": self._written.lost,
+            "refusals_stored": self._refused.stored,
+            "refusals_lost": self._refused.lost,
             "bytes": self._retention.size,
             "oldest": None if oldest is None else rfc3339(oldest),
         }
@@ -114,10 +117,13 @@ class Historian:
         return period
 
     def _writes(self, period: TimeRange) -> Iterator[str]:
-        pending = self._outcomes.pending(period)
-        stored = self._reader.writes(pending.file, pending.last, period)
+        found = list[Iterable[Outcome]]()
+        for outcomes in (self._written, self._refused):
+            pending = outcomes.pending(period)
+            stored = self._reader.writes(outcomes.ring, pending.file, pending.last, period)
+            found += (stored, pending.outcomes)
         try:
-            for outcome in merge(stored, pending.outcomes, key=lambda outcome: outcome.time):
+            for outcome in merge(*found, key=lambda outcome: outcome.time):
                 yield outcome.text
         except (sqlite3.Error, OSError) as error:
             raise Busy(f"history cannot be read: {error}") from error

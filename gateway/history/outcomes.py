@@ -1,13 +1,25 @@
-"""Outcomes of writes that wait for the disk, where queries already find them."""
+"""Outcomes of writes that wait for the disk, where queries already find them.
+
+Refusals of the gateway itself come as fast as a client can send. They have a ring of their own, so
+that they push out no write that a device may have executed.
+"""
 
 import threading
 from collections import deque
+from enum import StrEnum
 from typing import NamedTuple
 
 from gateway.history.recent import Identity
 from gateway.history.timerange import TimeRange
 
 MOST_WAITING = 10_000
+
+
+class Ring(StrEnum):
+    """The tables of outcomes in the file."""
+
+    WRITTEN = "written"  # a device executed it, or may have
+    REFUSED = "refused"  # nothing was sent
 
 
 class Outcome(NamedTuple):
@@ -26,9 +38,11 @@ class Pending(NamedTuple):
 
 
 class Outcomes:
-    """Bounded. Every method holds the lock for a moment only, never while the disk is busy."""
+    """The outcomes of one ring. Bounded. Every method holds the lock for a moment only, never while
+    the disk is busy."""
 
-    def __init__(self) -> None:
+    def __init__(self, ring: Ring) -> None:
+        self.ring = ring
         self.stored = 0  # since the start
         self.lost = 0  # because too many waited
         self._waiting: deque[Outcome] = deque()

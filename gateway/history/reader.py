@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from gateway.errors import Busy
 from gateway.history.file import identity
-from gateway.history.outcomes import Outcome
+from gateway.history.outcomes import Outcome, Ring
 from gateway.history.recent import Identity, SortedRun
 from gateway.history.rows import from_row
 from gateway.history.timerange import TimeRange
@@ -82,19 +82,22 @@ class Reader:
             ).fetchall()
         return [from_row(tag, row) for row in rows] if is_same else None
 
-    def writes(self, file: Identity | None, last: int, period: TimeRange) -> Iterator[Outcome]:
-        """Yields outcomes of writes in the order of time, up to number `last`."""
+    def writes(
+        self, ring: Ring, file: Identity | None, last: int, period: TimeRange
+    ) -> Iterator[Outcome]:
+        """Yields outcomes of writes of a ring in the order of time, up to number `last`."""
         after = (period.first, -1)
         begun = False
         while True:
             with self._connection(file) as database:
                 rows = database.execute(
-                    "SELECT time, id, outcome FROM written WHERE (time, id) > (?, ?)"
+                    f"SELECT time, id, outcome FROM {ring} WHERE (time, id) > (?, ?)"  # noqa: S608
                     " AND time <= ? AND id <= ? ORDER BY time, id LIMIT 1000",
                     (*after, period.last, last),
                 ).fetchall()
                 is_there = database.execute(
-                    "SELECT 1 FROM written WHERE id = ?", after[1:]
+                    f"SELECT 1 FROM {ring} WHERE id = ?",  # noqa: S608  (our own name)
+                    after[1:],
                 ).fetchall()
             if begun and not is_there:  # perhaps later ones were dropped too
                 raise Busy("the next outcomes were dropped meanwhile: ask again")

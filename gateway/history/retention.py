@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable
 
 from gateway.history.file import HistoryFile
+from gateway.history.outcomes import Ring
 from gateway.history.recent import Recent, SortedRun
 
 _ROOM_OF_OUTCOME = 1024  # bytes in the file; outcomes take at most a tenth of it
@@ -24,10 +25,10 @@ class Retention:
         self._may_expire = _MOST_EXPIRED
         self._next_check = 0.0
 
-    @property
-    def most_outcomes(self) -> int:
+    def most_outcomes(self, ring: Ring) -> int:
         """Outcomes of writes that the file keeps."""
-        return max(100, self._max_size // 10 // _ROOM_OF_OUTCOME)
+        most = self._max_size // 10 // _ROOM_OF_OUTCOME
+        return max(100, most if ring is Ring.WRITTEN else most // 10)
 
     def run_was_sorted(self) -> None:
         """Checks the age of the runs at the next call of `make_room`."""

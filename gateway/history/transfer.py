@@ -1,7 +1,7 @@
 """Moves samples and outcomes from memory to the open history file, on the history thread."""
 
 import sqlite3
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from gateway.history.file import HistoryFile
 from gateway.history.outcomes import Outcomes
@@ -17,7 +17,7 @@ class Transfer:
     def __init__(
         self,
         recent: Recent,
-        outcomes: Outcomes,
+        outcomes: Sequence[Outcomes],
         retention: Retention,
         wall: Callable[[], int],
     ) -> None:
@@ -36,13 +36,14 @@ class Transfer:
 
     @property
     def is_unfinished(self) -> bool:
-        return bool(self._recent.waiting or self._outcomes)
+        return bool(self._recent.waiting or any(self._outcomes))
 
     def opened(self, file: HistoryFile) -> None:
         """Compares memory with the file, which may be another one than before."""
         unsorted = file.unsorted_runs()
         self._recent.opened(file.identity, file.sorted_runs(), unsorted)
-        self._outcomes.opened(file.identity, file.last_write())
+        for outcomes in self._outcomes:
+            outcomes.opened(file.identity, file.last_write(outcomes.ring))
         self._unsorted = [run for run in self._recent.runs() if run.number]
         in_memory = {run.number for run in self._unsorted}
         for number in unsorted:
@@ -52,7 +53,8 @@ class Transfer:
 
     def run(self, file: HistoryFile) -> None:
         """Stores everything that waits. Raises `sqlite3.Error` and `OSError`."""
-        self._store_outcomes(file)
+        for outcomes in self._outcomes:
+            self._store_outcomes(file, outcomes)
         self._recent.close_old()
         for run in self._recent.runs():
             self._store_samples(file, run)
@@ -69,16 +71,17 @@ class Transfer:
             self.stored += end - run.stored
             self._recent.stored(run, end)
 
-    def _store_outcomes(self, file: HistoryFile) -> None:
-        if not self._outcomes:
+    def _store_outcomes(self, file: HistoryFile, outcomes: Outcomes) -> None:
+        if not outcomes:
             return
-        outcomes = self._outcomes.begin_storing(file.last_write())
+        ring = outcomes.ring
+        waiting = outcomes.begin_storing(file.last_write(ring))
         try:
-            last = file.store_writes(outcomes, self._retention.most_outcomes)
+            last = file.store_writes(ring, waiting, self._retention.most_outcomes(ring))
         except sqlite3.Error:
-            self._outcomes.not_stored()
+            outcomes.not_stored()
             raise
-        self._outcomes.are_stored(last)
+        outcomes.are_stored(last)
 
     def _sort_closed(self, file: HistoryFile) -> None:
         for run in list(self._unsorted):

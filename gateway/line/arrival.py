@@ -4,8 +4,13 @@ import asyncio
 import time
 from collections.abc import Callable
 
+import structlog
+
+log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
+
 PERIOD = 0.1  # seconds between two measurements: no stamp is newer by more than this
 NEVER = float("inf")
+HELD = 1.0  # seconds; a loop that is later by this much was held with its process
 
 
 class ArrivalClock:
@@ -21,6 +26,7 @@ class ArrivalClock:
         self._wall = wall
         self._due = NEVER  # the time of the next measurement
         self._behind = 0.0  # seconds, until that time
+        self._released = -NEVER
         self._timer: asyncio.TimerHandle | None = None
         self._now: Callable[[], float] = lambda: 0.0
 
@@ -41,9 +47,17 @@ class ArrivalClock:
         behind = max(self._behind, self._now() - self._due)
         return self._wall() - int(behind * 1e9)
 
+    def released(self) -> float:
+        """Returns the time of the loop when it turned again after its process was held."""
+        now = self._now()
+        return now if now - self._due >= HELD else self._released
+
     def _measure(self, loop: asyncio.AbstractEventLoop) -> None:
         now = loop.time()
         # Bytes may be read only after this timer: they keep the stamp for one more period.
         self._behind = max(0.0, now - self._due)
+        if self._behind >= HELD:
+            self._released = now
+            log.warning("gateway stood still", seconds=round(self._behind, 1))
         self._due = now + PERIOD
         self._timer = loop.call_at(self._due, self._measure, loop)

@@ -136,6 +136,7 @@ class Channel:
         "alarm",
         "echo",
         "lost_by",
+        "may_not_send",
         "now",
         "quiet_since",
         "unanswered",
@@ -152,6 +153,7 @@ class Channel:
         self.quiet_since = 0.0  # the last time when the wire was busy
         self.alarm = Alarm()  # for the time-outs of its transactions
         self.lost_by: LineDown | None = None
+        self.may_not_send: Callable[[float, float], str] = lambda _since, _now: ""
         self.unanswered = Unanswered()  # the numbered requests of this connection that timed out
         self._port = port
 

@@ -17,9 +17,10 @@ from gateway.engine.device import Device
 from gateway.engine.effects import Effect, LogEvent, OnlineChange, Pause, RequestEnded, Samples
 from gateway.engine.engine import Engine
 from gateway.engine.jobs import Idle, Poll, Reopen, Settle, Traffic
-from gateway.engine.requests import Command, Outcome, Request, Write
+from gateway.engine.requests import WRITE_EXPIRY, Command, Outcome, Request, Write
 from gateway.errors import GatewayError, LineDown
 from gateway.line.channel import NEVER, Alarm, Channel, Echo
+from gateway.line.duty import Duty
 from gateway.line.perform import perform
 from gateway.line.transaction import Transaction
 from gateway.line.wire_log import WireLog
@@ -50,6 +51,7 @@ class Line:
         echo: bool | None = None,
         wall: Callable[[], int] = time.time_ns,
         seed: int = 0,
+        duty: Duty | None = None,
     ) -> None:
         """`echo`: the port receives its own bytes; None: not known. `wall`: ns since 1970."""
         self.engine = engine
@@ -57,6 +59,7 @@ class Line:
         self._sink = sink
         self._echo = Echo(engine.name, echo)
         self._wall = wall
+        self._duty = duty or Duty()
         self._random = random.Random(seed)  # noqa: S311  (jitter, not a secret)
         self._channel: Channel | None = None
         self._transaction: Transaction | None = None
@@ -69,16 +72,20 @@ class Line:
 
     # Clients
 
-    def write(self, device: Device, tag: Tag, units: Sequence[int]) -> asyncio.Future[WriteResult]:
-        """Writes as soon as the current transaction ends.
+    def write(
+        self, device: Device, tag: Tag, units: Sequence[int], within: float = WRITE_EXPIRY
+    ) -> asyncio.Future[WriteResult]:
+        """Writes as soon as the current transaction ends, if that is `within` so many seconds.
 
         The future ends when the device has acknowledged, or raises `GatewayError`.
         """
-        return self._submit(Write(device, tag, units, _now()))
+        return self._submit(Write(device, tag, units, _now(), within))
 
-    def command(self, device: Device, name: str, argument: str) -> asyncio.Future[str]:
+    def command(
+        self, device: Device, name: str, argument: str, within: float = WRITE_EXPIRY
+    ) -> asyncio.Future[str]:
         """Sends a command of the driver, such as run or stop. As `write`."""
-        return self._submit(Command(device, name, argument, _now()))
+        return self._submit(Command(device, name, argument, _now(), within))
 
     def _submit(self, request: Request) -> asyncio.Future[Any]:
         outcome = self._outcomes[request] = asyncio.get_running_loop().create_future()
@@ -149,6 +156,7 @@ class Line:
         try:
             port = await self._open_port(self)
             self._channel = Channel(port, self.engine.wire, WireLog(name), self._echo)
+            self._channel.may_not_send = self._duty.why_not
             self._channel.unanswered = self.engine.schedule.unanswered
             log.info("line open", line=name)
             self._deliver(self.engine.opened(_now()))

@@ -22,7 +22,16 @@ from gateway.engine.jobs import (
     WriteTogether,
 )
 from gateway.engine.requests import Command, Write
-from gateway.errors import BadValue, DeviceError, Evidence, LineDown, Refused, Unclear, Unsteady
+from gateway.errors import (
+    BadValue,
+    Busy,
+    DeviceError,
+    Evidence,
+    LineDown,
+    Refused,
+    Unclear,
+    Unsteady,
+)
 from gateway.line.transaction import Transaction
 from gateway.planning.planner import Block
 from gateway.protocols.driver import Controllable, Monitor, ScatteredWriter, Span, Talk
@@ -63,7 +72,7 @@ async def perform(job: Transacted, transaction: Transaction) -> Result:
                 return await _read_longer(transaction, device, job.span, block.span)
             return await device.settings.driver.read(transaction, block.span)
         return await _perform(job, transaction)
-    except (DeviceError, BadValue, LineDown) as error:
+    except (DeviceError, BadValue, LineDown, Busy) as error:
         return error
 
 
@@ -90,6 +99,7 @@ async def _perform(job: Transacted, transaction: Transaction) -> Result:
             if job.resyncs.before is not None:
                 spans = job.device.probe_spans
                 await job.device.driver.resync(transaction, None, job.resyncs.before, spans)
+            transaction.guard(job.submitted)
             return await driver.control(transaction, name, argument)
         case Answer(frame=frame):
             await transaction.tell(frame)
@@ -154,6 +164,7 @@ async def _write(write: Write, talk: Transaction) -> Sent:
 async def _only_reply(sending: Awaitable[bool], write: Write, talk: Transaction) -> bool:
     """Sends a write, then the resync that it needs. Raises `Unclear` if two replies arrived."""
     refused: Refused | None = None
+    talk.guard(write.submitted)
     try:
         acknowledged = await sending
     except Refused as error:

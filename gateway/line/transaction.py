@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 from gateway.engine.device import Device
 from gateway.engine.jobs import Traffic
 from gateway.engine.unanswered import TimedOut
-from gateway.errors import DeviceError, Evidence, Garbled, LineDown, NoReply
+from gateway.errors import Busy, DeviceError, Evidence, Garbled, LineDown, NoReply
 from gateway.line.channel import KEPT, NEVER, Channel
 from gateway.protocols.driver import Codec, EndedByGap
 
@@ -56,6 +56,7 @@ class Transaction:
         "_codec",
         "_device",
         "_gap",
+        "_guarded",
         "_heard",
         "_late",
         "_needs_resync",
@@ -88,6 +89,7 @@ class Transaction:
         self._stray: Evidence | None = None  # of frames that were no reply
         self._late: _LateReply | None = None
         self._gap: asyncio.TimerHandle | None = None  # when a silence ends a frame
+        self._guarded: float | None = None  # the next frame is a write of this time
 
     @property
     def may_echo(self) -> bool:
@@ -95,10 +97,23 @@ class Transaction:
         echo = self._channel.echo
         return not echo.strip and echo.found is not False
 
+    def guard(self, since: float) -> None:
+        """Marks the next frame as the write of a client, submitted at `since`.
+
+        It is sent only if the duty is proven in that moment. Otherwise `Busy` is raised.
+        """
+        self._guarded = since
+
+    def _check_duty(self) -> None:
+        since, self._guarded = self._guarded, None
+        if since is not None and (why := self._channel.may_not_send(since, self._channel.now())):
+            raise Busy(why)
+
     async def tell(self, frame: Any) -> None:
         data = self._codec.encode(frame)
         channel = self._channel
         await channel.quiet(self._device.silence)
+        self._check_duty()
         self.has_sent = True
         channel.send(data)
         self.traffic.sent += len(data)
@@ -118,6 +133,8 @@ class Transaction:
             if channel.quiet_since + device.silence > channel.now():
                 await channel.quiet(device.silence)
             self._begin_hearing()
+        if self._guarded is not None:
+            self._check_duty()
         data = self._codec.encode(frame)
         started, character = channel.now(), channel.wire.character
         spoken = (len(data) * (2 if channel.echo.strip else 1) + reply) * character

@@ -5,7 +5,7 @@ cancelled. It never blocks the event loop, and no package below it imports Zenoh
 """
 
 from gateway.northbound.interfaces import Device, History, Plant
-from gateway.northbound.northbound import Northbound, check
+from gateway.northbound.northbound import Northbound, check, standby_settings
 from gateway.northbound.standby import StandbySettings
 
 __all__ = [
@@ -15,4 +15,5 @@ __all__ = [
     "Plant",
     "StandbySettings",
     "check",
+    "standby_settings",
 ]

@@ -5,6 +5,7 @@ from collections.abc import Iterable, Mapping
 
 import zenoh
 
+from gateway.line.duty import Duty
 from gateway.northbound.claiming import NETWORK_WITHIN, Claiming
 from gateway.northbound.keys import Keys
 from gateway.northbound.second_session import SecondSession
@@ -24,10 +25,11 @@ class Admission:
         keys: Keys,
         config: zenoh.Config,
         devices: Iterable[str],
+        duty: Duty,
     ) -> None:
         """`config`: of the gateway's own session."""
         self.active = asyncio.Event()
-        self.standby = Standby(standby, keys)
+        self.standby = Standby(standby, keys, duty)
         self.replaced = self.standby.replaced
         group = None if standby is None else standby.group
         self.claiming = Claiming(keys, group, devices, self.active, self.replaced)

@@ -2,11 +2,14 @@
 
 A write or command that reached a device, or may have, is always reported: the line limits how
 often that happens. Refusals before anything was sent come as fast as a client can send, so beyond
-a burst they are only counted.
+a burst they are only counted and summarised. History keeps them apart, so that they push out no
+write that was sent.
 """
 
 import time
+from collections import Counter
 from collections.abc import Callable
+from typing import Protocol
 
 import structlog
 
@@ -15,6 +18,7 @@ from gateway.northbound import payload
 from gateway.northbound.payload import Failure, Problem, WriteOutcome
 from gateway.northbound.rate_limit import RateLimit
 from gateway.tags import WriteResult
+from gateway.tags.timestamps import rfc3339
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 
@@ -29,19 +33,25 @@ _FAILURE_EVENTS = {
 _SENT = frozenset({Problem.UNCLEAR, Problem.REFUSED})
 
 
+class Record(Protocol):
+    """Records an outcome as JSON. `time`: when it ended, in ns since 1970. Never blocks."""
+
+    def __call__(self, time: int, outcome: str, /, *, refused: bool) -> None: ...
+
+
 class Audit:
     """Called with every outcome, on the event loop."""
 
     def __init__(
         self,
         publish: Callable[[bytes], None],
-        record: Callable[[int, str], None] | None = None,
+        record: Record | None = None,
     ) -> None:
-        """`publish` and `record` get the outcome as JSON, `record` also the time it ended (ns
-        since 1970). They must not block."""
+        """`publish` gets the outcome as JSON. It must not block."""
         self._publish = publish
         self._record = record
         self._refusals = RateLimit(BURST, EVERY)
+        self._untold = Counter[str]()  # refusals of each kind since the last summary
 
     @property
     def suppressed(self) -> int:
@@ -52,17 +62,26 @@ class Audit:
         result = outcome.result
         was_sent = not isinstance(result, Failure) or result.problem in _SENT
         if not was_sent and not self._refusals.allows(time.monotonic()):
+            if isinstance(result, Failure):
+                self._untold[result.problem.value] += 1
             return
         _log(outcome)
-        data = payload.write_outcome(outcome)
-        self._publish(data)
-        if self._record is not None:
-            self._record(outcome.time, data.decode())
+        self._tell(outcome.time, payload.write_outcome(outcome), refused=not was_sent)
 
     def report_suppressed(self) -> None:
-        """Logs the number of refusals suppressed since the previous call, if there are any."""
+        """Summarises the refusals suppressed since the previous call, if there are any."""
         if count := self._refusals.newly_suppressed():
-            log.warning("refusals suppressed", count=count)
+            kinds, self._untold = dict(self._untold), Counter()
+            log.warning("refusals suppressed", count=count, kinds=kinds)
+            now = time.time_ns()
+            time_text = rfc3339(now)
+            summary = {"outcome": "suppressed", "count": count, "kinds": kinds, "time": time_text}
+            self._tell(now, payload.document(summary), refused=True)
+
+    def _tell(self, at: int, data: bytes, *, refused: bool) -> None:
+        self._publish(data)
+        if self._record is not None:
+            self._record(at, data.decode(), refused=refused)
 
 
 def _log(outcome: WriteOutcome) -> None:

@@ -44,6 +44,7 @@ class Claiming:
         self._admitted = admitted
         self._refused = refused
         self.withheld: Mapping[str, str] = {}  # with the gateways that serve them
+        self.namesake = False  # another gateway with this name serves
         self._keys = keys
         self._group = group
         self._devices = frozenset(devices)
@@ -84,7 +85,7 @@ class Claiming:
                         await self._until_seen(view, claims)
         except TimeoutError:
             log.warning("own claim not seen", so="other gateways with these devices go unnoticed")
-        if claims.own is None and not claims.taken():
+        if claims.own is None and not (claims.taken() or claims.namesake()):
             await self._claim(session, claims)
         if not self._must_start_over(claims):
             self._admitted.set()
@@ -104,7 +105,7 @@ class Claiming:
             await asyncio.sleep(0.05)
 
     async def _observe(self, view: zenoh.Session, claims: Claims) -> None:
-        def token_changed(sample: zenoh.Sample) -> None:
+        def token_changed(sample: zenoh.Sample, _at: float) -> None:
             key = str(sample.key_expr)
             if claims.own is not None and key == self._keys.claim(claims.own.session):
                 return
@@ -136,6 +137,11 @@ class Claiming:
 
     def _must_start_over(self, claims: Claims) -> bool:
         if self._refused.is_set():
+            return True
+        if claims.namesake():
+            self.namesake = True
+            self.withheld = claims.taken()
+            self._refused.set()
             return True
         if not claims.changed(self.withheld, time.monotonic()):
             return False

@@ -6,7 +6,8 @@ device belongs to the earlier ticket, or to the smaller session id of equal tick
 that comes second never displaces the first, whatever the clocks say, and two gateways that see
 both claims decide alike. The other gateway *withholds* the device: no polls, values or writes.
 
-The members of a standby group have the same devices. Their election decides, not the claims.
+The members of a standby group have the same devices. Their election decides, not the claims. Of
+two gateways with one name only the first serves, whatever their devices are.
 
 Synchronous; does no I/O. `now` is in seconds of one monotonic clock.
 """
@@ -66,6 +67,13 @@ class Claims:
             for device in self._devices & other.devices
             if own is None or device not in own.devices or other < own
         }
+
+    def namesake(self) -> bool:
+        """True if an earlier gateway has the same name: their keys would be the same."""
+        return any(
+            other.name == self._name and (self.own is None or other < self.own)
+            for other in self._others.values()
+        )
 
     def changed(self, withheld: Mapping[str, str], now: float) -> bool:
         """True when the withheld devices must become those of `taken`. Call it regularly."""

@@ -15,10 +15,11 @@ from gateway.config.commands import TO_ALL, NotControlled
 from gateway.engine.requests import CommandResult
 from gateway.errors import BadValue, GatewayError
 from gateway.northbound import encoding, payload
+from gateway.northbound.acceptance import Acceptance, Sender
 from gateway.northbound.interfaces import Plant
 from gateway.northbound.keys import Keys
 from gateway.northbound.payload import Failure, Problem, WriteOutcome
-from gateway.northbound.writers import NotAllowed, Sender, Writers
+from gateway.northbound.writers import NotAllowed, Repeated
 from gateway.northbound.writes import ANSWER_WITHIN
 from gateway.tags.timestamps import rfc3339
 
@@ -34,14 +35,14 @@ class Commands:
         plant: Plant,
         stamp: Callable[[], zenoh.Timestamp],
         audit: Callable[[WriteOutcome], None],
-        writers: Writers | None = None,
+        acceptance: Acceptance,
     ) -> None:
-        """`audit` gets every outcome; `writers` may command as well as write."""
+        """`audit` gets every outcome."""
         self._keys = keys
         self._plant = plant
         self._stamp = stamp
         self._audit = audit
-        self._writers = writers
+        self._acceptance = acceptance
 
     async def execute(
         self, key: str, data: bytes | None, sender: Sender
@@ -49,19 +50,22 @@ class Commands:
         """`key` is as received, wildcards included; `data` is the argument as text."""
         by, argument = sender.session, ""
         started = time.monotonic()
+        refused: Failure | None = None  # instead of `result` in the audit
         result: CommandResult | Failure = Failure(Problem.UNCLEAR, "the gateway is ending")
         try:
-            if self._writers is not None:
-                by = self._writers.owner(sender.token)
+            by, within = self._acceptance.accept(key, data, sender)
             argument = _argument(data)
             device, command = self._target(key)
             async with asyncio.timeout(ANSWER_WITHIN):
-                result = await self._plant.control(device, command, argument)
+                result = await self._plant.control(device, command, argument, within)
         except TimeoutError:
             reason = f"not answered within {ANSWER_WITHIN:g} s: it may yet be done"
             result = Failure(Problem.UNCLEAR, reason)
         except NotAllowed as error:
             result = Failure(Problem.NOT_ALLOWED, str(error))
+        except Repeated as error:
+            result = Failure(Problem.UNCLEAR, str(error))
+            refused = Failure(Problem.NOT_ALLOWED, str(error))
         except NotControlled as error:
             result = Failure(Problem.NOT_WRITABLE, str(error))
         except GatewayError as error:
@@ -69,7 +73,8 @@ class Commands:
         finally:
             took = time.monotonic() - started
             value = argument or None
-            self._audit(WriteOutcome(key, value, result, time.time_ns(), took, by, command=True))
+            told = refused or result
+            self._audit(WriteOutcome(key, value, told, time.time_ns(), took, by, command=True))
         return result
 
     def reply(self, result: CommandResult | Failure, query: zenoh.Query) -> None:

@@ -112,6 +112,7 @@ class Election:
         self._found: dict[RoleToken, float] = {}  # by queries, with the time
         self._links = _Links(now, needed=needs_link)
         self._claimed = self._decided = now
+        self.replaced_by: RoleToken | None = None  # None: held for too long
 
     def token_changed(self, token: RoleToken, present: bool) -> None:
         """Another gateway has declared or undeclared a token."""
@@ -143,7 +144,8 @@ class Election:
             case State.REPLACED:
                 pass
             case State.ACTIVE:
-                if paused or self._sees(Role.ACTIVE, now, before_me=True):
+                self.replaced_by = self._seen(Role.ACTIVE, now, before_me=True)
+                if paused or self.replaced_by is not None:
                     self.state = State.REPLACED
             case _ if not self._may_claim(now):
                 self.state = State.STANDBY
@@ -169,15 +171,16 @@ class Election:
         return sorted(token.name for token in self._tokens if token.role is Role.ACTIVE)
 
     def _may_claim(self, now: float) -> bool:
-        if self._sees(Role.ACTIVE, now) or self._sees(Role.CLAIM, now, before_me=True):
+        if self._seen(Role.ACTIVE, now) or self._seen(Role.CLAIM, now, before_me=True):
             return False
         if self._links.are_up:
             return self._links.are_settled(now)
         return self._alone is not None and now - self._links.lost >= max(self._alone, SETTLE_TIME)
 
-    def _sees(self, role: Role, now: float, *, before_me: bool = False) -> bool:
+    def _seen(self, role: Role, now: float, *, before_me: bool = False) -> RoleToken | None:
         seen = self._tokens | {
             token for token, found in self._found.items() if now - found <= QUERY_VALIDITY
         }
         mine = RoleToken(role, self.name, self.session)
-        return any(token.role is role and (not before_me or token < mine) for token in seen)
+        found = (token for token in seen if token.role is role and (not before_me or token < mine))
+        return min(found, default=None)

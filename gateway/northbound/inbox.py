@@ -1,7 +1,7 @@
 """The only way from Zenoh's threads to the event loop: a bounded queue and one wake-up.
 
-Zenoh calls on the thread that receives everything for the session, so the call only appends. An
-arrival that finds the queue full is refused at once.
+Zenoh calls on the thread that receives everything for the session, so the call only notes the
+time and appends. An arrival that finds the queue full is refused at once.
 """
 
 import asyncio
@@ -17,13 +17,16 @@ _BATCH_SIZE = 16  # taken in one turn of the loop, so that other tasks get their
 
 
 class Inbox(Generic[T]):
-    """Hands every arrival to `sink` on the event loop; beyond `LIMIT` to `refuse` at once."""
+    """Hands every arrival to `sink` on the event loop; beyond `LIMIT` to `refuse` at once.
 
-    def __init__(self, sink: Callable[[T], None], refuse: Callable[[T], None]) -> None:
+    `sink` also gets the time of the arrival, by the clock of the loop.
+    """
+
+    def __init__(self, sink: Callable[[T, float], None], refuse: Callable[[T], None]) -> None:
         self._loop = asyncio.get_running_loop()
         self._sink = sink
         self._refuse = refuse
-        self._queue: deque[T] = deque()
+        self._queue: deque[tuple[T, float]] = deque()
         self._drain_scheduled = False
 
     def __call__(self, arrival: T) -> None:
@@ -31,7 +34,7 @@ class Inbox(Generic[T]):
         if len(self._queue) >= LIMIT:
             self._refuse(arrival)
             return
-        self._queue.append(arrival)
+        self._queue.append((arrival, self._loop.time()))
         if not self._drain_scheduled:
             self._drain_scheduled = True
             with suppress(RuntimeError):  # the loop is closed, and the session will be
@@ -42,7 +45,7 @@ class Inbox(Generic[T]):
         for _ in range(_BATCH_SIZE):
             if not self._queue:
                 return
-            self._sink(self._queue.popleft())
+            self._sink(*self._queue.popleft())
         if self._queue and not self._drain_scheduled:
             self._drain_scheduled = True
             self._loop.call_soon(self._drain)

@@ -6,6 +6,7 @@ from typing import TypeVar
 
 import zenoh
 
+from gateway.northbound.acceptance import Acceptance
 from gateway.northbound.audit import Audit
 from gateway.northbound.commands import Commands
 from gateway.northbound.inbox import Inbox
@@ -14,7 +15,6 @@ from gateway.northbound.keys import Keys
 from gateway.northbound.queries import Queries, StatusDocuments
 from gateway.northbound.replies import Replies
 from gateway.northbound.tag_index import TagIndex
-from gateway.northbound.writers import Writers
 from gateway.northbound.writes import PutWrites, Writes
 
 T = TypeVar("T")
@@ -31,7 +31,7 @@ class Incoming:
         audit: Audit,
         documents: StatusDocuments,
         history: History | None,
-        writers: Writers | None,
+        acceptance: Acceptance,
     ) -> None:
         self._keys = keys
         self._plant = plant
@@ -39,7 +39,7 @@ class Incoming:
         self._audit = audit
         self._documents = documents
         self._history = history
-        self._writers = writers
+        self._acceptance = acceptance
         self._queries: Queries | None = None
         self._puts: PutWrites | None = None
 
@@ -55,8 +55,8 @@ class Incoming:
     def start(self, session: zenoh.Session) -> "Declarations":
         """Returns the declarations that send queries and puts here."""
         stamp = session.new_timestamp
-        writes = Writes(self._plant, self._index, self._audit, self._writers)
-        commands = Commands(self._keys, self._plant, stamp, self._audit, self._writers)
+        writes = Writes(self._plant, self._index, self._audit, self._acceptance)
+        commands = Commands(self._keys, self._plant, stamp, self._audit, self._acceptance)
         replies = Replies(self._keys, self._plant, self._index, stamp, self._history)
         self._queries = Queries(
             self._plant, self._index, writes, commands, replies, self._documents
@@ -65,6 +65,10 @@ class Incoming:
         queries = Inbox(self._queries.take, self._queries.refuse)
         puts = Inbox(self._puts.take, self._puts.refuse)
         return Declarations(session, self._keys, self._commands(), self._index, queries, puts)
+
+    def begin(self) -> None:
+        """Call it when the gateway becomes active, before it takes queries for the plant."""
+        self._acceptance.begin()
 
     async def close(self) -> None:
         """Ends what waits for devices; replies that are on their way get half a second."""

@@ -4,6 +4,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Literal, Protocol
 
 from gateway.engine.requests import CommandResult
+from gateway.line.duty import Duty
 from gateway.tags import Sample, Tag, WriteResult
 from gateway.values import Value
 
@@ -25,6 +26,9 @@ class Device(Protocol):
 class Plant(Protocol):
     """The devices, their samples, writes and commands. All but `sample` on the event loop."""
 
+    @property
+    def duty(self) -> Duty: ...
+
     def devices(self) -> Iterable[Device]: ...
 
     def tag(self, key: str) -> Tag | None:
@@ -41,9 +45,10 @@ class Plant(Protocol):
         """Notes samples that are about to be published again: later changes are measured against
         them."""
 
-    async def write(self, tag: Tag, value: Value) -> WriteResult:
+    async def write(self, tag: Tag, value: Value, within: float) -> WriteResult:
         """Returns when the device has acknowledged. Raises `GatewayError`; `Busy` and `BadValue`
-        only when nothing was sent. Cancelled when the client no longer waits."""
+        only when nothing was sent: after `within` seconds nothing is sent any more. Cancelled when
+        the client no longer waits."""
 
     def commands(self) -> Mapping[str, frozenset[str]]:
         """By device: the commands of its protocol, allowed or not."""
@@ -51,7 +56,9 @@ class Plant(Protocol):
     def speaker(self, line: str) -> str:
         """Returns the device that sends a command to all stations of a line. Raises `BadValue`."""
 
-    async def control(self, device: str, command: str, argument: str) -> CommandResult:
+    async def control(
+        self, device: str, command: str, argument: str, within: float
+    ) -> CommandResult:
         """Returns the device's answer. Raises `GatewayError`; `BadValue` before anything is
         sent."""
 
@@ -79,5 +86,6 @@ class History(Protocol):
     def writes(self, time_range: str, limit: int | None, now: int) -> Iterator[str]:
         """Outcomes of writes and commands, as on the `writes` key. Raises like `samples`."""
 
-    def record_write(self, time: int, outcome: str) -> None:
-        """Records one outcome, as on the `writes` key; `time`: ns since 1970. Never blocks."""
+    def record_write(self, time: int, outcome: str, *, refused: bool) -> None:
+        """Records one outcome, as on the `writes` key; `time`: ns since 1970. `refused`: nothing
+        was sent. Never blocks."""

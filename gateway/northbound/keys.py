@@ -126,10 +126,6 @@ class Keys:
         """The liveliness tokens of one standby group lie below."""
         return f"{self.prefix}/@standby/{group}"
 
-    def role_token(self, group: str, role: str, gateway: str, session: str) -> str:
-        """The liveliness token of one gateway's role in a standby group."""
-        return f"{self.group(group)}/{role}/{gateway}/{session}"
-
     @property
     def claims(self) -> str:
         """The claims of all gateways under the prefix."""

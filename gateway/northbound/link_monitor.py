@@ -35,7 +35,7 @@ class LinkMonitor:
             zenoh.handlers.Callback(inbox, indirect=False), history=True
         )
 
-    def take(self, event: zenoh.TransportEvent) -> None:
+    def take(self, event: zenoh.TransportEvent, _at: float) -> None:
         """Handles one event on the event loop."""
         session, kind = str(event.transport.zid), str(event.transport.whatami)
         is_up = event.kind != zenoh.SampleKind.DELETE

@@ -11,6 +11,7 @@ import zenoh
 from gateway.config import Config, ZenohConfig, ZenohMode
 from gateway.errors import GatewayError
 from gateway.northbound import secrets
+from gateway.northbound.acceptance import Acceptance
 from gateway.northbound.admission import Admission
 from gateway.northbound.audit import Audit
 from gateway.northbound.inbox import Inbox
@@ -19,6 +20,7 @@ from gateway.northbound.interfaces import History, Plant
 from gateway.northbound.keys import Keys
 from gateway.northbound.link_monitor import LinkMonitor
 from gateway.northbound.losses import Losses
+from gateway.northbound.one_process import only_process
 from gateway.northbound.publisher import Publisher, ScanBatches
 from gateway.northbound.republish import Republisher
 from gateway.northbound.session import (
@@ -77,13 +79,12 @@ class Northbound:
         self._config = configure(settings)
         self._is_client = settings.mode is ZenohMode.CLIENT
         known_writers = None if writers is None else Writers(writers)
-        if self._is_client:
-            self.exclusive.set()  # it takes no endpoint, and may wait for its router for ever
+        self._exposures = _exposures(self._config, writers, standby)
         self._plant = plant
         self._links = LinkMonitor()
         index = TagIndex(self.keys, plant.devices())
         devices = [device.name for device in index.devices]
-        self._admission = Admission(standby, self.keys, self._config, devices)
+        self._admission = Admission(standby, self.keys, self._config, devices, plant.duty)
         losses = Losses(drop_limit(self._config))
         self._publisher = Publisher(self.keys, losses)
         self._batches = ScanBatches(self._publisher, index.devices)
@@ -104,7 +105,7 @@ class Northbound:
             audit,
             self._status.documents,
             history,
-            known_writers,
+            Acceptance(plant.duty, known_writers),
         )
         self._declared: list[object] = []  # Zenoh undeclares an object without a reference
 
@@ -136,6 +137,11 @@ class Northbound:
         return self._admission.replaced
 
     @property
+    def namesake(self) -> bool:
+        """True if another gateway with this name serves already: this one must end."""
+        return self._admission.claiming.namesake
+
+    @property
     def withheld(self) -> Mapping[str, str]:
         """Devices of the file that other gateways serve, with the names of those gateways."""
         return self._admission.claiming.withheld
@@ -150,12 +156,19 @@ class Northbound:
         """Serves until cancelled; closes the session in every case, within 2 s.
 
         Call it once only: another session needs another `Northbound`. Raises `GatewayError` when
-        the session cannot be opened (a client waits for its router), and an `ExceptionGroup` with
-        a later failure. The open session sets `exclusive`: a second process with the same
-        configuration fails here, because the endpoint is in use.
+        the session cannot be opened (a client waits for its router) or this gateway has another
+        process, and an `ExceptionGroup` with a later failure. The open session sets `exclusive`: a
+        second process with the same endpoint fails here.
         """
-        for exposure in secrets.exposures(self._config):
+        for exposure in self._exposures:
             log.warning("Zenoh session exposed", why=exposure)
+        places = (self._config.get_json(f"{side}/endpoints") for side in ("listen", "connect"))
+        with only_process(self.keys.own, *places):
+            await self._run()
+
+    async def _run(self) -> None:
+        if self._is_client:
+            self.exclusive.set()  # it takes no endpoint, and may wait for its router for ever
         alone = asyncio.create_task(self._admission.run_alone())
         try:
             session = await open_session(self._config, retry=self._is_client)
@@ -193,6 +206,7 @@ class Northbound:
             tasks.create_task(self._admission.run(session))
             tasks.create_task(self._status.run())
             await self._admission.active.wait()
+            self._incoming.begin()
             self._declared += await off_loop(self._declare_plant, declarations)
             await self._republisher.publish_all()
             self._status.publish()
@@ -239,9 +253,32 @@ class Northbound:
         return {**documents, "zenoh": zenoh_document, **self._admission.documents()}
 
 
-def check(config: Config) -> None:
-    """Checks Zenoh settings and files without opening anything. Raises `ConfigError`."""
+def check(config: Config) -> list[str]:
+    """Checks Zenoh settings and files without opening anything. Returns warnings, as sentences.
+    Raises `ConfigError`."""
     Keys(config.zenoh.prefix, config.name)
-    configure(config.zenoh)
+    session = configure(config.zenoh)
     if config.writers_file is not None:
         Writers(config.writers_file)
+    standby = standby_settings(config)
+    if standby is not None:
+        secrets.group_secret(standby.secret_file)
+    return _exposures(session, config.writers_file, standby)
+
+
+def standby_settings(config: Config) -> StandbySettings | None:
+    """Returns None for a gateway without a standby group."""
+    if config.standby is None:
+        return None
+    return StandbySettings(config.standby, config.standby_alone, config.standby_secret_file)
+
+
+def _exposures(
+    session: zenoh.Config, writers: Path | None, standby: StandbySettings | None
+) -> list[str]:
+    found = secrets.exposures(session)
+    if writers is not None:
+        found += secrets.unruled(session)
+    if standby is not None and standby.secret_file is None:
+        found += secrets.unsigned()
+    return found

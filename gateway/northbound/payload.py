@@ -23,7 +23,7 @@ from gateway.tags.timestamps import rfc3339
 from gateway.values import Value, parse_decimal
 
 LONGEST_WRITE = 64 * 1024  # bytes; a tag holds 250 characters at most
-_LONGEST_REASON = 300
+LONGEST_REASON = 300
 _GOOD = Quality.GOOD  # looking up a member of an enumeration takes 0.2 µs
 
 
@@ -38,7 +38,7 @@ class Problem(StrEnum):
     NO_REPLY = "no-reply"  # the device is silent; nothing was sent
     BUSY = "busy"  # too many requests are waiting; nothing was done
     UNKNOWN_TAG = "unknown-tag"
-    NOT_ALLOWED = "not-allowed"  # the client's token is missing or unknown
+    NOT_ALLOWED = "not-allowed"  # the client's signature is missing, wrong or too old
     BAD_QUERY = "bad-query"  # a read with parameters that cannot be parsed
     NO_HISTORY = "no-history"  # a read of the past from a gateway without history
 
@@ -233,7 +233,7 @@ def loggable(requested: Value | None) -> Value | None:
 
 def short(text: str) -> str:
     """Limits a text from a client to a printable length, and to valid UTF-8."""
-    text = text if len(text) <= _LONGEST_REASON else f"{text[:_LONGEST_REASON]}…"
+    text = text if len(text) <= LONGEST_REASON else f"{text[:LONGEST_REASON]}…"
     return text.encode("utf-8", "replace").decode()
 
 

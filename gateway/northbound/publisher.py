@@ -23,6 +23,7 @@ import structlog
 import zenoh
 
 from gateway.northbound import encoding, payload
+from gateway.northbound.blocks import parts_of
 from gateway.northbound.interfaces import Device
 from gateway.northbound.keys import Keys
 from gateway.northbound.losses import Losses
@@ -107,15 +108,23 @@ class Publisher:
         return key
 
     def block(self, device: str, samples: Sequence[Sample]) -> None:
-        """Queues the changed samples of one scan of a device, merged with a waiting block."""
+        """Queues the changed samples of one scan of a device, merged with a waiting block.
+
+        A long block goes out in parts: many clients drop long messages.
+        """
         if self._session is None or self._closing:
             return
         key = self._keys.block(device)
+        merged: dict[str, Sample] = {}
         with self._filled:
-            older = self._waiting.pop(key, None)
-            merged = dict(older[2]) if older and isinstance(older[2], dict) else {}
+            for part in range(len(self._waiting)):
+                older = self._waiting.pop((key, part), None)
+                if older is None or not isinstance(older[2], dict):
+                    break
+                merged |= older[2]
             merged |= {sample.tag.name: sample for sample in samples}
-            self._waiting[key] = (self._session.new_timestamp(), key, merged)
+            for part, some in enumerate(parts_of(merged)):
+                self._waiting[key, part] = (self._session.new_timestamp(), key, some)
             self._filled.notify()
 
     def events(self, samples: Iterable[Sample]) -> None:

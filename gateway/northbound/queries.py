@@ -14,6 +14,7 @@ import zenoh
 
 from gateway.engine.requests import CommandResult
 from gateway.errors import BadValue, Busy
+from gateway.northbound.acceptance import sender
 from gateway.northbound.answers import Answer, AnswerPool, QueryCounters
 from gateway.northbound.commands import Commands
 from gateway.northbound.interfaces import Plant
@@ -21,7 +22,7 @@ from gateway.northbound.keys import Family, ParsedKey, max_age, parse_key
 from gateway.northbound.payload import Failure, Problem
 from gateway.northbound.replies import Replies
 from gateway.northbound.tag_index import TagIndex
-from gateway.northbound.writes import ANSWER_WITHIN, Writes, sender
+from gateway.northbound.writes import ANSWER_WITHIN, Writes
 from gateway.tags import Tag, WriteResult
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
@@ -65,8 +66,8 @@ class Queries:
         else:
             self._pool.refuse(query)
 
-    def take(self, query: zenoh.Query) -> None:
-        """Starts the answer to one query."""
+    def take(self, query: zenoh.Query, at: float) -> None:
+        """Starts the answer to one query. `at`: when it arrived."""
         parsed = parse_key(str(query.key_expr))
         if self._is_foreign(parsed):
             self._pool.dismiss(query)
@@ -75,9 +76,9 @@ class Queries:
             return
         match parsed.family:
             case Family.SET:
-                self._start(self._set(query))
+                self._start(self._set(query, at))
             case Family.COMMAND:
-                self._start(self._command(query))
+                self._start(self._command(query, at))
             case Family.STATUS if query.parameters.get("_time") is not None:
                 self._pool.answer_wide(query, partial(self._replies.writes, time.time_ns()))
             case Family.STATUS:
@@ -120,17 +121,19 @@ class Queries:
         """Ends the answering threads, after the session is closed."""
         self._pool.end()
 
-    async def _set(self, query: zenoh.Query) -> None:
+    async def _set(self, query: zenoh.Query, at: float) -> None:
         result: WriteResult | Failure = _ENDING
+        key, by = str(query.key_expr), sender(query, at)
         try:
-            result = await self._writes.write(str(query.key_expr), _data(query), sender(query))
+            result = await self._writes.write(key, _data(query), by)
         finally:
             self._pool.answer(query, partial(self._replies.outcome, result))
 
-    async def _command(self, query: zenoh.Query) -> None:
+    async def _command(self, query: zenoh.Query, at: float) -> None:
         result: CommandResult | Failure = _ENDING
+        key, by = str(query.key_expr), sender(query, at)
         try:
-            result = await self._commands.execute(str(query.key_expr), _data(query), sender(query))
+            result = await self._commands.execute(key, _data(query), by)
         finally:
             self._pool.answer(query, partial(self._commands.reply, result))
 

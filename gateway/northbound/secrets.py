@@ -15,6 +15,7 @@ import zenoh
 from gateway.errors import ConfigError
 
 PASSWORD_VARIABLE = "PLC_GATEWAY_ZENOH_PASSWORD"  # noqa: S105  (the name of a variable)
+SHORTEST_SECRET = 20  # characters of the secret of a standby group
 _SECRET = re.compile(r"""["']?(password|\w*_base64)["']?\s*:\s*["'\d]""")
 _MAY_HOLD_SECRET = re.compile(r"passw|usrpwd|_base64", re.IGNORECASE)
 _LOCAL_PROTOCOLS = ("unixsock-stream",)
@@ -52,6 +53,19 @@ def password(file: Path | None) -> str | None:
     found = readable_secret(file, "zenoh.password_file").partition("\n")[0].strip()
     if not found:
         raise ConfigError(f"zenoh.password_file {file} has an empty first line")
+    return found
+
+
+def group_secret(file: Path | None) -> str | None:
+    """Returns the first line of the secret of a standby group. Raises `ConfigError`."""
+    if file is None:
+        return None
+    called = "gateway.standby_secret_file"
+    found = readable_secret(file, called).partition("\n")[0].strip()
+    if len(found) < SHORTEST_SECRET:
+        raise ConfigError(
+            f"{called} {file}: its first line has fewer than {SHORTEST_SECRET} characters"
+        )
     return found
 
 
@@ -116,6 +130,27 @@ def exposures(config: zenoh.Config) -> list[str]:
             f"passwords and values travel in the clear on {', '.join(unencrypted)}: use tls/"
         )
     return warnings
+
+
+def unsigned() -> list[str]:
+    """Returns the warning about a standby group without a secret."""
+    warning = (
+        "`standby` without `standby_secret_file`: any program that connects can take both gateways "
+        "off the wire; see docs/standby.md"
+    )
+    return [warning]
+
+
+def unruled(config: zenoh.Config) -> list[str]:
+    """Returns a warning, as a sentence, if clients connect here and no rules restrict their keys:
+    for a gateway that knows its writers."""
+    if not _endpoints(config) or _setting(config, "access_control/enabled") is True:
+        return []
+    warning = (
+        "`writers` without access_control: any program that connects can answer a write in place "
+        "of the gateway, and publish values; see docs/access-control.md"
+    )
+    return [warning]
 
 
 def _endpoints(config: zenoh.Config) -> list[object]:

@@ -4,11 +4,15 @@ import asyncio
 import time
 from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 
 import structlog
 import zenoh
 
+from gateway.line.duty import Duty
+from gateway.northbound import secrets
 from gateway.northbound.election import Election, Role, RoleToken, State
+from gateway.northbound.group_tokens import GroupTokens
 from gateway.northbound.inbox import Inbox
 from gateway.northbound.keys import Keys
 from gateway.northbound.second_session import SecondSession
@@ -24,10 +28,14 @@ _TOKENS = {State.CLAIMING: (Role.CLAIM,), State.ACTIVE: (Role.CLAIM, Role.ACTIVE
 
 @dataclass(frozen=True, slots=True)
 class StandbySettings:
-    """`group`: shared by the gateways of one plant. `alone`: seconds, see `Election`."""
+    """`group`: shared by the gateways of one plant. `alone`: seconds, see `Election`.
+
+    `secret_file`: its first line is the secret that signs the tokens of the group.
+    """
 
     group: str
     alone: float | None = None
+    secret_file: Path | None = None
 
 
 class Standby:
@@ -36,7 +44,9 @@ class Standby:
     Without settings it is `enabled` false, and active at once and for ever.
     """
 
-    def __init__(self, settings: StandbySettings | None, keys: Keys) -> None:
+    def __init__(self, settings: StandbySettings | None, keys: Keys, duty: Duty) -> None:
+        """`duty` gets the proof that this gateway is active, again and again. Raises `ConfigError`
+        for a bad secret."""
         self.enabled = settings is not None
         self.active = asyncio.Event()
         self.replaced = asyncio.Event()
@@ -44,6 +54,9 @@ class Standby:
         if not self.enabled:
             self.active.set()
         self._keys = keys
+        secret = secrets.group_secret(self._settings.secret_file)
+        self._group = GroupTokens(keys, self._settings.group, secret)
+        self._duty = duty
         self._election: Election | None = None
         self._session: zenoh.Session | None = None  # of the tokens
         self._tokens: dict[Role, zenoh.LivelinessToken] = {}
@@ -82,11 +95,11 @@ class Standby:
         """Observes the group as soon as the session of the tokens is open."""
         found = await second.session()
 
-        def token_changed(sample: zenoh.Sample) -> None:
-            if token := _parse_token(str(sample.key_expr)):
+        def token_changed(sample: zenoh.Sample, _at: float) -> None:
+            if token := self._group.parse(str(sample.key_expr), time.monotonic()):
                 election.token_changed(token, sample.kind == zenoh.SampleKind.PUT)
 
-        def link_changed(event: zenoh.TransportEvent) -> None:
+        def link_changed(event: zenoh.TransportEvent, _at: float) -> None:
             linked, kind = str(event.transport.zid), str(event.transport.whatami)
             is_up = event.kind != zenoh.SampleKind.DELETE
             election.link_changed(linked, is_up, kind == "router", time.monotonic())
@@ -98,15 +111,16 @@ class Standby:
         def declare() -> list[object]:
             return [
                 found.info.declare_transport_events_listener(links, history=True),
-                found.liveliness().declare_subscriber(self._group_keys, tokens, history=True),
+                found.liveliness().declare_subscriber(self._group.all, tokens, history=True),
             ]
 
         self._declared = await off_loop(declare)
 
     async def _decide(self, election: Election, opening: asyncio.Task[None]) -> None:
-        def token_found(reply: zenoh.Reply) -> None:
-            if reply.ok and (token := _parse_token(str(reply.ok.key_expr))):
-                election.token_found(token, time.monotonic())
+        def token_found(reply: zenoh.Reply, _at: float) -> None:
+            now = time.monotonic()
+            if reply.ok and (token := self._group.parse(str(reply.ok.key_expr), now)):
+                election.token_found(token, now)
 
         replies = Inbox(token_found, lambda _: None)
         without_link = 0
@@ -118,9 +132,15 @@ class Standby:
                 log.info("standby state changed", group=self._settings.group, state=state.value)
             await self._update_tokens(election, state)
             if state is State.ACTIVE:
+                self._duty.prove(asyncio.get_running_loop().time())
                 self.active.set()
             if state is State.REPLACED and not self.replaced.is_set():
-                log.error("gateway replaced", why="another gateway of the group may be active")
+                by = election.replaced_by
+                log.error(
+                    "gateway replaced",
+                    why="another gateway of the group may be active",
+                    token=None if by is None else self._group.key(by),
+                )
                 self.replaced.set()
             without_link = without_link + 1 if election.waits_for_link else 0
             if without_link == _DECISIONS_WITHOUT_LINK:
@@ -139,22 +159,11 @@ class Standby:
             await off_loop(self._tokens.pop(role).undeclare)
         for role in wanted:
             if role not in self._tokens:
-                group, name = self._settings.group, self._keys.gateway
-                key = self._keys.role_token(group, role.value, name, election.session)
+                key = self._group.key(RoleToken(role, self._keys.gateway, election.session))
                 self._tokens[role] = await off_loop(session.liveliness().declare_token, key)
-
-    @property
-    def _group_keys(self) -> str:
-        return f"{self._keys.group(self._settings.group)}/**"
 
     def _query_tokens(self, session: zenoh.Session, replies: Inbox[zenoh.Reply]) -> None:
         """Queries the tokens besides subscribing to them, so that one lost message does no
         harm."""
         handler = zenoh.handlers.Callback(replies, indirect=False)
-        session.liveliness().get(self._group_keys, handler, timeout=_QUERY_TIMEOUT)
-
-
-def _parse_token(key: str) -> RoleToken | None:
-    """`…/@standby/<group>/<role>/<name>/<session>`"""
-    *_, role, name, session = key.split("/")
-    return RoleToken(Role(role), name, session) if role in list(Role) else None
+        session.liveliness().get(self._group.all, handler, timeout=_QUERY_TIMEOUT)

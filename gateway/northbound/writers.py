@@ -1,70 +1,85 @@
-"""The writers file: clients that may write, known by the salted hashes of their tokens.
+"""The writers file: clients that may write, known by the signatures of their requests.
 
-A line of the file is `name:salt:hash`, where hash is SHA-256 of salt and token in hexadecimal. A
-token is long and random, so it needs no slow hash; a slow hash would let any client keep the
-gateway busy with wrong tokens.
+A line of the file is `name:secret`. The secret is never sent. A signed request counts once, and
+only for seconds: a program that receives it cannot use it again.
 """
 
-import hashlib
-import hmac
 import re
 import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
 
 import structlog
 
 from gateway.errors import ConfigError, GatewayError
+from gateway.northbound import signatures
 from gateway.northbound.secrets import readable_secret
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 
-SHORTEST_TOKEN, LONGEST_TOKEN = 20, 200  # characters
-_MOST = 100  # writers: each costs a hash for every write
-_LINE = re.compile(r"([\w.\-]{1,60}):([\w.\-]{8,100}):([0-9a-fA-F]{64})\Z")
+LATEST, EARLIEST = 5.0, 1.0  # seconds that a signature may be old, or ahead of our clock
+_MOST = 100  # writers
+_LINE = re.compile(r"([\w.\-]{1,60}):([\w.\-~+/=]{20,200})\Z")
+_OLD_LINE = re.compile(r"[\w.\-]{1,60}:[\w.\-]{8,100}:[0-9a-fA-F]{64}\Z")
 _CHECK_EVERY = 1.0  # seconds between two looks at the file
 
 
 class NotAllowed(GatewayError):
-    """The token is missing or unknown; nothing was done."""
+    """The signature is missing, wrong or too old; nothing was done."""
 
 
-class Sender(NamedTuple):
-    """The client that sent a query or put."""
-
-    session: str | None = None  # Zenoh's id, if the client sends it
-    token: bytes | None = None
-
-
-class _Writer(NamedTuple):
-    name: str
-    salt: bytes
-    digest: bytes
+class Repeated(GatewayError):
+    """A signed request arrived twice. The first one may have been done."""
 
 
 class Writers:
     """The file, reloaded when it changes. Raises `ConfigError` if the first load fails."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, wall: Callable[[], int] = time.time_ns) -> None:
+        """`wall`: ns since 1970."""
         self._path = path
+        self._wall = wall
         self._checked = time.monotonic()
         self._version = self._stat()
         self._writers = _load(path)
+        self._nonces: dict[str, float] = {}  # with the times of their signatures
+        self._since = wall() / 1e9 + EARLIEST  # an earlier process may have taken older ones
 
-    def owner(self, token: bytes | None) -> str:
-        """Returns the name of the token's owner. Raises `NotAllowed`."""
+    def begin(self) -> None:
+        """Refuses older signatures from now on: another gateway of the group took them."""
+        self._since = max(self._since, self._wall() / 1e9)
+
+    def writer(self, key: str, data: bytes, attachment: bytes | None) -> str:
+        """Returns the name of the writer that signed the request. Raises `NotAllowed`,
+        `Repeated`."""
         self._reload()
-        if token is None:
-            raise NotAllowed("writing needs a token, as the attachment of the query or put")
-        if len(token) < SHORTEST_TOKEN:
-            raise NotAllowed(f"a token has at least {SHORTEST_TOKEN} characters")
-        name = None
-        for writer in self._writers:  # always all: the time must not show which one matched
-            if hmac.compare_digest(hashlib.sha256(writer.salt + token).digest(), writer.digest):
-                name = writer.name
-        if name is None:
-            raise NotAllowed("the token is unknown")
-        return name
+        signed = signatures.parse(attachment)
+        if signed is None:
+            raise NotAllowed(
+                'a signature is required, as the attachment {"by", "time", "nonce", "signature"}: '
+                "see docs/security.md"
+            )
+        secret = self._writers.get(signed.by)
+        if secret is None or not signed.matches(secret, key, data):
+            raise NotAllowed("the signature is wrong: is the secret, the key or the value another?")
+        self._check_time(signed.made)
+        if signed.nonce in self._nonces:
+            raise Repeated("this signed request arrived before: it may have been done")
+        self._nonces[signed.nonce] = signed.made
+        return signed.by
+
+    def _check_time(self, made: float) -> None:
+        now = self._wall() / 1e9
+        self._since = max(self._since, now - LATEST)
+        for nonce in [nonce for nonce, at in self._nonces.items() if at <= self._since]:
+            del self._nonces[nonce]
+        if made > now + EARLIEST:
+            raise NotAllowed(f"its time is {made - now:.1f} s ahead of the gateway's clock")
+        if made <= self._since:
+            age = max(0.0, now - made)
+            raise NotAllowed(
+                f"it was signed {age:.1f} s ago, more than {LATEST:g} s or before the gateway began"
+            )
 
     def _reload(self) -> None:
         now = time.monotonic()
@@ -79,7 +94,7 @@ class Writers:
             self._writers = _load(self._path)
             log.info("writers file reloaded", count=len(self._writers))
         except ConfigError as error:
-            self._writers = ()
+            self._writers = {}
             log.error("writers file rejected", why=str(error), so="every write is refused")  # noqa: TRY400  (a sentence, no trace)
 
     def _stat(self) -> tuple[int, ...] | None:
@@ -90,20 +105,27 @@ class Writers:
         return (found.st_mtime_ns, found.st_size, found.st_ino, found.st_mode)
 
 
-def _load(path: Path) -> tuple[_Writer, ...]:
-    writers: dict[str, _Writer] = {}
+def _load(path: Path) -> dict[str, bytes]:
+    """Returns the secrets by name."""
+    writers: dict[str, bytes] = {}
     text = readable_secret(path, "writers.file")
     for number, line in enumerate(text.splitlines(), 1):
         line = line.strip()
         if not line or line.startswith("#"):
             continue
+        place = f"writers.file {path}, line {number}"
+        if _OLD_LINE.match(line):
+            raise ConfigError(
+                f"{place}: tokens are no longer sent, so their hashes are of no use: make a secret "
+                "and write the line as name:secret; see docs/security.md"
+            )
         match = _LINE.match(line)
         if match is None:
-            raise ConfigError(f"writers.file {path}, line {number}: write it as name:salt:hash")
-        name, salt, digest = match.groups()
+            raise ConfigError(f"{place}: write it as name:secret, with 20 to 200 characters")
+        name, secret = match.groups()
         if name in writers:
-            raise ConfigError(f"writers.file {path}, line {number}: {name} is there twice")
-        writers[name] = _Writer(name, salt.encode(), bytes.fromhex(digest))
+            raise ConfigError(f"{place}: {name} is there twice")
+        writers[name] = secret.encode()
     if len(writers) > _MOST:
         raise ConfigError(f"writers.file {path}: {len(writers)} writers, more than {_MOST}")
-    return tuple(writers.values())
+    return writers

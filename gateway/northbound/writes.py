@@ -13,11 +13,12 @@ import zenoh
 
 from gateway.errors import Busy, GatewayError
 from gateway.northbound import payload
+from gateway.northbound.acceptance import Acceptance, Sender, sender
 from gateway.northbound.interfaces import Plant
 from gateway.northbound.keys import parse_key
 from gateway.northbound.payload import Failure, Problem, WriteOutcome
 from gateway.northbound.tag_index import TagIndex
-from gateway.northbound.writers import LONGEST_TOKEN, NotAllowed, Sender, Writers
+from gateway.northbound.writers import NotAllowed, Repeated
 from gateway.tags import Tag, WriteResult
 from gateway.values import Value
 
@@ -36,13 +37,13 @@ class Writes:
         plant: Plant,
         index: TagIndex,
         audit: Callable[[WriteOutcome], None],
-        writers: Writers | None = None,
+        acceptance: Acceptance,
     ) -> None:
-        """`audit` gets every outcome. Without `writers`, Zenoh alone decides who may write."""
+        """`audit` gets every outcome."""
         self._plant = plant
         self._index = index
         self._audit = audit
-        self._writers = writers
+        self._acceptance = acceptance
         self._waiting = 0
 
     async def write(self, key: str, data: bytes | None, sender: Sender) -> WriteResult | Failure:
@@ -53,36 +54,39 @@ class Writes:
         result: WriteResult | Failure = Failure(
             Problem.UNCLEAR, "the gateway ended before the write"
         )
+        refused: Failure | None = None  # instead of `result` in the audit
         self._waiting += 1
         try:
-            if self._writers is not None:
-                by = self._writers.owner(sender.token)
+            by, within = self._acceptance.accept(key, data, sender)
             target = self._target(key)
             if isinstance(target, Failure):
                 result = target
             else:
                 value = payload.parse_write(data or b"")
-                result = await self._write_tag(target, value)
+                result = await self._write_tag(target, value, within)
         except TimeoutError:
             result = Failure(
                 Problem.UNCLEAR, f"not acknowledged within {ANSWER_WITHIN:g} s: it may yet be done"
             )
         except NotAllowed as error:
             result = Failure(Problem.NOT_ALLOWED, str(error))
+        except Repeated as error:
+            result = Failure(Problem.UNCLEAR, str(error))
+            refused = Failure(Problem.NOT_ALLOWED, str(error))
         except GatewayError as error:
             result = payload.failure(error)
         finally:
             self._waiting -= 1
             took = time.monotonic() - started
             value_key = parse_key(key).target
-            self._audit(WriteOutcome(value_key, value, result, time.time_ns(), took, by))
+            self._audit(WriteOutcome(value_key, value, refused or result, time.time_ns(), took, by))
         return result
 
-    async def _write_tag(self, tag: Tag, value: Value) -> WriteResult:
+    async def _write_tag(self, tag: Tag, value: Value, within: float) -> WriteResult:
         if self._waiting > MOST_WAITING:
             raise Busy(f"{MOST_WAITING} writes are waiting already")
         async with asyncio.timeout(ANSWER_WITHIN):
-            return await self._plant.write(tag, value)
+            return await self._plant.write(tag, value, within)
 
     def _target(self, key: str) -> Tag | Failure:
         value_key = parse_key(key).target
@@ -109,12 +113,12 @@ class PutWrites:
         self._index = index
         self._tasks: set[asyncio.Task[object]] = set()
 
-    def take(self, put: zenoh.Sample) -> None:
-        """Called on the event loop."""
+    def take(self, put: zenoh.Sample, at: float) -> None:
+        """Called on the event loop. `at`: when the put arrived."""
         key = str(put.key_expr)
         if "*" not in key and not self._index.owns(parse_key(key).target):
             return  # for another gateway
-        work = self._writes.write(key, _payload(put), sender(put))
+        work = self._writes.write(key, _payload(put), sender(put, at))
         task: asyncio.Task[object] = asyncio.get_running_loop().create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._ended)
@@ -131,15 +135,6 @@ class PutWrites:
         self._tasks.discard(task)
         if not task.cancelled() and (error := task.exception()):
             log.error("write crashed", exc_info=error)
-
-
-def sender(message: zenoh.Query | zenoh.Sample) -> Sender:
-    """Returns session and token of the client, as far as it sends them: most clients do not."""
-    source, token = message.source_info, message.attachment
-    return Sender(
-        None if source is None else str(source.source_id.zid),
-        None if token is None or len(token) > LONGEST_TOKEN else token.to_bytes(),
-    )
 
 
 def _payload(put: zenoh.Sample) -> bytes | None:

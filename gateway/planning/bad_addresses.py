@@ -199,6 +199,7 @@ class BadAddresses:
         self.changed |= {Span(area, n - 1, 2) for area, n in self.splits}
         self._suspected |= self.splits  # one search is enough to find them again
         self.splits.clear()
+        self._rejoin_at = None
         return True
 
     def abandon(self) -> None:

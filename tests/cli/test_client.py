@@ -2,6 +2,7 @@
 
 import json
 import signal
+import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import replace
@@ -217,6 +218,44 @@ def test_a_late_value_of_a_lost_gateway_is_not_shown(config: Config) -> None:
         served = there.declare_queryable("plant/**", saying(("mixer/speed", good(3), None)))
         token = there.liveliness().declare_token("plant/@gateway/demo")
         assert shown_as(news) == 3
+
+
+def test_the_values_of_a_device_that_went_offline_are_queried(config: Config) -> None:
+    """Whatever was published of it may be lost on the way."""
+    with (
+        answering(config, {}) as there,
+        connected(config, print) as client,
+        closing(client.follow(["**"])) as news,
+    ):
+        served = there.declare_queryable("plant/**", saying(("mixer/speed", good(1), None)))
+        token = there.liveliness().declare_token("plant/@gateway/demo/alive/mixer")
+        assert shown_as(news) == 1
+        served.undeclare()  # type: ignore[no-untyped-call]  # Zenoh's stub lacks it
+        served = there.declare_queryable("plant/**", saying(("mixer/speed", good(2), None)))
+        otherwise = threading.Timer(10, there.put, ("plant/mixer/speed", good(99)))
+        otherwise.start()
+        token.undeclare()  # type: ignore[no-untyped-call]  # Zenoh's stub lacks it
+        while (value := shown_as(news)) == 1:
+            pass
+        otherwise.cancel()
+        assert value == 2
+
+
+def test_a_block_of_an_older_gateway_may_be_longer_than_what_a_gateway_takes(
+    config: Config,
+) -> None:
+    device = replace(config.lines[0].devices[0], blocks="only")
+    config = replace(config, lines=(replace(config.lines[0], devices=(device,)),))
+    with (
+        answering(config, {"plant/**": saying(("mixer/speed", good(1), None))}) as there,
+        connected(config, print) as client,
+        closing(client.follow(["**"])) as news,
+    ):
+        assert shown_as(news) == 1
+        large = {"speed": json.loads(good(2)), "other": "x" * 1_000_000}
+        there.put("plant/mixer/@block", json.dumps(large))
+        there.put("plant/mixer/@block", json.dumps({"speed": json.loads(good(3))}))
+        assert shown_as(news) == 2
 
 
 def test_in_a_standby_group_a_value_after_the_loss_causes_a_new_query(tmp_path: Path) -> None:

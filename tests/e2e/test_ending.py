@@ -180,7 +180,8 @@ async def test_a_second_gateway_at_the_same_port_reports_it_and_waits(
 
 def test_a_zenoh_port_in_use_is_reported_in_one_line(plant: Plant, tmp_path: Path) -> None:
     lines = {"hall": vigor_line("simulator", {"speed": {"address": "D10"}})}
-    other = write_config(tmp_path / "other.yaml", plant.endpoint, lines)
+    name = {"name": "other"}
+    other = write_config(tmp_path / "other.yaml", plant.endpoint, lines, gateway=name)
     with started(plant.config):
         done = plc_gateway("run", other)
     assert done.code == 1

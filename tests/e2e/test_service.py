@@ -195,7 +195,7 @@ async def test_a_published_value_is_found_by_the_next_query(tmp_path: Path) -> N
     assert speed is not None
     found: dict[str, list[object]] = {}
 
-    def answer(query: str) -> None:
+    def answer(query: str, _at: float) -> None:
         found[query] = [sample.value for sample in historian.samples(speed, "[..]", None)]
 
     class Network:

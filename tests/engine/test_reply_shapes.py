@@ -4,7 +4,7 @@ import pytest
 
 from gateway.engine.device import Device
 from gateway.engine.health import State
-from gateway.engine.jobs import Poll, Probe, Resynced, Sent
+from gateway.engine.jobs import Idle, Poll, Probe, Resynced, Sent
 from gateway.engine.longer_reads import KNOWN_FOR, MOST_FAILED, MOST_WARY
 from gateway.engine.reply_shapes import (
     MARK_FIRST,
@@ -126,16 +126,18 @@ def test_a_longer_span_without_replies_is_given_up() -> None:
     longer = span._replace(size=11)
     read(shapes, dev, 0.0)
     for _ in range(MOST_FAILED - 1):
-        shapes.longer.unanswered(span)
+        shapes.longer.unanswered(span, 0.0)
         assert read(shapes, dev, 0.01) == span  # alone, once
     shapes.longer.answered(span)
     for _ in range(MOST_FAILED - 1):
-        shapes.longer.unanswered(span)
+        shapes.longer.unanswered(span, 0.0)
         read(shapes, dev, 0.01)
     assert read(shapes, dev, 0.02) == longer
-    shapes.longer.unanswered(span)
+    shapes.longer.unanswered(span, 0.03)
     assert [read(shapes, dev, now) for now in (0.04, 0.06)] == [span, span]
-    shapes.longer.restart(0.07)
+    shapes.longer.restart(0.07)  # it was online before, and knew the same addresses
+    assert longer not in [read(shapes, dev, now) for now in (0.08, 0.1)]
+    shapes.longer.restart(KNOWN_FOR + 0.1)
     assert longer in [read(shapes, dev, now) for now in (0.08, 0.1)]
 
 
@@ -315,3 +317,27 @@ def test_on_a_wire_that_is_never_quiet_a_resync_shows_the_order_from_time_to_tim
     assert marks[0] >= MARK_FIRST
     assert marks[-1] >= MARK_LONGEST
     assert marks == sorted(marks)
+
+
+def test_a_device_that_is_silent_about_other_addresses_stays_online_with_no_retries() -> None:
+    """A longer read without a reply made it offline, again and again."""
+    rig = Rig(device(words(100, 10, every=0.05), retries=0))
+    rig.bring(State.ONLINE)
+    own, longer = 0, 0
+    for _ in range(200):
+        rig.now += 0.02
+        match rig.next():
+            case Probe() as probe:
+                rig.conclude(probe, Resynced(9))
+            case Poll(span=span, block=block) as poll if span == block.span:
+                own += 1
+                rig.conclude(poll, [0] * span.size)
+            case Poll() as poll:
+                longer += 1
+                rig.fail(poll)
+            case Idle(until=until):
+                rig.now = until
+    assert rig.device.state is State.ONLINE
+    assert "device offline" not in [event.event for event in rig.logged]
+    assert longer == MOST_FAILED
+    assert own > 30

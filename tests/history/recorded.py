@@ -37,8 +37,9 @@ def history(
         assert historian.close(10)
 
 
-def record_outcome(historian: Historian, outcome: WriteOutcome) -> None:
-    historian.record_write(outcome.time, payload.write_outcome(outcome).decode())
+def record_outcome(historian: Historian, outcome: WriteOutcome, *, refused: bool = False) -> None:
+    text = payload.write_outcome(outcome).decode()
+    historian.record_write(outcome.time, text, refused=refused)
 
 
 def values(

@@ -119,7 +119,7 @@ class SlowHistory:
     def writes(self, time_range: str, limit: int | None, now: int) -> Iterator[str]:
         return self._answer(time_range, now, ["{}"])
 
-    def record_write(self, time: int, outcome: str) -> None:
+    def record_write(self, time: int, outcome: str, *, refused: bool) -> None:
         raise NotImplementedError
 
     def _answer(self, time_range: str, now: int, found: list[T]) -> Iterator[T]:

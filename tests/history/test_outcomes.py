@@ -76,3 +76,29 @@ def test_queries_see_each_outcome_once_while_it_moves_to_disk(tmp_path: Path) ->
         for number in range(500):
             record_outcome(historian, write(number))
             assert written(historian) == list(range(number + 1))
+
+
+def test_refusals_push_out_no_write(tmp_path: Path) -> None:
+    path = tmp_path / "h.db"
+    with history(path, max_size=10**6) as historian:
+        for number in range(20):
+            record_outcome(historian, write(number))
+        for number in range(20, 1000):
+            record_outcome(historian, write(number), refused=True)
+        until(historian, writes_stored=20, refusals_stored=980)
+        assert written(historian) == [*range(20), *range(900, 1000)]
+        record_outcome(historian, write(1000))
+        assert written(historian)[-2:] == [999, 1000]  # in the order of time, also from memory
+
+
+def test_a_file_of_an_older_version_gets_a_ring_of_refusals(tmp_path: Path) -> None:
+    path = tmp_path / "h.db"
+    with history(path) as historian:
+        record_outcome(historian, write(1))
+        until(historian, writes_stored=1)
+    with closing(sqlite3.connect(path)) as database:
+        database.execute("DROP TABLE refused")
+    with history(path) as historian:
+        record_outcome(historian, write(2), refused=True)
+        until(historian, refusals_stored=1)
+        assert written(historian) == [1, 2]

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from gateway.errors import Busy
 from gateway.history import Historian, TimeRange
 from gateway.history.file import HistoryFile
-from gateway.history.outcomes import Outcome
+from gateway.history.outcomes import Outcome, Ring
 from gateway.history.reader import Part, Reader, in_order
 from gateway.history.recent import Identity
 from gateway.history.timerange import EARLIEST, LATEST
@@ -69,10 +69,10 @@ def test_writes_that_are_dropped_during_an_answer_end_it_with_an_error(tmp_path:
     everything = TimeRange(EARLIEST, LATEST)
     with closing(HistoryFile(path, 10**8)) as file:
         outcomes = [Outcome(NOON + n, str(n)) for n in range(2500)]
-        last = file.store_writes(outcomes, 2500)
-        answer = Reader(path).writes(file.identity, last, everything)
+        last = file.store_writes(Ring.WRITTEN, outcomes, 2500)
+        answer = Reader(path).writes(Ring.WRITTEN, file.identity, last, everything)
         found = [next(answer).text for _ in range(10)]
-        assert file.store_writes([Outcome(NOON + 2500, "2500")], 500) == 2501
+        assert file.store_writes(Ring.WRITTEN, [Outcome(NOON + 2500, "2500")], 500) == 2501
         with pytest.raises(Busy, match="dropped meanwhile"):
             found.extend(outcome.text for outcome in answer)
         assert found == [str(n) for n in range(len(found))]
@@ -116,7 +116,7 @@ def test_a_file_that_has_just_been_replaced_answers_no_query(
         with pytest.raises(Busy, match="another file"):
             reader.samples(another, SPEED, run, everything, None)
         with pytest.raises(Busy, match="another file"):
-            next(reader.writes(another, 1, everything))
+            next(reader.writes(Ring.WRITTEN, another, 1, everything))
         shutil.copy(path, tmp_path / "copy.db")
         (tmp_path / "copy.db").replace(path)
         with pytest.raises(Busy, match="another file"):

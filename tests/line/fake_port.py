@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 from gateway.line.channel import Channel, Echo
+from gateway.line.duty import Duty
 from gateway.line.transaction import Transaction
 from gateway.line.wire_log import WireLog
 from gateway.planning.wire_timing import WireTiming
@@ -55,6 +56,7 @@ def opened(
     echo: bool = False,
     needs_resync: bool = False,
     unmatched: list[Any] | None = None,
+    duty: Duty | None = None,
 ) -> Transaction:
     """A transaction on the port. `unmatched` collects the frames that are no reply."""
     driver = driver or Vigor(station=1)
@@ -65,6 +67,7 @@ def opened(
         device.health.answered()
     channel = Channel(port, wire, WireLog("test"), Echo("test", echo))
     channel.quiet_since = quiet_since
+    channel.may_not_send = (duty or Duty()).why_not
     frames = [] if unmatched is None else unmatched
     port.talk = Transaction(channel, device, lambda _, frame, echo: frames.append(frame))
     return port.talk

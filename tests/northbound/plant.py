@@ -13,6 +13,7 @@ from gateway.errors import (
     BadValue,
     Busy,
 )
+from gateway.line.duty import Duty
 from gateway.northbound import Northbound
 from gateway.protocols.driver import Address, Span, Unit
 from gateway.tags import Reason, Sample, Tag, WriteResult, WriteRule, bad, good
@@ -45,6 +46,7 @@ class PlainPlant:
     command ends with `command_result`."""
 
     def __init__(self, *devices: PlainDevice) -> None:
+        self.duty = Duty()
         self._devices = devices
         self._tags = {tag.key: tag for device in devices for tag in device.tags}
         self.samples = {
@@ -70,7 +72,7 @@ class PlainPlant:
     def sample(self, tag: Tag) -> Sample:
         return self.samples[tag.key]
 
-    async def write(self, tag: Tag, value: Value) -> WriteResult:
+    async def write(self, tag: Tag, value: Value, within: float) -> WriteResult:
         tag.encode(value)
         await self.gate.wait()
         if value in self.endings:
@@ -89,7 +91,9 @@ class PlainPlant:
             raise BadValue(f"there is no line {line}")
         return "oven"
 
-    async def control(self, device: str, command: str, argument: str) -> CommandResult:
+    async def control(
+        self, device: str, command: str, argument: str, within: float
+    ) -> CommandResult:
         self.commanded.append((device, command, argument))
         if isinstance(self.command_result, Exception):
             raise self.command_result

@@ -17,7 +17,13 @@ def outcome(result: WriteResult | Failure, number: int = 0) -> WriteOutcome:
 def test_a_flood_of_refusals_is_counted_while_sent_writes_are_all_reported() -> None:
     published: list[bytes] = []
     recorded: list[tuple[int, str]] = []
-    audit = Audit(published.append, lambda time, text: recorded.append((time, text)))
+    rings: list[bool] = []
+
+    def record(time: int, text: str, *, refused: bool) -> None:
+        recorded.append((time, text))
+        rings.append(refused)
+
+    audit = Audit(published.append, record)
     with structlog.testing.capture_logs() as lines:
         for number in range(10_000):
             audit(outcome(Failure(Problem.UNKNOWN_TAG, "no"), number))
@@ -29,11 +35,14 @@ def test_a_flood_of_refusals_is_counted_while_sent_writes_are_all_reported() -> 
             audit(outcome(ending))
         audit.report_suppressed()
         audit.report_suppressed()
-    assert len(published) == len(recorded) == BURST + 3
+    assert len(published) == len(recorded) == BURST + 3 + 1
+    assert rings == BURST * [True] + 3 * [False] + [True]
     assert [text.encode() for _, text in recorded] == published
-    assert [time for time, _ in recorded] == [*range(BURST), 0, 0, 0]
+    assert [time for time, _ in recorded[:-1]] == [*range(BURST), 0, 0, 0]
     words = [json.loads(data)["outcome"] for data in published[BURST:]]
-    assert words == ["written", "unclear", "refused"]
+    assert words == ["written", "unclear", "refused", "suppressed"]
+    summary = json.loads(published[-1])
+    assert (summary["count"], summary["kinds"]) == (9_700, {"unknown-tag": 9_700})
     assert audit.suppressed == 10_000 - BURST
     assert len(lines) == BURST + 3 + 1
     assert lines[-1]["count"] == 10_000 - BURST

@@ -25,6 +25,19 @@ def test_a_device_that_another_gateway_claimed_is_taken() -> None:
     assert first.taken() == {}
 
 
+def test_of_two_gateways_with_one_name_the_second_must_end() -> None:
+    first, second = Claims("1", "demo", None, ["mixer"]), Claims("2", "demo", None, ["press"])
+    assert not first.namesake()
+    second.found(first.claim(1000, ()))
+    assert second.namesake()
+    first.found(second.claim(1001, ()))
+    assert (first.namesake(), second.namesake()) == (False, True)
+    second.lost("1")
+    assert not second.namesake()
+    first.found(gateway("3").claim(1, ()))
+    assert not first.namesake()
+
+
 def test_a_clock_that_is_behind_does_not_displace_the_first_gateway() -> None:
     first, second = gateway("2"), gateway("1")
     second.found(first.claim(1_000_000, ()))

@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import time
 from typing import Any
 
 import pytest
@@ -11,11 +12,11 @@ from structlog.testing import capture_logs
 from gateway.config.commands import NotControlled
 from gateway.engine.requests import CommandResult
 from gateway.errors import LineDown
+from gateway.northbound.acceptance import Acceptance, Sender
 from gateway.northbound.audit import Audit
 from gateway.northbound.commands import Commands
 from gateway.northbound.keys import Family, Keys, parse_key
 from gateway.northbound.payload import Failure, Problem
-from gateway.northbound.writers import Sender
 from tests.northbound.plant import PlainPlant, mixer
 
 KEYS = Keys("plant", "demo")
@@ -51,9 +52,10 @@ def execute(
     published: list[bytes] = []
     recorded: list[str] = []
     with capture_logs() as logs:
-        audit = Audit(published.append, lambda _, text: recorded.append(text))
-        commands = Commands(KEYS, plant, no_stamp, audit)
-        result = asyncio.run(commands.execute(key, data, Sender("client")))
+        audit = Audit(published.append, lambda _, text, *, refused: recorded.append(text))
+        commands = Commands(KEYS, plant, no_stamp, audit, Acceptance(plant.duty, None))
+        sender = Sender("client", None, time.monotonic())
+        result = asyncio.run(commands.execute(key, data, sender))
     assert [text.encode() for text in recorded] == published
     return result, [*logs, *(json.loads(line) for line in published)]
 

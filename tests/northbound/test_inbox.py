@@ -11,7 +11,7 @@ from tests.northbound.plant import (
 async def test_a_full_inbox_refuses_arrivals_and_loses_none_that_it_took() -> None:
     taken: list[int] = []
     refused: list[int] = []
-    inbox: Inbox[int] = Inbox(taken.append, refused.append)
+    inbox: Inbox[int] = Inbox(lambda n, _at: taken.append(n), refused.append)
 
     def fill() -> None:
         for n in range(LIMIT):

@@ -1,12 +1,11 @@
-"""The writers file: tokens that permit writes, and the name of the writer in the audit."""
+"""The writers file: signatures that permit writes, and the name of the writer in the audit."""
 
-import hashlib
 import json
 import re
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,19 +14,17 @@ import pytest
 from gateway.config import ZenohConfig
 from gateway.errors import ConfigError
 from gateway.northbound import Northbound
-from gateway.northbound.writers import NotAllowed, Writers
+from gateway.northbound.signatures import sign
+from gateway.northbound.writers import EARLIEST, LATEST, NotAllowed, Repeated, Writers
 from gateway.tags import Sample, Tag
+from gateway.tags.timestamps import rfc3339
 from tests.northbound.access import PAGE, secret
-from tests.northbound.plant import mixer, running
+from tests.northbound.plant import mixer, running, until
 from tests.zenoh_peer import ZenohPeer, free_endpoint
 
 RECIPE = "plant/mixer/recipe/@set"
-
-
-TOKEN = "Zm9vYmFyYmF6cXV4Zm9vYmFyYmF6cXV4"  # noqa: S105  (of a test)
-
-
-SALT = "0123456789abcdef"
+SECRET = "Zm9vYmFyYmF6cXV4Zm9vYmFyYmF6cXV4"  # noqa: S105  (of a test)
+ALICE = f"alice:{SECRET}\n"
 
 
 class RecordedWrites:
@@ -42,91 +39,184 @@ class RecordedWrites:
     def writes(self, time_range: str, limit: int | None, now: int) -> Iterator[str]:
         raise NotImplementedError
 
-    def record_write(self, time: int, outcome: str) -> None:
+    def record_write(self, time: int, outcome: str, *, refused: bool) -> None:
         self.recorded.append(json.loads(outcome))
 
 
-def writers_line(name: str, token: str) -> str:
-    return f"{name}:{SALT}:{hashlib.sha256((SALT + token).encode()).hexdigest()}\n"
+def signed(data: bytes, by: str = "alice", key: str = RECIPE, secret: str = SECRET) -> bytes:
+    return sign(by, secret, rfc3339(time.time_ns()), key, data)
 
 
-async def test_only_a_token_of_the_writers_file_writes_and_its_owner_is_named(
-    tmp_path: Path,
-) -> None:
-    file = secret(tmp_path / "writers.txt", "# plant\n\n" + writers_line("alice", TOKEN))
-    plant = mixer()
-    endpoint = free_endpoint()
-    history = RecordedWrites()
-    northbound = Northbound(
-        ZenohConfig(listen=(endpoint,)),
-        "demo",
-        plant,
-        writers=file,
-        history=history,
-    )
+def past_start() -> Callable[[], bool]:
+    """A condition: signatures made now are from after the start of the gateway."""
+    began = time.time()
+    return lambda: time.time() > began + EARLIEST
+
+
+async def test_only_a_signed_request_writes_and_its_writer_is_named(tmp_path: Path) -> None:
+    file = secret(tmp_path / "writers.txt", "# plant\n\n" + ALICE)
+    plant, endpoint, history = mixer(), free_endpoint(), RecordedWrites()
+    settings = ZenohConfig(listen=(endpoint,))
+    northbound = Northbound(settings, "demo", plant, writers=file, history=history)
+    begun = past_start()
     async with running(northbound), ZenohPeer("client", connect=[endpoint]) as client:
         audit = await client.subscribe("plant/@gateway/demo/writes")
-        for token in (None, b"", b"short", TOKEN[:-1].encode(), b"\xff" * 40, b"x" * 5000):
-            [reply] = await client.get(RECIPE, b"7", attachment=token)
+        await until(begun)
+        wrong = (None, b"", SECRET.encode(), b"\xff" * 40, b"x" * 5000, signed(b"7", "bob"))
+        for attachment in wrong:
+            [reply] = await client.get(RECIPE, b"7", attachment=attachment)
             assert reply.json["error"] == "not-allowed"
-            assert TOKEN[:-1] not in reply.payload.decode()
-            await client.put(RECIPE, b"7", attachment=token)
-        [reply] = await client.get(RECIPE, b"8", attachment=TOKEN.encode())
+            assert SECRET[:-1] not in reply.payload.decode()
+            await client.put(RECIPE, b"7", attachment=attachment)
+        stolen = signed(b"8")
+        [reply] = await client.get(RECIPE, b"8", attachment=stolen)
         assert reply.ok
-        await client.put(RECIPE, b"9", attachment=TOKEN.encode())
-        await audit.until(lambda of: len(of.samples) == 14)
+        [reply] = await client.get(RECIPE, b"8", attachment=stolen)
+        assert reply.json["error"] == "unclear"  # for the writer: the first one was done
+        await client.put(RECIPE, b"9", attachment=signed(b"9"))
+        await audit.until(lambda of: len(of.samples) == 15)
         lines = [sample.json for sample in audit.samples]
-        assert {line["outcome"] for line in lines[:12]} == {"not-allowed"}
-        assert [(line["value"], line["by"]) for line in lines[12:]] == [(8, "alice"), (9, "alice")]
+        outcomes = [line["outcome"] for line in lines]
+        assert outcomes == 12 * ["not-allowed"] + ["written", "not-allowed", "written"]
+        assert [(line["value"], line["by"]) for line in lines if line["outcome"] == "written"] == [
+            (8, "alice"),
+            (9, "alice"),
+        ]
         assert plant.written == [("mixer/recipe", 8), ("mixer/recipe", 9)]
         assert history.recorded == lines
 
 
-def test_a_withdrawn_token_or_a_file_readable_by_all_permits_no_write(
+class Clock:
+    """The wall clock of a `Writers`, in seconds."""
+
+    def __init__(self) -> None:
+        self.now = 1_790_000_000.0
+
+    def __call__(self) -> int:
+        return int(self.now * 1e9)
+
+
+def known(tmp_path: Path) -> tuple[Writers, Clock]:
+    """The writers of a gateway that began a minute ago."""
+    clock = Clock()
+    writers = Writers(secret(tmp_path / "writers.txt", ALICE), clock)
+    clock.now += 60
+    return writers, clock
+
+
+def made(at: float, key: str = RECIPE, data: bytes = b"7") -> bytes:
+    return sign("alice", SECRET, rfc3339(int(at * 1e9)), key, data)
+
+
+def test_a_signature_covers_key_value_time_nonce_and_name(tmp_path: Path) -> None:
+    writers, clock = known(tmp_path)
+    attachment = made(clock.now)
+    fields = json.loads(attachment)
+    other = {
+        "by": "bob",
+        "time": rfc3339(int((clock.now - 1) * 1e9)),
+        "nonce": "0" * 32,
+        "signature": "0" * 64,
+    }
+    for name, text in other.items():
+        with pytest.raises(NotAllowed, match="signature is wrong"):
+            writers.writer(RECIPE, b"7", json.dumps({**fields, name: text}).encode())
+    for key, data in ((RECIPE.replace("recipe", "speed"), b"7"), (RECIPE, b"8"), (RECIPE, b"")):
+        with pytest.raises(NotAllowed, match="signature is wrong"):
+            writers.writer(key, data, attachment)
+    assert writers.writer(RECIPE, b"7", attachment) == "alice"
+    with pytest.raises(Repeated):
+        writers.writer(RECIPE, b"7", attachment)
+
+
+@pytest.mark.parametrize("off", [-LATEST - 0.1, EARLIEST + 0.1, -3600.0, 3600.0])
+def test_a_signature_counts_for_seconds(tmp_path: Path, off: float) -> None:
+    writers, clock = known(tmp_path)
+    with pytest.raises(NotAllowed, match=r"s ago|s ahead"):
+        writers.writer(RECIPE, b"7", made(clock.now + off))
+    for near in (-LATEST + 0.1, EARLIEST - 0.1, 0.0):
+        assert writers.writer(RECIPE, b"7", made(clock.now + near)) == "alice"
+
+
+def test_no_signature_counts_twice_whatever_the_clock_does(tmp_path: Path) -> None:
+    writers, clock = known(tmp_path)
+    attachment = made(clock.now + 0.9)
+    writers.writer(RECIPE, b"7", attachment)
+    for step in (1.0, 4.0, 1.0, -3.0, -600.0, 603.0, 10.0, -10.0):
+        clock.now += step
+        with pytest.raises((Repeated, NotAllowed)):
+            writers.writer(RECIPE, b"7", attachment)
+
+
+def test_a_signature_from_before_the_start_or_the_takeover_does_not_count(tmp_path: Path) -> None:
+    clock = Clock()
+    writers = Writers(secret(tmp_path / "writers.txt", ALICE), clock)
+    for at in (clock.now - 1, clock.now, clock.now + 0.9 * EARLIEST):
+        with pytest.raises(NotAllowed, match="before the gateway began"):
+            writers.writer(RECIPE, b"7", made(at))
+    clock.now += 60
+    taken_by_the_other = made(clock.now - 2)
+    writers.begin()
+    with pytest.raises(NotAllowed):
+        writers.writer(RECIPE, b"7", taken_by_the_other)
+    assert writers.writer(RECIPE, b"7", made(clock.now + 0.1)) == "alice"
+
+
+def test_a_withdrawn_secret_or_a_file_readable_by_all_permits_no_write(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    clock = [0.0]
-    monkeypatch.setattr(time, "monotonic", lambda: clock[0])
-    file = secret(tmp_path / "writers.txt", writers_line("alice", TOKEN))
-    writers = Writers(file)
-    assert writers.owner(TOKEN.encode()) == "alice"
-    file.write_text(writers_line("bob", TOKEN))
-    assert writers.owner(TOKEN.encode()) == "alice"  # the file is checked once a second
-    clock[0] += 2
-    assert writers.owner(TOKEN.encode()) == "bob"
+    monotonic = [0.0]
+    monkeypatch.setattr(time, "monotonic", lambda: monotonic[0])
+    writers, clock = known(tmp_path)
+    file = tmp_path / "writers.txt"
+
+    def may(by: str) -> bool:
+        try:
+            attachment = sign(by, SECRET, rfc3339(clock()), RECIPE, b"7")
+            return writers.writer(RECIPE, b"7", attachment) == by
+        except NotAllowed:
+            return False
+
+    assert may("alice")
+    file.write_text(f"bob:{SECRET}\n")
+    assert may("alice")  # the file is checked once a second
+    monotonic[0] += 2
+    assert (may("alice"), may("bob")) == (False, True)
     file.chmod(0o644)
-    clock[0] += 2
-    with pytest.raises(NotAllowed):
-        writers.owner(TOKEN.encode())
+    monotonic[0] += 2
+    assert not may("bob")
     file.chmod(0o600)
-    clock[0] += 2
-    assert writers.owner(TOKEN.encode()) == "bob"
+    monotonic[0] += 2
+    assert may("bob")
     file.unlink()
-    clock[0] += 2
-    with pytest.raises(NotAllowed):
-        writers.owner(TOKEN.encode())
+    monotonic[0] += 2
+    assert not may("bob")
 
 
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("alice:" + TOKEN, "line 1: write it as name:salt:hash"),
-        ("alice:salt:zz", "line 1: write it as name:salt:hash"),
-        (writers_line("alice", TOKEN) * 2, "line 2: alice is there twice"),
-        ("".join(writers_line(f"w{n}", TOKEN) for n in range(101)), "more than 100"),
+        ("alice", "line 1: write it as name:secret"),
+        ("alice:" + SECRET[:19], "line 1: write it as name:secret, with 20 to 200"),
+        (f"alice:0123456789abcdef:{'0' * 64}", "line 1: tokens are no longer sent"),
+        (ALICE * 2, "line 2: alice is there twice"),
+        ("".join(f"w{n}:{SECRET}\n" for n in range(101)), "more than 100"),
     ],
 )
 def test_a_bad_writers_file_is_a_configuration_error(tmp_path: Path, text: str, says: str) -> None:
     with pytest.raises(ConfigError, match=says) as raised:
         Writers(secret(tmp_path / "writers.txt", text))
-    assert TOKEN not in str(raised.value)
+    assert SECRET[:19] not in str(raised.value)
 
 
-def test_the_command_of_the_page_makes_a_line_and_its_token(tmp_path: Path) -> None:
+def test_the_command_of_the_page_makes_a_line_of_the_file(tmp_path: Path) -> None:
     (program,) = re.findall(r'^\$ python3 -c "(.*)"$', PAGE.read_text(), re.MULTILINE)
     out = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, check=True
     )
-    token, line = out.stdout.splitlines()
-    writers = Writers(secret(tmp_path / "writers.txt", line))
-    assert writers.owner(token.removeprefix("token ").encode()) == "alice"
+    clock = Clock()
+    writers = Writers(secret(tmp_path / "writers.txt", out.stdout), clock)
+    clock.now += 60
+    name, _, made_secret = out.stdout.strip().partition(":")
+    attachment = sign(name, made_secret, rfc3339(clock()), RECIPE, b"7")
+    assert writers.writer(RECIPE, b"7", attachment) == "alice"

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gateway.engine.device import Device
-from gateway.planning.bad_addresses import RETRIES
+from gateway.planning.bad_addresses import RETRIES, SILENT, SPLIT_FIRST
 from gateway.planning.planner import Block
 from gateway.protocols.driver import Span
 from tests.sim.plant import device, make_tag
@@ -131,6 +131,25 @@ def test_an_address_that_works_again_rejoins_its_block(
             if block.span in found.bad_addresses.bad and asker.ask(block):
                 break
     assert [block.span.size for block in found.blocks] == [41]
+
+
+def test_splits_found_after_a_new_try_of_the_whole_block_are_kept_until_the_next() -> None:
+    """They were dropped with the next good read, and a silent device was searched for ever."""
+    found = words(*range(16))
+    (whole,), bad = found.blocks, found.bad_addresses
+
+    def search() -> None:
+        bad.went_silent(whole)
+        for half in bad.refused(whole, 0, SILENT):
+            bad.read(half)
+
+    search()
+    assert not bad.rejoin(0.0)
+    assert bad.rejoin(SPLIT_FIRST)
+    search()
+    assert not bad.rejoin(SPLIT_FIRST + 1.0)
+    assert not bad.rejoin(SPLIT_FIRST + 2.0)
+    assert bad.cuts == {("D", 8)}
 
 
 def test_a_bad_address_in_a_faster_block_is_cut_off() -> None:

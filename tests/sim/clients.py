@@ -21,7 +21,7 @@ from tests.sim.wire import SimWire
 
 SOON = 1.0  # seconds within which an unacknowledged request arrives, if ever
 NOT_SENT = (Busy, Offline, LineDown)
-_QUIET = ("deaf", "reboot", "vanish", "flicker", "hang", "hung", *DELAYING)
+_QUIET = ("deaf", "reboot", "vanish", "flicker", "hung", *DELAYING)
 
 
 @dataclass(eq=False)

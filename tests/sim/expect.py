@@ -17,7 +17,9 @@ from gateway.tags import Quality, Reason, Tag
 from tests.sim.bus import UNTIMELY, Bus, summed
 from tests.sim.episodes import CALM, Episode
 from tests.sim.judge import Judge
+from tests.sim.manners import SILENT
 from tests.sim.net import SimNet
+from tests.sim.stations import Troubled
 from tests.sim.wire import SimWire
 
 SPOKEN = 0.35  # seconds: the longest request and reply of a seed
@@ -236,10 +238,7 @@ class Expectations:
                 station = self.judge.stations.get(device.name)
                 if station is None or station.lacks(tag) or not self.judge.readable(tag):
                     continue
-                every = self.every(bus, device, tag)
-                patience = 4 * load * every + 6 * longest * len(bus.line.engine.devices)
-                if bus.collides or tag.span.area == LISTENED:
-                    patience += 20 * every + LONGEST_PAUSE
+                patience = self._patience(bus, device, tag, station)
                 since = self.judge.read_at.get(tag, 0.0)
                 if self.judge.now - since <= patience or behind > since:
                     continue
@@ -253,8 +252,21 @@ class Expectations:
                 self.judge.story.counts["starved"] += 1
                 self.judge.broke(
                     f"{tag.key} was not read for {self.judge.now - since:.1f} s, "
-                    f"every {every:g} s is asked for, load {load:.2f}"
+                    f"every {self.every(bus, device, tag):g} s is asked for, load {load:.2f}"
                 )
+
+    def _patience(self, bus: Bus, device: Device, tag: Tag, station: Troubled) -> float:
+        """Returns the seconds within which a tag is read, without faults."""
+        longest, load = self.times(bus.line)
+        every = self.every(bus, device, tag)
+        patience = 4 * load * every + 6 * longest * len(bus.line.engine.devices)
+        if bus.collides or tag.span.area == LISTENED:
+            patience += 20 * every + LONGEST_PAUSE
+        if station.manners.unknown == SILENT:  # its blocks are halved by time-outs
+            if device.driver.protocol == "vigor":  # every second resync reads M0, which it lacks
+                return math.inf
+            patience *= 3
+        return patience
 
     def _unwell(self, line: str, device: str, since: float, ahead: float) -> bool:
         return any(

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from tests.sim.episodes import CALM, Episode, series
-from tests.sim.manners import Manners, manners_of
+from tests.sim.manners import SILENT, Manners, manners_of
 
 STATION_KINDS: tuple[str, ...] = (
     *("twice", "twice", "held-replies", "held-requests", "twin", "refusing"),
@@ -17,7 +17,8 @@ LINE_KINDS: tuple[str, ...] = ("reset", "reset", "master", "master", "buffering"
 NET_STATION_KINDS: tuple[str, ...] = ("twice", "refusing", "deaf")
 NET_LINE_KINDS: tuple[str, ...] = ("hung",)
 PARTIES = frozenset((*STATION_KINDS, *LINE_KINDS, "frozen"))
-DELAYING = ("stall", "held-requests", "reset", "master", "buffering")  # requests arrive later
+# Requests arrive later.
+DELAYING = ("stall", "hang", "held-requests", "reset", "master", "buffering")
 HUNG = 120.0  # seconds within which a connection without any reply is opened again
 RESETS = 4  # at most, in one episode
 HASTE = {"hostile": 0.1}  # paces with other parties: how short the pauses between them are
@@ -33,6 +34,9 @@ def hostile_episodes(
     for name, line in lines.items():
         tcp = line["port"].startswith("tcp:")
         wires = NET_LINE_KINDS if tcp else LINE_KINDS
+        if not any(map(_is_polled, line["devices"].values())):
+            # No reply is missed: a hung connection looks like a device that has nothing to say.
+            wires = tuple(kind for kind in wires if kind != "hung")
         stations = NET_STATION_KINDS if tcp else STATION_KINDS
         yield from series(name, "", wires, chance, seconds, 1500.0 * haste, LASTS)
         for device, settings in line["devices"].items():
@@ -60,11 +64,36 @@ def hostile_manners(lines: dict[str, Any], seed: int, pace: str) -> dict[str, Ma
 
 
 def bridges(lines: dict[str, Any], seed: int, pace: str) -> dict[str, float]:
-    """Draws the connections that end at a bridge to serial units: by line, its time-out."""
+    """Draws the connections that end at a bridge to serial units: by line, its time-out.
+
+    Not drawn: a bridge that waits longer than the gateway, before a unit that is silent about
+    unknown addresses. All its replies come too late, and the device flaps until the file gives it a
+    longer `reply_timeout`, as its diagnosis says.
+    """
+    manners = hostile_manners(lines, seed, pace)
     chance = random.Random(f"bridge {seed}")
     timeouts = {name: chance.choice((0.0, 0.6, 1.0, 3.0)) for name in sorted(lines)}
     tcp = {name for name, line in lines.items() if line["port"].startswith("tcp:")}
-    return {name: timeouts[name] for name in tcp if pace in HASTE}
+    return {
+        name: _shorter(timeouts[name], lines[name]["devices"], manners)
+        for name in tcp
+        if pace in HASTE
+    }
+
+
+def _shorter(timeout: float, devices: dict[str, Any], manners: dict[str, Manners]) -> float:
+    """Returns the time-out of a bridge; 0 if one of its units cannot be behind it."""
+    for name, device in devices.items():
+        waits = (int(device[key].removesuffix("ms")) for key in ("reply_timeout", "late_guard"))
+        if manners[name].unknown == SILENT and timeout >= sum(waits) / 1000:
+            return 0.0
+    return timeout
+
+
+def _is_polled(device: dict[str, Any]) -> bool:
+    if device["protocol"] != "frames":
+        return device.get("station") != 0
+    return bool(device.get("ask"))
 
 
 def resets(episode: Episode) -> list[float]:

@@ -15,6 +15,7 @@ from gateway.engine.device import Device, DeviceSettings
 from gateway.engine.engine import Engine
 from gateway.engine.health import State
 from gateway.errors import GatewayError
+from gateway.line.duty import Duty
 from gateway.line.line import Line
 from gateway.planning.wire_timing import WireTiming
 from gateway.protocols.driver import AnyDriver, Span, Timing, Unit
@@ -86,6 +87,7 @@ class Plant:
     now: dict[Tag, Sample] = field(default_factory=dict)
     echo_in_file: bool = True  # False: an adapter echoes, and the file does not mention it
     listeners: list[Callable[[Sequence[Sample]], None]] = field(default_factory=list)
+    duty: Duty | None = None
     line: Line = field(init=False)
 
     def __post_init__(self) -> None:
@@ -96,6 +98,7 @@ class Plant:
             echo=(self.bench.echo and self.echo_in_file) or None,
             wall=lambda: int(_now() * SECOND),
             seed=self.bench.seed,
+            duty=self.duty,
         )
 
     def samples(self, samples: Sequence[Sample]) -> None:
@@ -214,14 +217,19 @@ def made_device(
 
 
 def plant(
-    devices: Sequence[Device], *, wire: WireTiming = WIRE, seed: int = 0, **bench: Any
+    devices: Sequence[Device],
+    *,
+    wire: WireTiming = WIRE,
+    seed: int = 0,
+    duty: Duty | None = None,
+    **bench: Any,
 ) -> Plant:
     """Makes a station for every device. The knobs of station and bench work at any time."""
     stations = [
         Unruly(VigorStation(d.driver.station), seed * 1000 + i, wire=wire)
         for i, d in enumerate(devices)
     ]
-    return Plant(list(devices), stations, Bench(seed=seed, **bench), wire)
+    return Plant(list(devices), stations, Bench(seed=seed, **bench), wire, duty=duty)
 
 
 @asynccontextmanager

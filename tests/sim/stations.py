@@ -84,6 +84,7 @@ class Troubled:
 
     def __post_init__(self) -> None:
         self._busy_until = 0.0
+        self._replied_at = 0.0
         self._now = 0.0
         self.broke_off = False  # the last answer
         self.computed: set[tuple[str, int]] = set()  # written by its own program
@@ -105,7 +106,7 @@ class Troubled:
         memory.write = write  # type: ignore[method-assign,assignment]  # the only place to observe writes
 
     def hear(self, data: bytes, now: float) -> tuple[bytes, float] | None:
-        if self.deaf or (self.manners.single and now < self._busy_until):
+        if self.deaf or (self.manners.single and now < self._replied_at):
             return None
         self._now = now
         said = self._mannered(data, b"".join(self.inner.hear(data, now)))
@@ -126,7 +127,8 @@ class Troubled:
         delay = self.turnaround + (self.late(chance) if self.late and said is real else 0.0)
         if self.ordered:
             delay = max(delay, self._busy_until - now)  # as a PLC's do
-        self._busy_until = now + delay + len(said) * self.character + 0.002
+        self._replied_at = now + delay + len(said) * self.character
+        self._busy_until = self._replied_at + 0.002
         return said, delay
 
     def _mannered(self, data: bytes, said: bytes) -> bytes:

@@ -1,7 +1,6 @@
 """The client of a running gateway: reads, writes, follows."""
 
 import json
-import os
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, suppress
@@ -14,6 +13,7 @@ import orjson
 import zenoh
 
 from gateway.cli.client.arguments import matches, parse_value, tags_by_key
+from gateway.cli.client.signing import signature
 from gateway.cli.terminal import printable
 from gateway.config import Config
 from gateway.config.commands import TO_ALL
@@ -23,7 +23,6 @@ from gateway.tags import Tag
 from gateway.tags.timestamps import rfc3339
 from gateway.values import Kind, Value
 
-TOKEN_VARIABLE = "PLC_GATEWAY_WRITE_TOKEN"  # noqa: S105  (the name of a variable)
 REPLY_TIMEOUT = 10.0  # seconds
 _CHANGED = "does the gateway run with the current version of this file?"
 _LONGEST_LIST = 10  # tags in one sentence
@@ -58,6 +57,7 @@ class Client:
         self._tell = tell
         self._user = user
         self._duplicated: set[str] = set()  # devices of several gateways, reported once
+        self._will_query = False  # because a device went online or offline
 
     @property
     def no_reply(self) -> str:
@@ -146,6 +146,7 @@ class Client:
                 if present and isinstance(event, Row):
                     rows = [event]
                     continue
+                self._will_query = False
                 # A value without a gateway is late, or from a gateway that became active: only the
                 # latter replies to a query. Values that arrive meanwhile are newer and follow it.
                 try:
@@ -193,10 +194,16 @@ class Client:
         """Returns watchers of the gateway: they put True to query again, False when it is lost.
 
         In a standby group the start or end of any member may change the active one: query again.
+        So it is with a device: its values may be lost on the way.
         """
         key = self._keys.own
         if self._has_standby:
             key = f"{key.rpartition('/')[0]}/*"
+
+        def device(_: zenoh.Sample) -> None:
+            if not self._will_query:  # one query serves all devices
+                self._will_query = True
+                put(True)
 
         def token(sample: zenoh.Sample) -> None:
             put(self._has_standby or sample.kind == zenoh.SampleKind.PUT)
@@ -207,6 +214,7 @@ class Client:
 
         return (
             self._session.liveliness().declare_subscriber(key, token),
+            self._session.liveliness().declare_subscriber(f"{key}/alive/*", device),
             self._session.info.declare_transport_events_listener(link),
         )
 
@@ -234,7 +242,7 @@ class Client:
             if not (served and querier.matching_status.matching):  # type: ignore[attr-defined]
                 may = f"may {self._user} do this, and " if self._user else ""
                 raise GatewayError(f"no gateway accepts {key}: nothing was sent; {may}{_CHANGED}")
-            for reply in querier.get(payload=payload, attachment=os.environ.get(TOKEN_VARIABLE)):
+            for reply in querier.get(payload=payload, attachment=signature(key, payload)):
                 answer = reply.ok or reply.err
                 with suppress(orjson.JSONDecodeError):  # Zenoh's own `Timeout` is not JSON
                     if answer is not None:

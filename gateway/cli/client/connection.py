@@ -22,6 +22,7 @@ _OPEN: dict[str, object] = {
     "listen/endpoints": [],
     "access_control/enabled": False,
     "transport/auth/usrpwd/dictionary_file": None,
+    "transport/link/rx/max_message_size": 2**30,  # Zenoh's own: the gateway's is short
 }
 
 
