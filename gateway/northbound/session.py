@@ -21,7 +21,7 @@ log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 T = TypeVar("T")
 CLOSE_WITHIN = 2.0  # seconds
 _SHORTEST_RETRY, _LONGEST_RETRY = 0.5, 5.0  # seconds between two attempts of a client
-_DROP_LIMIT = "transport/link/tx/queue/congestion_control/drop/wait_before_drop"
+
 
 # The gateway's defaults, where Zenoh's do not fit. A value in the user's Zenoh file has priority.
 _DEFAULTS: dict[str, object] = {
@@ -37,7 +37,7 @@ _DEFAULTS: dict[str, object] = {
     "transport/unicast/accept_timeout": 3000,  # ms
     "transport/link/tx/lease": 3000,  # ms until the tokens of a frozen gateway end
     # µs. The default of 1 ms silently loses a part of every burst.
-    _DROP_LIMIT: 50_000,
+    "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 50_000,
     # µs that a frozen client may hold an answering thread before its link is closed.
     "transport/link/tx/queue/congestion_control/block/wait_before_close": 1_000_000,
 }
@@ -72,7 +72,8 @@ def configure(settings: ZenohConfig) -> zenoh.Config:
 
 def drop_limit(config: zenoh.Config) -> float:
     """Returns the seconds that a put waits for room on a full link before Zenoh drops it."""
-    return float(json.loads(config.get_json(_DROP_LIMIT))) / 1e6
+    path = "transport/link/tx/queue/congestion_control/drop/wait_before_drop"
+    return float(json.loads(config.get_json(path))) / 1e6
 
 
 def as_client(config: zenoh.Config) -> zenoh.Config:
