@@ -57,7 +57,7 @@ async def run(config: Config, started: Callable[[], None] = lambda: None) -> Non
                 f"gateway {others} serves every device of this file already: a device belongs to "
                 "one gateway, or to the gateways of one standby group"
             )
-        log.warning("gateway starts over", why="another gateway serves its devices")
+        log.warning("gateway starts over")  # the entry before says why
 
 
 async def _serve(
@@ -65,8 +65,9 @@ async def _serve(
 ) -> Mapping[str, str] | None:
     """Runs one gateway until `stop`, or until another gateway serves devices of the file.
 
-    `withheld`: devices that other gateways serve. Returns them if they have changed, or if a
-    gateway of the standby group replaced this one: then it starts again. Otherwise None.
+    `withheld`: devices that other gateways serve. Returns them if they have changed, if a gateway
+    of the standby group replaced this one, or if the event loop stood still: then it starts again.
+    Otherwise None.
     """
     config = file.without(withheld)
     clock = ArrivalClock()

@@ -8,7 +8,7 @@ import typer
 from gateway.cli import direct
 from gateway.cli.client import connected
 from gateway.cli.logs import LogFormat, LogLevel, set_up
-from gateway.cli.terminal import ConfigPath, Direct, end, err
+from gateway.cli.terminal import ConfigPath, Direct, end, err, printable
 from gateway.cli.write import error_code, outcome
 from gateway.config import load
 from gateway.config.commands import check_command, line_of
@@ -32,4 +32,4 @@ def control(
         answer = client.control(line_of(loaded, device).name, device, command, argument)
     if "error" in answer:
         end(outcome(device, answer), error_code(answer))
-    print(answer["answer"])
+    print(printable(str(answer["answer"])))

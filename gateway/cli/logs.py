@@ -6,14 +6,21 @@ import queue
 import select
 import sys
 import threading
-from collections.abc import Callable
+import time
+from collections.abc import Callable, MutableMapping
 from enum import StrEnum
+from typing import Any
 
 import structlog
+
+from gateway.cli.terminal import printable
+from gateway.northbound.rate_limit import RateLimit
 
 log = structlog.get_logger("gateway.log")
 
 LIMIT = 10_000  # entries that wait while the reader of stderr stalls: 2 to 4 MB
+BURST = 20  # entries of one event and device at once
+EVERY = 60.0  # seconds between further ones
 _END_WITHIN = 0.2  # seconds for the last entries
 
 
@@ -83,6 +90,40 @@ class QueuedHandler(logging.Handler):
                 select.select((), (self._file,), ())
 
 
+class Repeats:
+    """Drops entries of one event and device that come too fast, and counts them in the next one.
+
+    A bad line makes several entries a second: hundreds of megabytes a day for some devices.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._limits: dict[tuple[object, ...], RateLimit] = {}
+
+    def __call__(
+        self, _logger: object, _method: str, event: MutableMapping[str, Any]
+    ) -> MutableMapping[str, Any]:
+        source = event.get("line"), event.get("device")
+        if source == (None, None):
+            return event
+        limit = self._limits.setdefault((event["event"], *source), RateLimit(BURST, EVERY))
+        if not limit.allows(self._clock()):
+            raise structlog.DropEvent
+        if unlogged := limit.newly_suppressed():
+            event["unlogged"] = unlogged
+        return event
+
+
+def _without_control_characters(
+    _logger: object, _method: str, event: MutableMapping[str, Any]
+) -> MutableMapping[str, Any]:
+    """Keys and values of the network may hold line feeds and control sequences."""
+    for name, value in event.items():
+        if isinstance(value, str):
+            event[name] = printable(value)
+    return event
+
+
 def set_up(form: LogFormat, level: LogLevel) -> Callable[[str], None]:
     """Logs to stderr: text for people, or one JSON document per line for programs.
 
@@ -100,8 +141,10 @@ def set_up(form: LogFormat, level: LogLevel) -> Callable[[str], None]:
     structlog.configure(
         processors=[
             structlog.stdlib.filter_by_level,
+            *([] if level is LogLevel.DEBUG else [Repeats()]),
             structlog.stdlib.add_log_level,
             structlog.processors.TimeStamper(fmt="iso", utc=True),
+            _without_control_characters,
             structlog.processors.format_exc_info,
             render,
         ],

@@ -1,8 +1,12 @@
 """The command line, `plc-gateway COMMAND`: each command is a module of this folder."""
 
+import errno
+import io
 import json
+import os
 import sys
-from typing import Annotated
+from contextlib import suppress
+from typing import Annotated, NoReturn
 
 import typer
 
@@ -23,18 +27,39 @@ cli = typer.Typer(
     rich_markup_mode=None,
 )
 
+_OUTPUT_FAILED = {errno.ENOSPC, errno.EDQUOT, errno.EIO}  # a full disk, a terminal that has gone
+
 
 def main() -> None:
     """Runs the command of `sys.argv`. Exit codes: 0 success, 1 failure, 2 the user's mistake."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # a locale may have ASCII only
     try:
-        cli()
+        try:
+            cli()
+        finally:
+            sys.stdout.flush()
     except (ConfigError, BadValue) as error:
         end(str(error), USER_MISTAKE)
     except GatewayError as error:
         end(str(error), FAILED)
     except BrokenPipeError:
-        sys.stderr.close()
-        sys.exit(FAILED)
+        _end_without_output()
+    except OSError as error:
+        if error.errno not in _OUTPUT_FAILED:
+            raise
+        with suppress(OSError):
+            print(f"the output cannot be written: {error.strerror}", file=sys.stderr, flush=True)
+        _end_without_output()
+
+
+def _end_without_output() -> NoReturn:
+    """Exits; Python would report once more what it cannot write."""
+    null = os.open(os.devnull, os.O_WRONLY)
+    for stream in (sys.stdout, sys.stderr):
+        os.dup2(null, stream.fileno())
+    sys.exit(FAILED)
 
 
 def _print_version(wanted: bool) -> None:

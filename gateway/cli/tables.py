@@ -7,7 +7,7 @@ from rich.table import Table
 from rich.text import Text
 
 from gateway.cli.client import Row
-from gateway.cli.terminal import out
+from gateway.cli.terminal import out, printable
 from gateway.tags import Quality, Sample, Tag
 from gateway.tags.timestamps import rfc3339
 
@@ -50,12 +50,14 @@ def table_of(rows: Iterable[Row], tags: dict[str, Tag]) -> Table:
             Text(row.tag),
             Text("-" if document.get("value") is None else value_text(document["value"])),
             Text(tag.unit if tag else ""),
-            Text(quality, style="" if good else "red"),
-            Text(str(document.get("time", ""))),
+            Text(printable(quality), style="" if good else "red"),
+            Text(printable(str(document.get("time", "")))),
         )
     return table
 
 
 def value_text(value: object) -> str:
-    """Returns a value as JSON and YAML write it."""
-    return {True: "true", False: "false"}[value] if isinstance(value, bool) else str(value)
+    """Returns a value as JSON and YAML write it, without control characters."""
+    if isinstance(value, bool):
+        return {True: "true", False: "false"}[value]
+    return printable(str(value))

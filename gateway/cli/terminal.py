@@ -26,6 +26,17 @@ Direct = Annotated[
 AsJson = Annotated[bool, typer.Option("--json", help="One JSON document per line.")]
 
 
+def printable(text: str, keep: str = "") -> str:
+    """Escapes characters that move the cursor, forge a line or control the terminal otherwise.
+
+    Values and reasons come from devices and from other programs on the network.
+    """
+    if text.isprintable():
+        return text
+    escaped = (c if c.isprintable() or c in keep else repr(c)[1:-1] for c in text)
+    return "".join(escaped)
+
+
 def end(message: str, code: int) -> NoReturn:
     """Prints the message to stderr and exits with the code."""
     err.print(message)

@@ -12,7 +12,7 @@ from gateway.cli import direct
 from gateway.cli.client import connected, parse_value, tags_by_key
 from gateway.cli.logs import LogFormat, LogLevel, set_up
 from gateway.cli.tables import value_text
-from gateway.cli.terminal import FAILED, USER_MISTAKE, AsJson, ConfigPath, Direct, err
+from gateway.cli.terminal import FAILED, USER_MISTAKE, AsJson, ConfigPath, Direct, err, printable
 from gateway.config import Config, load
 from gateway.errors import BadValue, ConfigError, GatewayError
 from gateway.northbound import payload
@@ -79,7 +79,7 @@ def outcome(target: str, answer: dict[str, object]) -> str:
     """Describes the outcome of a write or command in one line."""
     if "error" in answer:
         code = f" {answer['code']}" if answer.get("code") else ""
-        return f"{target}: {answer['error']}{code}: {answer.get('reason')}"
+        return printable(f"{target}: {answer['error']}{code}: {answer.get('reason')}")
     took = f"{float(str(answer['took'])) * 1000:.0f} ms"
     how = "acknowledged by the PLC"
     if answer.get("verified"):

@@ -262,6 +262,7 @@ class Builder:
             user=found.user,
             password_file=self._file(found.password_file, (*own, "password_file")),
             users_file=self._file(found.users_file, (*own, "users_file")),
+            refresh=found.refresh,
         )
 
     def _file(self, name: FilePath | None, path: Path) -> FilePath | None:

@@ -120,6 +120,8 @@ class ZenohSection(Section):
     """Its first line is the password; left out: the variable PLC_GATEWAY_ZENOH_PASSWORD."""
     users_file: FilePath | None = None
     """The users that may connect to this gateway: one line `user:password` each."""
+    refresh: Interval = 600.0
+    """Every value is published at least this often: the longest time that a lost one can cost."""
 
     @model_validator(mode="after")
     def _with_user(self) -> Self:

@@ -44,6 +44,7 @@ class ZenohConfig:
     user: str | None = None  # of this gateway, where it connects to
     password_file: Path | None = None
     users_file: Path | None = None  # for those who connect: a line `user:password` each
+    refresh: float = 600.0  # seconds in which every value is published at least once
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -104,6 +104,8 @@ def _write_default(setting: dict[str, Any]) -> None:
             setting["default"] = _in_unit(seconds, SECONDS)
         case int(octets), str():
             setting["default"] = _in_unit(octets, BYTES)
+        case dict(), _:
+            setting["default"] = {}  # a section: its settings have their own
         case (str(host), int(port)), _:
             setting["default"] = f"{host}:{port}"
         case None, _ if not _may_be_null(setting):

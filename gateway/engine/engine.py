@@ -192,10 +192,10 @@ class Engine:
         return self._effects.take()
 
     def expedite(self, device: Device, tag: Tag) -> None:
-        """Polls the tag's block before all other polls."""
+        """Polls the tag's block before all other polls, for a read on demand."""
         poll = self.schedule.reader(device, tag)
         if poll is not None:
-            self.schedule.expedite(poll)
+            self.schedule.expedite(poll, on_demand=True)
 
     def received(self, data: bytes, now: float, time: int) -> list[Effect]:
         """Takes bytes that arrived outside of a transaction."""

@@ -15,7 +15,7 @@ from gateway.planning.planner import Block
 from gateway.protocols.driver import Span, UnnumberedReplies
 from gateway.tags import Sample
 
-EXPEDITED, NOT_QUEUED = -1, -2  # tickets of polls that are in no heap
+NOT_QUEUED, EXPEDITED, ON_DEMAND = -1, -2, -3  # tickets of polls that are in no heap
 
 
 @dataclass(slots=True)

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 
 from gateway.engine.device import Device
-from gateway.engine.jobs import EXPEDITED, Poll
+from gateway.engine.jobs import EXPEDITED, NOT_QUEUED, ON_DEMAND, Poll
 
 ROOM = 16  # entries of a heap in addition to twice the valid ones
 NO_PLACE, LATE = -1, -2  # places of a device: nothing is due; its first poll is late
@@ -73,7 +73,7 @@ class PollQueue:
 
     def push(self, poll: Poll) -> None:
         """Adds a poll that waits until it is due, if its device is online."""
-        if not (poll.live and poll.device.health.online) or poll.ticket == EXPEDITED:
+        if not (poll.live and poll.device.health.online) or poll.ticket <= EXPEDITED:
             return
         poll.ticket = next(self._tickets)
         waiting = self.waiting
@@ -86,11 +86,23 @@ class PollQueue:
         for poll in polls:
             self.push(poll)
 
-    def expedite(self, poll: Poll) -> None:
-        """Puts the poll before all due polls."""
-        if poll.ticket != EXPEDITED:
-            poll.ticket = EXPEDITED
+    def expedite(self, poll: Poll, *, on_demand: bool = False) -> None:
+        """Puts the poll before all due polls; on demand behind those that are not."""
+        if on_demand and poll.ticket > EXPEDITED:
+            poll.ticket = ON_DEMAND
             self.expedited.append(poll)
+        elif not on_demand and poll.ticket != EXPEDITED:
+            if poll.ticket == ON_DEMAND:
+                self.expedited.remove(poll)
+            poll.ticket = EXPEDITED
+            self.expedited.appendleft(poll)
+
+    def return_due(self, now: float) -> None:
+        """Makes expedited polls that are due by now due polls like others."""
+        for poll in [poll for poll in self.expedited if poll.due <= now]:
+            self.expedited.remove(poll)
+            poll.ticket = NOT_QUEUED
+            self.push(poll)
 
     def ripen(self, now: float) -> bool:
         """Moves polls that became due, and finds the first. Returns True if one can be sent."""

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 
 from gateway.engine.device import Device
 from gateway.engine.health import PAUSE_LONGEST, State
-from gateway.engine.jobs import EXPEDITED, NOT_QUEUED, Idle, LastRead, Poll, Probe
+from gateway.engine.jobs import EXPEDITED, NOT_QUEUED, ON_DEMAND, Idle, LastRead, Poll, Probe
 from gateway.engine.poll_queue import PollQueue
 from gateway.engine.probe_schedule import ProbeSchedule
 from gateway.engine.requests import Request, RequestQueue
@@ -15,6 +15,7 @@ from gateway.tags import Tag
 
 NEVER = float("inf")
 LONG = 10.0  # seconds: a longer interval is too long to wait for a first value
+ON_DEMAND_SHARE = 0.25  # share of the wire time for polls on demand that delay others
 FIRST_SHARE = 0.1  # share of the wire time for blocks of long intervals without good values
 GOLDEN = 0.6180339887498949  # any number of its multiples is spread evenly
 
@@ -26,7 +27,8 @@ class Schedule:
       not wait behind one whose device needs a resync while a device has just failed.
     * Polls go by earliest deadline, over all devices. On an overloaded line the device that has
       used the wire least in recent seconds goes first.
-    * An expedited poll goes before other polls, but not twice in a row while one is due.
+    * An expedited poll goes before other polls, but not twice in a row while one is due. Polls on
+      demand get a quarter of the wire's time, and more if they end before the next poll is due.
     * A late poll is done once, not once per missed period.
     * A block of a long interval without good values gets an early deadline, in turn with others:
       all these together get a tenth of the wire's time.
@@ -53,6 +55,8 @@ class Schedule:
         self._readers: dict[Device, dict[Tag, Poll]] = {}  # made at the first call of `reader`
         self._wrote = False
         self._expedited = False
+        self._on_demand_lane = now  # until then no poll on demand delays another
+        self._on_demand_at = NEVER  # when the poll on demand in flight was sent
         self._first_lane = now  # the deadline of the last block without good values
         for device in devices:
             self.plan(device, now)
@@ -68,7 +72,7 @@ class Schedule:
         polls = []
         for block in device.blocks:
             known = old.get(block.span)
-            if known is None or known.ticket == EXPEDITED:
+            if known is None or known.ticket <= EXPEDITED:
                 poll = Poll(device, block, now)
             else:
                 poll = Poll(device, block, known.due, missed=known.missed)
@@ -121,12 +125,12 @@ class Schedule:
             self._first_lane = soon
             poll.soon = max(soon, poll.due + turn)
 
-    def expedite(self, poll: Poll) -> None:
+    def expedite(self, poll: Poll, *, on_demand: bool = False) -> None:
         """Polls this next, after requests, because a client waits for it."""
         if poll.device.health.state is State.OFFLINE:
             poll.device.health.probe_soon()
         elif poll.live and poll.device.health.online:
-            self._queue.expedite(poll)
+            self._queue.expedite(poll, on_demand=on_demand)
 
     # Questions
 
@@ -150,14 +154,17 @@ class Schedule:
     # The next job
 
     def next(self, now: float) -> Request | Probe | Poll | Idle:
+        self._share_on_demand(now)
         due = self._queue.ripen(now)
+        waiting = self._queue.waiting
+        until = waiting[0][0] if waiting else NEVER
+        if due and self._queue.due is None and not self._may_expedite(now, until):
+            due, until = False, min(until, self._on_demand_lane)
         if self.requests.waiting and not (self._wrote and due):
             job = self._next_request(now, due)
             if job is not None:
                 return job
         self._wrote = False
-        waiting = self._queue.waiting
-        until = waiting[0][0] if waiting else NEVER
         others = [device for device in self.devices if not device.health.online]
         if others:
             probe = self._probes.next(others, now, now if due else until)
@@ -165,6 +172,15 @@ class Schedule:
                 return probe
             until = min(until, probe)
         return self._next_poll(now) if due else Idle(until)
+
+    def _share_on_demand(self, now: float) -> None:
+        """Charges the poll on demand that has ended: others wait three times as long."""
+        if now >= self._on_demand_at:
+            took, self._on_demand_at = now - self._on_demand_at, NEVER
+            lane = max(self._on_demand_lane, now - took)
+            self._on_demand_lane = lane + took / ON_DEMAND_SHARE
+        if now < self._on_demand_lane and self._queue.expedited:
+            self._queue.return_due(now)
 
     def _next_request(self, now: float, due: bool) -> Request | Probe | None:
         first = self.requests.first.device
@@ -181,8 +197,8 @@ class Schedule:
     def _next_poll(self, now: float) -> Poll | Probe:
         queue = self._queue
         poll = queue.due
-        expedited = bool(queue.expedited) and not (self._expedited and poll is not None)
-        if expedited or poll is None:
+        first = queue.expedited and not self._expedited and self._may_expedite(now, now)
+        if expedited := poll is None or bool(first):
             poll = queue.expedited[0]
         shapes = poll.device.shapes
         if shapes is not None and shapes.mark_due <= now < shapes.at + shapes.quiet:
@@ -194,14 +210,23 @@ class Schedule:
             poll = other
             expedited = False
         self._expedited = poll.expedited = expedited
+        if poll.ticket == ON_DEMAND:
+            self._on_demand_at = now
         return self._hand_out(poll, now)
+
+    def _may_expedite(self, now: float, until: float) -> bool:
+        """True if the first expedited poll may be sent; another poll is due at `until`."""
+        poll = self._queue.expedited[0]
+        if now >= self._on_demand_lane or poll.ticket != ON_DEMAND:
+            return True
+        return now + poll.device.seconds(poll.block.cost) <= until
 
     def alongside(self, poll: Poll, most: int, now: float) -> list[Poll]:
         """Returns more due polls of the device, if it accepts several requests at once."""
         return [self._hand_out(other, now) for other in self._queue.more(poll.device, most)]
 
     def _hand_out(self, poll: Poll, now: float) -> Poll:
-        if poll.ticket == EXPEDITED:
+        if poll.ticket <= EXPEDITED:
             self._queue.expedited.remove(poll)
         poll.ticket = NOT_QUEUED  # its entry in the heap is stale now
         if poll.due > now:

@@ -38,6 +38,10 @@ class Admission:
     def documents(self) -> Mapping[str, Mapping[str, object]]:
         return self.standby.documents() | self.claiming.documents()
 
+    def sessions(self) -> list[zenoh.Session]:
+        """Sessions of tokens; the gateway's own may be one of them."""
+        return self._second.opened
+
     async def run_alone(self) -> None:
         """Lets the gateway serve while a client waits for its router, unless it has a group."""
         await asyncio.sleep(NETWORK_WITHIN)

@@ -2,7 +2,6 @@
 
 import asyncio
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
@@ -20,18 +19,21 @@ from gateway.northbound.incoming import Declarations, Incoming
 from gateway.northbound.interfaces import History, Plant
 from gateway.northbound.keys import Keys
 from gateway.northbound.link_monitor import LinkMonitor
+from gateway.northbound.losses import Losses
 from gateway.northbound.one_process import only_process
 from gateway.northbound.publisher import Publisher, ScanBatches
 from gateway.northbound.republish import Republisher
 from gateway.northbound.session import (
     CLOSE_WITHIN,
     configure,
+    drop_limit,
     off_loop,
     open_session,
 )
 from gateway.northbound.standby import StandbySettings
 from gateway.northbound.status_publisher import StatusPublisher
 from gateway.northbound.tag_index import TagIndex
+from gateway.northbound.watchdog import Watchdog
 from gateway.northbound.writers import Writers
 from gateway.tags import Sample
 
@@ -49,8 +51,9 @@ class Northbound:
     * `exclusive`: no other process runs this gateway; files and lines may be opened.
     * `active`: this gateway may open its lines.
     * `opened`: everything is declared, and all current values are queued.
-    * `replaced`: another gateway is active, or serves one of the devices. Close the lines, end
-      this, and start another `Northbound` that does `withhold` the devices `withheld` here.
+    * `replaced`: another gateway is active, or serves one of the devices, or the event loop stood
+      still. Close the lines, end this, and start another `Northbound` that does `withhold` the
+      devices `withheld` here.
 
     Raises `ConfigError` for a bad prefix, name, endpoint, Zenoh file or writers file, and for a
     secret that every user of this machine could read.
@@ -80,11 +83,15 @@ class Northbound:
             log.warning("Zenoh session exposed", why=exposure)
         self._plant = plant
         self._links = LinkMonitor()
-        self._index = TagIndex(self.keys, plant.devices())
-        devices = [device.name for device in self._index.devices]
+        index = TagIndex(self.keys, plant.devices())
+        devices = [device.name for device in index.devices]
         self._admission = Admission(standby, self.keys, self._config, devices, plant.duty)
-        self._publisher = Publisher(self.keys)
-        self._batches = ScanBatches(self._publisher, self._index.devices)
+        losses = Losses(drop_limit(self._config))
+        self._publisher = Publisher(self.keys, losses)
+        self._batches = ScanBatches(self._publisher, index.devices)
+        self._republisher = Republisher(
+            self._batches.publish, plant, index, self._links, losses, settings.refresh
+        )
         audit = Audit(
             partial(self._publisher.document, self.keys.writes),
             None if history is None else history.record_write,
@@ -95,7 +102,7 @@ class Northbound:
         self._incoming = Incoming(
             self.keys,
             plant,
-            self._index,
+            index,
             audit,
             self._status.documents,
             history,
@@ -119,7 +126,7 @@ class Northbound:
 
     def counters(self) -> dict[str, int]:
         """Messages out, in and dropped since the start."""
-        outgoing = asdict(self._publisher.counters) | {"links": len(self._links)}
+        outgoing = self._publisher.counts() | {"links": len(self._links)}
         return outgoing | self._incoming.counters()
 
     @property
@@ -168,7 +175,7 @@ class Northbound:
             alone.cancel()
         self.exclusive.set()
         try:
-            await self._serve(session)
+            await self._serve_watched(session)
         finally:
             closing = asyncio.ensure_future(self._close(session))
             try:
@@ -176,6 +183,17 @@ class Northbound:
             except asyncio.CancelledError:
                 await asyncio.wait([closing])  # a second cancellation must not leave it half closed
                 raise
+
+    async def _serve_watched(self, session: zenoh.Session) -> None:
+        replaced = self.replaced.set
+        watchdog = Watchdog(lambda: [session, *self._admission.sessions()], replaced)
+        with watchdog.watching():
+            try:
+                await self._serve(session)
+            except* (GatewayError, zenoh.ZError):
+                if not watchdog.has_fired:
+                    raise
+                replaced()
 
     async def _serve(self, session: zenoh.Session) -> None:
         self._publisher.start(session)
@@ -189,12 +207,11 @@ class Northbound:
             await self._admission.active.wait()
             self._incoming.begin()
             self._declared += await off_loop(self._declare_plant, declarations)
-            republisher = Republisher(self._batches.publish, self._plant, self._index, self._links)
-            await republisher.publish_all()
+            await self._republisher.publish_all()
             self._status.publish()
             self.opened.set()
             log.info("Zenoh session ready", prefix=self.keys.prefix, id=str(session.zid()))
-            tasks.create_task(republisher.run())
+            tasks.create_task(self._republisher.run())
 
     def _declare_first(
         self,

@@ -13,9 +13,10 @@ times as long, and for a moment after a link has returned puts on declared keys 
 
 import asyncio
 import threading
+import time
 from collections.abc import Hashable, Iterable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import count
 
 import structlog
@@ -25,6 +26,7 @@ from gateway.northbound import encoding, payload
 from gateway.northbound.blocks import parts_of
 from gateway.northbound.interfaces import Device
 from gateway.northbound.keys import Keys
+from gateway.northbound.losses import Losses
 from gateway.tags import Sample, Tag
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
@@ -41,18 +43,20 @@ class Published:
     dropped: int = 0  # events and documents: the queue was full, or no session was open yet
 
 
-# One put. A bool declares or undeclares the liveliness token, a dict holds the samples of a block.
-# A plain tuple: creating a named tuple takes as long as queueing it.
-_Entry = tuple[zenoh.Timestamp | None, str, Sample | bytes | bool | dict[str, Sample]]
+# A bool declares or undeclares the liveliness token, a dict holds the samples of a block.
+_Data = Sample | bytes | bool | dict[str, Sample]
+# One put. A plain tuple: creating a named tuple takes as long as queueing it.
+_Entry = tuple[zenoh.Timestamp | None, str, _Data]
 
 
 class Publisher:
     """The queue (event loop) and the thread that empties it."""
 
-    def __init__(self, keys: Keys) -> None:
+    def __init__(self, keys: Keys, losses: Losses) -> None:
         self.counters = Published()
         self.ended = asyncio.Event()  # the thread has ended, expected or not
         self._keys = keys
+        self._losses = losses
         self._online: dict[str, bool] = {}  # by device
         self._session: zenoh.Session | None = None
         self._tokens: dict[str, zenoh.LivelinessToken] = {}
@@ -66,13 +70,19 @@ class Publisher:
 
     # -- event loop --
 
+    def counts(self) -> dict[str, int]:
+        """Counters since the start, by their names in the status."""
+        return asdict(self.counters) | {"congested": self._losses.congested}
+
     def start(self, session: zenoh.Session) -> None:
         self._session = session
-        self._loop = asyncio.get_running_loop()
         for device, online in self._online.items():
             self.set_online(device, online)
         self._thread = threading.Thread(
-            target=self._run, args=(session,), name="zenoh publisher", daemon=True
+            target=self._run,
+            args=(session, asyncio.get_running_loop()),
+            name="zenoh publisher",
+            daemon=True,
         )
         self._thread.start()
 
@@ -157,15 +167,16 @@ class Publisher:
 
     # -- the publishing thread --
 
-    def _run(self, session: zenoh.Session) -> None:
+    def _run(self, session: zenoh.Session, loop: asyncio.AbstractEventLoop) -> None:
         try:
             self._send_all(session)
         finally:
             with suppress(RuntimeError):  # the loop is closed already
-                self._loop.call_soon_threadsafe(self.ended.set)
+                loop.call_soon_threadsafe(self.ended.set)
 
     def _send_all(self, session: zenoh.Session) -> None:
         while batch := self._next_batch():
+            before = time.monotonic()
             while batch:
                 stamp, key, data = batch.pop()
                 try:
@@ -174,6 +185,9 @@ class Publisher:
                     if session.is_closed():
                         return
                     log.warning("Zenoh put failed", key=key, error=str(error))
+                now = time.monotonic()
+                self._losses.sent(_samples(data), now - before, now)
+                before = now
 
     def _next_batch(self) -> list[_Entry]:
         """Returns all waiting entries, the first at the end; empty only when the publisher ends.
@@ -194,7 +208,7 @@ class Publisher:
         session: zenoh.Session,
         stamp: zenoh.Timestamp | None,
         key: str,
-        data: Sample | bytes | bool | dict[str, Sample],
+        data: _Data,
     ) -> None:
         if isinstance(data, Sample):
             encoding.put(session, key, data, stamp)
@@ -213,6 +227,12 @@ class Publisher:
                 token.undeclare()  # type: ignore[no-untyped-call]  # Zenoh's stub lacks it
         elif key not in self._tokens:
             self._tokens[key] = session.liveliness().declare_token(key)
+
+
+def _samples(data: _Data) -> Iterable[Sample]:
+    if isinstance(data, Sample):
+        return (data,)
+    return data.values() if isinstance(data, dict) else ()
 
 
 class ScanBatches:

@@ -1,16 +1,20 @@
 """Publishes samples again that subscribers may have missed.
 
-All values after a link has returned, because Zenoh stores nothing; bad values with their heartbeat.
-Good values are repeated as they are read. A value of an event tag is published once; only its bad
-quality is published again, as for other tags.
+All values after a link has returned, because Zenoh stores nothing; values that a full link may have
+dropped; every value once per `refresh`, which bounds any other loss; bad values with their
+heartbeat. Good values are repeated as they are read. A value of an event tag is published once;
+only its bad quality is published again, as for other tags.
 """
 
 import asyncio
+import itertools
+import math
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 
 from gateway.northbound.interfaces import Plant
 from gateway.northbound.link_monitor import LinkMonitor
+from gateway.northbound.losses import Losses
 from gateway.northbound.tag_index import TagIndex
 from gateway.tags import Quality, Sample, Tag
 
@@ -18,8 +22,15 @@ from gateway.tags import Quality, Sample, Tag
 _SETTLE_TIME = 0.3
 # Other clients of a restarted router may reconnect later than this gateway: publish again.
 _LATE_CLIENTS = 5.0
+# A link that flaps makes the gateway publish everything at growing pauses, until it is calm.
+_LONGEST_PAUSE, _CALM = 30.0, 60.0  # seconds
+_NEVER = float("-inf")
 _BATCH_SIZE = 500  # samples in one turn of the loop
 _HEARTBEAT_CHECK = 1.0  # seconds: a heartbeat may be this late
+_LOSS_CHECK = 0.5  # seconds
+# Few at a time: a burst would fill a narrow link again.
+_FEW, _FEW_EVERY = 100, 0.02  # samples, seconds
+_REFRESH_EVERY = 0.2  # seconds, where many tags are refreshed
 
 
 class Republisher:
@@ -31,39 +42,74 @@ class Republisher:
         plant: Plant,
         index: TagIndex,
         links: LinkMonitor,
+        losses: Losses,
+        refresh: float,
     ) -> None:
+        """`refresh`: seconds in which every tag is published at least once."""
         self._publish = publish
         self._plant = plant
         self._index = index
         self._links = links
+        self._losses = losses
+        self._refresh = refresh
 
     async def publish_all(self) -> None:
         tags = self._index.tags
         for start in range(0, len(tags), _BATCH_SIZE):
-            current = [self._plant.sample(tag) for tag in tags[start : start + _BATCH_SIZE]]
-            again = [s for s in current if not s.tag.event or s.quality is Quality.BAD]
-            self._plant.mark_published(again)
-            self._publish(again)
+            self._publish_again(tags[start : start + _BATCH_SIZE])
             await asyncio.sleep(0)
+
+    def _publish_again(self, tags: Sequence[Tag]) -> None:
+        current = [self._plant.sample(tag) for tag in tags]
+        again = [s for s in current if not s.tag.event or s.quality is Quality.BAD]
+        self._plant.mark_published(again)
+        self._publish(again)
 
     async def run(self) -> None:
         """Runs until cancelled."""
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(self._after_returned_links())
             tasks.create_task(self._heartbeats())
+            tasks.create_task(self._lost_values())
+            tasks.create_task(self._refreshes())
 
     async def _after_returned_links(self) -> None:
-        returned = self._links.returned
+        returned, pause, last = self._links.returned, _SETTLE_TIME, _NEVER
         while True:
             await returned.wait()
-            await asyncio.sleep(_SETTLE_TIME)
+            pause = min(2 * pause, _LONGEST_PAUSE) if _now() - last < _CALM else _SETTLE_TIME
+            await asyncio.sleep(pause)
             returned.clear()
             await self.publish_all()
+            last = _now()
             with suppress(TimeoutError):
                 async with asyncio.timeout(_LATE_CLIENTS):
                     await returned.wait()
                     continue
             await self.publish_all()
+
+    async def _lost_values(self) -> None:
+        while True:
+            await asyncio.sleep(_LOSS_CHECK)
+            tags, congested = self._losses.due(_now()), self._losses.congested
+            for start in range(0, len(tags), _FEW):
+                if self._losses.congested > congested:
+                    break  # the link is full again: the rest waits for the next round
+                self._publish_again(tags[start : start + _FEW])
+                await asyncio.sleep(_FEW_EVERY)
+
+    async def _refreshes(self) -> None:
+        """Publishes the tags in turn, evenly over the time of `refresh`."""
+        tags = self._index.tags
+        if not tags:
+            return
+        few = math.ceil(len(tags) * _REFRESH_EVERY / self._refresh)
+        pause = self._refresh * few / len(tags)
+        due = _now()
+        for start in itertools.cycle(range(0, len(tags), few)):
+            due += pause
+            await asyncio.sleep(due - _now())
+            self._publish_again(tags[start : start + few])
 
     async def _heartbeats(self) -> None:
         tags = [tag for tag in self._index.tags if tag.heartbeat]
@@ -75,7 +121,7 @@ class Republisher:
                 await asyncio.sleep(0)
 
     def _due(self, tags: list[Tag], published_at: dict[Tag, float]) -> list[Sample]:
-        now, due = asyncio.get_running_loop().time(), []
+        now, due = _now(), []
         for tag in tags:
             sample = self._plant.sample(tag)
             if sample.quality is Quality.GOOD:
@@ -84,3 +130,7 @@ class Republisher:
                 published_at[tag] = now
                 due.append(sample)
         return due
+
+
+def _now() -> float:
+    return asyncio.get_running_loop().time()

@@ -29,6 +29,11 @@ class SecondSession:
     def needed(self) -> bool:
         return self._config is not None
 
+    @property
+    def opened(self) -> list[zenoh.Session]:
+        """The session, if it is open."""
+        return [] if self._session is None else [self._session]
+
     async def session(self) -> zenoh.Session:
         """Waits until the session is open: without a network this takes until there is one."""
         while (session := self._session) is None:

@@ -32,6 +32,9 @@ _DEFAULTS: dict[str, object] = {
     "scouting/gossip/autoconnect": [],  # no links around the router and its access control
     "timestamping/enabled": True,
     "transport/shared_memory/enabled": False,
+    # Connections that say nothing keep new clients out, 100 of them for 10 s by default.
+    "transport/unicast/accept_pending": 400,
+    "transport/unicast/accept_timeout": 3000,  # ms
     "transport/link/tx/lease": 3000,  # ms until the tokens of a frozen gateway end
     # µs. The default of 1 ms silently loses a part of every burst.
     "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 50_000,
@@ -74,6 +77,12 @@ def configure(settings: ZenohConfig) -> zenoh.Config:
     if settings.mode is ZenohMode.CLIENT and json.loads(config.get_json("connect/endpoints")) == []:
         raise ConfigError("zenoh mode client: name its router in `connect`")
     return config
+
+
+def drop_limit(config: zenoh.Config) -> float:
+    """Returns the seconds that a put waits for room on a full link before Zenoh drops it."""
+    path = "transport/link/tx/queue/congestion_control/drop/wait_before_drop"
+    return float(json.loads(config.get_json(path))) / 1e6
 
 
 def as_client(config: zenoh.Config) -> zenoh.Config:

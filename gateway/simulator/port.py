@@ -134,13 +134,16 @@ class HalfDuplex:
     def _reply(self, data: bytes, start: float) -> None:
         sending = self._put(data, start)
         chunk = FIFO if self._character else len(data)
-        now = self._loop.time()  # the same for all pieces, so that they keep their order
-        for first in range(0, len(data), chunk):
-            self._deliver_later(sending, first, min(first + chunk, len(data)), now)
+        ends = [min(first + chunk, len(data)) for first in range(0, len(data), chunk)]
+        pieces = iter(zip([0, *ends], ends, strict=False))
 
-    def _deliver_later(self, sending: _Sending, first: int, last: int, now: float) -> None:
-        due = sending.start + last * self._character
-        self._at(due, lambda: self._deliver(sending.heard(first, last)), now)
+        def deliver_next() -> None:
+            # The timers of uvloop count milliseconds and do not keep their order.
+            self._deliver(sending.heard(*next(pieces)))
+
+        now = self._loop.time()
+        for end in ends:
+            self._at(sending.start + end * self._character, deliver_next, now)
 
     def _at(self, due: float, then: Callable[[], None], now: float) -> None:
         def unless_cut() -> None:

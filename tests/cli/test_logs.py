@@ -8,7 +8,7 @@ import pytest
 import structlog
 
 from gateway.cli import logs
-from gateway.cli.logs import QueuedHandler
+from gateway.cli.logs import QueuedHandler, Repeats
 
 
 @pytest.fixture
@@ -58,3 +58,24 @@ def test_a_reader_that_has_gone_costs_only_the_entries(pipe: tuple[int, int]) ->
         handler.write("y")
     handler.close()
     assert handler.dropped == 5
+
+
+def test_repeated_entries_of_a_device_are_logged_now_and_then_with_their_number() -> None:
+    now = 0.0
+    repeats = Repeats(lambda: now)
+
+    def passes(**entry: object) -> dict[str, object] | None:
+        try:
+            return dict(repeats(None, "info", entry))
+        except structlog.DropEvent:
+            return None
+
+    failed = {"event": "transaction failed", "device": "mixer", "line": "hall"}
+    found = [passes(**failed) for _ in range(100)]
+    assert [one for one in found if one is not None] == [failed] * logs.BURST
+    assert passes(**failed | {"device": "oven"})
+    assert passes(**failed | {"event": "device offline"})
+    now = logs.EVERY
+    assert passes(**failed) == failed | {"unlogged": 100 - logs.BURST}
+    assert passes(**failed) is None
+    assert all(passes(event="tag written", key="plant/mixer/speed") for _ in range(100))

@@ -30,7 +30,7 @@ class Done(NamedTuple):
 
 
 def plc_gateway(*arguments: object, **how: Any) -> Done:
-    """Runs a command to its end."""
+    """Runs a command to its end. `cwd`; `env`: variables besides those of this process."""
     done = subprocess.run(
         [sys.executable, "-m", "gateway", *map(str, arguments)],
         stdin=subprocess.DEVNULL,
@@ -38,7 +38,7 @@ def plc_gateway(*arguments: object, **how: Any) -> Done:
         text=True,
         timeout=PATIENCE,
         cwd=how.pop("cwd", ROOT),
-        env=_ENVIRONMENT,
+        env=_ENVIRONMENT | how.pop("env", {}),
         check=False,
     )
     assert "Traceback" not in done.stderr, done.stderr

@@ -1,6 +1,7 @@
 """Each sentence of the class docstring is a test; in any order of calls no poll is lost."""
 
 import itertools
+from collections.abc import Sequence
 from typing import Any
 
 from hypothesis import settings
@@ -118,6 +119,69 @@ def test_but_not_twice_in_a_row_while_one_is_due() -> None:
         schedule.expedite(expedited)
         asked.append(polled(schedule, 0.0))
     assert asked == [expedited, other, expedited, expedited]
+
+
+def questions(schedule: Schedule, asked: Sequence[Poll], until: float) -> dict[Poll, int]:
+    """Clients ask for these polls all the time; a poll takes its expected time."""
+    now, sent = 0.0, dict[Poll, int]()
+    while now < until:
+        for poll in asked:
+            schedule.expedite(poll, on_demand=True)
+        match schedule.next(now):
+            case Poll() as poll:
+                now += poll.device.seconds(poll.block.cost)
+                schedule.polled(poll, now)
+                sent[poll] = sent.get(poll, 0) + 1
+            case Idle(then):
+                now = then
+    return sent
+
+
+def fast_and_slow(every: float) -> Device:
+    """A device with a poll of one word every 100 ms, and two long ones."""
+    numbers = [n for start in (1000, 2000) for n in range(start, start + 64)]
+    slow = [make_tag(f"D{n}", every=every) for n in numbers]
+    found = device([make_tag("D0", every=0.1), *slow])
+    found.health.answered()
+    return found
+
+
+def test_questions_of_clients_do_not_hold_up_a_fast_poll() -> None:
+    schedule = Schedule([dev := fast_and_slow(every=60.0)], 0.0)
+    fast, *asked = schedule.polls(dev)
+    assert 0.1 < dev.seconds(asked[0].block.cost) < 0.4
+    sent = questions(schedule, asked, 60.0)
+    assert sent[fast] > 0.8 * 600
+    share = sum(sent[poll] * dev.seconds(poll.block.cost) for poll in asked) / 60.0
+    assert share > 0.2  # the clients get theirs
+
+
+def test_a_poll_after_a_write_does_not_wait_with_questions() -> None:
+    dev = online(0, 1000, 2000, every=10.0)
+    schedule = Schedule([dev], 0.0)
+    first, second, written = (polled(schedule, 0.0) for _ in range(3))
+    for poll in (first, second, written):
+        schedule.expedite(poll, on_demand=True)
+    assert polled(schedule, 1.0) is first
+    schedule.expedite(written)
+    schedule.expedite(written, on_demand=True)
+    assert polled(schedule, 3.0) is written
+    assert polled(schedule, 3.0) is second
+
+
+def test_questions_that_hold_up_no_poll_get_the_rest_of_the_wire() -> None:
+    dev = online(0, 1000, every=1.0)
+    schedule = Schedule([dev], 0.0)
+    _, asked = schedule.polls(dev)
+    took = dev.seconds(asked.block.cost)
+    assert questions(schedule, [asked], 10.0)[asked] * took > 0.8 * 10.0
+
+
+def test_a_poll_that_clients_ask_for_is_not_polled_less_than_without_them() -> None:
+    schedule = Schedule([dev := fast_and_slow(every=1.0)], 0.0)
+    _, *asked = schedule.polls(dev)
+    sent = questions(schedule, asked, 60.0)
+    assert min(sent[poll] for poll in asked) > 50
 
 
 def test_a_poll_expedited_while_it_is_in_flight_is_sent_once_more() -> None:

@@ -257,7 +257,10 @@ async def test_an_event_is_not_published_again_when_the_link_returns() -> None:
             pass
 
     everything: Any = Everything()
-    await Republisher(repeated.extend, everything, everything, everything).publish_all()
+    republisher = Republisher(
+        repeated.extend, everything, everything, everything, everything, 600.0
+    )
+    await republisher.publish_all()
     assert [sample.tag.key for sample in repeated] == ["scale/weight", "scale/state"]
 
 

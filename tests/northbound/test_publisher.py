@@ -10,6 +10,7 @@ import time
 from typing import Any
 
 from gateway.northbound.keys import Keys
+from gateway.northbound.losses import Losses
 from gateway.northbound.publisher import EVENTS_LIMIT, Publisher
 from tests.northbound.plant import (
     PlainDevice,
@@ -72,7 +73,7 @@ class StuckSession:
 async def test_while_a_put_blocks_the_newest_value_of_each_tag_is_kept_in_order() -> None:
     plant = mixer()
     session: Any = StuckSession()
-    publisher = Publisher(Keys("plant", "demo"))
+    publisher = Publisher(Keys("plant", "demo"), Losses(1.0))
     publisher.start(session)
     publisher.values([plant.now("mixer/speed", 0)])
     await asyncio.to_thread(session.hangs.wait, 5)
@@ -98,7 +99,7 @@ async def test_while_a_put_blocks_the_newest_value_of_each_tag_is_kept_in_order(
 async def test_events_beyond_the_limit_are_dropped_and_counted() -> None:
     plant = mixer()
     session: Any = StuckSession()
-    publisher = Publisher(Keys("plant", "demo"))
+    publisher = Publisher(Keys("plant", "demo"), Losses(1.0))
     publisher.events([plant.now("mixer/speed", 0)])  # no session yet
     publisher.start(session)
     publisher.values([plant.now("mixer/recipe", 0)])

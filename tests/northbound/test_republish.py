@@ -3,6 +3,7 @@
 import asyncio
 import time
 from collections.abc import Sequence
+from typing import Any
 
 import pytest
 
@@ -10,6 +11,7 @@ from gateway.config import ZenohConfig, ZenohMode
 from gateway.northbound import Northbound
 from gateway.northbound.keys import Keys
 from gateway.northbound.link_monitor import LinkMonitor
+from gateway.northbound.losses import Losses
 from gateway.northbound.republish import Republisher
 from gateway.northbound.tag_index import TagIndex
 from gateway.tags import Reason, Sample, bad
@@ -21,6 +23,7 @@ from tests.northbound.plant import (
     mixer,
     tag,
 )
+from tests.sim.virtual import now, on_virtual_time
 from tests.zenoh_peer import ZenohPeer, free_endpoint
 
 
@@ -53,7 +56,7 @@ async def test_an_event_is_published_once_but_its_bad_quality_again() -> None:
     plant = PlainPlant(PlainDevice("reader", (code, weight)))
     index = TagIndex(Keys("plant", "demo"), plant.devices())
     published: list[Sample] = []
-    republisher = Republisher(published.extend, plant, index, LinkMonitor())
+    republisher = Republisher(published.extend, plant, index, LinkMonitor(), Losses(1.0), 600.0)
     await republisher.publish_all()  # as at a start
     assert published == [bad(of, Reason.STARTING, plant.sample(of).time) for of in (code, weight)]
     published.clear()
@@ -75,7 +78,7 @@ async def test_the_plant_marks_republished_samples_before_they_go_out() -> None:
         assert plant.republished == published
 
     index = TagIndex(Keys("plant", "demo"), plant.devices())
-    await Republisher(publish, plant, index, LinkMonitor()).publish_all()
+    await Republisher(publish, plant, index, LinkMonitor(), Losses(1.0), 600.0).publish_all()
     assert len(published) == 4
 
 
@@ -109,3 +112,79 @@ async def test_after_a_router_was_killed_and_returned_everything_is_published_ag
     finally:
         serves.cancel()
         await asyncio.wait([serves], timeout=5)
+
+
+def republisher(plant: PlainPlant, published: list[Sample], **how: Any) -> Republisher:
+    index = TagIndex(Keys("plant", "demo"), plant.devices())
+    settings = {"links": LinkMonitor(), "losses": Losses(0.05), "refresh": 1e6, **how}
+    return Republisher(published.extend, plant, index, **settings)
+
+
+def of_mixer(count: int) -> PlainPlant:
+    plant = PlainPlant(PlainDevice("mixer", tuple(tag("mixer", f"t{n}") for n in range(count))))
+    for n in range(count):
+        plant.now(f"mixer/t{n}", n)
+    return plant
+
+
+@on_virtual_time
+async def test_values_that_a_full_link_may_have_dropped_are_published_again() -> None:
+    plant, published, losses = of_mixer(1000), list[Sample](), Losses(0.05)
+    current = list(plant.samples.values())
+    losses.sent(current[:300], 0.05, now())
+    task = asyncio.create_task(republisher(plant, published, losses=losses).run())
+    await asyncio.sleep(1.6)
+    assert published == current[:300]
+    task.cancel()
+
+
+@on_virtual_time
+async def test_a_round_ends_when_the_link_is_full_again() -> None:
+    plant, losses = of_mixer(1000), Losses(0.05)
+    published: list[Sample] = []
+
+    def publish(samples: Sequence[Sample]) -> None:
+        published.extend(samples)
+        losses.sent(samples, 0.05, now())
+
+    index = TagIndex(Keys("plant", "demo"), plant.devices())
+    losses.sent(plant.samples.values(), 0.05, now())
+    again = Republisher(publish, plant, index, LinkMonitor(), losses, 1e6)
+    task = asyncio.create_task(again.run())
+    await asyncio.sleep(1.4)
+    assert len(published) == 100
+    await asyncio.sleep(12.0)
+    assert len(set(published[:1000])) == 1000  # each round continues the one before
+    task.cancel()
+
+
+@on_virtual_time
+async def test_every_value_is_published_once_in_the_time_of_refresh() -> None:
+    plant, published = of_mixer(1000), list[Sample]()
+    task = asyncio.create_task(republisher(plant, published, refresh=60.0).run())
+    await asyncio.sleep(30.05)
+    assert len(published) in range(490, 511)  # evenly
+    await asyncio.sleep(30.0)
+    assert {sample.tag.name for sample in published} == {f"t{n}" for n in range(1000)}
+    assert len(published) < 1020
+    task.cancel()
+
+
+@on_virtual_time
+async def test_a_link_that_flaps_publishes_everything_at_growing_pauses() -> None:
+    plant, published, links = of_mixer(10), list[Sample](), LinkMonitor()
+    task = asyncio.create_task(republisher(plant, published, links=links).run())
+    for _ in range(600):  # ten minutes
+        links.returned.set()
+        await asyncio.sleep(1.0)
+    assert len(published) in range(220, 300)  # not 10 times 600
+    links.returned.set()
+    published.clear()
+    await asyncio.sleep(31.0)
+    assert len(published) >= 10  # the last return is not forgotten
+    await asyncio.sleep(60.0)
+    published.clear()
+    links.returned.set()
+    await asyncio.sleep(0.4)
+    assert len(published) == 10  # calm: at once again
+    task.cancel()

@@ -2,6 +2,8 @@
 
 import asyncio
 import itertools
+from collections.abc import Callable
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -263,3 +265,35 @@ def test_the_same_play_is_heard_the_same_and_no_character_is_lost(
 async def test_a_simulator_is_not_opened_without_its_stations() -> None:
     with pytest.raises(ValueError, match="open_simulator"):
         await open_port(SimulatorAddress(), SerialSettings(), RecordingReceiver())
+
+
+class Backwards(asyncio.SelectorEventLoop):
+    """Each timer fires earlier than the one before it, by far more than a piece takes."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._earlier = itertools.count()
+
+    def call_at(  # type: ignore[override]  # its generic signature says no more
+        self, when: float, callback: Callable[..., object], *args: Any, context: Any = None
+    ) -> asyncio.TimerHandle:
+        when -= next(self._earlier) * 1e-3
+        return super().call_at(when, callback, *args, context=context)
+
+
+def test_the_pieces_of_a_reply_keep_their_order_when_timers_do_not() -> None:
+    received = RecordingReceiver()
+
+    async def play() -> None:
+        station = FixedStation(bytes(range(200)))
+        port = await open_simulator(
+            [station], WireTiming(100_000_000, 10), received, turnaround=0.15
+        )
+        port.write(REQUEST)
+        until = asyncio.get_running_loop().time() + 5.0
+        while len(received.data) < 200 and asyncio.get_running_loop().time() < until:
+            await asyncio.sleep(0)
+
+    with asyncio.Runner(loop_factory=Backwards) as runner:
+        runner.run(play())
+    assert received.data == bytes(range(200))

@@ -14,6 +14,7 @@ import zenoh
 
 from gateway.cli.client.arguments import matches, parse_value, tags_by_key
 from gateway.cli.client.signing import signature
+from gateway.cli.terminal import printable
 from gateway.config import Config
 from gateway.config.commands import TO_ALL
 from gateway.errors import GatewayError
@@ -291,5 +292,5 @@ def _document(data: bytes) -> dict[str, object]:
 
 def _reason(data: bytes) -> str:
     with suppress(orjson.JSONDecodeError):
-        return str(_document(data).get("reason", data.decode("utf-8", "replace")))
-    return data.decode("utf-8", "replace")
+        return printable(str(_document(data).get("reason", data.decode("utf-8", "replace"))))
+    return printable(data.decode("utf-8", "replace"))
