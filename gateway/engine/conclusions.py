@@ -29,6 +29,8 @@ from gateway.engine.results import Results
 from gateway.engine.together import Together
 from gateway.errors import BadValue, DeviceError, Garbled, LineDown, Refused, Unclear, Unsteady
 
+NEVER_QUIET = "the line is never quiet, the order of replies is unknown: noise, or another master"
+
 
 class Conclusions:
     """The rules that lead from one job to the next of the same transaction.
@@ -111,9 +113,12 @@ class Conclusions:
                 Resynced() | Refused()
             ):  # an error reply counts too, but may belong to an older request
                 told_from = result.told_from if isinstance(result, Resynced) else 0
-                if not probe.again and self._results.outstanding_requests(device) > told_from:
+                outstanding = self._results.outstanding_requests(device)
+                if not probe.again and outstanding > told_from:
+                    # A device server may pass on all of them, one after another.
                     quiet = device.longest_reply
-                    self._in_flight.continuation = Settle(device, quiet, quiet, probe)
+                    guard = (outstanding + 1) * quiet
+                    self._in_flight.continuation = Settle(device, guard, quiet, probe)
                 else:
                     self._results.answered(device, now, time, resynced=True)
             case Unclear():
@@ -153,7 +158,9 @@ class Conclusions:
     def _settled(self, settle: Settle, result: Result, now: float, time: int) -> None:
         device, after = settle.device, settle.after
         if settle.error is None:
-            if isinstance(after, Probe):
+            if isinstance(result, Settled) and not result.quiet:
+                self.unclear(after, Garbled(NEVER_QUIET), Traffic(), now, time)
+            elif isinstance(after, Probe):
                 again = Probe(device, after.outstanding, after.token + 1, again=True)
                 self._in_flight.continuation = again
             return

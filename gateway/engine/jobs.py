@@ -294,9 +294,13 @@ class HeldTogether:
 
 @dataclass(frozen=True, slots=True)
 class Settled:
-    """The line has settled. `late`: seconds from the time-out to the late reply, if any."""
+    """The line has settled. `late`: seconds from the time-out to the late reply, if any.
+
+    `quiet`: False if bytes arrived all the time.
+    """
 
     late: float | None
+    quiet: bool = True
 
 
 Success = Sequence[int] | Resynced | Sent | HeldTogether | Settled | str | None

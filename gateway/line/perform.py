@@ -17,7 +17,6 @@ from gateway.engine.jobs import (
     Resynced,
     Sent,
     Settle,
-    Settled,
     Transacted,
     WriteTogether,
 )
@@ -80,7 +79,7 @@ async def _perform(job: Transacted, transaction: Transaction) -> Result:
     driver: Any = job.device.settings.driver
     match job:
         case Settle(guard=guard, gap=gap):
-            return Settled(await transaction.settle(guard, gap))
+            return await transaction.settle(guard, gap)
         case Probe(outstanding=outstanding, token=token, timeout=timeout):
             spans = job.device.probe_spans
             talk = transaction if timeout is None else ShortTalk(transaction, timeout)

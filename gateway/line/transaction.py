@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from gateway.engine.device import Device
-from gateway.engine.jobs import Traffic
+from gateway.engine.jobs import Settled, Traffic
 from gateway.engine.unanswered import TimedOut
 from gateway.errors import DeviceError, Evidence, Garbled, LineDown, NoReply
 from gateway.line.channel import KEPT, NEVER, Channel
@@ -211,12 +211,11 @@ class Transaction:
         for request in self._open:
             _fail(request, error)
 
-    async def settle(self, guard: float, gap: float) -> float | None:
+    async def settle(self, guard: float, gap: float) -> Settled:
         """Sends nothing until this transaction can no longer disturb the next.
 
         After a time-out: until the late reply has arrived, or for `guard` seconds. After noise:
-        until `gap` seconds have passed without a byte, at most `guard`. Returns how late the
-        reply was in seconds, or None when it did not arrive.
+        until `gap` seconds have passed without a byte, at most `guard`.
         """
         channel, late = self._channel, self._late
         start = channel.now()
@@ -224,16 +223,16 @@ class Transaction:
         if late is None:
             late = _LateReply(lambda frame: None)
             while channel.lost_by is None:
-                quiet = min(channel.quiet_since + gap, until)
-                if quiet <= channel.now():
-                    break
-                await self._wait(late, quiet)
-            return None
+                quiet = channel.quiet_since + gap
+                if min(quiet, until) <= channel.now():
+                    return Settled(late=None, quiet=quiet <= channel.now())
+                await self._wait(late, min(quiet, until))
+            return Settled(late=None)
         if late.arrived:
-            return 0.0
+            return Settled(late=0.0)
         if channel.lost_by is None:
             await self._wait(late, until)
-        return channel.now() - start if late.arrived else None
+        return Settled(channel.now() - start if late.arrived else None)
 
     async def _wait(self, late: _LateReply, end: float) -> None:
         """Waits until the late reply has arrived, the port is lost, or `end`."""

@@ -414,3 +414,21 @@ def test_two_silent_blocks_are_found_where_one_failure_makes_the_device_offline(
     assert {span.start for span in rig.device.bad_addresses.bad} == bad
     assert good_now(rig) == {"D0", "D500", "D1000", "D1001"}
     assert events(rig).count("device offline") == 2
+
+
+def test_the_line_is_quiet_before_a_probe_that_may_have_an_older_reply_is_repeated() -> None:
+    """A device server that stays behind passed on old requests, one by one, also after a wait."""
+    rig = online(retries=3)
+    for _ in range(2):
+        job = rig.transacted()
+        rig.fail(job)
+    probe = rig.transacted()
+    assert isinstance(probe, Probe)
+    rig.conclude(probe, Resynced(0))
+    settle = rig.transacted()
+    assert isinstance(settle, Settle)
+    assert settle.gap == rig.device.longest_reply
+    assert settle.guard == 3 * rig.device.longest_reply
+    rig.conclude(settle, Settled(None, quiet=False))
+    assert rig.device.health.needs_resync
+    assert "never quiet" in str(rig.device.health.trouble)

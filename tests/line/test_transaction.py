@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 
+from gateway.engine.jobs import Settled
 from gateway.errors import Evidence, Garbled, LineDown, NoReply, Refused
 from gateway.protocols.driver import Span
 from gateway.protocols.modbus import ModbusRtu, ModbusTcp
@@ -89,7 +90,7 @@ async def test_settling_ends_with_the_late_reply() -> None:
     with pytest.raises(NoReply):
         await read(talk)
     start = now()
-    late = await talk.settle(10.0, 0.02)
+    late = (await talk.settle(10.0, 0.02)).late
     assert late is not None
     assert now() - start == pytest.approx(late)
     assert now() == pytest.approx(port.sent[0][0] + 0.5)
@@ -103,7 +104,7 @@ async def test_settling_without_a_late_reply_ends_with_the_guard() -> None:
     with pytest.raises(NoReply):
         await read(talk)
     start = now()
-    assert await talk.settle(0.4, 0.02) is None
+    assert (await talk.settle(0.4, 0.02)).late is None
     assert now() - start == pytest.approx(0.4)
 
 
@@ -117,7 +118,7 @@ async def test_a_late_refusal_is_the_late_reply_unless_a_resync_is_needed(
     talk = opened(port, needs_resync=needs_resync)
     with pytest.raises(NoReply):
         await read(talk)
-    late = await talk.settle(10.0, 0.02)
+    late = (await talk.settle(10.0, 0.02)).late
     assert (late is None) is needs_resync
 
 
@@ -135,7 +136,7 @@ async def test_an_unmatched_frame_does_not_end_the_settling() -> None:
     port.say(frame, 0.1)
     port.talk = talk
     start = now()
-    assert await talk.settle(0.4, 0.02) is None
+    assert (await talk.settle(0.4, 0.02)).late is None
     assert now() - start == pytest.approx(0.4)
     assert len(frames) == 1
 
@@ -252,6 +253,19 @@ async def test_port_loss_ends_the_settling(garbled: bool) -> None:
 
 
 @on_virtual_time
+async def test_a_wire_that_is_never_quiet_does_not_settle() -> None:
+    port = FakePort()
+    talk = opened(port)
+    await read(talk)
+    settling = asyncio.create_task(talk.settle(1.0, 0.3))
+    for _ in range(6):
+        await asyncio.sleep(0.2)
+        talk.received(b"?")
+    assert await settling == Settled(late=None, quiet=False)
+    assert await talk.settle(1.0, 0.3) == Settled(late=None)
+
+
+@on_virtual_time
 async def test_noise_between_two_requests_of_a_transaction_is_dropped() -> None:
     port = FakePort()
     talk = opened(port)
@@ -327,4 +341,4 @@ async def test_a_reply_that_waited_while_the_loop_stood_still_is_late() -> None:
     talk.received(b"".join(port.station.hear(port.sent[0][1], now())))
     with pytest.raises(NoReply):
         await asking
-    assert await talk.settle(0.5, 0.02) == 0.0
+    assert (await talk.settle(0.5, 0.02)).late == 0.0

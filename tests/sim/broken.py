@@ -292,7 +292,7 @@ MUTANTS = (
     Mutant(
         "after a stall the first reply that fits is believed",
         "engine/conclusions.py",
-        "if not probe.again and self._results.outstanding_requests(device) > told_from:",
+        "if not probe.again and outstanding > told_from:",
         "if False:",
         "tests/line/test_stalled_link.py",
     ),
@@ -362,8 +362,8 @@ MUTANTS = (
     Mutant(
         "the line does not settle after an unclear end",
         "line/perform.py",
-        "            return Settled(await transaction.settle(guard, gap))\n",
-        "            return Settled(None)\n",
+        "            return await transaction.settle(guard, gap)\n",
+        "            return await transaction.settle(0.0, 0.0)\n",
         "tests/line",
         (54, 55, 53, 48),
         "late",
@@ -815,6 +815,13 @@ MUTANTS = (
         "    return longer or ",
         "    return ",
         "tests/engine/test_reply_shapes.py",
+    ),
+    Mutant(
+        "a probe is repeated although older replies still arrive",
+        "engine/conclusions.py",
+        "if isinstance(result, Settled) and not result.quiet:",
+        "if False:",
+        "tests/engine/test_results.py",
     ),
     Mutant(
         "splits found again are dropped at once",
