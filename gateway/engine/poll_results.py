@@ -10,13 +10,22 @@ from gateway.engine.jobs import Poll
 from gateway.engine.plans import Plans
 from gateway.engine.results import Results
 from gateway.engine.schedule import Schedule
-from gateway.errors import DeviceError, Garbled, GatewayError, Refusal, Refused, Unsteady
+from gateway.errors import (
+    DeviceError,
+    Evidence,
+    Garbled,
+    GatewayError,
+    Refusal,
+    Refused,
+    Unsteady,
+)
 from gateway.planning.bad_addresses import RETRIES, SILENT
 from gateway.planning.planner import Block, describe
 from gateway.tags import Reason, Sample
 from gateway.tags.unchanged import Unchanged
 
 TOGETHER = RETRIES[0] + 1.0  # seconds in which all addresses that return are tried
+OF_OTHERS = (Evidence.STATION, Evidence.SHAPE, Evidence.ECHO)  # they say nothing of addresses
 BUSY_PAUSE = 0.2  # seconds of pause for a busy device, doubled each time
 
 
@@ -230,7 +239,8 @@ class PollResults:
             return
         others_answered = health.consecutive_failures <= 1
         lasting = others_answered and (known or half or poll.missed > 0)
-        if lasting and self._halved(poll, error, SILENT, now, time):
+        of_others = isinstance(error, Garbled) and error.evidence in OF_OTHERS
+        if lasting and not of_others and self._halved(poll, error, SILENT, now, time):
             return
         self._end_badly(poll, health.reason, error, now, time, answered=False)
         self._end_search(device, now)

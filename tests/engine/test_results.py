@@ -11,7 +11,7 @@ from gateway.engine.jobs import Idle, Poll, Probe, Reopen, Resynced, Settle, Set
 from gateway.engine.poll_results import BUSY_PAUSE
 from gateway.engine.reply_shapes import QUIET
 from gateway.engine.turnaround import LEARN_EVERY
-from gateway.errors import DeviceError, Garbled, Refusal, Refused, Unsteady
+from gateway.errors import DeviceError, Evidence, Garbled, Refusal, Refused, Unsteady
 from gateway.planning.bad_addresses import RETRIES, SILENT, SPLIT_FIRST
 from gateway.planning.planner import plan
 from gateway.protocols.computer_link import ComputerLink
@@ -356,6 +356,24 @@ def test_a_poll_of_several_at_once_without_a_reply_turns_bad_after_its_own_retri
     assert bad
     assert {sample.tag for sample in bad} == {silent}
     assert rig.device.health.online
+
+
+def test_replies_of_another_station_make_no_address_bad() -> None:
+    """After three minutes of them a block stayed bad for 300 s."""
+    rig = online(retries=1)
+    foreign = Garbled("another station spoke", evidence=Evidence.STATION)
+    while rig.now < 60.0:
+        job = rig.next()
+        match job:
+            case Idle():
+                rig.now = job.until
+            case Probe():
+                rig.conclude(job, Resynced(9))
+            case _:
+                assert isinstance(job, Poll | Settle)
+                rig.conclude(job, foreign if isinstance(job, Poll) else Settled(None))
+    assert rig.device.bad_addresses.clear
+    assert good_now(rig) == set()
 
 
 # Learning

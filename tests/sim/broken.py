@@ -824,6 +824,13 @@ MUTANTS = (
         "tests/engine/test_results.py",
     ),
     Mutant(
+        "replies of another station make an address bad",
+        "engine/poll_results.py",
+        "        if lasting and not of_others and",
+        "        if lasting and",
+        "tests/engine/test_results.py",
+    ),
+    Mutant(
         "splits found again are dropped at once",
         "planning/bad_addresses.py",
         "        self.splits.clear()\n        self._rejoin_at = None\n",
