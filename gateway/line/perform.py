@@ -175,10 +175,7 @@ async def _only_reply(sending: Awaitable[bool], write: Write, talk: Transaction)
         talk.guard(None)
     if write.resyncs.after is not None:
         try:
-            device = write.device
-            await device.driver.resync(
-                talk, write.tag.span, write.resyncs.after, device.probe_spans
-            )
+            await _resync_after(write, write.resyncs.after, talk)
         except Refused as error:
             raise Unclear(TWO_REPLIES) from error
         if talk.traffic.extra:
@@ -186,6 +183,17 @@ async def _only_reply(sending: Awaitable[bool], write: Write, talk: Transaction)
     if refused is not None:
         raise refused
     return acknowledged
+
+
+async def _resync_after(write: Write, token: int, talk: Transaction) -> None:
+    """Sends the resync. If the device lacks its addresses, those of the last read follow."""
+    device = write.device
+    try:
+        await device.driver.resync(talk, write.tag.span, token, device.probe_spans)
+    except Refused:
+        if device.last_read is None:
+            raise
+        await device.driver.read(talk, device.last_read)
 
 
 async def _read_back(job: ReadBack, talk: Talk[Any]) -> HeldTogether:

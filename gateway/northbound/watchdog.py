@@ -48,11 +48,11 @@ class Watchdog:
             yield
         finally:
             self._ended.set()
+            self._next_turn.cancel()
 
     def _turn(self) -> None:
         self._turned = True
-        if not self._ended.is_set():
-            self._loop.call_later(_TICK, self._turn)
+        self._next_turn = self._loop.call_later(_TICK, self._turn)
 
     # -- the watchdog's thread --
 
