@@ -3,7 +3,7 @@
 from collections import Counter
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 
-from gateway.planning.bad_addresses import BadAddresses
+from gateway.planning.bad_addresses import BadAddresses, within
 from gateway.planning.planner import Block
 from gateway.protocols.driver import Cost, Span, UnnumberedReplies
 
@@ -99,7 +99,7 @@ class LongerReads:
         found: dict[Hashable, Span] = {self._driver.reply_shape(span): span}
         _, lacking = self._lacking.get(span, (0.0, []))
         for longer in self._longer(span):
-            if any(_inside(refused, longer) for refused in lacking):
+            if any(within(refused, longer) for refused in lacking):
                 continue
             found.setdefault(self._driver.reply_shape(longer), longer)
             if len(found) == MOST_WARY:
@@ -120,9 +120,3 @@ class LongerReads:
             crosses = any(longer.start < place < end for place in cuts)
             if not crosses and self._driver.cost(longer) is not None:
                 yield longer
-
-
-def _inside(inner: Span, outer: Span) -> bool:
-    """Returns True if the outer span has all addresses of the inner one."""
-    end = inner.start + inner.size
-    return outer.start <= inner.start and end <= outer.start + outer.size

@@ -73,7 +73,8 @@ class _Node:
         return set().union(*(half.splits() for half in self.halves))
 
 
-def _within(inner: Span, outer: Span) -> bool:
+def within(inner: Span, outer: Span) -> bool:
+    """Returns True if the outer span has all addresses of the inner one."""
     return inner.area == outer.area and (
         outer.start <= inner.start and inner.start + inner.size <= outer.start + outer.size
     )
@@ -222,7 +223,7 @@ class BadAddresses:
         areas = {span.area for span, _, _ in known.refused}
         candidates = [tag for tag in tags if tag.span.area in areas]
         for span, since, code in known.refused:
-            inside = tuple(tag for tag in candidates if _within(tag.span, span))
+            inside = tuple(tag for tag in candidates if within(tag.span, span))
             if [(i.start, i.end) for i in items_of(inside)] == [
                 (span.start, span.start + span.size)
             ]:

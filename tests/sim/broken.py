@@ -840,7 +840,7 @@ MUTANTS = (
     Mutant(
         "one refused longer read ends all longer reads",
         "engine/longer_reads.py",
-        "            if any(_inside(refused, longer) for refused in lacking):\n",
+        "            if any(within(refused, longer) for refused in lacking):\n",
         "            if lacking:\n",
         "tests/engine/test_reply_shapes.py",
     ),
