@@ -16,6 +16,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from inspect import isclass, isfunction
 from pathlib import Path
 from types import ModuleType
@@ -60,6 +61,7 @@ class World:
         turns.loop.set_exception_handler(self._crashed)
         self.trace = hashlib.sha256()
         self._sessions = 0
+        self.calm, self.traced = CALM, True
         self.gateway = Gateway(config, self.wall, self._opener)
         self.history = Historian(history.path, history.keep, history.max_size, self.wall)
         self.northbound = Northbound(config.zenoh, "sim", self.gateway, history=self.history)
@@ -81,10 +83,10 @@ class World:
         return session
 
     def _crashed(self, _: object, context: dict[str, Any]) -> None:
-        self.judge.broke(f"a callback ended: {context.get('exception')!r}")
+        self.judge.broke(f"a callback failed: {context.get('exception')!r}")
 
     def _note(self, key: str, data: bytes) -> None:
-        if "@gateway" not in key:
+        if self.traced and "@gateway" not in key:
             self.trace.update(repr((self.turns.loop.time(), key, data)).encode())
 
     # From the gateway: the history, as the service connects it
@@ -102,7 +104,7 @@ class World:
         for device in config.devices:
             chance = random.Random(f"steps {self.story.seed} {device.name}")
             self.slaves[device.name] = Slave(
-                device.driver, list(device.tags), chance, self.judge.executed
+                device.driver, list(device.tags), chance, self.drawn, self.judge.executed
             )
         stations = [self.slaves[device.name] for device in config.devices]
         return lambda receiver: open_simulator(stations, config.wire, receiver)
@@ -217,7 +219,7 @@ class World:
         )
         for task in done:
             self.judge.broke(f"{task.get_name()} ended by itself: {task.exception()!r}")
-        await asyncio.sleep(CALM)
+        await asyncio.sleep(self.calm)
         await _end(people)
         await self._at_the_end()
         await _end([*lines, *others, *faults])
@@ -293,9 +295,16 @@ def replaced(world: Callable[[], World], turns: Turns, time: Time) -> Iterator[N
 
 
 def run(
-    seed: int, hours: float, pace: str = "north", only: Sequence[str] = (), *, traced: bool = True
+    seed: int,
+    hours: float,
+    pace: str = "north",
+    only: Sequence[str] = (),
+    *,
+    traced: bool = True,
+    calm: float = CALM,
 ) -> Story:
-    """Runs one seed. `only`: the kinds of faults that happen; empty: all."""
+    """Runs one seed. `only`: the kinds of faults that happen; empty: all. `calm`: seconds without
+    faults at the end; with less than a minute the judge complains."""
     story = Story(seed, hours, pace, tuple(only))
 
     async def whole(folder: Path) -> None:
@@ -303,12 +312,16 @@ def run(
         assert isinstance(loop, VirtualLoop)
         turns, worlds = Turns(loop), list[World]()
         time = Time(loop.time, lambda: worlds[0].wall())
-        drawn = draw(seed, hours * 3600, CALM, folder)
+        drawn = draw(seed, hours * 3600, calm, folder)
+        if only:
+            kept = tuple(fault for fault in drawn.faults if fault.kind in only)
+            drawn = replace(drawn, faults=kept)
         path = folder / "config.yaml"
         path.write_text(json.dumps(drawn.document))
         with replaced(lambda: worlds[0], turns, time):
             try:
                 worlds.append(World(drawn, load(path), story, hours * 3600, turns))
+                worlds[0].calm, worlds[0].traced = calm, traced
                 await worlds[0].live()
             finally:
                 turns.end()

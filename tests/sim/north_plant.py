@@ -1,5 +1,6 @@
 """Draws the plant, the network and the faults of a seed at the northbound edge."""
 
+import json
 import os
 import random
 from collections.abc import Callable
@@ -15,7 +16,8 @@ from gateway.tags import Tag
 REFRESHES = (20.0, 60.0, 600.0)
 RATES = (8_000.0, 16_000.0, 125_000.0, 500_000.0, 10_000_000.0)  # bytes per second
 LATENCIES = (0.0002, 0.005, 0.04, 0.3)
-STEPS = (0.5, 3.0, 20.0, 90.0, 400.0)  # seconds between two values of a tag
+# Seconds between two values of a tag. In a calm plant the links are not full all the time.
+BUSY, CALM = (0.5, 3.0, 20.0, 90.0, 400.0), (20.0, 90.0, 90.0, 400.0)
 
 
 class Fault(NamedTuple):
@@ -45,6 +47,8 @@ class Drawn:
     people: dict[str, Place]
     faults: tuple[Fault, ...]
     refresh: float
+    steps: tuple[float, ...]
+    together: bool  # tags of one step change at the same time
 
 
 def draw(seed: int, seconds: float, calm: float, folder: Path) -> Drawn:
@@ -53,9 +57,14 @@ def draw(seed: int, seconds: float, calm: float, folder: Path) -> Drawn:
     lines = {f"line{n}": _line(n, chance) for n in range(chance.choice((1, 1, 2)))}
     keep = chance.choice((60.0, 120.0, 2 * (seconds + calm), 20 * (seconds + calm)))
     port = 1024 + os.getpid() % 60_000  # one process has it: no other session is opened
+    (folder / "zenoh.json5").write_text(json.dumps(_transport(chance)))
     document = {
         "gateway": {"name": "sim"},
-        "zenoh": {"listen": [f"tcp/127.0.0.1:{port}"], "refresh": f"{refresh:g}s"},
+        "zenoh": {
+            "listen": [f"tcp/127.0.0.1:{port}"],
+            "refresh": f"{refresh:g}s",
+            "config_file": str(folder / "zenoh.json5"),
+        },
         "history": {
             "path": str(folder / "history.db"),
             "keep": f"{keep:.0f}s",
@@ -71,7 +80,22 @@ def draw(seed: int, seconds: float, calm: float, folder: Path) -> Drawn:
     faults += _faults(["asker", "reader", "writer"], ("leave",), chance, seconds, 30.0)
     devices = [name for line in lines.values() for name in line["devices"]]
     faults += _faults(devices, ("deaf", "mute", "slow", "slow"), chance, seconds, 30.0)
-    return Drawn(document, routers, viewers, people, tuple(sorted(faults)), refresh)
+    return Drawn(
+        *(document, routers, viewers, people, tuple(sorted(faults)), refresh),
+        steps=chance.choice((BUSY, CALM, CALM)),
+        together=chance.random() < 0.7,
+    )
+
+
+def _transport(chance: random.Random) -> dict[str, Any]:
+    """Settings of the user: smaller queues are full sooner."""
+    batch, low = chance.choice(((8192, 16), (8192, 2), (2048, 4), (2048, 1)))
+    drop = chance.choice((10_000, 50_000))
+    queue = {
+        "size": {"data_low": low},
+        "congestion_control": {"drop": {"wait_before_drop": drop}},
+    }
+    return {"transport": {"link": {"tx": {"batch_size": batch, "queue": queue}}}}
 
 
 def _at(chance: random.Random, routers: dict[str, Place]) -> str:
@@ -142,6 +166,7 @@ class Slave:
         driver: AnyDriver,
         tags: list[Tag],
         chance: random.Random,
+        drawn: Drawn,
         executed: Callable[[str, int], None],
     ) -> None:
         self.inner: Station = station_of(driver)
@@ -153,7 +178,7 @@ class Slave:
         memory = self.inner.memory
         for tag in tags:
             if tag.write is None:
-                memory.animate(tag.span.area, tag.span.start, _steps(tag, chance))
+                memory.animate(tag.span.area, tag.span.start, _steps(drawn, chance))
         plain = memory.write
 
         def write(area: str, start: int, values: Any) -> None:
@@ -180,7 +205,8 @@ class Slave:
         return [] if self.mute else replies
 
 
-def _steps(tag: Tag, chance: random.Random) -> Callable[[float], int]:
+def _steps(drawn: Drawn, chance: random.Random) -> Callable[[float], int]:
     """Returns a value that stays for a while; equal ones are far apart."""
-    every, phase, own = chance.choice(STEPS), chance.random(), chance.randrange(60_000)
+    every, phase, own = chance.choice(drawn.steps), chance.random(), chance.randrange(60_000)
+    phase *= not drawn.together
     return lambda now: (int(now / every + phase) * 7919 + own) % 65_521

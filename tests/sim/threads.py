@@ -125,7 +125,7 @@ class Turns:
 
     def ended(self, thread: "Thread", error: Exception | None) -> None:
         if error is not None:
-            self.crashed.append(f"thread {thread.name} ended: {error!r}")
+            self.crashed.append(f"thread {thread.name} failed: {error!r}")
         if not self.ending:
             self.wake(thread.joining, len(thread.joining))
             self._back.release()
