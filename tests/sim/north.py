@@ -12,14 +12,10 @@ import hashlib
 import json
 import logging
 import random
-import sys
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from inspect import isclass, isfunction
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import structlog
@@ -36,14 +32,15 @@ from tests.sim.north_judge import BEGIN, Judge, View
 from tests.sim.north_peers import Client, Net, Router
 from tests.sim.north_plant import Drawn, Fault, Place, Slave, draw
 from tests.sim.story import Story
-from tests.sim.threads import Threading, Time, Turns
+from tests.sim.threads import Turns
 from tests.sim.virtual import VirtualLoop, run_virtual
+from tests.sim.virtual_threading import replaced
 from tests.sim.virtual_zenoh import Received, Session
 
-CALM = 60.0  # seconds at the end without faults
+CALM = 90.0  # seconds at the end without faults
 LEASE = 3.0  # seconds
 LOOK_EVERY = 2.0  # seconds
-_SHM = Path("/dev/shm")  # noqa: S108 - a file there costs no disk
+_SHM = Path("/dev/shm")  # a file there costs no disk
 
 
 class World:
@@ -111,8 +108,7 @@ class World:
 
     def _build_network(self) -> None:
         self.routers = {
-            name: Router(self.net, name, place.rate, place.latency)
-            for name, place in self.drawn.routers.items()
+            name: Router(self.net, name, place) for name, place in self.drawn.routers.items()
         }
         self.viewers = {name: self._client(name, place) for name, place in self._places("viewers")}
         self.people = {name: self._client(name, place) for name, place in self._places("people")}
@@ -132,7 +128,7 @@ class World:
         return list(getattr(self.drawn, group).items())
 
     def _client(self, name: str, place: Place) -> Client:
-        return Client(self.net, name, place.rate, place.latency, self.routers.get(place.at))
+        return Client(self.net, name, place, self.routers.get(place.at))
 
     def _view(self, client: Client, *, blocks: bool) -> None:
         view = View(client, client.at is not None)
@@ -179,8 +175,8 @@ class World:
             await asyncio.sleep(chance.uniform(0.2, 4.0))
 
     async def _narrow(self, peer: Any, seconds: float) -> None:
-        """Another program uses most of the link: 4 kB/s remain."""
-        peer.link.set_rate(min(1.0, 4_000 / peer.link.rate))
+        """Another program uses most of the link."""
+        peer.link.set_rate(min(1.0, 2_000 / peer.link.rate))
         await asyncio.sleep(seconds)
         if not peer.link.held:
             peer.link.set_rate(1.0)
@@ -203,8 +199,8 @@ class World:
         self.history.record(starting)
         lines = [asyncio.create_task(line.run()) for line in self.gateway.lines]
         await self.northbound.opened.wait()
-        links = [peer.link for peer in (*self.routers.values(), *self.viewers.values())]
-        links += [client.link for client in self.people.values()]
+        links = [peer.link for peer in self.routers.values()]
+        links += [peer.link for peer in (*self.viewers.values(), *self.people.values())]
         others = [asyncio.create_task(link.keep_open()) for link in links]
         others += [asyncio.create_task(self._look())]
         people = [
@@ -238,7 +234,7 @@ class World:
 
     async def _at_the_end(self) -> None:
         """All is calm, and a client with a good link finds everything."""
-        client = Client(self.net, "last", 10_000_000.0, 0.001)
+        client = Client(self.net, "last", Place(10_000_000.0, 0.001, 16_384, ""))
         opening = asyncio.create_task(client.link.keep_open())
         await asyncio.sleep(1.0)
         person = Person(
@@ -263,37 +259,6 @@ async def _end(tasks: Sequence[asyncio.Task[Any]]) -> None:
     await asyncio.gather(*tasks, return_exceptions=True)
 
 
-@contextmanager
-def replaced(world: Callable[[], World], turns: Turns, time: Time) -> Iterator[None]:
-    """Replaces `threading`, `time` and `zenoh.open` in the gateway, also as default arguments."""
-    threads = Threading(turns)
-    instead = {"threading": threads, "time": time, "SimpleQueue": threads.SimpleQueue}
-    real: Any = sys.modules["time"]
-    clocks = {real.monotonic: time.monotonic, real.time_ns: time.time_ns}
-    undo: list[tuple[Any, str, Any]] = [(zenoh, "open", zenoh.open)]
-    zenoh.open = lambda config: world().open(config)  # type: ignore[assignment,misc]
-    for module in [m for name, m in sys.modules.items() if name.startswith("gateway.")]:
-        for name, new in instead.items():
-            old = vars(module).get(name)
-            if isinstance(old, ModuleType) or name == "SimpleQueue" and old is not None:
-                undo.append((module, name, old))
-                setattr(module, name, new)
-        for kind in filter(isclass, list(vars(module).values())):
-            for function in filter(isfunction, vars(kind).values()):
-                defaults = function.__defaults__ or ()
-                if any(default in clocks for default in defaults if callable(default)):
-                    undo.append((function, "__defaults__", defaults))
-                    function.__defaults__ = tuple(
-                        clocks.get(default, default) if callable(default) else default
-                        for default in defaults
-                    )
-    try:
-        yield
-    finally:
-        for owner, name, old in reversed(undo):
-            setattr(owner, name, old)
-
-
 def run(
     seed: int,
     hours: float,
@@ -304,21 +269,27 @@ def run(
     calm: float = CALM,
 ) -> Story:
     """Runs one seed. `only`: the kinds of faults that happen; empty: all. `calm`: seconds without
-    faults at the end; with less than a minute the judge complains."""
+    faults at the end; with less the judge complains."""
     story = Story(seed, hours, pace, tuple(only))
 
     async def whole(folder: Path) -> None:
         loop = asyncio.get_running_loop()
         assert isinstance(loop, VirtualLoop)
         turns, worlds = Turns(loop), list[World]()
-        time = Time(loop.time, lambda: worlds[0].wall())
+
+        def opened(config: zenoh.Config) -> Session:
+            return worlds[0].open(config)
+
+        def wall() -> int:
+            return worlds[0].wall()
+
         drawn = draw(seed, hours * 3600, calm, folder)
         if only:
             kept = tuple(fault for fault in drawn.faults if fault.kind in only)
             drawn = replace(drawn, faults=kept)
         path = folder / "config.yaml"
         path.write_text(json.dumps(drawn.document))
-        with replaced(lambda: worlds[0], turns, time):
+        with replaced(opened, turns, wall):
             try:
                 worlds.append(World(drawn, load(path), story, hours * 3600, turns))
                 worlds[0].calm, worlds[0].traced = calm, traced

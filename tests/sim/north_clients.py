@@ -158,16 +158,12 @@ class Person:
             after = f";after={end['next']}"
         return False
 
-    def _all_of(
-        self, found: Sequence[tuple[str, int, Any]], since: float, arrived: float
-    ) -> None:
+    def _all_of(self, found: Sequence[tuple[str, int, Any]], since: float, arrived: float) -> None:
         if lack := self.judge.missing(found, since, arrived):
             self.judge.broke(lack)
 
     def _no_doubles(self, found: Sequence[tuple[str, int, Any]]) -> None:
-        recorded = {
-            (tag, time, value): 0 for _, tag, time, value in self.judge.recorded
-        }
+        recorded = {(tag, time, value): 0 for _, tag, time, value in self.judge.recorded}
         for _, tag, time, value in self.judge.recorded:
             recorded[tag, time, value] += 1
         for sample in found:

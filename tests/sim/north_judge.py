@@ -20,6 +20,8 @@ DELAYED = 1.0  # seconds in the queues of a link that is not full
 ON_WIRE = 0.2  # seconds from the last check of a write to its execution
 STORED = 1.0  # seconds until a sample is in the file
 NOT_DONE = ("busy", "line-down", "no-reply", "bad-value", "not-writable", "unknown-tag")
+NOT_SENT = set(NOT_DONE)
+MOST_OUTCOMES = 500  # that every history file of a seed keeps
 GATEWAY = "plant/@gateway/sim"
 
 
@@ -200,11 +202,20 @@ class Judge:
 
     def at_the_end(self, outcomes: Sequence[Any]) -> None:
         """`outcomes`: all of history."""
+        for attempt in self.attempts.values():
+            if attempt.done and not set(attempt.published) & {"written", "unclear"}:
+                what = f"write of {attempt.value} to {attempt.tag}"
+                self.broke(f"{what} was done, and recorded as {attempt.published}")
         recorded: dict[Attempt, list[str]] = {}
         for outcome in outcomes:
             if (attempt := self._of(outcome)) is not None:
                 recorded.setdefault(attempt, []).append(outcome["outcome"])
-        for attempt in self.attempts.values():
+        sent = [
+            attempt
+            for attempt in self.attempts.values()
+            if attempt.done or attempt.told == "written" or set(attempt.published) - NOT_SENT
+        ]
+        for attempt in sent[-MOST_OUTCOMES:]:
             if attempt.arrived is None or attempt.arrived < self.now - self.keep:
                 continue
             what = f"write of {attempt.value} to {attempt.tag}"
@@ -213,8 +224,6 @@ class Judge:
                 self.broke(f"{what}: recorded as {found}, published as {attempt.published}")
             if attempt.told == "written" and found != ["written"]:
                 self.broke(f"{what} was told as done, and recorded as {found}")
-            if attempt.done and not set(found) & {"written", "unclear"}:
-                self.broke(f"{what} was done, and recorded as {found}")
 
     # History
 

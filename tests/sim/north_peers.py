@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from itertools import count
 from typing import Any
 
+from tests.sim.north_plant import Place
 from tests.sim.pipe import Limits, Pipe, Rank
 from tests.sim.threads import Turns
 from tests.sim.virtual_zenoh import Received, Reply, Session, Token, matches
@@ -53,8 +54,8 @@ class Router:
 
     whatami = "router"
 
-    def __init__(self, net: Net, name: str, rate: float, latency: float) -> None:
-        self.link = Link(net, self, rate, latency)
+    def __init__(self, net: Net, name: str, place: Place) -> None:
+        self.link = Link(net, self, place)
         self.zid = f"{name}{next(NUMBERS):x}"
         self.clients: list[Client] = []
         self.tokens: dict[str, None] = {}
@@ -102,11 +103,9 @@ class Client:
 
     whatami = "client"
 
-    def __init__(
-        self, net: Net, name: str, rate: float, latency: float, at: Router | None = None
-    ) -> None:
+    def __init__(self, net: Net, name: str, place: Place, at: Router | None = None) -> None:
         self.net, self.name, self.at = net, name, at
-        self.link = Link(net, self, rate, latency)
+        self.link = Link(net, self, place)
         self.zid = f"{name}{next(NUMBERS):x}"
         self.subscribed = ""
         self.take: Callable[[Received], None] = lambda _: None
@@ -221,15 +220,14 @@ class Client:
 class Link:
     """The link of a client or router: to the gateway, or to the router of the client."""
 
-    def __init__(self, net: Net, peer: Any, rate: float, latency: float) -> None:
-        self.rate, self.latency = rate, latency
-        self.buffer = 16_384
+    def __init__(self, net: Net, peer: Any, place: Place) -> None:
+        self.rate = place.rate
         self.is_up = False
         self.barred = 0  # causes for which it cannot be opened
         self.held = 0  # causes for which nothing passes
         self.since = float("-inf")  # the last change
         self._lost = 0, float("-inf")  # messages, and when the last: of earlier connections
-        self._net, self._peer = net, peer
+        self._net, self._peer, self._place = net, peer, place
         self.down: Pipe
         self.up: Pipe
 
@@ -265,8 +263,8 @@ class Link:
             session.linked(peer)
 
     def _pipe(self, limits: Limits, deliver: Callable[[Any], None]) -> Pipe:
-        rate, buffer = self.rate, self.buffer
-        return Pipe(self._net.turns, limits, rate, self.latency, buffer, deliver, self.close)
+        rate, latency, buffer, _ = self._place
+        return Pipe(self._net.turns, limits, rate, latency, buffer, deliver, self.close)
 
     def close(self) -> None:
         """Closes both ends at once."""

@@ -13,11 +13,12 @@ from gateway.stations.registry import station_of
 from gateway.stations.station import Station
 from gateway.tags import Tag
 
-REFRESHES = (20.0, 60.0, 600.0)
-RATES = (8_000.0, 16_000.0, 125_000.0, 500_000.0, 10_000_000.0)  # bytes per second
+REFRESHES = (20.0, 60.0, 600.0, 600.0)
+RATES = (8_000.0, 8_000.0, 16_000.0, 125_000.0, 500_000.0, 10_000_000.0)  # bytes per second
 LATENCIES = (0.0002, 0.005, 0.04, 0.3)
+STORM, QUIET = 60.0, 90.0  # seconds
 # Seconds between two values of a tag. In a calm plant the links are not full all the time.
-BUSY, CALM = (0.5, 3.0, 20.0, 90.0, 400.0), (20.0, 90.0, 90.0, 400.0)
+BUSY, CALM = (0.5, 3.0, 20.0, 90.0, 400.0), (90.0, 90.0, 400.0)
 
 
 class Fault(NamedTuple):
@@ -34,6 +35,7 @@ class Place(NamedTuple):
 
     rate: float
     latency: float
+    buffer: int  # bytes that the system takes beside Zenoh's queues
     at: str  # its router; empty: the gateway
 
 
@@ -48,7 +50,7 @@ class Drawn:
     faults: tuple[Fault, ...]
     refresh: float
     steps: tuple[float, ...]
-    together: bool  # tags of one step change at the same time
+    phase: float | None  # tags of one step change at the same time
 
 
 def draw(seed: int, seconds: float, calm: float, folder: Path) -> Drawn:
@@ -76,20 +78,20 @@ def draw(seed: int, seconds: float, calm: float, folder: Path) -> Drawn:
     viewers = {f"viewer{n}": _place(chance, _at(chance, routers)) for n in range(3)}
     people = {name: _place(chance, _at(chance, routers)) for name in ("asker", "reader", "writer")}
     everybody = [*routers, *viewers, *people]
-    faults = _faults(everybody, ("stall", "cut", "cut", "flap", "narrow"), chance, seconds, 25.0)
-    faults += _faults(["asker", "reader", "writer"], ("leave",), chance, seconds, 30.0)
+    faults = _faults(everybody, ("stall", "cut", "cut", "flap", "narrow"), chance, seconds, 15.0)
+    faults += _faults(["asker", "reader", "writer"], ("leave",), chance, seconds, 15.0)
     devices = [name for line in lines.values() for name in line["devices"]]
-    faults += _faults(devices, ("deaf", "mute", "slow", "slow"), chance, seconds, 30.0)
+    faults += _faults(devices, ("deaf", "mute", "slow", "slow"), chance, seconds, 15.0)
     return Drawn(
         *(document, routers, viewers, people, tuple(sorted(faults)), refresh),
         steps=chance.choice((BUSY, CALM, CALM)),
-        together=chance.random() < 0.7,
+        phase=chance.choice((chance.random(), chance.random(), None)),
     )
 
 
 def _transport(chance: random.Random) -> dict[str, Any]:
     """Settings of the user: smaller queues are full sooner."""
-    batch, low = chance.choice(((8192, 16), (8192, 2), (2048, 4), (2048, 1)))
+    batch, low = chance.choice(((8192, 16), (8192, 1), (2048, 4), (2048, 1)))
     drop = chance.choice((10_000, 50_000))
     queue = {
         "size": {"data_low": low},
@@ -103,7 +105,7 @@ def _at(chance: random.Random, routers: dict[str, Place]) -> str:
 
 
 def _place(chance: random.Random, at: str) -> Place:
-    return Place(chance.choice(RATES), chance.choice(LATENCIES), at)
+    return Place(chance.choice(RATES), chance.choice(LATENCIES), chance.choice((2048, 16_384)), at)
 
 
 def _faults(
@@ -113,22 +115,21 @@ def _faults(
     seconds: float,
     every: float,
 ) -> list[Fault]:
+    """Draws a storm of a minute, then a time in which all must become right, and so on."""
     lengths = {"stall": 2.5, "cut": 40.0, "leave": 6.0, "flap": 20.0, "narrow": 30.0}
     found = []
-    at = chance.expovariate(1 / every)
-    while at < seconds:
+    stormy = chance.expovariate(1 / every)
+    while (at := stormy // STORM * (STORM + QUIET) + stormy % STORM) < seconds:
         kind = chance.choice(kinds)
         longest = lengths.get(kind, 30.0)
         end = min(seconds, at + chance.uniform(0.05, longest))
         found.append(Fault(at, end, kind, chance.choice(targets)))
-        at += chance.expovariate(1 / every)
+        stormy += chance.expovariate(1 / every)
     return found
 
 
 def _line(number: int, chance: random.Random) -> dict[str, Any]:
-    devices = {
-        f"d{number}{n}": _device(n + 1, chance) for n in range(chance.choice((1, 2, 3)))
-    }
+    devices = {f"d{number}{n}": _device(n + 1, chance) for n in range(chance.choice((1, 2, 3)))}
     return {"port": "simulator", "baudrate": 19200, "format": "8E1", "devices": devices}
 
 
@@ -137,7 +138,7 @@ def _device(station: int, chance: random.Random) -> dict[str, Any]:
     for group in range(chance.choice((1, 2))):
         every = chance.choice(("500ms", "1s", "2s"))
         history = chance.random() < 0.7
-        for n in range(chance.choice((5, 20, 60))):
+        for n in range(chance.choice((5, 20, 60, 120))):
             address = 200 * group + n
             tags[f"v{address}"] = {
                 "address": f"holding:{address}",
@@ -146,8 +147,12 @@ def _device(station: int, chance: random.Random) -> dict[str, Any]:
             }
     for n in range(3):
         rule: Any = chance.choice((True, True, {"verify": True}))
-        address = f"holding:{900 + n}"
-        tags[f"w{n}"] = {"address": address, "every": "1s", "write": rule, "history": True}
+        tags[f"w{n}"] = {
+            "address": f"holding:{900 + n}",
+            "every": "1s",
+            "write": rule,
+            "history": True,
+        }
     blocks = chance.choice((False, False, True, "only"))
     return {
         "protocol": "modbus-rtu",
@@ -208,5 +213,6 @@ class Slave:
 def _steps(drawn: Drawn, chance: random.Random) -> Callable[[float], int]:
     """Returns a value that stays for a while; equal ones are far apart."""
     every, phase, own = chance.choice(drawn.steps), chance.random(), chance.randrange(60_000)
-    phase *= not drawn.together
+    if drawn.phase is not None:
+        phase = drawn.phase
     return lambda now: (int(now / every + phase) * 7919 + own) % 65_521

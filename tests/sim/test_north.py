@@ -12,8 +12,9 @@ import pytest
 
 from tests.sim.north import run
 from tests.sim.pipe import OVERHEAD, Limits, Pipe, Rank
-from tests.sim.threads import Threading, Turns
+from tests.sim.threads import Turns
 from tests.sim.virtual import VirtualLoop, now, on_virtual_time
+from tests.sim.virtual_threading import Threading
 
 ROOT = Path(__file__).parents[2]
 LIMITS = Limits((8192, 8192, 1000), batch=500, drop_after=0.05, close_after=3.0)
@@ -43,10 +44,10 @@ class Bench:
         assert isinstance(loop, VirtualLoop)
         self.turns = Turns(loop)
         self.arrived: list[str] = []
-        self.pipe = Pipe(
-            *(self.turns, LIMITS, 1000.0, 0.0, 500, self.arrived.append),
-            stuck=lambda: self.pipe.close(),
-        )
+        self.pipe = Pipe(*(self.turns, LIMITS, 1000.0, 0.0, 500, self.arrived.append, self._close))
+
+    def _close(self) -> None:
+        self.pipe.close()
 
     def fill(self, count: int) -> None:
         for n in range(count):
@@ -100,7 +101,6 @@ async def test_room_is_free_when_a_whole_batch_has_left() -> None:
     ) == [False, False, True]
     await asyncio.sleep(began + 3.0 - now())
     assert bench.arrived == ["0", "1", "2", "3", "4", "5", "sent"]
-
 
 
 @on_virtual_time

@@ -6,7 +6,6 @@ goes on. So a run with threads is repeated exactly, and a wait of the event loop
 """
 
 import threading
-import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from itertools import count
@@ -275,34 +274,3 @@ class SimpleQueue:
         while not self._items:
             self.turns.wait(self._waiting)
         return self._items.popleft()
-
-
-KINDS = (Thread, Lock, Condition, Event, Semaphore, SimpleQueue)
-
-
-class Threading:
-    """Replaces the module `threading` in the gateway."""
-
-    def __init__(self, turns: Turns) -> None:
-        self._turns = turns
-        for kind in KINDS:
-            own = type(kind.__name__, (kind,), {"turns": turns})
-            setattr(self, kind.__name__, own)
-
-    def get_ident(self) -> int:
-        running = self._turns.running
-        return 0 if running is None else running.ident or 0
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(threading, name)
-
-
-class Time:
-    """Replaces the module `time` in the gateway."""
-
-    def __init__(self, monotonic: Callable[[], float], time_ns: Callable[[], int]) -> None:
-        self.monotonic = monotonic
-        self.time_ns = time_ns
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(time, name)

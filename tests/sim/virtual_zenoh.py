@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import lru_cache
 from itertools import count
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, Self
 
 import zenoh
 
@@ -134,7 +134,7 @@ class Query:
             self._ended = True
             self._session.hand_over(self._pipe, Rank.ANSWER, Reply(self._number), 0)
 
-    def __enter__(self) -> "Query":
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
