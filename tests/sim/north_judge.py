@@ -208,8 +208,8 @@ class Judge:
                 self.broke(f"{what} was done, and recorded as {attempt.published}")
         recorded: dict[Attempt, list[str]] = {}
         for outcome in outcomes:
-            if (attempt := self._of(outcome)) is not None:
-                recorded.setdefault(attempt, []).append(outcome["outcome"])
+            if (asked := self._of(outcome)) is not None:
+                recorded.setdefault(asked, []).append(outcome["outcome"])
         sent = [
             attempt
             for attempt in self.attempts.values()
