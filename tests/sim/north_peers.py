@@ -4,6 +4,7 @@ import asyncio
 import json
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 from itertools import count
 from typing import Any
 
@@ -44,8 +45,9 @@ class Answer:
             self.ended = how
             self.over.set()
 
-    @property
+    @cached_property
     def values(self) -> list[tuple[str, Any]]:
+        """The keys and documents; ask when it is over."""
         return [(reply.key_expr, json.loads(reply.payload.to_bytes())) for reply in self.replies]
 
 
