@@ -21,13 +21,11 @@ from typing import Any
 import structlog
 import zenoh
 
-from gateway.app import Gateway
 from gateway.config import Config, LineConfig, load
-from gateway.history import Historian
-from gateway.northbound import Northbound
 from gateway.simulator.port import open_simulator
-from gateway.tags import Sample
+from gateway.tags import Sample, Tag
 from tests.sim.north_clients import Person
+from tests.sim.north_gateway import Process, end
 from tests.sim.north_judge import BEGIN, Judge, View
 from tests.sim.north_peers import Client, Net, Router
 from tests.sim.north_plant import Drawn, Fault, Place, Slave, draw
@@ -58,14 +56,10 @@ class World:
         turns.loop.set_exception_handler(self._crashed)
         self.trace = hashlib.sha256()
         self._sessions = 0
+        self._restarting = False
         self.calm, self.traced = CALM, True
-        self.gateway = Gateway(config, self.wall, self._opener)
-        self.history = Historian(history.path, history.keep, history.max_size, self.wall)
-        self.northbound = Northbound(config.zenoh, "sim", self.gateway, history=self.history)
-        self.gateway.subscribe(self.judge)
-        self.gateway.subscribe(self.northbound)
-        self.gateway.subscribe(self)
-        self.gateway.add_document("history", self.history.document)
+        self._config = config
+        self.process = Process(config, self.judge, self.wall, self._opener)
         self._build_network()
 
     def wall(self) -> int:
@@ -86,19 +80,12 @@ class World:
         if self.traced and "@gateway" not in key:
             self.trace.update(repr((self.turns.loop.time(), key, data)).encode())
 
-    # From the gateway: the history, as the service connects it
-
-    def publish(self, samples: Sequence[Sample]) -> None:
-        self.judge.record(samples)
-        self.history.record(samples)
-
-    def set_online(self, device: str, online: bool) -> None:
-        """History keeps no device states."""
-
     # Building
 
     def _opener(self, config: LineConfig) -> Callable[[Any], Any]:
         for device in config.devices:
+            if device.name in self.slaves:
+                break  # the program of before had the line
             chance = random.Random(f"steps {self.story.seed} {device.name}")
             self.slaves[device.name] = Slave(
                 device.driver, list(device.tags), chance, self.drawn, self.judge.executed
@@ -112,10 +99,10 @@ class World:
         }
         self.viewers = {name: self._client(name, place) for name, place in self._places("viewers")}
         self.people = {name: self._client(name, place) for name, place in self._places("people")}
-        tags = [tag for device in self.gateway.config.devices for tag in device.tags]
+        tags = [tag for device in self._config.devices for tag in device.tags]
         self.persons = {
             name: Person(
-                *(client, self.judge, tags, self.gateway.sample),
+                *(client, self.judge, tags, self._current),
                 random.Random(f"{name} {self.story.seed}"),
                 rarity=8.0,
             )
@@ -123,6 +110,9 @@ class World:
         }
         for name, client in self.viewers.items():
             self._view(client, blocks=name == "viewer2")
+
+    def _current(self, tag: Tag) -> Sample:
+        return self.process.gateway.sample(tag)
 
     def _places(self, group: str) -> list[tuple[str, Place]]:
         return list(getattr(self.drawn, group).items())
@@ -151,8 +141,22 @@ class World:
             await asyncio.sleep(fault.end - fault.start)
             setattr(slave, fault.kind, getattr(slave, fault.kind) - 1)
             return
+        if fault.kind == "restart":
+            await self._restart(fault.end - fault.start)
+            return
         peer: Any = {**self.routers, **self.viewers, **self.people}[fault.target]
         await getattr(self, f"_{fault.kind}")(peer, fault.end - fault.start)
+
+    async def _restart(self, seconds: float) -> None:
+        """The program ends as after SIGTERM, and another one starts."""
+        if self._restarting:
+            return
+        self._restarting = True
+        await self.process.stop()
+        await asyncio.sleep(seconds)
+        self.process = Process(self._config, self.judge, self.wall, self._opener)
+        await self.process.start()
+        self._restarting = False
 
     async def _stall(self, peer: Any, seconds: float) -> None:
         peer.link.held += 1
@@ -190,15 +194,7 @@ class World:
     # The run
 
     async def live(self) -> None:
-        serving = asyncio.create_task(self.northbound.run(), name="northbound")
-        await self.northbound.exclusive.wait()
-        self.history.start()
-        await self.northbound.active.wait()
-        starting = list(self.gateway.mirror.samples())
-        self.judge.record(starting)
-        self.history.record(starting)
-        lines = [asyncio.create_task(line.run()) for line in self.gateway.lines]
-        await self.northbound.opened.wait()
+        await self.process.start()
         links = [peer.link for peer in self.routers.values()]
         links += [peer.link for peer in (*self.viewers.values(), *self.people.values())]
         others = [asyncio.create_task(link.keep_open()) for link in links]
@@ -209,17 +205,17 @@ class World:
             asyncio.create_task(self.persons["writer"].write_now_and_then()),
         ]
         faults = [asyncio.create_task(self._suffer(fault)) for fault in self.drawn.faults]
-        watched = [serving, *lines, *others, *people]
+        watched = [*others, *people]
         done, _ = await asyncio.wait(
             watched, timeout=self.seconds, return_when=asyncio.FIRST_COMPLETED
         )
         for task in done:
-            self.judge.broke(f"{task.get_name()} ended by itself: {task.exception()!r}")
+            self.judge.broke(f"{task.get_name()} failed by itself: {task.exception()!r}")
         await asyncio.sleep(self.calm)
-        await _end(people)
+        await end(people)
         await self._at_the_end()
-        await _end([*lines, *others, *faults])
-        await _end([serving])
+        await end([*others, *faults])
+        await self.process.stop()
         for link in links:
             self.story.counts["lost by congestion"] += link.lost[0]
         self.story.trace = self.trace.hexdigest()
@@ -228,6 +224,8 @@ class World:
         while True:
             await asyncio.sleep(LOOK_EVERY)
             self.judge.look()
+            if not self._restarting:
+                self.process.look()
             for crash in self.turns.crashed:
                 self.judge.broke(crash)
             self.turns.crashed.clear()
@@ -238,7 +236,7 @@ class World:
         opening = asyncio.create_task(client.link.keep_open())
         await asyncio.sleep(1.0)
         person = Person(
-            *(client, self.judge, self.persons["asker"].tags, self.gateway.sample),
+            *(client, self.judge, self.persons["asker"].tags, self._current),
             random.Random(0),
             rarity=8.0,
         )
@@ -250,13 +248,7 @@ class World:
             self.judge.broke("the record of writes gets no whole answer, and all is calm")
         else:
             self.judge.at_the_end(outcomes)
-        await _end([opening])
-
-
-async def _end(tasks: Sequence[asyncio.Task[Any]]) -> None:
-    for task in tasks:
-        task.cancel()
-    await asyncio.gather(*tasks, return_exceptions=True)
+        await end([opening])
 
 
 def run(

@@ -202,10 +202,6 @@ class Judge:
 
     def at_the_end(self, outcomes: Sequence[Any]) -> None:
         """`outcomes`: all of history."""
-        for attempt in self.attempts.values():
-            if attempt.done and not set(attempt.published) & {"written", "unclear"}:
-                what = f"write of {attempt.value} to {attempt.tag}"
-                self.broke(f"{what} was done, and recorded as {attempt.published}")
         recorded: dict[Attempt, list[str]] = {}
         for outcome in outcomes:
             if (asked := self._of(outcome)) is not None:
@@ -220,10 +216,12 @@ class Judge:
                 continue
             what = f"write of {attempt.value} to {attempt.tag}"
             found = recorded.get(attempt, [])
-            if found != attempt.published:
+            if found != attempt.published and found != ["unclear"]:  # as the gateway ended
                 self.broke(f"{what}: recorded as {found}, published as {attempt.published}")
             if attempt.told == "written" and found != ["written"]:
                 self.broke(f"{what} was told as done, and recorded as {found}")
+            if attempt.done and not {"written", "unclear"} & set(found):
+                self.broke(f"{what} was done, and recorded as {found}")
 
     # History
 

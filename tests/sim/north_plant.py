@@ -80,6 +80,8 @@ def draw(seed: int, seconds: float, calm: float, folder: Path) -> Drawn:
     everybody = [*routers, *viewers, *people]
     faults = _faults(everybody, ("stall", "cut", "cut", "flap", "narrow"), chance, seconds, 15.0)
     faults += _faults(["asker", "reader", "writer"], ("leave",), chance, seconds, 15.0)
+    restarts = random.Random(f"restarts {seed}")
+    faults += _faults(["gateway"], ("restart",), restarts, seconds, 60.0)
     devices = [name for line in lines.values() for name in line["devices"]]
     faults += _faults(devices, ("deaf", "mute", "slow", "slow"), chance, seconds, 15.0)
     return Drawn(
@@ -116,7 +118,14 @@ def _faults(
     every: float,
 ) -> list[Fault]:
     """Draws a storm of a minute, then a time in which all must become right, and so on."""
-    lengths = {"stall": 2.5, "cut": 40.0, "leave": 6.0, "flap": 20.0, "narrow": 30.0}
+    lengths = {
+        "stall": 2.5,
+        "cut": 40.0,
+        "leave": 6.0,
+        "flap": 20.0,
+        "narrow": 30.0,
+        "restart": 3.0,
+    }
     found = []
     stormy = chance.expovariate(1 / every)
     while (at := stormy // STORM * (STORM + QUIET) + stormy % STORM) < seconds:

@@ -81,8 +81,8 @@ class Peer(Protocol):
 
     def wants(self, key: str) -> bool: ...
 
-    def closed(self) -> None:
-        """The gateway closed the link."""
+    @property
+    def link(self) -> Any: ...
 
 
 class Query:
@@ -230,8 +230,7 @@ class Session:
     def close(self) -> None:
         self._closed = True
         for peer in [*self._peers.values()]:
-            self.unlinked(peer)
-            peer.closed()
+            peer.link.close()
 
     def _publish(self, key: str, data: bytes, kind: zenoh.SampleKind, **about: Any) -> None:
         if self._closed:
