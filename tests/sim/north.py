@@ -37,7 +37,9 @@ from tests.sim.virtual_zenoh import Received, Session
 
 CALM = 90.0  # seconds at the end without faults
 LEASE = 3.0  # seconds
+ENDED = 10.0  # seconds
 LOOK_EVERY = 2.0  # seconds
+FLOOD = 3000  # queries: more than the gateway holds open
 _SHM = Path("/dev/shm")  # a file there costs no disk
 
 
@@ -185,6 +187,20 @@ class World:
         if not peer.link.held:
             peer.link.set_rate(1.0)
 
+    async def _flood(self, client: Client, seconds: float) -> None:
+        """The program asks a lot, and receives nothing."""
+        link = client.link
+        if not link.is_up:
+            return
+        link.held += 1
+        link.down.set_rate(0.0)
+        key = f"plant/{self.persons['asker'].tags[0].key}"
+        async with asyncio.TaskGroup() as tasks:
+            for _ in range(FLOOD):
+                tasks.create_task(client.get(key, LEASE))
+        link.close()
+        link.held -= 1
+
     async def _leave(self, client: Client, seconds: float) -> None:
         client.link.barred += 1
         client.leave()
@@ -213,6 +229,7 @@ class World:
             self.judge.broke(f"{task.get_name()} failed by itself: {task.exception()!r}")
         await asyncio.sleep(self.calm)
         await end(people)
+        await asyncio.sleep(ENDED)  # their last writes have ended
         await self._at_the_end()
         await end([*others, *faults])
         await self.process.stop()

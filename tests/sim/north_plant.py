@@ -80,8 +80,9 @@ def draw(seed: int, seconds: float, calm: float, folder: Path) -> Drawn:
     everybody = [*routers, *viewers, *people]
     faults = _faults(everybody, ("stall", "cut", "cut", "flap", "narrow"), chance, seconds, 15.0)
     faults += _faults(["asker", "reader", "writer"], ("leave",), chance, seconds, 15.0)
-    restarts = random.Random(f"restarts {seed}")
-    faults += _faults(["gateway"], ("restart",), restarts, seconds, 60.0)
+    more = random.Random(f"more {seed}")
+    faults += _faults(["gateway"], ("restart",), more, seconds, 60.0)
+    faults += _faults(list(people), ("flood",), more, seconds, 60.0)
     devices = [name for line in lines.values() for name in line["devices"]]
     faults += _faults(devices, ("deaf", "mute", "slow", "slow"), chance, seconds, 15.0)
     return Drawn(
