@@ -1373,8 +1373,8 @@ MUTANTS = (
     Mutant(
         "the end of a refused query waits on the event loop",
         "northbound/answers.py",
-        "            self.counters.unanswered += 1\n            self._ends.submit(_end, query)\n",
-        "            self.counters.unanswered += 1\n            _end(query)\n",
+        "            self._ends.submit(self._refuse, query, self._reply_busy)\n",
+        "            self._refuse(query, self._reply_busy)\n",
         "tests/northbound/test_answers.py",
         (4,),
         "north",
