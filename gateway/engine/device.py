@@ -57,7 +57,7 @@ class Device:
     bad_addresses: BadAddresses = field(init=False)
     turnaround: Turnaround = field(init=False)
     blocks: tuple[Block, ...] = ()
-    last_read: Span | None = None  # the last block that was read
+    last_read: Span | None = None  # the last block that was read: the device has it
     monitor: MonitorList = field(default_factory=MonitorList)
     window: int = field(init=False)  # requests that may be outstanding at once
     silence: float = field(init=False)  # seconds before each request
@@ -271,11 +271,6 @@ class Device:
             silent = sum(other.silent for other in known.values())
             pause = max(pause, silent * self.longest_reply / SILENT_SHARE)
         return max(pause, block.every)
-
-    def was_read(self, block: Block) -> None:
-        """Notes a good read: the device has these addresses."""
-        if not block.listed:
-            self.last_read = block.span
 
     @property
     def probe_spans(self) -> Sequence[Span]:

@@ -427,8 +427,8 @@ MUTANTS = (
     Mutant(
         "requests in quick succession expect one shape",
         "engine/reply_shapes.py",
-        "elif now - used.get(shape, -NEVER) < self.quiet:",
-        "elif now < used.get(shape, -NEVER):",
+        "elif now - (longest_ago := used.get(shape, -NEVER)) < self.quiet:",
+        "elif now < (longest_ago := used.get(shape, -NEVER)):",
         "tests/engine/test_reply_shapes.py tests/line/test_repeated_replies.py",
     ),
     Mutant(
