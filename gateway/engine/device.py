@@ -14,7 +14,7 @@ from gateway.errors import LineDown
 from gateway.planning.bad_addresses import RETRIES, BadAddresses
 from gateway.planning.monitor_lists import with_monitor_list
 from gateway.planning.planner import Block, around, plan, runs_of
-from gateway.planning.wire_timing import WireTiming
+from gateway.planning.wire_timing import Transactions, WireTiming
 from gateway.protocols.driver import AnyDriver, Cost, Monitor, NoReplyCauses, Span, Timing, Windowed
 from gateway.tags import Tag
 
@@ -147,6 +147,11 @@ class Device:
         return self.wire.transaction(cost, self.timing, self.turnaround.expected)
 
     @property
+    def transactions(self) -> Transactions:
+        """The durations of transactions with this station, for the planner."""
+        return Transactions(self.wire, self.timing, self.turnaround.expected)
+
+    @property
     def longest_poll(self) -> float:
         """Seconds of its longest poll."""
         longest = max((self.seconds(block.cost) for block in self.blocks), default=0.0)
@@ -161,7 +166,7 @@ class Device:
     def plan(self) -> None:
         """Plans the blocks that read the tags, without the bad addresses."""
         bad = self.bad_addresses
-        blocks = plan(self.tags, self.driver, self.seconds, bad.cuts)
+        blocks = plan(self.tags, self.driver, self.transactions, bad.cuts)
         if self.monitor.allowed:
             blocks = with_monitor_list(blocks, self.driver, self.seconds, bad.bad.keys())
         self.blocks = blocks
@@ -197,7 +202,7 @@ class Device:
             if len(tags) * rates >= MOST_PLANNED:
                 break
         kept = [block for place, block in enumerate(blocks) if place not in near]
-        found = plan(tags, self.driver, self.seconds, bad.cuts)
+        found = plan(tags, self.driver, self.transactions, bad.cuts)
         self.blocks = tuple(sorted((*kept, *found), key=lambda block: block.span))
         if self.shapes is not None:
             self.shapes.longer.planned(self.blocks)
