@@ -19,6 +19,7 @@ from gateway.line.line import Line, SampleSink
 from gateway.northbound.status import Document, device_document, line_document, standing
 from gateway.simulator.plant import station_for
 from gateway.simulator.port import open_simulator
+from gateway.stations.station import Station
 from gateway.tags import Quality, Reason, Sample, Tag, WriteResult, bad
 from gateway.tags.mirror import Mirror
 from gateway.tags.timestamps import rfc3339
@@ -32,8 +33,14 @@ OpenPort = Callable[[Receiver], Awaitable[Port]]
 def opener(line: LineConfig) -> OpenPort:
     """Returns a function that opens the port of the line, or its simulated devices in memory."""
     if isinstance(line.port, SimulatorAddress):
-        stations = [station_for(device.driver, device.tags) for device in line.devices]
-        return lambda receiver: open_simulator(stations, line.wire, receiver)
+        stations: list[Station] = []  # they keep their values when the line opens again
+
+        def simulated(receiver: Receiver) -> Awaitable[Port]:
+            if not stations:  # made when the line opens: a large plant has many
+                stations.extend(station_for(one.driver, one.tags) for one in line.devices)
+            return open_simulator(stations, line.wire, receiver)
+
+        return simulated
     return lambda receiver: open_port(line.port, line.serial, receiver)
 
 
