@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import InitVar, dataclass, field
 from typing import Literal
 
 from gateway.engine.health import Health, State, diagnosis
@@ -66,8 +66,9 @@ class Device:
     # Its recent use of the wire, to compare with that of other devices: the binary logarithm of
     # the seconds, plus the half-lives until the time of counting. It grows, and never decays.
     use: float = -math.inf
+    plan_now: InitVar[bool] = True  # False: the owner calls `plan` before the line runs
 
-    def __post_init__(self) -> None:
+    def __post_init__(self, plan_now: bool) -> None:
         driver = self.driver
         self.bad_addresses = BadAddresses(driver.cost)
         self.turnaround = Turnaround(self.settings.turnaround)
@@ -78,7 +79,8 @@ class Device:
         self.shapes = (
             None if self.broadcast else reply_shapes(driver, self.polled_tags, self.bad_addresses)
         )
-        self.plan()
+        if plan_now:
+            self.plan()
 
     @property
     def name(self) -> str:
