@@ -25,16 +25,20 @@ from gateway.values import Value
 FRESH_WITHIN = 5.0  # seconds that a client waits for a read on demand
 
 
-def forecasts(config: Config) -> list[LineForecast]:
-    """Calculates the load and the worst ages of each line of the file."""
-    return [
-        forecast(
-            line.name,
-            [Device(device, line.wire) for device in line.devices if device.enabled],
-            line.wire,
-        )
-        for line in config.lines
-    ]
+def forecasts(
+    config: Config, report: Callable[[str, float], None] | None = None
+) -> list[LineForecast]:
+    """Calculates the load and the worst ages of each line of the file.
+
+    `report` receives the name of this step and the share of it that is done.
+    """
+    found = []
+    for line in config.lines:
+        devices = [Device(device, line.wire) for device in line.devices if device.enabled]
+        found.append(forecast(line.name, devices, line.wire))
+        if report is not None:
+            report("planning the requests", len(found) / len(config.lines))
+    return found
 
 
 class Subscriber(Protocol):

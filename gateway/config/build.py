@@ -1,6 +1,6 @@
 """Builds the configuration from the data of the file, and notes every mistake."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from os.path import realpath
 from pathlib import Path as FilePath
@@ -45,7 +45,9 @@ class Builder:
 
     mistakes: Mistakes
     folder: FilePath
+    report: Callable[[float], None] | None = None  # receives the share of the devices that is built
     _devices: dict[str, str] = field(default_factory=dict)  # name -> its line
+    _count: int = 0  # devices in the file
     _tags: DeviceTags = field(init=False)
 
     def __post_init__(self) -> None:
@@ -57,6 +59,7 @@ class Builder:
         raw_lines = data.get("lines")
         defaults = self._defaults(data, (), TagDefaults())
         lines = []
+        self._count = sum(len(mapping(_devices_of(raw))) for _, raw in mapping(raw_lines))
         for name, raw in mapping(raw_lines):
             path: Path = ("lines", name)
             line = self._line(self._name(name, path), raw, path, defaults)
@@ -102,6 +105,8 @@ class Builder:
             device = self._device(checked, raw_device, place, defaults)
             if device is not None:
                 devices.append(device)
+            if self.report is not None:
+                self.report(len(self._devices) / self._count)
         if raw.get("devices") == {}:
             self.mistakes.add((*path, "devices"), "no devices: a line has at least one")
         if line is None:
@@ -253,6 +258,10 @@ class Builder:
             keep=top.history.keep,
             max_size=top.history.max_size,
         )
+
+
+def _devices_of(raw: object) -> object:
+    return raw.get("devices") if isinstance(raw, dict) else None
 
 
 def _either(own: float | None, default: float) -> float:

@@ -12,6 +12,7 @@ import yaml
 from gateway.config.yaml_scalars import scalar
 
 _DEEPEST = 50  # levels; the tree reports deeper ones
+_REPORTED = 5  # levels: a device is on the fifth
 _PLAIN = (None, "")  # styles of a scalar without quotes
 
 
@@ -19,15 +20,23 @@ class _NotPlainError(Exception):
     """The file needs the tree."""
 
 
-def plain_data(text: bytes, texts: frozenset[str]) -> dict[str, Any] | None:
+def plain_data(
+    text: bytes, texts: frozenset[str], report: Callable[[float], None] | None = None
+) -> dict[str, Any] | None:
     """Returns the data of a plain file; None for all others.
 
-    `texts`: keys whose values are texts even where they look like numbers.
+    `texts`: keys whose values are texts even where they look like numbers. `report` receives the
+    share that is read.
     """
+
+    def reported(mark: Any) -> None:
+        if report is not None:
+            report(min(1.0, mark.index / len(text)))
+
     if not yaml.__with_libyaml__:
         return None
     try:
-        return _Stream(yaml.CBaseLoader(text).get_event, texts).document()
+        return _Stream(yaml.CBaseLoader(text).get_event, texts, reported).document()
     except (yaml.YAMLError, _NotPlainError):
         return None
 
@@ -35,9 +44,12 @@ def plain_data(text: bytes, texts: frozenset[str]) -> dict[str, Any] | None:
 class _Stream:
     """The events of one file. Equal texts and numbers become one object."""
 
-    def __init__(self, event: Callable[[], Any], texts: frozenset[str]) -> None:
+    def __init__(
+        self, event: Callable[[], Any], texts: frozenset[str], report: Callable[[Any], None]
+    ) -> None:
         self._event = event
         self._texts = texts
+        self._report = report
         self._names: dict[str, str] = {}
         self._values: dict[str, object] = {}
 
@@ -56,6 +68,8 @@ class _Stream:
         while True:
             key = event()
             if type(key) is yaml.MappingEndEvent:
+                if level <= _REPORTED:
+                    self._report(key.start_mark)
                 return found
             if type(key) is not yaml.ScalarEvent or key.tag or key.anchor:
                 raise _NotPlainError

@@ -4,7 +4,7 @@ A key is always a text. A key written twice is a mistake, and so is anything tha
 to a Python program. A plain file is read as a stream; its tree is made for the lines of mistakes.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path as FilePath
@@ -93,12 +93,12 @@ class YamlFile:
                 break
         return _line(mark)
 
-    def read(self, mistakes: Mistakes) -> None:
+    def read(self, mistakes: Mistakes, report: Callable[[float], None] | None = None) -> None:
         """Fills `data`, and notes YAML that a configuration must not use.
 
         Raises `ConfigErrors` where the file cannot be read.
         """
-        found = plain_data(self.text.encode(), self.texts)
+        found = plain_data(self.text.encode(), self.texts, report)
         if found is None:
             found = self._plain(self._tree(), (), mistakes)
         self.data = found if isinstance(found, dict) else {}
@@ -181,15 +181,18 @@ class YamlFile:
         return self._entries[id(node)]
 
 
-def read_yaml(path: FilePath, texts: frozenset[str]) -> tuple[YamlFile, Mistakes]:
+def read_yaml(
+    path: FilePath, texts: frozenset[str], report: Callable[[float], None] | None = None
+) -> tuple[YamlFile, Mistakes]:
     """Returns the file and the mistakes found so far.
 
-    `texts` are the keys whose values are texts even where they look like numbers (`7E1`).
+    `texts` are the keys whose values are texts even where they look like numbers (`7E1`). `report`
+    receives the share that is read.
     Raises `ConfigErrors` where the file cannot be read.
     """
     file = YamlFile(str(path), _text(path), texts)
     mistakes = Mistakes(file)
-    file.read(mistakes)
+    file.read(mistakes, report)
     return file, mistakes
 
 
