@@ -15,7 +15,7 @@ from gateway.protocols.models import Model
 
 LONG_ROW = 300  # items of one area
 LONGEST_KEPT = 500  # items of a row whose requests are remembered
-Seconds = Callable[[Cost], float]  # must be equal to those that give equal results
+Seconds = Callable[[Cost], float]  # of a transaction; equal ones give equal results
 
 
 class Row(NamedTuple):
