@@ -5,11 +5,14 @@ import json
 import shutil
 import socket
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import pytest
+
+from gateway.cli.client import connected
 from gateway.config import load
+from gateway.errors import GatewayError
 from tests.attacks.security_pages import (
     VALUES,
     block,
@@ -21,7 +24,7 @@ from tests.attacks.security_pages import (
     tls_of,
     user_of,
 )
-from tests.e2e.processes import Program, free_port, plc_gateway
+from tests.e2e.processes import Program, free_port
 from tests.northbound.access import GATEWAY_RULES, PASSWORDS, certificates, secret, users
 from tests.zenoh_peer import Reply, ZenohPeer
 
@@ -99,11 +102,7 @@ async def test_with_mutual_true_every_client_needs_a_certificate_of_the_authorit
             async with client(f"tls/{here}", tls_of(tmp_path, name)) as person:
                 assert len(await person.get("plant/**")) == reads, name
                 assert len(await person.get(RECIPE, b"7")) == may_write, name
-        with ThreadPoolExecutor() as several:
-            read = several.submit(plc_gateway, "read", path)
-            write = several.submit(plc_gateway, "write", path, "mixer/recipe", "8")
-        assert read.result().code == 0
-        assert "nothing was sent" in write.result().err
+        await asyncio.to_thread(reads_and_does_not_write, path)
     # Without it, the certificate only proves the identity of the gateway.
     assert "mutual: true" in TLS
     path = plant_file(tmp_path, TLS.replace(", mutual: true", ""), port)
@@ -113,6 +112,14 @@ async def test_with_mutual_true_every_client_needs_a_certificate_of_the_authorit
         assert deceived  # a gateway with this certificate is not the one of the other authority
         async with client(f"tls/{here}", tls_of(tmp_path)) as anyone:
             assert (await writes(anyone)).ok
+
+
+def reads_and_does_not_write(path: Path) -> None:
+    """The client of the command line."""
+    with connected(load(path), print) as own:
+        assert len(own.values("**")) == VALUES
+        with pytest.raises(GatewayError, match="nothing was sent"):
+            own.write("mixer/recipe", 8)
 
 
 async def test_by_name_and_password(tmp_path: Path) -> None:

@@ -4,7 +4,6 @@
 sentence of a page needs a test, or a place among those that promise nothing.
 """
 
-import ast
 import re
 
 import pytest
@@ -268,10 +267,9 @@ def test_every_sentence_of_the_page_is_quoted_once(page: str) -> None:
 
 def test_every_rule_has_tests_that_exist() -> None:
     known = [
-        node.name
-        for file in sorted((ROOT / "tests").rglob("test_*.py"))
-        for node in ast.walk(ast.parse(file.read_text("utf-8")))
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+        name
+        for file in (ROOT / "tests").rglob("test_*.py")
+        for name in re.findall(r"^(?:async )?def (test_\w+)", file.read_text("utf-8"), re.MULTILINE)
     ]
     for rules in RULES.values():
         for quote, tests in rules.items():
