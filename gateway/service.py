@@ -18,7 +18,7 @@ from gateway.history import Historian
 from gateway.history.state_file import StateFile
 from gateway.line.arrival import ArrivalClock
 from gateway.line.duty import Duty
-from gateway.northbound import Northbound, standby_settings
+from gateway.northbound import Northbound, group_settings
 from gateway.tags import Sample
 
 log = structlog.get_logger("gateway")
@@ -133,7 +133,7 @@ def _northbound(config: Config, gateway: Gateway, history: Historian | None) -> 
         gateway,
         history=history,
         writers=config.writers_file,
-        standby=standby_settings(config),
+        group=group_settings(config),
     )
 
 

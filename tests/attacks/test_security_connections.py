@@ -201,7 +201,7 @@ def test_files_with_secrets_are_closed_and_hold_users_or_the_gateway_does_not_st
     tmp_path: Path,
 ) -> None:
     """Each mistake in a folder of its own. No message shows what the file contains."""
-    quoted("`key`, `password_file`, `users_file`, `writers.file`, and a `config_file` that")
+    quoted("`users_file`, `writers.file`, `gateway.secret_file`, and a `config_file` that contains")
     password = json.dumps({"transport": {"auth": {"usrpwd": {"user": "a", "password": HIDDEN}}}})
     line = f"viewer:{HIDDEN}\n"
     open_files = {
@@ -209,10 +209,12 @@ def test_files_with_secrets_are_closed_and_hold_users_or_the_gateway_does_not_st
         "password.txt": HIDDEN,
         "users.txt": line,
         "writers.txt": line,
+        "plant.txt": HIDDEN,
         "zenoh.json5": password,
     }
     mistakes: list[tuple[str, str, int, str]] = [
         *((name, text, 0o644, "is open to every user") for name, text in open_files.items()),
+        ("plant.txt", HIDDEN[:19], 0o640, "its first line has fewer than 20 characters"),
         ("users.txt", "\n", 0o640, "would accept every connection"),
         ("users.txt", line + f"operator {HIDDEN}\n", 0o640, "line 2: write it as name:password"),
         ("zenoh.json5", password[:-1], 0o640, "it may hold a password, so no more is shown"),
@@ -229,6 +231,7 @@ def test_files_with_secrets_are_closed_and_hold_users_or_the_gateway_does_not_st
         users(folder)
         secret(folder / "password.txt", "of-the-gateway")
         secret(folder / "writers.txt", f"alice:{'s' * 40}\n")
+        secret(folder / "plant.txt", "s" * 20)
         (folder / "zenoh.json5").write_text("{}")
         page = PASSWORD.replace("router.plant", "127.0.0.1") + "  config_file: zenoh.json5\n"
         if name == "plant.yaml":
@@ -237,7 +240,8 @@ def test_files_with_secrets_are_closed_and_hold_users_or_the_gateway_does_not_st
         else:
             (folder / name).write_text(text)
             (folder / name).chmod(mode)
-        return plant_file(folder, page, writers={"file": "writers.txt"})
+        own = {"name": "demo", "secret_file": "plant.txt"}
+        return plant_file(folder, page, writers={"file": "writers.txt"}, gateway=own)
 
     paths = [written(number) for number in range(len(mistakes))]
     with Program(sys.executable, "-c", RUN_EACH, *paths) as program:
@@ -249,4 +253,4 @@ def test_files_with_secrets_are_closed_and_hold_users_or_the_gateway_does_not_st
         assert program.lines[end] == "ended with 2", (name, said)
         assert words in said, (name, said)
         assert name in said or name == "plant.yaml", said
-        assert HIDDEN not in said, (name, said)
+        assert HIDDEN[:19] not in said, (name, said)

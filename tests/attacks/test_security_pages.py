@@ -28,6 +28,9 @@ COVERED = "test_a_signature_covers_key_value_time_nonce_and_name"
 STOLEN = "test_a_program_that_receives_a_signed_write_can_do_nothing_with_it"
 TAKEOVER = "test_a_gateway_that_becomes_active_accepts_no_signature_from_before"
 FLOOD = "test_the_audit_trail_keeps_the_writes"
+SHARED = "test_the_second_gateway_leaves_the_device_to_the_first"
+CLAIMED = "test_forged_claims_are_refused_and_those_of_the_plant_count"
+TOKEN = "test_a_forged_token_is_refused_and_the_gateway_goes_on"  # noqa: S105  (a test)
 ONE_A_SECOND = "test_a_rate_limit_allows_a_burst_and_then_one_per_interval"
 BEYOND = "test_no_client_gets_beyond_the_limits_or_delays_another_line"
 HOSTILE = "test_a_flood_of_everything_costs_little_memory_and_no_poll"
@@ -79,8 +82,8 @@ RULES: dict[str, dict[str, tuple[str, ...]]] = {
         "line that is not `name:password` is a mistake too.": (FILES,),
         "The configuration file itself contains no password and no key. These files must be closed "
         "to other users of the machine (`chmod 640`, group of the service), or the gateway does "
-        "not start: `key`, `password_file`, `users_file`, `writers.file`, and a `config_file` that "
-        "contains a password.": (FILES, PASSWORDS),
+        "not start: `key`, `password_file`, `users_file`, `writers.file`, `gateway.secret_file`, "
+        "and a `config_file` that contains a password.": (FILES, PASSWORDS),
         "The gateway never shows their content in logs, status or messages,": (UNSHOWN, FILES),
         "and quotes nothing from a `config_file` that may contain a password.": (FILES,),
         # Use the command line with a secured gateway
@@ -152,6 +155,14 @@ RULES: dict[str, dict[str, tuple[str, ...]]] = {
         "Writes that found no free place are counted there as `puts_refused` and `refused`.": (
             BEYOND,
         ),
+        # Several gateways
+        "Gateways under one prefix [share out their "
+        "devices](zenoh.md#the-same-device-in-two-files) by claims.": (SHARED,),
+        "A secret that all gateways of the plant have prevents this:": (CLAIMED,),
+        "The first line of the file has 20 characters or more.": (FILES,),
+        "A claim without its signature takes no device off. The log names it (`claim refused`), "
+        "and `refused_claims` in the status.": (CLAIMED,),
+        "The secret also signs the tokens of a [standby group](standby.md).": (TOKEN,),
         # Limits
         "| message | 256 kB | dropped by Zenoh before it is put together |": (BEYOND,),
         "| payload of a write | a JSON value of 64 kB | refused |": (BEYOND,),
@@ -241,6 +252,18 @@ NO_PROMISES: dict[str, tuple[str, ...]] = {
             "Writes that are refused before anything is sent (`not-allowed`, `unknown-tag`,"
             " `bad-value` and others) can arrive very fast."
         ),
+        (
+            "Without access control any connected program can claim too: it takes devices "
+            "off a gateway, or ends it in its own name."
+        ),
+        (
+            "Give the file to all gateways while they are stopped: one with the secret "
+            "ignores one without it, and both would serve the same device."
+        ),
+        (
+            "A program that saw a signed claim can repeat it after its gateway has ended. "
+            "Only access control prevents this."
+        ),
     ),
     "docs/access-control.md": (
         (
@@ -281,7 +304,7 @@ def test_every_rule_has_tests_that_exist() -> None:
 def test_every_program_of_the_pages_is_run() -> None:
     """The settings, commands and rules are read out of the page by the tests."""
     used = {
-        "docs/security.md": ["text", "yaml", "yaml", "console", "yaml", "console"],
+        "docs/security.md": ["text", "yaml", "yaml", "console", "yaml", "console", "yaml"],
         "docs/access-control.md": ["json5", "json5"],
         "SECURITY.md": [],
     }

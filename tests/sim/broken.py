@@ -953,8 +953,8 @@ MUTANTS = (
     Mutant(
         "a standby signature is good for every role",
         "northbound/group_tokens.py",
-        '_signature(self._secret, key)}"',
-        '_signature(self._secret, token.session)}"',
+        '{self._secret.signature(key)}"',
+        '{self._secret.signature(token.session)}"',
         "tests/northbound/test_group_tokens.py",
     ),
     Mutant(
@@ -1225,5 +1225,19 @@ MUTANTS = (
         '    "transport/unicast/accept_timeout": 3000,  # ms\n',
         "",
         "tests/attacks/test_silent_connections.py",
+    ),
+    Mutant(
+        "a forged claim takes devices off",
+        "northbound/claim_documents.py",
+        "if not (isinstance(signature, str) and self._secret.signed(text, signature)):",
+        "if False:",
+        "tests/northbound/test_claim_documents.py",
+    ),
+    Mutant(
+        "the signature of a claim is good for other devices",
+        "northbound/claim_documents.py",
+        '    return f"{key}\\n{orjson.dumps(unsigned).decode()}"\n',
+        "    return key\n",
+        "tests/northbound/test_claim_documents.py",
     ),
 )
