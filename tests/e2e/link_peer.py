@@ -5,7 +5,7 @@ commands from its standard input and prints `ok …` after each:
 
     set D0100 5    what its program would do     get D0500    mute / speak   its answers are lost
     forget         its registered lists          say 1E61     on-demand data, unasked
-    gone D0500     NAK 06 whenever it is named   heard        the commands since this was last asked
+    gone D0500     NAK 06 to whatever reads it   heard        the commands since this was last asked
 """
 
 import os
@@ -22,7 +22,6 @@ class Plc:
         self.peer = Peer(station, frame_format, True)
         self.port = os.open(port, os.O_RDWR | os.O_NOCTTY)
         self.mute = False
-        self.gone = ""
         self.heard: list[str] = []
         self._request = b""
 
@@ -41,8 +40,6 @@ class Plc:
         if request[1:5] == b"FFFF":  # the global flag, without a reply
             self.peer.devices["M8126"] = int(request[8:9])
             return b""
-        if self.gone and self.gone in request.decode():
-            return self.peer.nak("06")
         return self.peer.hear(request)
 
     def obey(self, words: list[str]) -> object:
@@ -56,8 +53,7 @@ class Plc:
             case ["forget"]:
                 self.peer.registered.clear()
             case ["gone", name]:
-                self.gone = name
-                self.peer.registered.clear()  # a read by list would not name it
+                self.peer.missing.add(name)
             case ["say", data]:
                 os.write(self.port, self.peer.stx(data, "FE"))
             case ["heard"]:

@@ -4,6 +4,7 @@ It hears one whole request and gives one whole answer. Devices are kept under th
 five-character names; nothing is forgiven.
 """
 
+from collections.abc import Iterable
 from typing import Literal, TypeVar
 
 T = TypeVar("T")
@@ -11,6 +12,10 @@ T = TypeVar("T")
 FrameFormat = Literal[1, 4]
 Procedure = tuple[FrameFormat, bool]  # the second: sum check
 PROCEDURES: list[Procedure] = [(1, True), (1, False), (4, True), (4, False)]
+
+
+class _Missing(Exception):
+    """A request names a device that this PLC does not have."""
 
 
 def summed(block: bytes) -> bytes:
@@ -31,6 +36,7 @@ class Peer:
         self.registered: dict[str, list[str]] = {}
         self.confirmed = 0
         self.waits: list[int] = []
+        self.missing: set[str] = set()  # NAK 06 for whatever reads or writes them
 
     # blocks
 
@@ -68,7 +74,10 @@ class Peer:
         if text[:4] != f"{self.station:02X}FF":
             return b""
         self.waits.append(int(text[6], 16))
-        return self.obey(text[4:6], text[7:])
+        try:
+            return self.obey(text[4:6], text[7:])
+        except _Missing:
+            return self.nak("06")
 
     def obey(self, command: str, area: str) -> bytes:
         match command:
@@ -77,18 +86,22 @@ class Peer:
             case "BT" | "WT":
                 size = 6 if command == "BT" else 9
                 entries = self.entries(area, size, 20 if command == "BT" else 10)
+                self.has(entry[:5] for entry in entries)
                 for entry in entries:
                     self.put([entry[:5]], entry[5:], command == "WT")
                 return self.ack()
             case "BM" | "WM":
                 assert not self.fx
-                self.registered[command[0]] = self.entries(area, 5, 10)
+                entries = self.entries(area, 5, 10)
+                self.has(entries)
+                self.registered[command[0]] = entries
                 return self.ack()
             case "MB" | "MN" | "MW":
                 assert area == ""
                 kind = "B" if command == "MB" else "W"
                 if kind not in self.registered:
                     return self.nak("06")
+                self.has(self.registered[kind])
                 return self.stx("".join(self.show(n, kind == "W") for n in self.registered[kind]))
             case "TT":
                 assert 1 <= int(area[:2], 16) == len(area) - 2 <= (254 if self.fx else 128)
@@ -102,6 +115,7 @@ class Peer:
 
     def batch(self, command: str, area: str) -> bytes:
         names = self.run(area[:5], area[5:7], command)
+        self.has(names)
         if command[1] == "W":
             return self.put(names, area[7:], command[0] == "W")
         assert len(area) == 7
@@ -130,6 +144,10 @@ class Peer:
         assert 1 <= items <= most, (command, head, items)
         step = 16 if command[0] == "W" and bit_device else 1
         return [self.name(letters, number + i * step) for i in range(items)]
+
+    def has(self, names: Iterable[str]) -> None:
+        if not self.missing.isdisjoint(names):
+            raise _Missing
 
     def entries(self, area: str, size: int, most: int) -> list[str]:
         count, rest = int(area[:2], 16), area[2:]
