@@ -28,7 +28,7 @@ _TOKENS = {State.CLAIMING: (Role.CLAIM,), State.ACTIVE: (Role.CLAIM, Role.ACTIVE
 
 @dataclass(frozen=True, slots=True)
 class GroupSettings:
-    """How the gateways of a plant know each other. `alone`: seconds, see `Election`.
+    """Settings that the gateways of a plant share. `alone`: seconds, see `Election`.
 
     `group`: the standby group, None for a gateway outside of any. `secret_file`: its first line is
     the secret that signs tokens and claims.
