@@ -1240,4 +1240,18 @@ MUTANTS = (
         "    return key\n",
         "tests/northbound/test_claim_documents.py",
     ),
+    Mutant(
+        "our own client asks for all values at once",
+        "cli/client/client.py",
+        '        if "*" in wanted and not max_age:\n',
+        "        if False:\n",
+        "tests/cli/test_client.py",
+    ),
+    Mutant(
+        "our own client overlooks lost values of a page",
+        "cli/client/value_pages.py",
+        "        if lacking or not",
+        "        if not",
+        "tests/cli/test_client.py",
+    ),
 )
