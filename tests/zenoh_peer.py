@@ -231,7 +231,7 @@ class ZenohPeer:
         return replies
 
     async def get_until(self, selector: str, fits: Callable[[Any], bool]) -> Any:
-        """Waits until the one document fits: a status may be a fifth of a second old."""
+        """Waits until the one document fits."""
         async with asyncio.timeout(TIMEOUT):
             while True:
                 [reply] = await self.get(selector)

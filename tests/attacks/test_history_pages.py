@@ -1,7 +1,6 @@
 """History in pages: whole, each sample once, over any link, and while others ask for it all."""
 
 import asyncio
-import json
 import sqlite3
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, closing
@@ -126,5 +125,6 @@ async def test_damage_is_told_and_the_rest_is_answered(tmp_path: Path) -> None:
         end: dict[str, Any] = {}
         assert set(await pages(client, "plant/**?_time=[..];page=150", end)) == found
         await asyncio.to_thread(program.says, "history damaged")
-        [status] = await client.get("plant/@gateway/demo/history")
-        assert "damaged" in json.loads(status.payload)["state"]
+        await client.get_until(
+            "plant/@gateway/demo/history", lambda status: "damaged" in status["state"]
+        )

@@ -1254,4 +1254,18 @@ MUTANTS = (
         "        if not",
         "tests/cli/test_client.py",
     ),
+    Mutant(
+        "a query of the status gets an older one",
+        "northbound/status_publisher.py",
+        "        while self._collected_at < called:\n",
+        "        while self._collected_at < 0:\n",
+        "tests/northbound/test_status_publisher.py",
+    ),
+    Mutant(
+        "every query of the status collects it",
+        "northbound/status_publisher.py",
+        "_PAUSE = 9.0\n",
+        "_PAUSE = 0.0\n",
+        "tests/northbound/test_status_publisher.py",
+    ),
 )
