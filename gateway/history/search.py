@@ -12,10 +12,9 @@ from gateway.history.rows import Stored, from_row
 from gateway.history.sections import FullRow
 from gateway.history.timerange import EARLIEST, TimeRange
 from gateway.tags import Sample, Tag
+from gateway.tags.recorded import Place, Recorded, RecordedQuery
 from gateway.tags.timestamps import rfc3339
 
-# The place of a sample in the order of recording: the file, the run, and the number in the run.
-Place = tuple[str, int, int]
 _MANY = 2048  # samples in memory between two pauses
 _Placed = tuple[int, Tag, int, Stored, int | None, str | None]  # a row with its number and tag
 
@@ -56,23 +55,19 @@ class Search:
             raise lost
 
     def as_recorded(
-        self,
-        tags: Mapping[str, Tag],
-        period: TimeRange,
-        after: Place | None,
-        page: int | None,
-        pause: Callable[[], None],
-    ) -> Iterator[tuple[Sample | Damaged | bool, Place | None]]:
-        """Yields the samples of many tags in the order of recording, each with its cursor.
+        self, query: RecordedQuery, period: TimeRange, pause: Callable[[], None]
+    ) -> Recorded:
+        """Yields the samples of many tags in the order of recording, each with its place.
 
         `Damaged` is yielded after the rest of a damaged run. Samples without a place in the file
         come last, without a place: a later search finds them again. The last pair has True, or
         False before a run that would pass `page` samples: it is not read twice then. Raises `Busy`;
         calls `pause` at least every few milliseconds of reading.
         """
+        tags, page = query.tags, query.page
         file, sorted_runs, newest = self._recent.content()
         mark = _mark(file)
-        (_, begin, first), period = _start(after, mark, period)
+        (_, begin, first), period = _start(query.after, mark, period)
         stored = _Stored(self._reader, self.damage, file, period)
         runs = [run for run in sorted_runs if run.number >= begin]
         numbers = stored.numbers(tags, stored.of(runs))

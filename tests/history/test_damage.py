@@ -17,13 +17,14 @@ from gateway.history.schema import ForeignFile
 from gateway.history.search import Search
 from gateway.history.timerange import EARLIEST, LATEST
 from gateway.tags import Sample, Tag, good
+from gateway.tags.recorded import RecordedQuery
 from gateway.values import Value
 from tests.history.recorded import NOON, SECOND, history, numbered, values
 from tests.history_writer import tag
 
 ALWAYS = TimeRange(EARLIEST, LATEST)
 TAGS = [tag(f"t{n}") for n in range(7)]
-BY_KEY = {tag.key: tag for tag in TAGS}
+EVERYTHING = RecordedQuery({tag.key: tag for tag in TAGS}, "", None, None, 0)
 FLIPS = 60
 CONTENT: list[Value] = [1, 2.5, "text", True, 2**63, -7]
 
@@ -60,7 +61,7 @@ def answers(path: Path) -> Iterator[Answer]:
 
 def _all(search: Search) -> Answer:
     found, told = set[tuple[str, int, Value | None]](), False
-    for sample, _ in search.as_recorded(BY_KEY, ALWAYS, None, None, lambda: None):
+    for sample, _ in search.as_recorded(EVERYTHING, ALWAYS, lambda: None):
         if isinstance(sample, Damaged):
             told = True
         elif not isinstance(sample, bool):
