@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from gateway.errors import BadValue, Busy
+from gateway.history.checker import Checker
 from gateway.history.outcomes import Outcome, Outcomes, Ring
 from gateway.history.reader import Reader
 from gateway.history.recent import Recent
@@ -49,14 +50,17 @@ class Historian:
         self._retention = Retention(keep, max_size, self._recent, wall)
         self._transfer = Transfer(self._recent, rings, self._retention, wall)
         self._writer = Writer(path, max_size, self._transfer, self._reader)
+        self._checker = Checker(self._search)
 
     def start(self) -> None:
         """Starts to write. A file that cannot be opened is tried again: see `document`."""
         self._writer.start()
+        self._checker.start()
 
     def close(self, within: float = 2.0) -> bool:
         """Stores everything in memory; True if that was done in time. Blocks: not on the event
         loop."""
+        self._checker.close()
         return self._writer.close(within)
 
     # -- event loop --

@@ -10,12 +10,13 @@ from gateway.history.reader import Part, Reader, in_order
 from gateway.history.recent import Identity, Recent, SortedRun
 from gateway.history.rows import Stored, from_row
 from gateway.history.sections import FullRow
-from gateway.history.timerange import EARLIEST, TimeRange
+from gateway.history.timerange import EARLIEST, LATEST, TimeRange
 from gateway.tags import Sample, Tag
 from gateway.tags.recorded import Place, Recorded, RecordedQuery
 from gateway.tags.timestamps import rfc3339
 
 _MANY = 2048  # samples in memory between two pauses
+_ALL = range(2**31)  # the numbers of all tags
 _Placed = tuple[int, Tag, int, Stored, int | None, str | None]  # a row with its number and tag
 
 
@@ -96,6 +97,20 @@ class Search:
             if number:
                 place = mark, number, max(skipped, count) - 1
         yield True, place
+
+    def check(self) -> Iterator[None]:
+        """Reads all sorted runs once, a part for each step, and notes the damage. Raises `Busy`
+        and `sqlite3.Error`."""
+        file, sorted_runs, _ = self._recent.content()
+        for run in sorted_runs:
+            try:
+                listed = self._reader.listed(file, run)
+                for group in sections.groups(listed, _ALL, TimeRange(EARLIEST, LATEST)):
+                    if self._reader.rows(file, run, group) is None:
+                        break  # dropped
+                    yield
+            except Damaged as error:
+                self.damage.found(file, run, str(error))
 
 
 class _Stored:

@@ -1268,4 +1268,11 @@ MUTANTS = (
         "_PAUSE = 0.0\n",
         "tests/northbound/test_status_publisher.py",
     ),
+    Mutant(
+        "damage of the history waits for a query",
+        "history/historian.py",
+        "        self._checker.start()\n",
+        "",
+        "tests/history/test_damage.py",
+    ),
 )
