@@ -19,7 +19,7 @@ from gateway.history.state_file import StateFile
 from gateway.line.arrival import ArrivalClock
 from gateway.line.duty import Duty
 from gateway.line.line import Line
-from gateway.northbound import Northbound, standby_settings
+from gateway.northbound import Northbound, group_settings
 from gateway.northbound.session import off_loop
 from gateway.tags import Sample
 
@@ -136,7 +136,7 @@ def _northbound(config: Config, gateway: Gateway, history: Historian | None) -> 
         gateway,
         history=history,
         writers=config.writers_file,
-        standby=standby_settings(config),
+        group=group_settings(config),
     )
 
 

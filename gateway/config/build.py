@@ -76,9 +76,7 @@ class Builder:
             state_file=None if top.gateway.state is None else self.folder / top.gateway.state,
             standby=top.gateway.standby,
             standby_alone=top.gateway.standby_alone,
-            standby_secret_file=self._file(
-                top.gateway.standby_secret_file, ("gateway", "standby_secret_file")
-            ),
+            secret_file=self._file(top.gateway.secret_file, ("gateway", "secret_file")),
             writers_file=self._file(top.writers.file, ("writers", "file")) if top.writers else None,
             zenoh=self._zenoh(top),
             history=self._history(top),
