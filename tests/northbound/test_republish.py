@@ -3,6 +3,7 @@
 import asyncio
 import time
 from collections.abc import Sequence
+from contextlib import AsyncExitStack
 from typing import Any
 
 import pytest
@@ -21,6 +22,7 @@ from tests.northbound.plant import (
     gateway_and_client,
     has_value,
     mixer,
+    serving,
     tag,
 )
 from tests.sim.virtual import now, on_virtual_time
@@ -112,6 +114,21 @@ async def test_after_a_router_was_killed_and_returned_everything_is_published_ag
     finally:
         serves.cancel()
         await asyncio.wait([serves], timeout=5)
+
+
+async def test_a_client_of_the_process_before_gets_all_values_of_the_next() -> None:
+    plant, settings = mixer(), ZenohConfig(listen=(free_endpoint(),))
+    async with AsyncExitStack() as peers:
+        async with serving(plant, settings) as northbound:
+            client = ZenohPeer("client", connect=settings.listen)
+            received = await (await peers.enter_async_context(client)).subscribe("plant/**")
+            northbound.publish([plant.now("mixer/speed", 1)])
+            await received.next(has_value("plant/mixer/speed", 1))
+            received.forget()
+        plant.now("mixer/speed", 2)
+        async with serving(plant, settings):  # it has published all before the client is linked
+            await received.next(has_value("plant/mixer/speed", 2))
+            await received.until(lambda of: len(of.latest()) == 4)
 
 
 def republisher(plant: PlainPlant, published: list[Sample], **how: Any) -> Republisher:
