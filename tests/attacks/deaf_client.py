@@ -1,4 +1,6 @@
-"""A client that asks a lot and receives nothing: `python deaf_client.py ENDPOINT 60 2000`.
+"""A client that asks a lot and receives nothing.
+
+    python deaf_client.py tcp/127.0.0.1:7447 60 2000
 
 Its first reply holds up the thread that receives, as a slow callback does.
 """
