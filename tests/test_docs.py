@@ -33,7 +33,7 @@ from gateway.config.yaml_file import read_yaml
 from gateway.engine.device import DeviceSettings
 from gateway.history import Historian
 from gateway.line.duty import Duty
-from gateway.northbound import StandbySettings, payload
+from gateway.northbound import GroupSettings, payload
 from gateway.northbound.keys import Keys
 from gateway.northbound.payload import Problem
 from gateway.northbound.secrets import exposures
@@ -626,7 +626,7 @@ def test_the_status_documents_have_the_fields_of_the_page(endpoint: str, tmp_pat
         assert asking.ended() == 0
         found = dict(line.split(maxsplit=1) for line in asking.lines)
     known: dict[str, Any] = {"history": Historian(tmp_path / "history.db", 1, 10**8).document()}
-    known |= Standby(StandbySettings("hall"), Keys("plant", "demo"), Duty()).documents()
+    known |= Standby(GroupSettings("hall"), None, Keys("plant", "demo"), Duty()).documents()
     for key, text in found.items():
         path_there = re.sub(r"/.*", "/", key.removeprefix("plant/@gateway/demo/"))
         known[path_there] = json.loads(text)

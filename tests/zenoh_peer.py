@@ -231,7 +231,7 @@ class ZenohPeer:
         return replies
 
     async def get_until(self, selector: str, fits: Callable[[Any], bool]) -> Any:
-        """Waits until the one document fits: a status may be a fifth of a second old."""
+        """Waits until the one document fits."""
         async with asyncio.timeout(TIMEOUT):
             while True:
                 [reply] = await self.get(selector)
@@ -252,8 +252,11 @@ class ZenohPeer:
             for replies in result
         ]
 
-    async def put(self, key: str, payload: bytes, attachment: bytes | None = None) -> None:
-        await self._request("put", key=key, payload=_text(payload), attachment=_text(attachment))
+    async def put(
+        self, key: str, payload: bytes, attachment: bytes | None = None, times: int = 1
+    ) -> None:
+        sent = {"payload": _text(payload), "attachment": _text(attachment), "times": times}
+        await self._request("put", key=key, **sent)
 
     async def delete(self, key: str) -> None:
         await self._request("delete", key=key)
@@ -411,7 +414,8 @@ def _execute(session: zenoh.Session, kept: list[object], request: dict[str, Any]
         case {"do": "put", "key": key, "payload": payload, "attachment": attachment}:
             block = zenoh.CongestionControl.BLOCK
             data, token = _bytes_of(payload) or b"", _bytes_of(attachment)
-            session.put(key, data, congestion_control=block, attachment=token)
+            for _ in range(request["times"]):
+                session.put(key, data, congestion_control=block, attachment=token)
         case {"do": "delete", "key": key}:
             session.delete(key)
         case _:

@@ -45,7 +45,7 @@ def _read(config: Config, own: FilePath) -> Iterator[tuple[str, FilePath]]:
         "zenoh.password_file": zenoh.password_file,
         "zenoh.users_file": zenoh.users_file,
         "writers.file": config.writers_file,
-        "gateway.standby_secret_file": config.standby_secret_file,
+        "gateway.secret_file": config.secret_file,
     }
     if tls is not None:
         files |= {"zenoh.tls.ca": tls.ca, "zenoh.tls.key": tls.key}

@@ -67,14 +67,13 @@ class GatewaySection(Section):
     """A name shared by two gateways of one plant: one is active, the other is the standby."""
     standby_alone: Interval | None = None
     """Become active after this time without any Zenoh link; left out: wait for the network."""
-    standby_secret_file: FilePath | None = None
-    """The file whose first line signs the messages between the gateways of the standby group."""
+    secret_file: FilePath | None = None
+    """The file whose first line, the same for all gateways of a plant, signs claims and tokens."""
 
     @model_validator(mode="after")
     def _together(self) -> Self:
-        for name in ("standby_alone", "standby_secret_file"):
-            if getattr(self, name) is not None and self.standby is None:
-                raise ValueError(f"{name} has no effect without standby")
+        if self.standby_alone is not None and self.standby is None:
+            raise ValueError("standby_alone has no effect without standby")
         return self
 
 

@@ -92,7 +92,7 @@ class Config:
     state_file: Path | None = None  # learned properties of the devices, across restarts
     standby: str | None = None  # the group of an active and a standby gateway
     standby_alone: float | None = None  # seconds without a link until it becomes active
-    standby_secret_file: Path | None = None  # None: its tokens are not signed
+    secret_file: Path | None = None  # None: claims and tokens are not signed
     writers_file: Path | None = None  # None: every client of Zenoh may write
     zenoh: ZenohConfig
     history: HistoryConfig | None

@@ -9,16 +9,18 @@ from os.path import realpath
 from pathlib import Path
 from typing import TypeVar
 
-from gateway.errors import BadValue, Busy, Damaged
+from gateway.errors import BadValue, Busy
+from gateway.history.checker import Checker
 from gateway.history.outcomes import Outcome, Outcomes, Ring
 from gateway.history.reader import Reader
 from gateway.history.recent import Recent
 from gateway.history.retention import Retention
-from gateway.history.search import Place, Search
+from gateway.history.search import Search
 from gateway.history.timerange import TimeRange, time_range
 from gateway.history.transfer import Transfer
 from gateway.history.writer import Writer
 from gateway.tags import Sample, Tag
+from gateway.tags.recorded import Recorded, RecordedQuery
 from gateway.tags.timestamps import rfc3339
 
 T = TypeVar("T")
@@ -48,14 +50,17 @@ class Historian:
         self._retention = Retention(keep, max_size, self._recent, wall)
         self._transfer = Transfer(self._recent, rings, self._retention, wall)
         self._writer = Writer(path, max_size, self._transfer, self._reader)
+        self._checker = Checker(self._search)
 
     def start(self) -> None:
         """Starts to write. A file that cannot be opened is tried again: see `document`."""
         self._writer.start()
+        self._checker.start()
 
     def close(self, within: float = 2.0) -> bool:
         """Stores everything in memory; True if that was done in time. Blocks: not on the event
         loop."""
+        self._checker.close()
         return self._writer.close(within)
 
     # -- event loop --
@@ -106,19 +111,10 @@ class Historian:
         period = self._range(time_range, limit, now)
         return islice(_readable(self._search.by_time(tag, period)), limit)
 
-    def as_recorded(
-        self,
-        tags: Mapping[str, Tag],
-        time_range: str,
-        after: Place | None,
-        page: int | None,
-        now: int,
-        pause: Callable[[], None],
-    ) -> Iterator[tuple[Sample | Damaged | bool, Place | None]]:
-        """Yields the samples of tags (by `device/name`) in the order of recording, each with its
-        place, as `Search.as_recorded` does. Raises `BadValue`, `Busy`."""
-        period = self._range(time_range, None, now)
-        return _readable(self._search.as_recorded(tags, period, after, page, pause))
+    def as_recorded(self, query: RecordedQuery, pause: Callable[[], None]) -> Recorded:
+        """Yields samples as `Search.as_recorded` does. Raises `BadValue`, `Busy`."""
+        period = self._range(query.time_range, None, query.now)
+        return _readable(self._search.as_recorded(query, period, pause))
 
     def writes(
         self, time_range: str, limit: int | None = None, now: int | None = None

@@ -90,13 +90,17 @@ class Reader:
         with self._lock:
             known = self._sections.get((file, run))
         if known is None:
-            with self._connection(file) as database:
-                known = sections.read(database, run.number)
+            known = self.listed(file, run)
             with self._lock:
                 if len(self._sections) >= _MOST_LISTS:
                     self._sections.clear()
                 self._sections[file, run] = known
         return known
+
+    def listed(self, file: Identity | None, run: SortedRun) -> list[Section]:
+        """Returns the sections of a run as they are on disk now. Raises `Damaged`."""
+        with self._connection(file) as database:
+            return sections.read(database, run.number)
 
     def rows(
         self, file: Identity | None, run: SortedRun, group: Sequence[Section]

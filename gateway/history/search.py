@@ -10,13 +10,13 @@ from gateway.history.reader import Part, Reader, in_order
 from gateway.history.recent import Identity, Recent, SortedRun
 from gateway.history.rows import Stored, from_row
 from gateway.history.sections import FullRow
-from gateway.history.timerange import EARLIEST, TimeRange
+from gateway.history.timerange import EARLIEST, LATEST, TimeRange
 from gateway.tags import Sample, Tag
+from gateway.tags.recorded import Place, Recorded, RecordedQuery
 from gateway.tags.timestamps import rfc3339
 
-# The place of a sample in the order of recording: the file, the run, and the number in the run.
-Place = tuple[str, int, int]
 _MANY = 2048  # samples in memory between two pauses
+_ALL = range(2**31)  # the numbers of all tags
 _Placed = tuple[int, Tag, int, Stored, int | None, str | None]  # a row with its number and tag
 
 
@@ -56,23 +56,19 @@ class Search:
             raise lost
 
     def as_recorded(
-        self,
-        tags: Mapping[str, Tag],
-        period: TimeRange,
-        after: Place | None,
-        page: int | None,
-        pause: Callable[[], None],
-    ) -> Iterator[tuple[Sample | Damaged | bool, Place | None]]:
-        """Yields the samples of many tags in the order of recording, each with its cursor.
+        self, query: RecordedQuery, period: TimeRange, pause: Callable[[], None]
+    ) -> Recorded:
+        """Yields the samples of many tags in the order of recording, each with its place.
 
         `Damaged` is yielded after the rest of a damaged run. Samples without a place in the file
         come last, without a place: a later search finds them again. The last pair has True, or
         False before a run that would pass `page` samples: it is not read twice then. Raises `Busy`;
         calls `pause` at least every few milliseconds of reading.
         """
+        tags, page = query.tags, query.page
         file, sorted_runs, newest = self._recent.content()
         mark = _mark(file)
-        (_, begin, first), period = _start(after, mark, period)
+        (_, begin, first), period = _start(query.after, mark, period)
         stored = _Stored(self._reader, self.damage, file, period)
         runs = [run for run in sorted_runs if run.number >= begin]
         numbers = stored.numbers(tags, stored.of(runs))
@@ -101,6 +97,20 @@ class Search:
             if number:
                 place = mark, number, max(skipped, count) - 1
         yield True, place
+
+    def check(self) -> Iterator[None]:
+        """Reads all sorted runs once, a part for each step, and notes the damage. Raises `Busy`
+        and `sqlite3.Error`."""
+        file, sorted_runs, _ = self._recent.content()
+        for run in sorted_runs:
+            try:
+                listed = self._reader.listed(file, run)
+                for group in sections.groups(listed, _ALL, TimeRange(EARLIEST, LATEST)):
+                    if self._reader.rows(file, run, group) is None:
+                        break  # dropped
+                    yield
+            except Damaged as error:
+                self.damage.found(file, run, str(error))
 
 
 class _Stored:

@@ -5,15 +5,15 @@ cancelled. It never blocks the event loop, and no package below it imports Zenoh
 """
 
 from gateway.northbound.interfaces import Device, History, Plant
-from gateway.northbound.northbound import Northbound, check, standby_settings
-from gateway.northbound.standby import StandbySettings
+from gateway.northbound.northbound import Northbound, check, group_settings
+from gateway.northbound.standby import GroupSettings
 
 __all__ = [
     "Device",
     "History",
     "Northbound",
     "Plant",
-    "StandbySettings",
+    "GroupSettings",
     "check",
-    "standby_settings",
+    "group_settings",
 ]

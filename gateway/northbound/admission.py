@@ -6,10 +6,12 @@ from collections.abc import Iterable, Mapping
 import zenoh
 
 from gateway.line.duty import Duty
+from gateway.northbound import secrets
 from gateway.northbound.claiming import NETWORK_WITHIN, Claiming
 from gateway.northbound.keys import Keys
+from gateway.northbound.plant_secret import PlantSecret
 from gateway.northbound.second_session import SecondSession
-from gateway.northbound.standby import Standby, StandbySettings
+from gateway.northbound.standby import GroupSettings, Standby
 
 
 class Admission:
@@ -21,18 +23,19 @@ class Admission:
 
     def __init__(
         self,
-        standby: StandbySettings | None,
+        settings: GroupSettings,
         keys: Keys,
         config: zenoh.Config,
         devices: Iterable[str],
         duty: Duty,
     ) -> None:
-        """`config`: of the gateway's own session."""
+        """`config`: of the gateway's own session. Raises `ConfigError` for a bad secret."""
         self.active = asyncio.Event()
-        self.standby = Standby(standby, keys, duty)
+        text = secrets.plant_secret(settings.secret_file)
+        secret = None if text is None else PlantSecret(text)
+        self.standby = Standby(settings, secret, keys, duty)
         self.replaced = self.standby.replaced
-        group = None if standby is None else standby.group
-        self.claiming = Claiming(keys, group, devices, self.active, self.replaced)
+        self.claiming = Claiming(keys, settings.group, secret, devices, self.active, self.replaced)
         self._second = SecondSession(config)
 
     def documents(self) -> Mapping[str, Mapping[str, object]]:

@@ -8,13 +8,14 @@ import asyncio
 import time
 from collections.abc import Iterable, Mapping
 
-import orjson
 import structlog
 import zenoh
 
-from gateway.northbound.claims import Claim, Claims
+from gateway.northbound.claim_documents import ClaimDocuments
+from gateway.northbound.claims import Claims
 from gateway.northbound.inbox import Inbox
 from gateway.northbound.keys import Keys
+from gateway.northbound.plant_secret import PlantSecret
 from gateway.northbound.second_session import SecondSession
 from gateway.northbound.session import off_loop
 
@@ -35,6 +36,7 @@ class Claiming:
         self,
         keys: Keys,
         group: str | None,
+        secret: PlantSecret | None,
         devices: Iterable[str],
         admitted: asyncio.Event,
         refused: asyncio.Event,
@@ -49,6 +51,7 @@ class Claiming:
         self._group = group
         self._devices = frozenset(devices)
         self._claims: Claims | None = None
+        self._documents = ClaimDocuments(keys, secret)
         self._unanswered: set[str] = set()  # keys of claims that were seen but not read
         self._changed = asyncio.Event()
         self._declared: list[object] = []  # Zenoh undeclares an object without a reference
@@ -63,12 +66,11 @@ class Claiming:
         own = None if self._claims is None else self._claims.own
         if own is None:
             return {}
-        document: dict[str, object] = {
-            "ticket": own.ticket,
-            "group": own.group,
-            "devices": sorted(own.devices),
-        }
-        return {f"claim/{own.session}": document}
+        return {f"claim/{own.session}": self._documents.document(own)}
+
+    def status(self) -> dict[str, object]:
+        """The fields of the gateway's status document."""
+        return {"refused_devices": self.withheld, "refused_claims": self._documents.refused}
 
     async def run(self, session: zenoh.Session, second: SecondSession) -> None:
         """Claims, then observes until cancelled. `session` is the gateway's own."""
@@ -114,6 +116,7 @@ class Claiming:
             else:
                 self._unanswered.discard(key)
                 claims.lost(key.rpartition("/")[2])
+                self._documents.forget(key)
             self._changed.set()
 
         tokens = zenoh.handlers.Callback(Inbox(token_changed, lambda _: None), indirect=False)
@@ -159,8 +162,11 @@ class Claiming:
         replies = await off_loop(_query, view, key)
         found = {}
         for reply in replies:
-            if reply.ok is not None and (claim := _parse(reply.ok)) is not None:
-                found[str(reply.ok.key_expr)] = claim
+            if reply.ok is None:
+                continue
+            key, data = str(reply.ok.key_expr), reply.ok.payload.to_bytes()
+            if (claim := self._documents.parse(key, data, time.monotonic())) is not None:
+                found[key] = claim
         for claim in found.values():
             if self._claims is not None:
                 self._claims.found(claim)
@@ -176,17 +182,3 @@ def _query(view: zenoh.Session, key: str) -> list[zenoh.Reply]:
             allowed_destination=zenoh.Locality.REMOTE,
         )
     )
-
-
-def _parse(sample: zenoh.Sample) -> Claim | None:
-    """Any client of Zenoh may answer: None for a document that is no claim."""
-    *_, name, _, session = str(sample.key_expr).split("/")
-    try:
-        document = orjson.loads(sample.payload.to_bytes())
-    except orjson.JSONDecodeError:
-        return None
-    match document:
-        case {"ticket": int(ticket), "group": str() | None as group, "devices": list(devices)}:
-            known = frozenset(device for device in devices if isinstance(device, str))
-            return Claim(ticket, session, name, group, known)
-    return None

@@ -1,17 +1,15 @@
-"""The keys of the liveliness tokens of a standby group, signed with the secret of the group.
+"""The keys of the liveliness tokens of a standby group, signed with the secret of the plant.
 
-    <prefix>/@standby/<group>/<role>/<gateway>/<session>/<signature>
-
-Any program that is connected can declare a token. Without the secret it can sign none.
+<prefix>/@standby/<group>/<role>/<gateway>/<session>/<signature>
 """
 
-import hashlib
 import hmac
 
 import structlog
 
 from gateway.northbound.election import Role, RoleToken
 from gateway.northbound.keys import Keys
+from gateway.northbound.plant_secret import PlantSecret
 from gateway.northbound.rate_limit import RateLimit
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
@@ -22,11 +20,11 @@ _SHOWN = 300  # characters of a refused key
 class GroupTokens:
     """Makes keys, and parses those of other gateways."""
 
-    def __init__(self, keys: Keys, group: str, secret: str | None) -> None:
+    def __init__(self, keys: Keys, group: str, secret: PlantSecret | None) -> None:
         """Without a `secret` tokens are not signed, and every token of the group counts."""
         self._keys = keys
         self._stem = keys.group(group)
-        self._secret = None if secret is None else secret.encode()
+        self._secret = secret
         self._log_limit = RateLimit(10, 60.0)  # any client can declare as many as it likes
 
     @property
@@ -35,7 +33,7 @@ class GroupTokens:
 
     def key(self, token: RoleToken) -> str:
         key = f"{self._stem}/{token.role.value}/{token.name}/{token.session}"
-        return key if self._secret is None else f"{key}/{_signature(self._secret, key)}"
+        return key if self._secret is None else f"{key}/{self._secret.signature(key)}"
 
     def parse(self, key: str, now: float) -> RoleToken | None:
         """Returns None, and logs the key, for a token that this group did not sign."""
@@ -44,16 +42,12 @@ class GroupTokens:
                 token = RoleToken(Role(role), name, session)
                 if self._secret is None and len(signature) <= 1:
                     return token
-                if hmac.compare_digest(key.encode(), self.key(token).encode()):
+                if self._secret and hmac.compare_digest(key.encode(), self.key(token).encode()):
                     return token
         if self._log_limit.allows(now):
             log.error(
                 "standby token refused",
                 token=key[:_SHOWN],
-                why="it is not signed with the secret of this group",
+                why="it is not signed with the secret of this gateway",
             )
         return None
-
-
-def _signature(secret: bytes, key: str) -> str:
-    return hmac.new(secret, key.encode(), hashlib.sha256).hexdigest()[:32]

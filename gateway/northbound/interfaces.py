@@ -4,9 +4,9 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Literal, Protocol
 
 from gateway.engine.requests import CommandResult
-from gateway.errors import Damaged
 from gateway.line.duty import Duty
 from gateway.tags import Sample, Tag, WriteResult
+from gateway.tags.recorded import Recorded, RecordedQuery
 from gateway.values import Value
 
 
@@ -74,10 +74,6 @@ class Plant(Protocol):
         """Documents by path: `status`, `lines/<line>`, `devices/<device>`."""
 
 
-# Of a recorded sample: the file, the run, and the number in the run.
-Place = tuple[str, int, int]
-
-
 class History(Protocol):
     """Recorded samples, found by Zenoh's time ranges. `now`: ns since 1970, when the query came."""
 
@@ -88,22 +84,8 @@ class History(Protocol):
         the file cannot be read now, and `Damaged` at the end when a part of it was left out.
         """
 
-    def as_recorded(
-        self,
-        tags: Mapping[str, Tag],
-        time_range: str,
-        after: Place | None,
-        page: int | None,
-        now: int,
-        pause: Callable[[], None],
-    ) -> Iterator[tuple[Sample | Damaged | bool, Place | None]]:
-        """The samples of tags (by `device/name`) in the order of recording, each with its place.
-
-        Starts after the place `after`, and may end after fewer samples than `page`. `Damaged`
-        stands for samples that are lost; the last pair has True if this was all. A sample without
-        a place is not stored yet: it is found again later. Calls `pause` at least every few
-        milliseconds. Raises `BadValue`, `Busy`.
-        """
+    def as_recorded(self, query: RecordedQuery, pause: Callable[[], None]) -> Recorded:
+        """Calls `pause` at least every few milliseconds. Raises `BadValue`, `Busy`."""
 
     def writes(self, time_range: str, limit: int | None, now: int) -> Iterator[str]:
         """Outcomes of writes and commands, as on the `writes` key. Raises like `samples`."""

@@ -30,7 +30,7 @@ from gateway.northbound.session import (
     off_loop,
     open_session,
 )
-from gateway.northbound.standby import StandbySettings
+from gateway.northbound.standby import GroupSettings
 from gateway.northbound.status_publisher import StatusPublisher
 from gateway.northbound.tag_index import TagIndex
 from gateway.northbound.watchdog import Watchdog
@@ -67,7 +67,7 @@ class Northbound:
         *,
         history: History | None = None,
         writers: Path | None = None,
-        standby: StandbySettings | None = None,
+        group: GroupSettings | None = None,
         status_every: float = STATUS_EVERY,
     ) -> None:
         """`history` answers queries of the past and records every audited outcome. `writers` is
@@ -78,14 +78,15 @@ class Northbound:
         self.opened = asyncio.Event()
         self._config = configure(settings)
         self._is_client = settings.mode is ZenohMode.CLIENT
+        group = group or GroupSettings()
         known_writers = None if writers is None else Writers(writers)
-        for exposure in _exposures(self._config, writers, standby):
+        for exposure in _exposures(self._config, writers, group):
             log.warning("Zenoh session exposed", why=exposure)
         self._plant = plant
         self._links = LinkMonitor()
         index = TagIndex(self.keys, plant.devices())
         devices = [device.name for device in index.devices]
-        self._admission = Admission(standby, self.keys, self._config, devices, plant.duty)
+        self._admission = Admission(group, self.keys, self._config, devices, plant.duty)
         losses = Losses(drop_limit(self._config))
         self._publisher = Publisher(self.keys, losses)
         self._batches = ScanBatches(self._publisher, index.devices)
@@ -247,7 +248,7 @@ class Northbound:
 
     def _collect_status(self) -> Mapping[str, Mapping[str, object]]:
         documents = dict(self._plant.status())
-        documents["status"] = {**documents["status"], "refused_devices": self.withheld}
+        documents["status"] = {**documents["status"], **self._admission.claiming.status()}
         zenoh_document = {**self.counters(), "to": self._links.kinds()}
         return {**documents, "zenoh": zenoh_document, **self._admission.documents()}
 
@@ -259,25 +260,18 @@ def check(config: Config) -> list[str]:
     session = configure(config.zenoh)
     if config.writers_file is not None:
         Writers(config.writers_file)
-    standby = standby_settings(config)
-    if standby is not None:
-        secrets.group_secret(standby.secret_file)
-    return _exposures(session, config.writers_file, standby)
+    secrets.plant_secret(config.secret_file)
+    return _exposures(session, config.writers_file, group_settings(config))
 
 
-def standby_settings(config: Config) -> StandbySettings | None:
-    """Returns None for a gateway without a standby group."""
-    if config.standby is None:
-        return None
-    return StandbySettings(config.standby, config.standby_alone, config.standby_secret_file)
+def group_settings(config: Config) -> GroupSettings:
+    return GroupSettings(config.standby, config.standby_alone, config.secret_file)
 
 
-def _exposures(
-    session: zenoh.Config, writers: Path | None, standby: StandbySettings | None
-) -> list[str]:
+def _exposures(session: zenoh.Config, writers: Path | None, group: GroupSettings) -> list[str]:
     found = secrets.exposures(session)
     if writers is not None:
         found += secrets.unruled(session)
-    if standby is not None and standby.secret_file is None:
+    if group.group is not None and group.secret_file is None:
         found += secrets.unsigned()
     return found

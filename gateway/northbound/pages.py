@@ -12,8 +12,8 @@ import orjson
 import zenoh
 
 from gateway.errors import BadValue, Damaged
-from gateway.northbound.interfaces import Place
 from gateway.tags import Tag
+from gateway.tags.recorded import Place
 
 LARGEST = 100_000  # replies
 

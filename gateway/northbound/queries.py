@@ -6,7 +6,7 @@ answering threads.
 
 import asyncio
 import time
-from collections.abc import Callable, Coroutine, Sequence
+from collections.abc import Awaitable, Callable, Coroutine, Sequence
 from functools import partial
 
 import structlog
@@ -27,7 +27,7 @@ from gateway.tags import Tag, WriteResult
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 
-StatusDocuments = Callable[[], dict[str, bytes]]  # by full key
+StatusDocuments = Callable[[], Awaitable[dict[str, bytes]]]  # by full key
 
 FRESH_LIMIT = 256  # tags that one query may have read from the devices
 _BUSY = Failure(Problem.BUSY, "too many queries are waiting; nothing was done")
@@ -140,7 +140,7 @@ class Queries:
     async def _status(self, query: zenoh.Query) -> None:
         documents: dict[str, bytes] = {}
         try:
-            documents = self._documents()
+            documents = await self._documents()
         finally:
             self._pool.answer(query, partial(self._replies.status, documents))
 

@@ -8,12 +8,13 @@ import zenoh
 
 from gateway.errors import BadValue, Busy, Damaged, GatewayError
 from gateway.northbound import encoding, pages, payload
-from gateway.northbound.interfaces import History, Place, Plant
+from gateway.northbound.interfaces import History, Plant
 from gateway.northbound.keys import Family, Keys, ParsedKey
 from gateway.northbound.payload import Failure, Problem
 from gateway.northbound.tag_index import TagIndex
 from gateway.northbound.turns import Pause, Rank, Turns
 from gateway.tags import Sample, Tag, WriteResult
+from gateway.tags.recorded import Place, Recorded, RecordedQuery
 
 ANSWER_WITHIN = 60.0  # seconds for a whole answer of history; its client has gone after that
 PAGE_WITHIN = 5.0  # seconds for a page
@@ -122,7 +123,8 @@ class Replies:
                     wanted = {tag.key: tag for tag in tags}
                     size, after = page or (None, None)
                     place = pages.recorded_place(after)
-                    found = self._history.as_recorded(wanted, time_range, place, size, now, pause)
+                    asked = RecordedQuery(wanted, time_range, place, size, now)
+                    found = self._history.as_recorded(asked, pause)
                     self._as_recorded(query, found, page, pause)
         except GatewayError as error:
             self._failed(error, query)
@@ -137,7 +139,7 @@ class Replies:
     def _as_recorded(
         self,
         query: zenoh.Query,
-        found: Iterable[tuple[Sample | Damaged | bool, Place | None]],
+        found: Recorded,
         page: pages.Page | None,
         pause: Pause,
     ) -> None:

@@ -15,7 +15,7 @@ import zenoh
 from gateway.errors import ConfigError
 
 PASSWORD_VARIABLE = "PLC_GATEWAY_ZENOH_PASSWORD"  # noqa: S105  (the name of a variable)
-SHORTEST_SECRET = 20  # characters of the secret of a standby group
+SHORTEST_SECRET = 20  # characters of the secret of a plant
 _SECRET = re.compile(r"""["']?(password|\w*_base64)["']?\s*:\s*["'\d]""")
 _MAY_HOLD_SECRET = re.compile(r"passw|usrpwd|_base64", re.IGNORECASE)
 _LOCAL_PROTOCOLS = ("unixsock-stream",)
@@ -56,11 +56,11 @@ def password(file: Path | None) -> str | None:
     return found
 
 
-def group_secret(file: Path | None) -> str | None:
-    """Returns the first line of the secret of a standby group. Raises `ConfigError`."""
+def plant_secret(file: Path | None) -> str | None:
+    """Returns the first line of the secret of the gateways of a plant. Raises `ConfigError`."""
     if file is None:
         return None
-    called = "gateway.standby_secret_file"
+    called = "gateway.secret_file"
     found = readable_secret(file, called).partition("\n")[0].strip()
     if len(found) < SHORTEST_SECRET:
         raise ConfigError(
@@ -135,7 +135,7 @@ def exposures(config: zenoh.Config) -> list[str]:
 def unsigned() -> list[str]:
     """Returns the warning about a standby group without a secret."""
     warning = (
-        "`standby` without `standby_secret_file`: any program that connects can take both gateways "
+        "`standby` without `secret_file`: any program that connects can take both gateways "
         "off the wire; see docs/standby.md"
     )
     return [warning]

@@ -10,11 +10,11 @@ import structlog
 import zenoh
 
 from gateway.line.duty import Duty
-from gateway.northbound import secrets
 from gateway.northbound.election import Election, Role, RoleToken, State
 from gateway.northbound.group_tokens import GroupTokens
 from gateway.northbound.inbox import Inbox
 from gateway.northbound.keys import Keys
+from gateway.northbound.plant_secret import PlantSecret
 from gateway.northbound.second_session import SecondSession
 from gateway.northbound.session import off_loop
 
@@ -27,13 +27,14 @@ _TOKENS = {State.CLAIMING: (Role.CLAIM,), State.ACTIVE: (Role.CLAIM, Role.ACTIVE
 
 
 @dataclass(frozen=True, slots=True)
-class StandbySettings:
-    """`group`: shared by the gateways of one plant. `alone`: seconds, see `Election`.
+class GroupSettings:
+    """Settings that the gateways of a plant share. `alone`: seconds, see `Election`.
 
-    `secret_file`: its first line is the secret that signs the tokens of the group.
+    `group`: the standby group, None for a gateway outside of any. `secret_file`: its first line is
+    the secret that signs tokens and claims.
     """
 
-    group: str
+    group: str | None = None
     alone: float | None = None
     secret_file: Path | None = None
 
@@ -41,21 +42,22 @@ class StandbySettings:
 class Standby:
     """Sets `active` when this gateway may open its lines, `replaced` when it must close them.
 
-    Without settings it is `enabled` false, and active at once and for ever.
+    Without a group it is `enabled` false, and active at once and for ever.
     """
 
-    def __init__(self, settings: StandbySettings | None, keys: Keys, duty: Duty) -> None:
-        """`duty` gets the proof that this gateway is active, again and again. Raises `ConfigError`
-        for a bad secret."""
-        self.enabled = settings is not None
+    def __init__(
+        self, settings: GroupSettings, secret: PlantSecret | None, keys: Keys, duty: Duty
+    ) -> None:
+        """`duty` gets the proof that this gateway is active, again and again."""
+        self.enabled = settings.group is not None
         self.active = asyncio.Event()
         self.replaced = asyncio.Event()
-        self._settings = settings or StandbySettings("")
+        self._name = settings.group or ""
+        self._alone = settings.alone
         if not self.enabled:
             self.active.set()
         self._keys = keys
-        secret = secrets.group_secret(self._settings.secret_file)
-        self._group = GroupTokens(keys, self._settings.group, secret)
+        self._group = GroupTokens(keys, self._name, secret)
         self._duty = duty
         self._election: Election | None = None
         self._session: zenoh.Session | None = None  # of the tokens
@@ -68,8 +70,7 @@ class Standby:
             return {}
         state = State.STANDBY if self._election is None else self._election.state
         others = [] if self._election is None else self._election.others_active()
-        group = self._settings.group
-        return {"standby": {"group": group, "stand": state.value, "others_active": others}}
+        return {"standby": {"group": self._name, "stand": state.value, "others_active": others}}
 
     async def run(self, session: zenoh.Session, second: SecondSession) -> None:
         """Runs until cancelled. `session` is the gateway's own; the tokens are in `second`. Raises
@@ -81,7 +82,7 @@ class Standby:
             str(session.zid()),
             time.monotonic(),
             needs_link=second.needed,
-            alone=self._settings.alone,
+            alone=self._alone,
         )
         opening = asyncio.create_task(self._open(second, election))
         try:
@@ -129,7 +130,7 @@ class Standby:
                 opening.result()
             before, state = election.state, election.decide(time.monotonic())
             if state is not before:
-                log.info("standby state changed", group=self._settings.group, state=state.value)
+                log.info("standby state changed", group=self._name, state=state.value)
             await self._update_tokens(election, state)
             if state is State.ACTIVE:
                 self._duty.prove(asyncio.get_running_loop().time())

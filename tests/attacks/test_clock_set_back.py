@@ -6,7 +6,7 @@ import signal
 import sys
 from pathlib import Path
 
-from tests.e2e.pacing import narrow_link
+from tests.e2e.paced_link import paced_link
 from tests.e2e.processes import ROOT, Program, vigor_line, write_config
 from tests.zenoh_peer import ZenohPeer, free_endpoint
 
@@ -34,18 +34,18 @@ async def test_a_consumer_misses_nothing_when_the_clock_is_set_back(tmp_path: Pa
     with Program(sys.executable, "-c", RUN, "run", file) as gateway:
         gateway.says("Zenoh session ready")
         async with (
-            narrow_link(int(endpoint.rpartition(":")[2])) as link,
+            paced_link(endpoint) as link,
             ZenohPeer("client", connect=[endpoint]) as client,
         ):
             catch_up = ROOT / "examples" / "catch_up.py"
-            at = f"tcp/127.0.0.1:{link.port}"
+            at = link.endpoint
             since = "2020-01-01T00:00:00Z"
             with Program(sys.executable, catch_up, "--connect", at, "--since", since) as consumer:
                 await asyncio.to_thread(consumer.says, "plant/mixer/speed")
                 os.kill(gateway.pid, signal.SIGUSR1)
                 until = asyncio.get_running_loop().time() + CUT
                 while asyncio.get_running_loop().time() < until:
-                    link.cut()
+                    await link.cut()
                     await asyncio.sleep(0.05)
                 replies = await client.get("plant/mixer/speed?_time=[..]", consolidation="NONE")
                 recorded = [reply.json["time"] for reply in replies]

@@ -6,12 +6,12 @@ from typing import Any
 
 from gateway.northbound.republish import _SETTLE_TIME
 from tests.attacks.tcp_peer import peer
-from tests.e2e.pacing import UNLIMITED, narrow_link
+from tests.e2e.paced_link import UNLIMITED, paced_link
 from tests.e2e.processes import started, write_config
 from tests.zenoh_peer import Subscription, ZenohPeer, free_endpoint
 
 TAGS = 600
-NARROW = 30_000.0  # bytes a second: a tenth of what the values need
+NARROW = 240_000.0  # bits a second: a tenth of what the values need
 
 
 class Counters:
@@ -43,7 +43,7 @@ async def test_no_value_stays_stale_after_a_link_was_too_full(tmp_path: Path) ->
     listen = f"{endpoint}#so_sndbuf=8192"  # otherwise the system keeps 4 MB on their way
     async with (
         peer(plc.serve) as port,
-        narrow_link(int(endpoint.rpartition(":")[2])) as link,
+        paced_link(endpoint) as link,
     ):
         tags = {f"t{n}": {"address": f"holding:{n}"} for n in range(TAGS)}
         device = {"protocol": "modbus-tcp", "station": 1, "tags": tags}
@@ -51,7 +51,7 @@ async def test_no_value_stays_stale_after_a_link_was_too_full(tmp_path: Path) ->
         file = write_config(tmp_path / "c.yaml", listen, {"net": line}, defaults={"every": "200ms"})
         with await asyncio.to_thread(started, file):
             async with (
-                ZenohPeer("client", connect=[f"tcp/127.0.0.1:{link.port}"]) as client,
+                ZenohPeer("client", connect=[link.endpoint]) as client,
                 ZenohPeer("client", connect=[endpoint]) as beside,
             ):
                 received = await client.subscribe("plant/**", advanced=True)
@@ -99,16 +99,16 @@ async def test_a_link_that_flaps_does_not_publish_everything_each_time(tmp_path:
     endpoint = free_endpoint()
     file = quiet(tmp_path / "c.yaml", endpoint, 1)
     flaps = 12
-    async with narrow_link(int(endpoint.rpartition(":")[2])) as link:
+    async with paced_link(endpoint) as link:
         with await asyncio.to_thread(started, file) as program:
             async with (
                 ZenohPeer("client", connect=[endpoint]) as beside,
-                ZenohPeer("client", connect=[f"tcp/127.0.0.1:{link.port}"]),
+                ZenohPeer("client", connect=[link.endpoint]),
             ):
                 values = await beside.subscribe("plant/plc/t0")
                 for _ in range(flaps):
                     said = len(program.lines)
-                    link.cut()
+                    await link.cut()
                     await asyncio.to_thread(program.says, "Zenoh link up", after=said)
                     await asyncio.sleep(_SETTLE_TIME)  # each return alone would publish again
                 assert 0 < len(values.samples) <= 8

@@ -39,3 +39,5 @@ async def test_the_audit_trail_keeps_the_writes(tmp_path: Path) -> None:
             [suppressed] = [line for line in lines_of_trail if line["outcome"] == "suppressed"]
             assert 90 <= len(told) <= 100  # the ring of refusals in a file of this size
             assert suppressed["kinds"] == {"unknown-tag": suppressed["count"]}
+            [counters] = await client.get("plant/@gateway/demo/zenoh")
+            assert counters.json["refusals_untold"] == suppressed["count"]

@@ -26,7 +26,7 @@ async def test_a_forged_token_is_refused_and_the_gateway_goes_on(tmp_path: Path)
         tmp_path / "b.yaml",
         endpoint,
         lines,
-        gateway={**group, "standby_secret_file": str(secret)},
+        gateway={**group, "secret_file": str(secret)},
     )
     with Program(sys.executable, "-c", RUN, "run", config) as gateway:
         await asyncio.to_thread(gateway.says, "device online")
@@ -40,8 +40,8 @@ async def test_a_forged_token_is_refused_and_the_gateway_goes_on(tmp_path: Path)
             [standby] = await client.get("plant/@gateway/b/standby")
             assert (standby.json["stand"], standby.json["others_active"]) == ("active", [])
         assert not gateway.has_said("gateway replaced")
-        assert not gateway.has_said("standby_secret_file")
+        assert not gateway.has_said("secret_file")
     unsigned = write_config(tmp_path / "open.yaml", endpoint, lines, gateway=group)
     checked = await asyncio.to_thread(plc_gateway, "check", unsigned)
     assert checked.code == 0
-    assert "warning: `standby` without `standby_secret_file`" in checked.err
+    assert "warning: `standby` without `secret_file`" in checked.err

@@ -121,7 +121,7 @@ async def test_the_woken_gateway_of_a_group_does_not_write_over_the_new_active_o
     secret = tmp_path / "hall.txt"
     secret.write_text("a secret of twenty or more")
     secret.chmod(0o600)
-    group = {"standby": "hall", "standby_secret_file": str(secret)}
+    group = {"standby": "hall", "secret_file": str(secret)}
     tags = {"recipe": {"address": "holding:7", "type": "uint16", "write": True}}
     device = {"protocol": "modbus-tcp", "station": 1, "reply_timeout": "20s", "tags": tags}
     with ExitStack() as programs:

@@ -1,8 +1,8 @@
 """History in pages: whole, each sample once, over any link, and while others ask for it all."""
 
 import asyncio
-import json
 import sqlite3
+import sys
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, closing
 from pathlib import Path
@@ -40,6 +40,15 @@ def config(folder: Path, endpoint: str) -> Path:
         {"hall": {"port": "simulator", "devices": {"mixer": device}}},
         history={"path": "h.db", "keep": "3650d"},
     )
+
+
+# The command itself; the pause between two checks of the file is shorter, so that the suite is.
+RUN = """
+import gateway.history.checker as checker
+checker.READ_EVERY = 0.05
+from gateway.cli.main import main
+main()
+"""
 
 
 @asynccontextmanager
@@ -108,11 +117,27 @@ async def test_pages_have_each_sample_once_over_a_slow_link_too(tmp_path: Path) 
         assert "accept_replies" in reply.json["reason"]
 
 
+def damage(path: Path) -> None:
+    """As a flipped bit would do it."""
+    recorded(path)
+    with closing(sqlite3.connect(path)) as database, database:
+        database.execute("UPDATE sample SET value = 1235 WHERE value = 1234")
+
+
+async def test_damage_is_told_before_anybody_asks(tmp_path: Path) -> None:
+    endpoint = free_endpoint()
+    damage(tmp_path / "h.db")
+    with Program(sys.executable, "-c", RUN, "run", config(tmp_path, endpoint)) as program:
+        await asyncio.to_thread(program.says, "history damaged", "a part of run 4 is damaged")
+        async with ZenohPeer("client", connect=[endpoint]) as client:
+            await client.get_until(
+                "plant/@gateway/demo/history", lambda status: "damaged" in status["state"]
+            )
+
+
 async def test_damage_is_told_and_the_rest_is_answered(tmp_path: Path) -> None:
     endpoint, path = free_endpoint(), tmp_path / "h.db"
-    recorded(path)
-    with closing(sqlite3.connect(path)) as database, database:  # as a flipped bit would do it
-        database.execute("UPDATE sample SET value = 1235 WHERE value = 1234")
+    damage(path)
     async with (
         serving(tmp_path, endpoint) as program,
         ZenohPeer("client", connect=[endpoint]) as client,
@@ -126,5 +151,6 @@ async def test_damage_is_told_and_the_rest_is_answered(tmp_path: Path) -> None:
         end: dict[str, Any] = {}
         assert set(await pages(client, "plant/**?_time=[..];page=150", end)) == found
         await asyncio.to_thread(program.says, "history damaged")
-        [status] = await client.get("plant/@gateway/demo/history")
-        assert "damaged" in json.loads(status.payload)["state"]
+        await client.get_until(
+            "plant/@gateway/demo/history", lambda status: "damaged" in status["state"]
+        )

@@ -14,7 +14,6 @@ SECONDS = 2.0
 
 async def reads(client: ZenohPeer) -> int:
     """The reads of the fast tag so far."""
-    await asyncio.sleep(0.21)  # a status document may be that old
     [reply] = await client.get(DEVICE)
     [count] = [r["reads"] for r in reply.json["requests"] if r["every"] < 1.0]
     assert isinstance(count, int)

@@ -1,7 +1,9 @@
 """Clients behind slow links get whole answers, and keep nobody else waiting."""
 
 import asyncio
+import json
 import signal
+import sys
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -68,6 +70,34 @@ async def test_answers_over_slow_links_are_whole(tmp_path: Path) -> None:
         for link, replies in zip(links, await asyncio.gather(*map(asked, links)), strict=True):
             assert {reply.key for reply in replies} == {f"plant/mixer/{tag}" for tag in TAGS}
             assert link.connections == 1  # the link was not closed meanwhile
+
+
+# The command itself; the longest wait for a page is shorter, so that the test is.
+READ = """
+import gateway.cli.client.client as client
+import gateway.cli.client.value_pages as pages
+client.REPLY_TIMEOUT, pages.PAGE_WITHIN = 3.5, 1.0
+from gateway.cli.main import main
+main()
+"""
+
+
+async def test_our_own_client_reads_more_than_arrives_in_the_time_of_one_query(
+    tmp_path: Path,
+) -> None:
+    """10,000 values at 64 kbit/s take minutes; here it is seconds."""
+    endpoint = free_endpoint()
+    async with (
+        plant(tmp_path, endpoint),
+        paced_link(endpoint, rate=64_000) as radio,
+    ):
+        lines = {"hall": vigor_line("simulator", TAGS)}
+        far = write_config(tmp_path / "far.yaml", radio.endpoint, lines)
+        with Program(sys.executable, "-c", READ, "read", far, "--json") as read:
+            assert await asyncio.to_thread(read.ended) == 0
+            rows = [json.loads(line) for line in read.lines]
+            assert {row["tag"] for row in rows} == {f"mixer/{tag}" for tag in TAGS}
+            assert all(row["quality"] == "good" for row in rows)
 
 
 async def test_an_answer_over_a_slow_link_delays_nobody(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from gateway.cli.client import Client, Row, connected, parse_value, wanted_keys
+from gateway.cli.client import Client, Row, connected, parse_value, value_pages, wanted_keys
 from gateway.config import Config, load
 from gateway.errors import ConfigError, GatewayError
 from gateway.values import Value
@@ -138,15 +138,29 @@ def described(query: zenoh.Query) -> None:
         query.reply("plant/mixer/speed/@meta", b"{}")
 
 
-def saying(*rows: tuple[str, bytes, Mapping[str, object] | None]) -> Answer:
-    """Replies with the matching rows: tag, payload, and the attachment of a raw value."""
+def saying(
+    *rows: tuple[str, bytes, Mapping[str, object] | None], by: str = "demo", lost: int = 0
+) -> Answer:
+    """Replies with the matching rows: tag, payload, and the attachment of a raw value.
+
+    It replies in pages, as the gateway `by`. `lost`: rows that do not arrive.
+    """
 
     def answer(query: zenoh.Query) -> None:
         with query:
-            for tag, data, about in rows:
-                if query.key_expr.intersects(f"plant/{tag}"):
-                    attachment = None if about is None else json.dumps(about)
-                    query.reply(f"plant/{tag}", data, attachment=attachment)
+            found = [row for row in rows if query.key_expr.intersects(f"plant/{row[0]}")]
+            size, after = query.parameters.get("page"), query.parameters.get("after") or ""
+            places = dict(place.partition(":")[::2] for place in after.split(","))
+            first = int(places.get(by, 0))
+            page = found[first:][: None if size is None else int(size)]
+            for tag, data, about in page[lost:]:
+                attachment = None if about is None else json.dumps(about)
+                query.reply(f"plant/{tag}", data, attachment=attachment)
+            if size is not None and page:
+                end = first + len(page)
+                complete, place = end == len(found), f"{by}:{end}"
+                document = {"samples": len(page), "complete": complete, "next": place}
+                query.reply(f"plant/@gateway/{by}/page", json.dumps(document))
 
     return answer
 
@@ -169,7 +183,8 @@ def test_a_raw_text_is_shown_unchanged(config: Config, text: str) -> None:
 
 def test_two_gateways_for_one_device_are_reported_once_and_sorted_by_tag(config: Config) -> None:
     first = saying(("mixer/speed", good(1), None), ("mixer/alarms/door", good(True), None))
-    other = saying(("mixer/speed", good(2), None), ("mixer/alarms/door", good(False), None))
+    both = ("mixer/speed", good(2), None), ("mixer/alarms/door", good(False), None)
+    other = saying(*both, by="other")
     told: list[str] = []
     with (
         answering(config, {"plant/**": first, "plant/mixer/**": other}),
@@ -180,6 +195,40 @@ def test_two_gateways_for_one_device_are_reported_once_and_sorted_by_tag(config:
     assert [tag for tag, _ in rows] == ["mixer/alarms/door"] * 2 + ["mixer/speed"] * 2
     assert {value for tag, value in rows if tag == "mixer/speed"} == {1, 2}
     assert told == ["more than one gateway replies for mixer: their values may differ"]
+
+
+def test_the_pages_of_two_gateways_arrive_together(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(value_pages, "FIRST", 2)
+    monkeypatch.setattr(value_pages, "PAGE_WITHIN", 0.0)  # so that each later page has one value
+    lines = {"hall": vigor_line("simulator", {f"d{i}": {"address": f"D{i}"} for i in range(9)})}
+    many = load(write_config(tmp_path / "many.yaml", free_endpoint(), lines))
+    left, right = (
+        saying(*((f"mixer/d{i}", good(i), None) for i in numbers), by=by)
+        for by, numbers in (("left", range(3)), ("right", range(3, 9)))
+    )
+    with (
+        answering(many, {"plant/**": left, "plant/mixer/**": right}),
+        connected(many, print) as client,
+    ):
+        assert rows_of(client, "**") == [(f"mixer/d{i}", i) for i in range(9)]
+
+
+def test_values_that_did_not_arrive_are_an_error(config: Config) -> None:
+    rows = [(f"mixer/{tag}", good(1), None) for tag in ("speed", "count")]
+
+    def without_end(query: zenoh.Query) -> None:
+        with query:
+            query.reply("plant/mixer/speed", good(1))
+
+    for cut in (saying(*rows, lost=1), saying(*rows, lost=2), without_end):
+        with (
+            answering(config, {"plant/**": cut}),
+            connected(config, print) as client,
+            pytest.raises(GatewayError, match="not all values have arrived"),
+        ):
+            client.values("**")
 
 
 def test_tags_outside_the_file_are_left_out(config: Config) -> None:

@@ -1245,7 +1245,7 @@ def test_security_settings_are_files_beside_the_configuration(
     for name in ("ca.pem", "gw.pem", "gw.key", "password", "users", "writers"):
         Path(name).touch()
     config = file(
-        "gateway: {name: left, standby: hall, standby_alone: 1min, standby_secret_file: password}\n"
+        "gateway: {name: left, standby: hall, standby_alone: 1min, secret_file: password}\n"
         "writers: {file: writers}\n"
         "zenoh:\n"
         "  tls: {ca: ca.pem, certificate: gw.pem, key: gw.key, mutual: true}\n"
@@ -1267,7 +1267,7 @@ def test_security_settings_are_files_beside_the_configuration(
         Path("users"),
     )
     assert (config.standby, config.standby_alone) == ("hall", 60.0)
-    assert config.standby_secret_file == Path("password")
+    assert config.secret_file == Path("password")
     assert config.writers_file == Path("writers")
 
 
@@ -1303,7 +1303,7 @@ def test_payload_is_json_unless_tag_device_line_or_file_sets_raw(
         ("writers: {file: nowhere}", "1: writers.file: there is no file nowhere"),
         ("writers: {}", "1: writers.file: missing"),
         ("gateway: {standby_alone: 1min}", "standby_alone has no effect without standby"),
-        ("gateway: {standby_secret_file: x}", "standby_secret_file has no effect without standby"),
+        ("gateway: {secret_file: nowhere}", "1: gateway.secret_file: there is no file nowhere"),
         ("gateway: {standby: a/b}", "1: gateway.standby: 'a/b' has a `/`"),
         ("defaults: {payload: xml}", "1: defaults.payload: 'xml' is not known: use json or raw"),
     ],

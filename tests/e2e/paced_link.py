@@ -14,13 +14,17 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, field
 
+UNLIMITED = float("inf")
 _SEGMENT = 1460  # bytes
 _BUFFER = 8192
 
 
 @dataclass
 class PacedLink:
-    """One direction has `rate` bits/s. `carried` counts bytes towards the client."""
+    """One direction has `rate` bits/s; assign it at any time.
+
+    `carried` counts bytes towards the client.
+    """
 
     endpoint: str
     target: tuple[str, int]
@@ -45,16 +49,16 @@ class PacedLink:
         with suppress(ConnectionRefusedError), client, _small(socket.socket()) as server:
             await asyncio.get_running_loop().sock_connect(server, self.target)
             client.setblocking(False)
-            done, rest = await asyncio.wait(
-                [
-                    asyncio.ensure_future(self._carry(client, server, down=False)),
-                    asyncio.ensure_future(self._carry(server, client, down=True)),
-                ],
-                return_when=asyncio.FIRST_COMPLETED,
-            )
-            for direction in rest:
-                direction.cancel()
-            await asyncio.wait(done | rest)
+            directions = [
+                asyncio.ensure_future(self._carry(client, server, down=False)),
+                asyncio.ensure_future(self._carry(server, client, down=True)),
+            ]
+            try:
+                await asyncio.wait(directions, return_when=asyncio.FIRST_COMPLETED)
+            finally:  # before the sockets are closed: another one may get their numbers
+                for direction in directions:
+                    direction.cancel()
+                await asyncio.wait(directions)
 
     async def _carry(self, source: socket.socket, sink: socket.socket, *, down: bool) -> None:
         loop = asyncio.get_running_loop()
@@ -92,7 +96,7 @@ class PacedLink:
         return self.carried > 20_000
 
     async def cut(self) -> None:
-        """Ends all connections."""
+        """Ends all connections; the next one is accepted."""
         for task in list(self._tasks):
             task.cancel()
         if self._tasks:
@@ -111,7 +115,7 @@ def _small(end: socket.socket) -> socket.socket:
 
 @asynccontextmanager
 async def paced_link(
-    endpoint: str, rate: float, delay: float = 0.0, loss: float = 0.0
+    endpoint: str, rate: float = UNLIMITED, delay: float = 0.0, loss: float = 0.0
 ) -> AsyncIterator[PacedLink]:
     """`endpoint`: of the gateway or router behind the link."""
     host, _, port = endpoint.removeprefix("tcp/").rpartition(":")

@@ -8,7 +8,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
@@ -145,9 +145,13 @@ class Program:
             self._news.notify_all()
 
 
-def gateway(*arguments: object, merged: bool = True) -> Program:
-    """Starts `plc-gateway …` as a process; for `run` wait with `.says("Zenoh session ready")`."""
-    return Program(sys.executable, "-m", "gateway", *arguments, merged=merged)
+def gateway(*arguments: object, merged: bool = True, variables: Sequence[str] = ()) -> Program:
+    """Starts `plc-gateway …` as a process; for `run` wait with `.says("Zenoh session ready")`.
+
+    `variables`: of its environment, besides those of this process, as `NAME=value`.
+    """
+    by = ("env", *variables) if variables else ()
+    return Program(*by, sys.executable, "-m", "gateway", *arguments, merged=merged)
 
 
 def started(config: Path) -> Program:

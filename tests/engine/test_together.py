@@ -17,7 +17,8 @@ def busy_device() -> Device:
     return Device(replace(plain, tags=tags), WIRE)
 
 
-Answers = Callable[[Poll, int], bool]  # by the poll and its place in the transaction
+# By the poll, its place in the transaction, and the number of polls in it.
+Answers = Callable[[Poll, int, int], bool]
 
 
 def transactions(rig: Rig, seconds: float, answers: Answers) -> list[int]:
@@ -36,21 +37,23 @@ def transactions(rig: Rig, seconds: float, answers: Answers) -> list[int]:
                 polls = [job, *rig.engine.alongside(job, rig.now)]
                 sizes.append(len(polls))
                 for place, poll in enumerate(polls):
-                    rig.conclude(
-                        poll,
-                        (0,) * poll.block.span.size if answers(poll, place) else SILENCE,
-                        REPLIED if poll is polls[-1] else Traffic(),
-                        took=0.002,
-                    )
+                    is_answered = answers(poll, place, len(polls))
+                    units = (0,) * poll.block.span.size if is_answered else SILENCE
+                    traffic = REPLIED if poll is polls[-1] else Traffic()
+                    rig.conclude(poll, units, traffic, took=0.002)
     return sizes
 
 
-def first_only(poll: Poll, place: int) -> bool:
+def first_only(_poll: Poll, place: int, _of: int) -> bool:
     return place == 0
 
 
-def every_one(poll: Poll, place: int) -> bool:
+def every_one(_poll: Poll, _place: int, _of: int) -> bool:
     return True
+
+
+def alone(_poll: Poll, _place: int, of: int) -> bool:
+    return of == 1
 
 
 def reduced(rig: Rig) -> int:
@@ -83,7 +86,7 @@ def test_it_is_tried_again_after_an_hour_once() -> None:
 def test_a_block_that_is_never_answered_costs_no_window() -> None:
     rig = Rig(busy_device())
     silent = rig.device.blocks[2].span
-    sizes = transactions(rig, 20.0, lambda poll, place: poll.block.span != silent)
+    sizes = transactions(rig, 20.0, lambda poll, _place, _of: poll.block.span != silent)
     assert reduced(rig) == 0
     assert max(sizes[-50:]) == 4
 
@@ -91,7 +94,7 @@ def test_a_block_that_is_never_answered_costs_no_window() -> None:
 def test_single_losses_cost_no_window() -> None:
     rig, count = Rig(busy_device()), 0
 
-    def seldom(poll: Poll, place: int) -> bool:
+    def seldom(_poll: Poll, _place: int, _of: int) -> bool:
         nonlocal count
         count += 1
         return count % 50 != 0
@@ -105,23 +108,6 @@ def test_requests_lost_together_are_sent_alone_also_after_the_device_was_offline
     """Behind a bridge with a time-out of its own each burst made the device offline again."""
     plain = busy_device().settings
     rig = Rig(Device(replace(plain, timing=replace(plain.timing, retries=0)), WIRE))
-    sizes: list[int] = []
-    while rig.now < 60.0:
-        job = rig.next()
-        match job:
-            case Idle(until=until):
-                rig.now = until
-            case Probe():
-                rig.conclude(job, Resynced(1000))
-            case Settle():
-                rig.conclude(job, Settled(None))
-            case Poll():
-                polls = [job, *rig.engine.alongside(job, rig.now)]
-                sizes.append(len(polls))
-                for poll in polls:
-                    alone = len(polls) == 1
-                    traffic = REPLIED if poll is polls[-1] else Traffic()
-                    units = (0,) * poll.block.span.size if alone else SILENCE
-                    rig.conclude(poll, units, traffic, took=0.002)
+    sizes = transactions(rig, 60.0, alone)
     assert sum(size > 1 for size in sizes) <= 2 * PROOFS
     assert reduced(rig) == 1

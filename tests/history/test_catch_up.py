@@ -6,20 +6,20 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import AsyncIterator, Callable, Iterator, Mapping
+from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
 from gateway.config import ZenohConfig, ZenohMode
 from gateway.engine.requests import CommandResult
-from gateway.errors import Damaged
 from gateway.history import Historian
 from gateway.northbound import Northbound, payload
 from gateway.northbound.answers import HISTORY_LIMIT
-from gateway.northbound.interfaces import History, Place
+from gateway.northbound.interfaces import History
 from gateway.northbound.payload import Failure, Problem, WriteOutcome
 from gateway.tags import Reason, Sample, Tag, WriteResult, bad, good
+from gateway.tags.recorded import Recorded, RecordedQuery
 from tests.e2e.processes import Program
 from tests.history.recorded import record_outcome
 from tests.history_writer import WEEK, until
@@ -118,16 +118,8 @@ class SlowHistory:
     def samples(self, tag: Tag, time_range: str, limit: int | None, now: int) -> Iterator[Sample]:
         return self._answer(time_range, now, [good(tag, 1, PAST)])
 
-    def as_recorded(
-        self,
-        tags: Mapping[str, Tag],
-        time_range: str,
-        after: Place | None,
-        page: int | None,
-        now: int,
-        pause: Callable[[], None],
-    ) -> Iterator[tuple[Sample | Damaged | bool, Place | None]]:
-        return self._answer(time_range, now, [(True, ("0", 0, 0))])
+    def as_recorded(self, query: RecordedQuery, pause: Callable[[], None]) -> Recorded:
+        return self._answer(query.time_range, query.now, [(True, ("0", 0, 0))])
 
     def writes(self, time_range: str, limit: int | None, now: int) -> Iterator[str]:
         return self._answer(time_range, now, ["{}"])

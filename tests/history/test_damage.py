@@ -2,6 +2,7 @@
 
 import random
 import sqlite3
+import time
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -9,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from gateway.errors import Busy, Damaged
-from gateway.history import TimeRange
+from gateway.history import Historian, TimeRange, checker
 from gateway.history.file import HistoryFile
 from gateway.history.reader import Reader
 from gateway.history.recent import Recent
@@ -17,13 +18,14 @@ from gateway.history.schema import ForeignFile
 from gateway.history.search import Search
 from gateway.history.timerange import EARLIEST, LATEST
 from gateway.tags import Sample, Tag, good
+from gateway.tags.recorded import RecordedQuery
 from gateway.values import Value
 from tests.history.recorded import NOON, SECOND, history, numbered, values
-from tests.history_writer import tag
+from tests.history_writer import WEEK, tag
 
 ALWAYS = TimeRange(EARLIEST, LATEST)
 TAGS = [tag(f"t{n}") for n in range(7)]
-BY_KEY = {tag.key: tag for tag in TAGS}
+EVERYTHING = RecordedQuery({tag.key: tag for tag in TAGS}, "", None, None, 0)
 FLIPS = 60
 CONTENT: list[Value] = [1, 2.5, "text", True, 2**63, -7]
 
@@ -60,7 +62,7 @@ def answers(path: Path) -> Iterator[Answer]:
 
 def _all(search: Search) -> Answer:
     found, told = set[tuple[str, int, Value | None]](), False
-    for sample, _ in search.as_recorded(BY_KEY, ALWAYS, None, None, lambda: None):
+    for sample, _ in search.as_recorded(EVERYTHING, ALWAYS, lambda: None):
         if isinstance(sample, Damaged):
             told = True
         elif not isinstance(sample, bool):
@@ -104,13 +106,18 @@ def test_a_flipped_bit_is_told_or_harmless(tmp_path: Path) -> None:
     assert told_of > FLIPS / 4
 
 
+DAMAGED_RUN = [
+    "UPDATE run SET last = first WHERE run = 2",
+    "DELETE FROM run WHERE run = 2",
+    "DELETE FROM section WHERE run = 2 AND number = 1",
+    "DELETE FROM sample WHERE run = 2 AND n = 7",
+]
+
+
 @pytest.mark.parametrize(
     "damage",
     [
-        "UPDATE run SET last = first WHERE run = 2",
-        "DELETE FROM run WHERE run = 2",
-        "DELETE FROM section WHERE run = 2 AND number = 1",
-        "DELETE FROM sample WHERE run = 2 AND n = 7",
+        *DAMAGED_RUN,
         "UPDATE tag SET key = 'mixer/other' WHERE id = 3",
         "DELETE FROM tag WHERE id = 7",
     ],
@@ -123,6 +130,27 @@ def test_a_lost_or_changed_row_of_any_table_is_told(tmp_path: Path, damage: str)
     for found, told in answers(path):
         assert told
         assert found < expected
+
+
+@pytest.mark.parametrize("damage", DAMAGED_RUN)
+def test_damage_of_a_run_is_known_without_a_query(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, damage: str
+) -> None:
+    monkeypatch.setattr(checker, "READ_EVERY", 0.01)
+    path = tmp_path / "h.db"
+    recorded(path)
+    with closing(sqlite3.connect(path)) as database, database:
+        database.execute(damage)
+    historian = Historian(path, WEEK, 10**8)
+    historian.start()
+    try:
+        for _ in range(1000):
+            if "damaged" in str(historian.document()["state"]):
+                break
+            time.sleep(0.01)
+        assert "samples between" in str(historian.document()["state"])
+    finally:
+        assert historian.close(10)
 
 
 def test_a_page_that_cannot_be_read_costs_only_its_samples(tmp_path: Path) -> None:

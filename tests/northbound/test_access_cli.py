@@ -152,16 +152,6 @@ def test_at_a_router_the_user_of_the_gateway_may_check_its_health_only(
         assert "may gateway query it?" in done.err
 
 
-def test_with_mutual_tls_the_command_line_uses_the_certificate_of_the_gateway(
-    tmp_path: Path,
-) -> None:
-    certificate, key = certificates(tmp_path)("gateway")
-    own = {"ca": "ca.pem", "certificate": certificate.name, "key": key.name, "mutual": True}
-    path = plant_file(tmp_path, listen=[tls_endpoint()], tls=own)
-    with started(path):
-        assert typed(None, "health", path).code == 0
-
-
 def test_without_mutual_tls_the_command_line_does_not_read_the_private_key(tmp_path: Path) -> None:
     with closed_by_itself(tmp_path) as path:
         (tmp_path / "gateway.key").write_text("not for the command line")

@@ -6,11 +6,11 @@ from structlog.testing import capture_logs
 from gateway.northbound.election import Role, RoleToken
 from gateway.northbound.group_tokens import GroupTokens
 from gateway.northbound.keys import Keys
+from gateway.northbound.plant_secret import PlantSecret
 
 ACTIVE = RoleToken(Role.ACTIVE, "a", "5e55")
-LEFT, RIGHT = (
-    GroupTokens(Keys("plant", name), "hall", "a secret of twenty or more") for name in ("a", "b")
-)
+SECRET = PlantSecret("a secret of twenty or more")
+LEFT, RIGHT = (GroupTokens(Keys("plant", name), "hall", SECRET) for name in ("a", "b"))
 
 
 def test_a_gateway_of_the_group_knows_the_tokens_of_the_other() -> None:
@@ -27,9 +27,7 @@ def test_a_gateway_of_the_group_knows_the_tokens_of_the_other() -> None:
         LEFT.key(ACTIVE._replace(name="b")).replace("/b/", "/a/"),
         LEFT.key(ACTIVE._replace(session="0")).replace("/0/", "/5e55/"),
         LEFT.key(ACTIVE) + "/more",
-        GroupTokens(Keys("plant", "a"), "yard", "a secret of twenty or more")
-        .key(ACTIVE)
-        .replace("yard", "hall"),
+        GroupTokens(Keys("plant", "a"), "yard", SECRET).key(ACTIVE).replace("yard", "hall"),
         "plant/@standby/hall/king/a/5e55",
         "plant/@standby/hall/active",
     ],
@@ -48,7 +46,7 @@ def test_without_a_secret_every_token_of_the_group_counts() -> None:
 
 
 def test_a_flood_of_forged_tokens_is_logged_a_few_times() -> None:
-    tokens = GroupTokens(Keys("plant", "b"), "hall", "a secret of twenty or more")
+    tokens = GroupTokens(Keys("plant", "b"), "hall", SECRET)
     with capture_logs() as logs:
         for number in range(1000):
             assert tokens.parse(f"plant/@standby/hall/active/a/{number}", 0.0) is None

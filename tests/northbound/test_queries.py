@@ -83,7 +83,7 @@ async def test_status_is_answered_and_published() -> None:
         assert reply.json == {"load": 0.5}
         received = await client.subscribe("plant/@gateway/*/status")
         status = (await received.next(lambda _: True)).json
-        assert status == {"state": "running", "refused_devices": {}}
+        assert status == {"state": "running", "refused_devices": {}, "refused_claims": []}
         [claimed] = await client.get(claim)
         assert claimed.json["devices"] == ["mixer", "oven"]
 

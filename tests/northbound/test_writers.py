@@ -5,19 +5,19 @@ import re
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from gateway.config import ZenohConfig
-from gateway.errors import ConfigError, Damaged
+from gateway.errors import ConfigError
 from gateway.northbound import Northbound
-from gateway.northbound.interfaces import Place
 from gateway.northbound.signatures import sign
 from gateway.northbound.writers import EARLIEST, LATEST, NotAllowed, Repeated, Writers
 from gateway.tags import Sample, Tag
+from gateway.tags.recorded import Recorded, RecordedQuery
 from gateway.tags.timestamps import rfc3339
 from tests.northbound.access import PAGE, secret
 from tests.northbound.plant import mixer, running, until
@@ -37,15 +37,7 @@ class RecordedWrites:
     def samples(self, tag: Tag, time_range: str, limit: int | None, now: int) -> Iterator[Sample]:
         raise NotImplementedError
 
-    def as_recorded(
-        self,
-        tags: Mapping[str, Tag],
-        time_range: str,
-        after: Place | None,
-        page: int | None,
-        now: int,
-        pause: Callable[[], None],
-    ) -> Iterator[tuple[Sample | Damaged | bool, Place | None]]:
+    def as_recorded(self, query: RecordedQuery, pause: Callable[[], None]) -> Recorded:
         raise NotImplementedError
 
     def writes(self, time_range: str, limit: int | None, now: int) -> Iterator[str]:

@@ -1,8 +1,9 @@
 """The client of a running gateway, over Zenoh."""
 
 from gateway.cli.client.arguments import matches, parse_value, tags_by_key, wanted_keys
-from gateway.cli.client.client import Client, Row
+from gateway.cli.client.client import Client
 from gateway.cli.client.connection import connected
+from gateway.cli.client.rows import Row
 
 __all__ = [
     "Client",

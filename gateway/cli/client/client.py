@@ -1,38 +1,29 @@
 """The client of a running gateway: reads, writes, follows."""
 
 import json
-import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, suppress
 from functools import partial
 from itertools import pairwise
 from queue import SimpleQueue
-from typing import NamedTuple
+from typing import Any
 
 import orjson
 import zenoh
 
-from gateway.cli.client.arguments import matches, parse_value, tags_by_key
+from gateway.cli.client.arguments import matches, tags_by_key
+from gateway.cli.client.rows import Row, document, raw, reason, without_gateway
 from gateway.cli.client.signing import signature
-from gateway.cli.terminal import printable
+from gateway.cli.client.value_pages import paged
 from gateway.config import Config
 from gateway.config.commands import TO_ALL
 from gateway.errors import GatewayError
 from gateway.northbound.keys import Keys
-from gateway.tags import Tag
-from gateway.tags.timestamps import rfc3339
-from gateway.values import Kind, Value
+from gateway.values import Value
 
 REPLY_TIMEOUT = 10.0  # seconds
 _CHANGED = "does the gateway run with the current version of this file?"
 _LONGEST_LIST = 10  # tags in one sentence
-
-
-class Row(NamedTuple):
-    """A sample to print: `document` is the decoded payload."""
-
-    tag: str  # device/name
-    document: dict[str, object]
 
 
 class Client:
@@ -71,13 +62,13 @@ class Client:
         The key expression has no prefix. When two gateways reply for a device, the result has
         both values of each tag, and `tell` gets a warning.
         """
-        selector = self._keys.value(wanted) + (f"?max_age={max_age}" if max_age else "")
-        found = []
-        for reply in self._query(selector):
-            if reply.err is not None:
-                raise GatewayError(_reason(reply.err.payload.to_bytes()))
-            if reply.ok is not None and (row := self._row(reply.ok)) is not None:
-                found.append(row)
+        key = self._keys.value(wanted)
+        if "*" in wanted and not max_age:
+            samples = paged(self._answers, key)
+        else:
+            replies = self._answers(f"{key}?max_age={max_age}" if max_age else key)
+            samples = (reply.ok for reply in replies if reply.ok is not None)
+        found = [row for sample in samples if (row := self._row(sample)) is not None]
         found.sort(key=lambda row: row.tag)
         self._report_duplicates(found)
         return found
@@ -96,8 +87,27 @@ class Client:
         """Returns `status`, `lines/<line>` or `devices/<device>` of the gateway."""
         for reply in self._query(self._keys.status(path)):
             if reply.ok is not None:
-                return _document(reply.ok.payload.to_bytes())
+                return document(reply.ok.payload.to_bytes())
         raise GatewayError(self.no_reply)
+
+    def documents(self) -> dict[str, dict[str, Any]]:
+        """Returns all status documents by path: `status`, `lines/<line>`, `devices/<device>`."""
+        stem = self._keys.status("")
+        found = {
+            str(reply.ok.key_expr).removeprefix(stem): document(reply.ok.payload.to_bytes())
+            for reply in self._query(self._keys.statuses)
+            if reply.ok is not None
+        }
+        if "status" not in found:
+            raise GatewayError(self.no_reply)
+        return found
+
+    def outcomes(self, since: str) -> list[dict[str, Any]] | None:
+        """Returns the outcomes of writes since a time as in `_time`; None without history."""
+        replies = self._query(f"{self._keys.writes}?_time=[{since}..]")
+        if any(reply.err is not None for reply in replies):
+            return None
+        return [document(reply.ok.payload.to_bytes()) for reply in replies if reply.ok is not None]
 
     def write(self, tag: str, value: Value) -> dict[str, object]:
         """Returns the outcome as the gateway sends it: `value ...` or `error ...`.
@@ -117,8 +127,8 @@ class Client:
         return self._request(key, argument.encode(), self._tags_of(device))
 
     def _tags_of(self, device: str) -> str:
-        """The descriptions of a device: only its gateway replies."""
-        return self._keys.meta(f"{device}/**")
+        """One description of a device: only its gateway replies."""
+        return self._keys.meta(f"{device}/**") + "?page=1"
 
     def follow(self, wanted: list[str]) -> Generator[Row, None, None]:
         """Yields the current values, then every change, without end.
@@ -158,7 +168,7 @@ class Client:
                 present = bool(rows)
                 lost = known.difference(row.tag for row in rows)
                 known -= lost
-                yield from map(_without_gateway, sorted(lost))
+                yield from map(without_gateway, sorted(lost))
 
     def _all(self, wanted: list[str]) -> list[Row]:
         return [row for key in wanted for row in self.values(key)]
@@ -175,7 +185,7 @@ class Client:
 
         def unpacked(tags: dict[str, str], sample: zenoh.Sample) -> None:
             with suppress(orjson.JSONDecodeError):
-                for name, known in _document(sample.payload.to_bytes()).items():
+                for name, known in document(sample.payload.to_bytes()).items():
                     if name in tags and isinstance(known, dict):
                         put(Row(tags[name], known))
 
@@ -218,11 +228,22 @@ class Client:
             self._session.info.declare_transport_events_listener(link),
         )
 
+    def _answers(self, selector: str) -> list[zenoh.Reply]:
+        """Raises `GatewayError` for an error reply too."""
+        replies = self._query(selector)
+        for reply in replies:
+            if reply.err is not None:
+                raise GatewayError(reason(reply.err.payload.to_bytes()))
+        return replies
+
     def _query(self, selector: str) -> list[zenoh.Reply]:
         try:
             return list(
                 self._session.get(
-                    selector, timeout=REPLY_TIMEOUT, consolidation=zenoh.ConsolidationMode.NONE
+                    selector,
+                    timeout=REPLY_TIMEOUT,
+                    consolidation=zenoh.ConsolidationMode.NONE,
+                    accept_replies=zenoh.ReplyKeyExpr.ANY,  # the end of a page has its own key
                 )
             )
         except zenoh.ZError as error:
@@ -246,16 +267,16 @@ class Client:
                 answer = reply.ok or reply.err
                 with suppress(orjson.JSONDecodeError):  # Zenoh's own `Timeout` is not JSON
                     if answer is not None:
-                        return _document(answer.payload.to_bytes())
+                        return document(answer.payload.to_bytes())
         raise GatewayError(f"{key}: no reply: it is unknown whether it was done")
 
     def _row(self, sample: zenoh.Sample) -> Row | None:
         tag = self._tags.get(self._keys.tag(str(sample.key_expr)) or "")
         with suppress(orjson.JSONDecodeError):
             if tag is not None and sample.attachment is not None:
-                return Row(tag.key, _raw(tag, sample, sample.attachment.to_bytes()))
+                return Row(tag.key, raw(tag, sample, sample.attachment.to_bytes()))
             if tag is not None and sample.kind == zenoh.SampleKind.PUT:
-                return Row(tag.key, _document(sample.payload.to_bytes()))
+                return Row(tag.key, document(sample.payload.to_bytes()))
         return None
 
     def _report_duplicates(self, rows: list[Row]) -> None:
@@ -268,29 +289,3 @@ class Client:
         for device in sorted(duplicated - self._duplicated):
             self._tell(f"more than one gateway replies for {device}: their values may differ")
         self._duplicated |= duplicated
-
-
-def _without_gateway(tag: str) -> Row:
-    """Returns the row of a tag after its gateway was lost."""
-    now = rfc3339(time.time_ns())
-    return Row(tag, {"value": None, "quality": "bad", "reason": "no-gateway", "time": now})
-
-
-def _raw(tag: Tag, sample: zenoh.Sample, about: bytes) -> dict[str, object]:
-    """Returns the document of a tag with `payload: raw` in the form of the other tags."""
-    value: Value | None = None
-    if sample.kind == zenoh.SampleKind.PUT:
-        text = sample.payload.to_bytes().decode("utf-8", "replace")
-        value = text if tag.layout.type.kind is Kind.STRING else parse_value(text)
-    return {"value": value, **_document(about)}
-
-
-def _document(data: bytes) -> dict[str, object]:
-    found = orjson.loads(data)
-    return found if isinstance(found, dict) else {"value": found}
-
-
-def _reason(data: bytes) -> str:
-    with suppress(orjson.JSONDecodeError):
-        return printable(str(_document(data).get("reason", data.decode("utf-8", "replace"))))
-    return printable(data.decode("utf-8", "replace"))

@@ -1,0 +1,49 @@
+"""Status documents: those of now, however many clients query them."""
+
+import asyncio
+import json
+import time
+from collections.abc import Mapping
+
+from gateway.northbound.audit import Audit
+from gateway.northbound.keys import Keys
+from gateway.northbound.losses import Losses
+from gateway.northbound.publisher import Publisher
+from gateway.northbound.status_publisher import StatusPublisher
+
+KEYS = Keys("plant", "demo")
+
+
+class Plant:
+    """Counts how often its state was collected, which takes `seconds`."""
+
+    def __init__(self, seconds: float = 0.0) -> None:
+        self.state = self.collected = 0
+        self._seconds = seconds
+
+    def collect(self) -> Mapping[str, Mapping[str, object]]:
+        self.collected += 1
+        until = time.monotonic() + self._seconds
+        while time.monotonic() < until:
+            pass
+        return {"status": {"state": self.state}}
+
+
+def published(plant: Plant) -> StatusPublisher:
+    publisher = Publisher(KEYS, Losses(0.05))
+    return StatusPublisher(KEYS, plant.collect, publisher, Audit(lambda _: None), 5.0)
+
+
+async def test_a_query_is_answered_with_the_state_of_now() -> None:
+    plant = Plant()
+    status = published(plant)
+    for plant.state in range(20):
+        found = await status.documents()
+        assert json.loads(found["plant/@gateway/demo/status"]) == {"state": plant.state}
+
+
+async def test_many_queries_at_once_cost_two_collections() -> None:
+    plant = Plant(0.002)
+    status = published(plant)
+    await asyncio.gather(*(status.documents() for _ in range(500)))
+    assert plant.collected == 2
