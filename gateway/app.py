@@ -2,67 +2,43 @@
 
 import asyncio
 import time
-from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import NamedTuple, Protocol
 
 from gateway import __version__
 from gateway.config import Config, LineConfig
 from gateway.config.commands import check_command, every_command, speaker
 from gateway.engine.device import Device, DeviceSettings
-from gateway.engine.engine import Engine
 from gateway.engine.forecast import LineForecast, forecast
 from gateway.engine.jobs import Poll
 from gateway.engine.requests import WRITE_EXPIRY, CommandResult
 from gateway.errors import Busy, Offline
+from gateway.line.build import OpenPort, line_of, opener
 from gateway.line.duty import Duty
-from gateway.line.line import Line, SampleSink
+from gateway.line.line import Line
 from gateway.northbound.status import Document, device_document, line_document, standing
-from gateway.simulator.plant import station_for
-from gateway.simulator.port import open_simulator
 from gateway.tags import Quality, Reason, Sample, Tag, WriteResult, bad
 from gateway.tags.mirror import Mirror
 from gateway.tags.timestamps import rfc3339
-from gateway.transport import Port, Receiver, SimulatorAddress, open_port
 from gateway.values import Value
 
 FRESH_WITHIN = 5.0  # seconds that a client waits for a read on demand
-OpenPort = Callable[[Receiver], Awaitable[Port]]
 
 
-def opener(line: LineConfig) -> OpenPort:
-    """Returns a function that opens the port of the line, or its simulated devices in memory."""
-    if isinstance(line.port, SimulatorAddress):
-        stations = [station_for(device.driver, device.tags) for device in line.devices]
-        return lambda receiver: open_simulator(stations, line.wire, receiver)
-    return lambda receiver: open_port(line.port, line.serial, receiver)
+def forecasts(
+    config: Config, report: Callable[[str, float], None] | None = None
+) -> list[LineForecast]:
+    """Calculates the load and the worst ages of each line of the file.
 
-
-def line_of(
-    config: LineConfig,
-    devices: Sequence[DeviceSettings],
-    sink: SampleSink,
-    *,
-    open_port: OpenPort | None = None,
-    wall: Callable[[], int] = time.time_ns,
-    seed: int = 0,
-    duty: Duty | None = None,
-) -> Line:
-    """Makes a line with some or all of its devices. `wall`: ns since 1970."""
-    engine = Engine(config.name, [Device(one, config.wire) for one in devices], config.wire, seed)
-    opens = open_port or opener(config)
-    return Line(engine, opens, sink, echo=config.echo, wall=wall, seed=seed, duty=duty)
-
-
-def forecasts(config: Config) -> list[LineForecast]:
-    """Calculates the load and the worst ages of each line of the file."""
-    return [
-        forecast(
-            line.name,
-            [Device(device, line.wire) for device in line.devices if device.enabled],
-            line.wire,
-        )
-        for line in config.lines
-    ]
+    `report` receives the name of this step and the share of it that is done.
+    """
+    found = []
+    for line in config.lines:
+        devices = [Device(device, line.wire) for device in line.devices if device.enabled]
+        found.append(forecast(line.name, devices, line.wire))
+        if report is not None:
+            report("planning the requests", len(found) / len(config.lines))
+    return found
 
 
 class Subscriber(Protocol):
@@ -89,8 +65,13 @@ class Gateway:
         wall: Callable[[], int] = time.time_ns,
         open_line: Callable[[LineConfig], OpenPort] = opener,
         duty: Duty | None = None,
+        *,
+        plan_now: bool = True,
     ) -> None:
-        """`wall`: nanoseconds since 1970. `open_line`: returns the opener of a line's port."""
+        """`wall`: nanoseconds since 1970. `open_line`: returns the opener of a line's port.
+
+        Without `plan_now` each line needs `plan` and `planned` before it runs.
+        """
         self.config = config
         self.duty = duty or Duty()
         self.mirror = Mirror((tag for device in config.devices for tag in device.tags), wall())
@@ -105,6 +86,9 @@ class Gateway:
         self._waiting: dict[Tag, list[_Reader]] = {}
         for seed, line in enumerate(config.lines):
             self._add_line(line, open_line(line), seed)
+        if plan_now:
+            for made in self.lines:
+                self.planned(made, self.plan(made))
         for device in config.devices:
             if not device.enabled:
                 self.mirror.update(bad(tag, Reason.DISABLED, wall()) for tag in device.tags)
@@ -119,12 +103,25 @@ class Gateway:
             wall=self._wall,
             seed=seed,
             duty=self.duty,
+            plan_now=False,
         )
         self.lines.append(line)
-        engine = line.engine
-        self._forecasts[config.name] = forecast(config.name, engine.devices, config.wire)
-        for device in engine.devices:
+        for device in line.engine.devices:
             self._places[device.name] = (line, device)
+
+    @staticmethod
+    def plan(line: Line) -> LineForecast:
+        """Plans the devices of a line. A thread may do it before `planned`: it takes long."""
+        engine = line.engine
+        for device in engine.devices:
+            device.plan()
+        return forecast(engine.name, engine.devices, engine.wire)
+
+    def planned(self, line: Line, expected: LineForecast) -> None:
+        """Takes over the plans of a line: it may run now."""
+        self._forecasts[line.engine.name] = expected
+        for device in line.engine.devices:
+            line.engine.schedule.plan(device, 0.0)
 
     def subscribe(self, subscriber: Subscriber) -> None:
         """Adds a subscriber. It receives each sample after the earlier subscribers."""
@@ -278,7 +275,8 @@ class Gateway:
         }
         for line in self.lines:
             engine = line.engine
-            expected = self._forecasts[engine.name]
+            if (expected := self._forecasts.get(engine.name)) is None:
+                continue  # not planned yet
             documents[f"lines/{engine.name}"] = line_document(engine, expected, now)
         for name, (line, device) in self._places.items():
             polls = line.engine.schedule.polls(device)

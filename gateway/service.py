@@ -18,7 +18,9 @@ from gateway.history import Historian
 from gateway.history.state_file import StateFile
 from gateway.line.arrival import ArrivalClock
 from gateway.line.duty import Duty
+from gateway.line.line import Line
 from gateway.northbound import Northbound, group_settings
+from gateway.northbound.session import off_loop
 from gateway.tags import Sample
 
 log = structlog.get_logger("gateway")
@@ -72,7 +74,7 @@ async def _serve(
     config = file.without(withheld)
     clock = ArrivalClock()
     duty = Duty(clock.released, shared=config.standby is not None)
-    gateway = Gateway(config, clock, duty=duty)
+    gateway = Gateway(config, clock, duty=duty, plan_now=False)
     gc.collect()
     gc.freeze()  # tags live as long as the gateway: each collection skips them
     history = _history(config)
@@ -88,6 +90,7 @@ async def _serve(
     async with AsyncExitStack() as cleanup:  # in reverse order of the start
         clock.start()
         cleanup.callback(clock.stop)
+        plans = _plan_lines(gateway, cleanup)
         zenoh = asyncio.create_task(northbound.run(), name="zenoh")
         cleanup.push_async_callback(_close, zenoh, history, state_file)
         exclusive, active, opened, replaced, stopping = events = [
@@ -109,7 +112,7 @@ async def _serve(
                 history.start()
             await _first(active, zenoh, stopping, replaced)
             if active.done():
-                lines = await _start_lines(gateway, history, state_file, cleanup)
+                lines = await _start_lines(gateway, plans, history, state_file, cleanup)
         await _first(opened, zenoh, stopping, replaced)
         if opened.done():
             started()
@@ -137,8 +140,27 @@ def _northbound(config: Config, gateway: Gateway, history: Historian | None) -> 
     )
 
 
+def _plan_lines(gateway: Gateway, cleanup: AsyncExitStack) -> list[asyncio.Task[None]]:
+    """Plans the lines one after another, beside the event loop: each may run once it is planned."""
+    turn = asyncio.Lock()
+
+    async def plan(line: Line) -> None:
+        async with turn:
+            gateway.planned(line, await off_loop(gateway.plan, line))
+
+    plans = [asyncio.create_task(plan(line), name="plan") for line in gateway.lines]
+    cleanup.push_async_callback(_end, plans)
+    return plans
+
+
+async def _run_planned(line: Line, plan: asyncio.Task[None]) -> None:
+    await plan
+    await line.run()
+
+
 async def _start_lines(
     gateway: Gateway,
+    plans: Sequence[asyncio.Task[None]],
     history: Historian | None,
     state_file: StateFile | None,
     cleanup: AsyncExitStack,
@@ -147,7 +169,10 @@ async def _start_lines(
         history.record(gateway.mirror.samples())  # "starting" marks the restart
     if state_file is not None:
         await cleanup.enter_async_context(_saved(state_file, gateway))
-    lines = [asyncio.create_task(line.run(), name=line.engine.name) for line in gateway.lines]
+    lines = [
+        asyncio.create_task(_run_planned(line, plan), name=line.engine.name)
+        for line, plan in zip(gateway.lines, plans, strict=True)
+    ]
     cleanup.push_async_callback(_end, lines)  # first, so that the last outcomes are published
     return lines
 

@@ -89,6 +89,26 @@ def test_before_the_lines_run_every_tag_is_starting(tmp_path: Path) -> None:
     assert watched.gateway.tag("mixer/missing") is None
 
 
+async def test_a_line_that_is_not_planned_refuses_writes(
+    tmp_path: Path,
+) -> None:
+    lines = {"hall": vigor_line("simulator", TAGS)}
+    path = write_config(tmp_path / "c.yaml", "tcp/127.0.0.1:7447", lines)
+    watched = Watched(Gateway(load(path), plan_now=False))
+    gateway, recipe = watched.gateway, tag(watched, "recipe")
+    with pytest.raises(LineDown, match="line hall is not open"):
+        await gateway.write(recipe, 7)
+    assert (await gateway.fresh(recipe, 0.0)).reason is Reason.STARTING
+    assert {"status", "devices/mixer"} <= gateway.status().keys()
+    assert "lines/hall" not in gateway.status()
+    [line] = gateway.lines
+    gateway.planned(line, gateway.plan(line))
+    assert "lines/hall" in gateway.status()
+    async with running(watched):
+        await watched.until_good("mixer/recipe")
+        assert (await gateway.write(recipe, 7)).acknowledged
+
+
 async def test_values_are_published_and_kept(tmp_path: Path) -> None:
     async with running(made(tmp_path)) as watched:
         await watched.until_good(*(f"mixer/{name}" for name in TAGS))

@@ -9,6 +9,7 @@ from rich.table import Table
 from rich.text import Text
 
 from gateway import app, northbound
+from gateway.cli.progress import progress
 from gateway.cli.terminal import ConfigPath, err, out
 from gateway.config import Config, load
 from gateway.engine.forecast import LineForecast
@@ -24,9 +25,10 @@ def check(
     ] = None,
 ) -> None:
     """Validate the file and print the plan of each line. Sends nothing."""
-    loaded = load(config)
-    warnings = northbound.check(loaded)
-    lines = app.forecasts(loaded)
+    with progress(err) as report:
+        loaded = load(config, report)
+        warnings = northbound.check(loaded)
+        lines = app.forecasts(loaded, report)
     few = sum(len(line.blocks) for line in lines) <= 100
     out.print(plan(lines, every_block=few if blocks is None else blocks))
     for tag in (tag for device in loaded.devices for tag in device.tags):

@@ -7,13 +7,13 @@ from collections.abc import Set as AbstractSet
 from contextlib import asynccontextmanager, suppress
 from dataclasses import replace
 
-from gateway import app
 from gateway.config import Config, LineConfig
 from gateway.config.commands import check_command, line_of
 from gateway.engine.device import Device
 from gateway.engine.requests import CommandResult
 from gateway.engine.unsolicited import unsolicited_tags
 from gateway.errors import BadValue, LineDown
+from gateway.line import build
 from gateway.line.line import Line
 from gateway.tags import Reason, Sample, Tag, WriteResult, bad
 from gateway.values import Value
@@ -115,7 +115,7 @@ def _line(config: LineConfig, devices: Collection[str], tags: Sequence[Tag], onc
         for device in config.devices
         if device.name in devices
     ]
-    return app.line_of(config, chosen, once)
+    return build.line_of(config, chosen, once)
 
 
 @asynccontextmanager

@@ -11,10 +11,8 @@ from typing import Annotated, NoReturn
 import typer
 
 from gateway import __version__
-from gateway.cli import check, control, read, run, scan_command, simulate, watch, write
-from gateway.cli.client import connected
-from gateway.cli.terminal import FAILED, USER_MISTAKE, ConfigPath, end, err
-from gateway.config import load
+from gateway.cli import check, control, read, run, scan_command, simulate, status, watch, write
+from gateway.cli.terminal import FAILED, USER_MISTAKE, end
 from gateway.config import schema as config_schema
 from gateway.errors import BadValue, ConfigError, GatewayError
 
@@ -89,13 +87,8 @@ cli.command(context_settings={"ignore_unknown_options": True})(control.control)
 cli.command()(watch.watch)
 cli.command()(scan_command.scan)
 cli.command()(simulate.simulate)
-
-
-@cli.command()
-def health(config: ConfigPath) -> None:
-    """Print the status of the running gateway. Exit code 0 if it replies (for containers)."""
-    with connected(load(config), err.print) as client:
-        print(json.dumps(client.status()))
+cli.command()(status.status)
+cli.command()(status.health)
 
 
 @cli.command()

@@ -12,7 +12,8 @@ import typer
 from gateway import service
 from gateway.cli.check import size
 from gateway.cli.logs import LogFormat, LogLevel, set_up
-from gateway.cli.terminal import ConfigPath
+from gateway.cli.progress import progress
+from gateway.cli.terminal import ConfigPath, err
 from gateway.config import Config, load
 from gateway.tags import Tag, WriteRule
 from gateway.transport.loop import new_event_loop
@@ -27,7 +28,8 @@ def run(
     log_level: Annotated[LogLevel, typer.Option(help="debug shows every byte")] = LogLevel.INFO,
 ) -> None:
     """Run the service: poll, publish on Zenoh, accept writes. SIGTERM or Ctrl-C ends it."""
-    loaded = load(config)
+    with progress(err) as report:
+        loaded = load(config, report)
     say = set_up(log_format, log_level)
     hint = next_steps(loaded, config, program())
     with asyncio.Runner(loop_factory=new_event_loop) as runner:

@@ -1,8 +1,9 @@
 """The configuration: one YAML file, checked as a whole, every mistake named with its line."""
 
 import gc
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 from gateway.config.build import Builder
@@ -37,14 +38,17 @@ __all__ = [
 _TEXTS = frozenset({"address", "description", "format", "name", "port", "prefix", "unit"})
 
 
-def load(path: str | Path) -> Config:
+def load(path: str | Path, report: Callable[[str, float], None] | None = None) -> Config:
     """Reads and checks the file. Paths in it are relative to its folder.
 
-    Raises `ConfigErrors` with every mistake.
+    `report` receives the name of each step and the share of it that is done. Raises `ConfigErrors`
+    with every mistake.
     """
+    read = None if report is None else partial(report, f"reading {Path(path).name}")
+    checked = None if report is None else partial(report, "checking the tags")
     with _without_gc():
-        file, mistakes = read_yaml(Path(path), _TEXTS)
-        config = Builder(mistakes, Path(path).parent).config(file.data)
+        file, mistakes = read_yaml(Path(path), _TEXTS, read)
+        config = Builder(mistakes, Path(path).parent, checked).config(file.data)
         if config is not None:
             check_files(config, Path(path), mistakes)
     mistakes.raise_all()

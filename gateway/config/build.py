@@ -1,13 +1,13 @@
 """Builds the configuration from the data of the file, and notes every mistake."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from os.path import realpath
 from pathlib import Path as FilePath
 from typing import Any
 
 from gateway.config import parsers
-from gateway.config.field_rules import field_tag
+from gateway.config.device_tags import DeviceTags, mapping
 from gateway.config.line_rules import check_line, line_wire
 from gateway.config.messages import Mistakes, Path, meant, shown
 from gateway.config.model import (
@@ -15,7 +15,6 @@ from gateway.config.model import (
     FileSection,
     LineSection,
     TagDefaults,
-    TagSection,
 )
 from gateway.config.records import (
     Config,
@@ -26,7 +25,7 @@ from gateway.config.records import (
     ZenohConfig,
     ZenohMode,
 )
-from gateway.config.tag_rules import TagSource, build_tag, inherit
+from gateway.config.tag_rules import inherit
 from gateway.config.validate import (
     driver_of,
     driver_settings,
@@ -38,8 +37,6 @@ from gateway.engine.device import DeviceSettings
 from gateway.errors import ConfigError
 from gateway.protocols.driver import AnyDriver, Timing
 from gateway.protocols.registry import PROTOCOLS
-from gateway.protocols.typed_fields import TypedFields
-from gateway.tags import Tag
 
 
 @dataclass(slots=True)
@@ -48,8 +45,13 @@ class Builder:
 
     mistakes: Mistakes
     folder: FilePath
+    report: Callable[[float], None] | None = None  # receives the share of the devices that is built
     _devices: dict[str, str] = field(default_factory=dict)  # name -> its line
-    _recorded: Path | None = None  # of the first tag with `history: true`
+    _count: int = 0  # devices in the file
+    _tags: DeviceTags = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._tags = DeviceTags(self.mistakes)
 
     def config(self, data: Mapping[str, Any]) -> Config | None:
         """Returns the whole file; None, after mistakes, where no part could be made."""
@@ -57,7 +59,8 @@ class Builder:
         raw_lines = data.get("lines")
         defaults = self._defaults(data, (), TagDefaults())
         lines = []
-        for name, raw in _mapping(raw_lines):
+        self._count = sum(len(mapping(_devices_of(raw))) for _, raw in mapping(raw_lines))
+        for name, raw in mapping(raw_lines):
             path: Path = ("lines", name)
             line = self._line(self._name(name, path), raw, path, defaults)
             if line is not None:
@@ -87,7 +90,7 @@ class Builder:
             return None
         defaults = self._defaults(raw, path, outer)
         devices = []
-        for device_name, raw_device in _mapping(raw.get("devices")):
+        for device_name, raw_device in mapping(raw.get("devices")):
             place: Path = (*path, "devices", device_name)
             checked = self._name(device_name, place)
             if checked in self._devices:
@@ -100,6 +103,8 @@ class Builder:
             device = self._device(checked, raw_device, place, defaults)
             if device is not None:
                 devices.append(device)
+            if self.report is not None:
+                self.report(len(self._devices) / self._count)
         if raw.get("devices") == {}:
             self.mistakes.add((*path, "devices"), "no devices: a line has at least one")
         if line is None:
@@ -126,7 +131,7 @@ class Builder:
         settings = section(DeviceSection, common, path, self.mistakes, "a device")
         driver = self._driver(raw.get("protocol"), own, path)
         defaults = self._defaults(raw, path, outer)
-        tags = tuple(self._tags(name, raw.get("tags"), (*path, "tags"), defaults, driver))
+        tags = self._tags.build(name, raw.get("tags"), (*path, "tags"), defaults, driver)
         if settings is None or driver is None:
             return None
         default = driver.timing
@@ -167,35 +172,6 @@ class Builder:
             protocol, {k: v for k, v in own.items() if k in known}, path, self.mistakes
         )
 
-    def _tags(
-        self,
-        device: str,
-        raw_tags: object,
-        path: Path,
-        defaults: TagDefaults,
-        driver: AnyDriver | None,
-    ) -> Iterator[Tag]:
-        seen: set[str] = set()
-        for raw_name, raw in _mapping(raw_tags):
-            place = (*path, raw_name)
-            name = self._name(raw_name, place, tag=True)
-            if name in seen:
-                self.mistakes.add(place, f"{name} is there twice, typed in two ways")
-            seen.add(name)
-            own = section(TagSection, raw, place, self.mistakes, "a tag")
-            if own is None or driver is None:
-                continue
-            unknown_type = isinstance(raw, dict) and "type" in raw and own.type is None
-            source = TagSource(device, name, own, defaults, place, type_unknown=unknown_type)
-            if isinstance(driver, TypedFields):
-                tag = field_tag(source, driver, driver, self.mistakes)
-            else:
-                tag = build_tag(source, driver, self.mistakes)
-            if tag is not None:
-                if tag.history and self._recorded is None:
-                    self._recorded = place
-                yield tag
-
     def _defaults(self, raw: Mapping[str, Any], path: Path, outer: TagDefaults) -> TagDefaults:
         found = raw.get("defaults")
         if not isinstance(found, dict):
@@ -203,9 +179,9 @@ class Builder:
         inner = section(TagDefaults, found, (*path, "defaults"), self.mistakes, "defaults")
         return outer if inner is None else inherit(outer, inner)
 
-    def _name(self, text: str, path: Path, *, tag: bool = False) -> str:
+    def _name(self, text: str, path: Path) -> str:
         try:
-            return parsers.tag_name(text) if tag else parsers.name(text)
+            return parsers.name(text)
         except ConfigError as error:
             self.mistakes.add(path, str(error))
             return text
@@ -224,9 +200,9 @@ class Builder:
                 )
 
     def _check_history(self, top: FileSection) -> None:
-        if self._recorded is not None and top.history is None:
+        if self._tags.recorded is not None and top.history is None:
             self.mistakes.add(
-                (*self._recorded, "history"),
+                (*self._tags.recorded, "history"),
                 "the file has no `history:` section: write `history: {path: history.db}` beside "
                 "`lines:`",
             )
@@ -282,8 +258,8 @@ class Builder:
         )
 
 
-def _mapping(raw: object) -> list[tuple[str, object]]:
-    return list(raw.items()) if isinstance(raw, dict) else []
+def _devices_of(raw: object) -> object:
+    return raw.get("devices") if isinstance(raw, dict) else None
 
 
 def _either(own: float | None, default: float) -> float:

@@ -1,12 +1,10 @@
-"""The YAML file as plain data that remembers the line of everything in it.
+"""The YAML file as plain data that knows the line of everything in it.
 
-The rules are those of YAML 1.2, which editors check by: `010` is ten, `yes` and `on` are
-texts, `1e-3` is a number. A key is always a text. A key written twice is a mistake, and so is
-anything that only makes sense to a Python program.
+A key is always a text. A key written twice is a mistake, and so is anything that only makes sense
+to a Python program. A plain file is read as a stream; its tree is made for the lines of mistakes.
 """
 
-import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path as FilePath
@@ -15,6 +13,8 @@ from typing import Any
 import yaml
 
 from gateway.config.messages import ConfigErrors, Mistakes, Path
+from gateway.config.yaml_events import plain_data
+from gateway.config.yaml_scalars import scalar
 
 Entries = dict[str, tuple[yaml.Node, yaml.Node]]
 
@@ -48,19 +48,6 @@ _LOADER: Any = type(
     },
 )
 
-_INT = re.compile(r"[-+]?[0-9]{1,300}\Z")  # a longer one is a float, and infinite
-_BASED = re.compile(r"0o[0-7]+\Z|0x[0-9A-Fa-f]+\Z")
-_FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?\Z")
-_WORDS: dict[str, object] = {
-    "": None,
-    "~": None,
-    **dict.fromkeys(("null", "Null", "NULL"), None),
-    **dict.fromkeys(("true", "True", "TRUE"), True),
-    **dict.fromkeys(("false", "False", "FALSE"), False),
-    **dict.fromkeys((".inf", "+.inf", ".Inf", "+.Inf"), float("inf")),
-    **dict.fromkeys(("-.inf", "-.Inf"), float("-inf")),
-    **dict.fromkeys((".nan", ".NaN"), float("nan")),
-}
 # Limits the growth of a small file by aliases; ten times a gateway of 10,000 tags.
 _MOST_NODES = 2_000_000
 # Advice by words in the message of the reader; the first match counts.
@@ -76,7 +63,6 @@ _REMEDIES = {
     "scanning": "put a text that begins with one of % @ ` & * ! | > in quotes",
 }
 _PLAIN_TAGS = set(_TAGS.values())
-_NUMERIC = frozenset("+-.0123456789")
 
 
 @dataclass(slots=True)
@@ -84,16 +70,17 @@ class YamlFile:
     """One file; `data` is dicts, lists, texts, numbers, booleans and None."""
 
     name: str
-    root: yaml.MappingNode
+    text: str
     texts: frozenset[str]
     data: dict[str, Any] = field(default_factory=dict)
+    _root: yaml.MappingNode | None = None
     _entries: dict[int, Entries] = field(default_factory=dict)
     _open: set[int] = field(default_factory=set)
     _nodes: int = 0
 
     def line(self, path: Path) -> int:
         """Returns the line, from 1, of the deepest part of `path` in the file."""
-        node: yaml.Node = self.root
+        node: yaml.Node = self._tree()
         mark = node.start_mark
         for chunk in path:
             if isinstance(node, yaml.MappingNode) and chunk in (entries := self._of(node)):
@@ -106,10 +93,20 @@ class YamlFile:
                 break
         return _line(mark)
 
-    def read(self, mistakes: Mistakes) -> None:
-        """Fills `data`, and notes YAML that a configuration must not use."""
-        found = self._plain(self.root, (), mistakes)
+    def read(self, mistakes: Mistakes, report: Callable[[float], None] | None = None) -> None:
+        """Fills `data`, and notes YAML that a configuration must not use.
+
+        Raises `ConfigErrors` where the file cannot be read.
+        """
+        found = plain_data(self.text.encode(), self.texts, report)
+        if found is None:
+            found = self._plain(self._tree(), (), mistakes)
         self.data = found if isinstance(found, dict) else {}
+
+    def _tree(self) -> yaml.MappingNode:
+        if self._root is None:
+            self._root = _compose(self.name, self.text)
+        return self._root
 
     def _plain(self, node: yaml.Node, path: Path, mistakes: Mistakes) -> Any:
         self._nodes += 1
@@ -124,7 +121,7 @@ class YamlFile:
             text = str(node.value)
             if node.style not in (None, "") or (path and path[-1] in self.texts and text):
                 return text
-            return _scalar(text)
+            return scalar(text)
         self._open.add(id(node))
         if isinstance(node, yaml.SequenceNode):
             result: Any = [
@@ -184,29 +181,35 @@ class YamlFile:
         return self._entries[id(node)]
 
 
-def read_yaml(path: FilePath, texts: frozenset[str]) -> tuple[YamlFile, Mistakes]:
+def read_yaml(
+    path: FilePath, texts: frozenset[str], report: Callable[[float], None] | None = None
+) -> tuple[YamlFile, Mistakes]:
     """Returns the file and the mistakes found so far.
 
-    `texts` are the keys whose values are texts even where they look like numbers (`7E1`).
+    `texts` are the keys whose values are texts even where they look like numbers (`7E1`). `report`
+    receives the share that is read.
     Raises `ConfigErrors` where the file cannot be read.
     """
-    text = _text(path)
+    file = YamlFile(str(path), _text(path), texts)
+    mistakes = Mistakes(file)
+    file.read(mistakes, report)
+    return file, mistakes
+
+
+def _compose(name: str, text: str) -> yaml.MappingNode:
     try:
         root = yaml.compose(text.encode(), Loader=_LOADER)
     except yaml.MarkedYAMLError as error:
-        raise ConfigErrors([_syntax(str(path), text, error)]) from None
+        raise ConfigErrors([_syntax(name, text, error)]) from None
     except yaml.reader.ReaderError as error:
         line = text.encode()[: error.position].count(b"\n") + 1
-        raise ConfigErrors([f"{path}:{line}: a control character: delete it"]) from None
+        raise ConfigErrors([f"{name}:{line}: a control character: delete it"]) from None
     if root is None:
-        raise ConfigErrors([f"{path}:1: the file is empty: it needs at least `lines:`"])
+        raise ConfigErrors([f"{name}:1: the file is empty: it needs at least `lines:`"])
     if not isinstance(root, yaml.MappingNode):
         begin = "a file begins with names such as `gateway:` and `lines:`, each with a colon"
-        raise ConfigErrors([f"{path}:{_line(root.start_mark)}: no settings: {begin}"])
-    file = YamlFile(str(path), root, texts)
-    mistakes = Mistakes(file)
-    file.read(mistakes)
-    return file, mistakes
+        raise ConfigErrors([f"{name}:{_line(root.start_mark)}: no settings: {begin}"])
+    return root
 
 
 def _text(path: FilePath) -> str:
@@ -254,18 +257,6 @@ def _syntax(name: str, text: str, error: yaml.MarkedYAMLError) -> str:
 
 def _line(mark: Any) -> int:
     return int(mark.line) + 1
-
-
-def _scalar(text: str) -> object:
-    if text in _WORDS:
-        return _WORDS[text]
-    if text[0] not in _NUMERIC:
-        return text
-    if _INT.match(text):
-        return int(text)
-    if _BASED.match(text):
-        return int(text, 0)
-    return float(text) if _FLOAT.match(text) else text
 
 
 def _is_merge(key: yaml.Node) -> bool:

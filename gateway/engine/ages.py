@@ -11,11 +11,12 @@ from gateway.planning.planner import Block
 
 
 class PolledBlock(NamedTuple):
-    """One block of a device. Each poll takes `seconds` of wire time."""
+    """One block of a device. Each poll takes `seconds` of wire time, and `longest` at most."""
 
     device: Device
     block: Block
     seconds: float
+    longest: float
 
 
 def polled_blocks(devices: Sequence[Device]) -> list[PolledBlock]:
@@ -25,8 +26,8 @@ def polled_blocks(devices: Sequence[Device]) -> list[PolledBlock]:
 
 def polled_block(device: Device, block: Block) -> PolledBlock:
     """Returns the block with the mean time of one poll, which reads it `verify_reads` times."""
-    seconds = fmean(device.poll_seconds(block))
-    return PolledBlock(device, block, device.settings.verify_reads * seconds)
+    reads, seconds = device.settings.verify_reads, device.poll_seconds(block)
+    return PolledBlock(device, block, reads * fmean(seconds), reads * max(seconds))
 
 
 def load_of(blocks: Sequence[PolledBlock]) -> float:

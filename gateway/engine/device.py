@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import InitVar, dataclass, field
 from typing import Literal
 
 from gateway.engine.health import Health, State, diagnosis
@@ -14,7 +14,7 @@ from gateway.errors import LineDown
 from gateway.planning.bad_addresses import RETRIES, BadAddresses
 from gateway.planning.monitor_lists import with_monitor_list
 from gateway.planning.planner import Block, around, plan, runs_of
-from gateway.planning.wire_timing import WireTiming
+from gateway.planning.wire_timing import Transactions, WireTiming
 from gateway.protocols.driver import AnyDriver, Cost, Monitor, NoReplyCauses, Span, Timing, Windowed
 from gateway.tags import Tag
 
@@ -57,7 +57,7 @@ class Device:
     bad_addresses: BadAddresses = field(init=False)
     turnaround: Turnaround = field(init=False)
     blocks: tuple[Block, ...] = ()
-    last_read: Span | None = None  # the last block that was read
+    last_read: Span | None = None  # the last block that was read: the device has it
     monitor: MonitorList = field(default_factory=MonitorList)
     window: int = field(init=False)  # requests that may be outstanding at once
     silence: float = field(init=False)  # seconds before each request
@@ -66,8 +66,9 @@ class Device:
     # Its recent use of the wire, to compare with that of other devices: the binary logarithm of
     # the seconds, plus the half-lives until the time of counting. It grows, and never decays.
     use: float = -math.inf
+    plan_now: InitVar[bool] = True  # False: the owner calls `plan` before the line runs
 
-    def __post_init__(self) -> None:
+    def __post_init__(self, plan_now: bool) -> None:
         driver = self.driver
         self.bad_addresses = BadAddresses(driver.cost)
         self.turnaround = Turnaround(self.settings.turnaround)
@@ -78,7 +79,8 @@ class Device:
         self.shapes = (
             None if self.broadcast else reply_shapes(driver, self.polled_tags, self.bad_addresses)
         )
-        self.plan()
+        if plan_now:
+            self.plan()
 
     @property
     def name(self) -> str:
@@ -147,6 +149,11 @@ class Device:
         return self.wire.transaction(cost, self.timing, self.turnaround.expected)
 
     @property
+    def transactions(self) -> Transactions:
+        """The durations of transactions with this station, for the planner."""
+        return Transactions(self.wire, self.timing, self.turnaround.expected)
+
+    @property
     def longest_poll(self) -> float:
         """Seconds of its longest poll."""
         longest = max((self.seconds(block.cost) for block in self.blocks), default=0.0)
@@ -161,7 +168,7 @@ class Device:
     def plan(self) -> None:
         """Plans the blocks that read the tags, without the bad addresses."""
         bad = self.bad_addresses
-        blocks = plan(self.tags, self.driver, self.seconds, bad.cuts)
+        blocks = plan(self.tags, self.driver, self.transactions, bad.cuts)
         if self.monitor.allowed:
             blocks = with_monitor_list(blocks, self.driver, self.seconds, bad.bad.keys())
         self.blocks = blocks
@@ -197,7 +204,7 @@ class Device:
             if len(tags) * rates >= MOST_PLANNED:
                 break
         kept = [block for place, block in enumerate(blocks) if place not in near]
-        found = plan(tags, self.driver, self.seconds, bad.cuts)
+        found = plan(tags, self.driver, self.transactions, bad.cuts)
         self.blocks = tuple(sorted((*kept, *found), key=lambda block: block.span))
         if self.shapes is not None:
             self.shapes.longer.planned(self.blocks)
@@ -271,11 +278,6 @@ class Device:
             silent = sum(other.silent for other in known.values())
             pause = max(pause, silent * self.longest_reply / SILENT_SHARE)
         return max(pause, block.every)
-
-    def was_read(self, block: Block) -> None:
-        """Notes a good read: the device has these addresses."""
-        if not block.listed:
-            self.last_read = block.span
 
     @property
     def probe_spans(self) -> Sequence[Span]:

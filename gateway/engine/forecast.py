@@ -2,13 +2,13 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from gateway.engine.ages import load_of, polled_blocks, worst_ages
 from gateway.engine.device import Device
 from gateway.engine.probes import seen_within
 from gateway.engine.reply_shapes import MARK_LONGEST
-from gateway.planning.planner import Block, plan
+from gateway.planning.planner import Block, shortest_round
 from gateway.planning.wire_timing import WireTiming
 from gateway.protocols.unsolicited import Unsolicited
 from gateway.tags import Tag
@@ -62,7 +62,7 @@ def forecast(name: str, devices: Sequence[Device], wire: WireTiming) -> LineFore
     """Calculates the forecast of a line from the plans of its devices."""
     blocks = polled_blocks(devices)
     load = load_of(blocks) + sum(map(_marks, devices))
-    longest = max((_longest(device, block) for device, block, _ in blocks), default=0.0)
+    longest = max((one.longest for one in blocks), default=0.0)
     write = max((_longest_write(device) for device in devices), default=0.0)
     silence = max((device.longest_reply for device in devices), default=0.0)
     cycle = sum(one.seconds for one in blocks)
@@ -73,7 +73,8 @@ def forecast(name: str, devices: Sequence[Device], wire: WireTiming) -> LineFore
         name=name,
         wire=wire,
         blocks=tuple(
-            BlockForecast(*one, age) for one, age in zip(blocks, worst_ages(blocks), strict=True)
+            BlockForecast(one.device, one.block, one.seconds, age)
+            for one, age in zip(blocks, worst_ages(blocks), strict=True)
         ),
         load=load,
         requests=requests,
@@ -94,11 +95,6 @@ def _marks(device: Device) -> float:
     return 0.0 if device.shapes is None else shortest / MARK_LONGEST
 
 
-def _longest(device: Device, block: Block) -> float:
-    """Returns the seconds of the longest poll of the block."""
-    return device.settings.verify_reads * max(device.poll_seconds(block))
-
-
 def _unsolicited_tags(device: Device) -> int:
     """Returns the number of its tags that cannot be polled."""
     driver = device.driver
@@ -109,9 +105,11 @@ def _unsolicited_tags(device: Device) -> int:
 
 def _round(device: Device) -> float:
     """Returns the seconds of one read of all tags, planned as if all had the same interval."""
-    alike = [replace(tag, every=1.0) for tag in device.tags]
-    blocks = plan(alike, device.driver, device.seconds, device.bad_addresses.cuts)
-    return sum(device.seconds(block.cost) for block in blocks)
+    blocks = device.blocks
+    if len({tag.every for tag in device.tags}) == 1 and not any(block.listed for block in blocks):
+        return sum(device.seconds(block.cost) for block in blocks)
+    cuts = device.bad_addresses.cuts
+    return shortest_round(device.tags, device.driver, device.transactions, cuts)
 
 
 def _longest_write(device: Device) -> float:

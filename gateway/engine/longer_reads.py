@@ -42,7 +42,7 @@ class LongerReads:
         """Returns the span itself, then longer ones whose replies have other shapes."""
         found = self.by_span.get(span)
         if found is None:
-            found = self.by_span[span] = self._choose(span)
+            found = self.by_span[span] = self._choose(span, MOST_WARY)
         return found
 
     def planned(self, blocks: Sequence[Block]) -> None:
@@ -52,7 +52,7 @@ class LongerReads:
     def costs(self, block: Block) -> list[Cost]:
         """Returns the costs of the spans that are usually read for the block."""
         alone = block.listed or self._shapes[self._driver.reply_shape(block.span)] < 2
-        choices = [] if alone else self._choose(block.span)[:MOST_CHOICES]
+        choices = [] if alone else self._choose(block.span, MOST_CHOICES)
         return [cost for span, _ in choices if (cost := self._driver.cost(span))] or [block.cost]
 
     def refused(self, span: Span, longer: Span, now: float) -> None:
@@ -94,29 +94,37 @@ class LongerReads:
                 del self._lacking[span]
                 self.failed.pop(span, None)
 
-    def _choose(self, span: Span) -> list[Choice]:
-        """Returns the span, and longer ones whose replies have other shapes."""
+    def _choose(self, span: Span, most: int) -> list[Choice]:
+        """Returns the span, and longer ones whose replies have other shapes; `most` in all."""
         found: dict[Hashable, Span] = {self._driver.reply_shape(span): span}
         _, lacking = self._lacking.get(span, (0.0, []))
         for longer in self._longer(span):
             if any(within(refused, longer) for refused in lacking):
                 continue
             found.setdefault(self._driver.reply_shape(longer), longer)
-            if len(found) == MOST_WARY:
+            if len(found) == most:
                 break
         return [(read, shape) for shape, read in found.items()]
 
     def _longer(self, span: Span) -> Iterator[Span]:
         """Yields spans around `span` that one request reads, those among the tags first."""
-        area, start, size = span
+        area, start, _ = span
         first, last = self._hull.get(area, (start, start))
-        steps = range(1, LONGEST_STEP + 1)
-        both = [Span(area, start, size + n) for n in steps]
-        both += [Span(area, start - n, size + n) for n in steps if start >= n]
-        among = [s for s in both if first <= s.start and s.start + s.size - 1 <= last]
         cuts = [place for name, place in self._bad.cuts if name == area]
-        for longer in [*among, *both]:
-            end = longer.start + longer.size
-            crosses = any(longer.start < place < end for place in cuts)
-            if not crosses and self._driver.cost(longer) is not None:
-                yield longer
+        for among in (True, False):
+            for longer in _around(span):
+                end = longer.start + longer.size
+                if among and not (first <= longer.start and end <= last + 1):
+                    continue
+                crosses = any(longer.start < place < end for place in cuts)
+                if not crosses and self._driver.cost(longer) is not None:
+                    yield longer
+
+
+def _around(span: Span) -> Iterator[Span]:
+    """Yields longer spans, first those that end later."""
+    area, start, size = span
+    for n in range(1, LONGEST_STEP + 1):
+        yield Span(area, start, size + n)
+    for n in range(1, min(LONGEST_STEP, start) + 1):
+        yield Span(area, start - n, size + n)

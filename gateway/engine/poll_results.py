@@ -55,7 +55,8 @@ class PollResults:
             counts.mean_gap += (gap - counts.mean_gap) / max(1, min(10, counts.reads))
         counts.reads += 1
         last.at, last.ever = now, True
-        device.was_read(block)
+        if not block.listed:
+            device.last_read = block.span
         self._effects.collected.append(Samples(self._samples(poll, units, time)))
         if block.of_fields:
             self._count_garbled(device, units)

@@ -67,13 +67,15 @@ class ReplyShapes:
         shape, read = choices[0][1], span  # the caller tells the block's own span by identity
         if now - self.at >= self.quiet:
             self._prove(now)
-        elif now - used.get(shape, -NEVER) < self.quiet:
+        elif now - (longest_ago := used.get(shape, -NEVER)) < self.quiet:
             some = choices if self.quiet == WARY else choices[:MOST_CHOICES]
-            best = min(some, key=lambda choice: used.get(choice[1], -NEVER))
             if span in self.longer.alone:
                 self.longer.alone.discard(span)
-            elif best is not choices[0]:
-                read, shape = best
+            else:  # as min(some, key=...), which is slower
+                for choice in some:
+                    at = used.get(choice[1], -NEVER)
+                    if at < longest_ago:
+                        longest_ago, (read, shape) = at, choice
         used[shape] = now
         self.last, self.span = shape, read
         return read

@@ -37,12 +37,16 @@ class StateFile:
     # -- any thread --
 
     def restore(self, devices: Iterable[Device]) -> None:
-        """Plans the devices by the file. Moves a file aside that cannot be parsed."""
+        """Restores what the file knows of the devices, and plans again those that have a plan.
+
+        Moves a file aside that cannot be parsed.
+        """
         learned_by_name = self._load()
         for device in devices:
             if (learned := learned_by_name.get(device.name)) is not None:
                 device.bad_addresses.restore(learned, device.tags)
-                device.plan()
+                if device.blocks:
+                    device.plan()
 
     def snapshot(self, devices: Iterable[Device]) -> bytes:
         """Returns the content of the file for the present state of the devices."""

@@ -67,9 +67,10 @@ async def perform(job: Transacted, transaction: Transaction) -> Result:
                 return await read_with_care(
                     transaction, device, block, span=job.span, register=job.register
                 )
+            units = await device.settings.driver.read(transaction, job.span)
             if job.span is not block.span:
-                return await _read_longer(transaction, device, job.span, block.span)
-            return await device.settings.driver.read(transaction, block.span)
+                units = _wanted(units, job.span, block.span)
+            return units
         return await _perform(job, transaction)
     except (DeviceError, BadValue, LineDown, Busy) as error:
         return error
@@ -109,11 +110,8 @@ async def _perform(job: Transacted, transaction: Transaction) -> Result:
     raise TypeError(f"{job.device.name} cannot perform {job!r}")
 
 
-async def _read_longer(
-    talk: Talk[Any], device: Device, longer: Span, wanted: Span
-) -> Sequence[int]:
-    """Reads the longer span around the wanted one. Returns the wanted units."""
-    units = await device.settings.driver.read(talk, longer)
+def _wanted(units: Sequence[int], longer: Span, wanted: Span) -> Sequence[int]:
+    """Returns the units of the wanted span, of those of the longer span around it."""
     begin = wanted.start - longer.start
     return units[begin : begin + wanted.size]
 
@@ -139,7 +137,7 @@ async def read_with_care(
 async def _read_once(talk: Talk[Any], device: Device, block: Block, span: Span) -> Sequence[int]:
     driver = device.driver
     if not block.listed or not isinstance(driver, Monitor):
-        return await _read_longer(talk, device, span, block.span)
+        return _wanted(await driver.read(talk, span), span, block.span)
     parts = await driver.read_registered(talk, block.listed)
     return [unit for part in parts for unit in part]
 

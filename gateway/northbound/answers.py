@@ -10,6 +10,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 
 import structlog
@@ -53,6 +54,7 @@ class AnswerPool:
         self._narrow = Workers(_NARROW_THREADS, "zenoh answers")
         self._wide = Workers(WIDE_LIMIT, "zenoh snapshots")
         self._history = Workers(HISTORY_LIMIT, "zenoh history")
+        self._ends = Workers(1, "zenoh ends")
         self._batch: deque[tuple[zenoh.Query, Answer]] = deque()
         self._closing = False
         self._ended = False
@@ -114,7 +116,7 @@ class AnswerPool:
     def end(self) -> None:
         """Ends the threads, after the session is closed."""
         self._ended = True
-        for pool in (self._narrow, self._wide, self._history):
+        for pool in (self._narrow, self._wide, self._history, self._ends):
             pool.end()
 
     def _flush(self) -> None:
@@ -137,14 +139,14 @@ class AnswerPool:
         self.counters.refused += 1
         if self._closing or not self._refusals.acquire(blocking=False):
             self.counters.unanswered += 1
-            query.drop()  # type: ignore[no-untyped-call]  # Zenoh's stub lacks it
+            self._ends.submit(_end, query)
             return
         self._narrow.submit(self._refuse, query, self._reply_busy)
 
     def dismiss(self, query: zenoh.Query) -> None:
         """Ends a query without a reply: it is for another gateway."""
         if self._closing or not self._refusals.acquire(blocking=False):
-            query.drop()  # type: ignore[no-untyped-call]  # Zenoh's stub lacks it
+            self._ends.submit(_end, query)
             return
         self._narrow.submit(self._refuse, query, _no_reply)
 
@@ -177,6 +179,12 @@ class AnswerPool:
             self._open.release()
             if room is not None:
                 room.release()
+
+
+def _end(query: zenoh.Query) -> None:
+    """Waits too while the link of the client is full, for seconds: not on the event loop."""
+    with suppress(zenoh.ZError):
+        query.drop()  # type: ignore[no-untyped-call]  # Zenoh's stub lacks it
 
 
 def _no_reply(_: zenoh.Query) -> None:

@@ -12,15 +12,19 @@ from gateway.northbound.rate_limit import RateLimit
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 
 _MOST_LOST = 256  # lost links that are remembered
+# Seconds after the start. Sessions that were linked to the process before come back meanwhile.
+_RETURNING = 30.0
+_NEVER = float("-inf")
 
 
 class LinkMonitor:
-    """Sets `returned` when a router, or a session that was linked before, is linked again."""
+    """Sets `returned` when a router, or a session that may have been linked before, is linked."""
 
     def __init__(self) -> None:
         self.returned = asyncio.Event()
         self._up: dict[str, str] = {}  # kind of each linked session, by its id
         self._lost: dict[str, None] = {}  # ids of unlinked sessions, oldest first
+        self._started = _NEVER
         self._log_limit = RateLimit(100, 1.0)  # any client can link as often as it likes
 
     def __len__(self) -> int:
@@ -31,6 +35,7 @@ class LinkMonitor:
         return sorted(self._up.values())
 
     def declare(self, session: zenoh.Session, inbox: Inbox[zenoh.TransportEvent]) -> object:
+        self._started = time.monotonic()
         return session.info.declare_transport_events_listener(
             zenoh.handlers.Callback(inbox, indirect=False), history=True
         )
@@ -51,6 +56,7 @@ class LinkMonitor:
 
     def _linked(self, session: str, kind: str) -> None:
         self._up[session] = kind
-        if kind == "router" or session in self._lost:
+        may_return = time.monotonic() - self._started < _RETURNING
+        if kind == "router" or session in self._lost or may_return:
             self._lost.pop(session, None)
             self.returned.set()

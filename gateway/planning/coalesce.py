@@ -13,8 +13,9 @@ intervals leave more: there the search follows only the cheapest `MOST`. Its res
 more than the least; no such case has been seen.
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from operator import itemgetter
+from typing import Any, NamedTuple
 
 # Seconds of one transaction over items first..last; None where one request cannot hold them.
 SecondsOf = Callable[[int, int], float | None]
@@ -31,13 +32,8 @@ class Request(NamedTuple):
     every: float
 
 
-class _Closed(NamedTuple):
-    """A linked list of the closed requests, newest first."""
-
-    request: Request
-    before: "_Closed | None"
-
-
+# A linked list of the closed requests, newest first: first item, last item, interval, the next.
+_Closed = tuple[int, int, float, Any]
 _Starts = tuple[int, ...]  # for each interval, fastest first: first item of its open request
 # A cover of the items so far: its wire time per second, as if the open requests ended here; the
 # open requests; the closed requests.
@@ -67,14 +63,8 @@ def coalesce(
             raise ValueError(item)
         fresh = [alone / every for every in rates]
         growth = _growth(item, states, seconds, split=item in splits, even=even)
-        step = _Step(item, rank[interval], rates, fresh, growth)
-        found: dict[_Starts, _State] = {}
-        for state in states:
-            for after in step.after(state):
-                known = found.get(after[1])
-                if known is None or after[0] < known[0] - _TINY:
-                    found[after[1]] = after
-        states = (_undominated if even else _contenders)(list(found.values()), fresh)
+        found = _step(states, item, rank[interval], rates, fresh, growth)
+        states = (_undominated if even else _contenders)(found, fresh)
     _, starts, done = min(states, key=_total)
     return _requests(starts, done, len(intervals) - 1, rates)
 
@@ -100,57 +90,75 @@ def _growth(
     return growth
 
 
-class _Step(NamedTuple):
-    """The choices at one item."""
+def _step(
+    states: Sequence[_State],
+    item: int,
+    rank: int,
+    rates: Sequence[float],
+    fresh: Sequence[float],
+    growth: dict[int, float | None],
+) -> list[_State]:
+    """Returns the states after `item`: each open request continues or ends, and others begin.
 
-    item: int
-    rate: int  # index of the item's own interval
-    rates: Sequence[float]
-    fresh: Sequence[float]  # by interval: the cost of a new request for the item alone
-    growth: dict[int, float | None]
-
-    def after(self, state: _State) -> Iterator[_State]:
-        """Yields every next state: each open request continues or ends, and others may begin.
-
-        Only the fastest open request may end although it could continue: it alone read the item
-        before. The others were of no use there and would have ended earlier.
-        """
-        total, starts, done = state
-        fastest: int | None = None
-        saved: float | None = None
+    `rank` is the place of the item's interval in `rates`; `fresh` the cost of a new request for
+    the item alone, by interval. Only the fastest open request may end although it could continue:
+    it alone read the item before. The others were of no use there and would have ended earlier.
+    """
+    found: dict[_Starts, _State] = {}
+    for total, starts, done in states:
+        fastest, saved = CLOSED, 0.0
         for rate, start in enumerate(starts):
             if start == CLOSED:
                 continue
-            more = self.growth[start]
+            more = growth[start]
             if more is None:
-                starts, done = self._end(starts, done, rate)
-            else:
-                more /= self.rates[rate]
-                total += more
-            if fastest is None:
+                starts, done = _end(starts, done, rate, item, rates)
+                if fastest == CLOSED:
+                    fastest = len(rates)  # it has ended already
+                continue
+            more /= rates[rate]
+            total += more
+            if fastest == CLOSED:
                 fastest, saved = rate, more
-        yield from self._read_item(total, starts, done)
-        if fastest is not None and saved is not None:
-            yield from self._read_item(total - saved, *self._end(starts, done, fastest))
+        _read(found, total, starts, done, item, rank, fresh)
+        if CLOSED < fastest < len(rates):
+            starts, done = _end(starts, done, fastest, item, rates)
+            _read(found, total - saved, starts, done, item, rank, fresh)
+    return list(found.values())
 
-    def _end(
-        self, starts: _Starts, done: _Closed | None, rate: int
-    ) -> tuple[_Starts, _Closed | None]:
-        request = Request(starts[rate], self.item - 1, self.rates[rate])
-        return (*starts[:rate], CLOSED, *starts[rate + 1 :]), _Closed(request, done)
 
-    def _read_item(self, total: float, starts: _Starts, done: _Closed | None) -> Iterator[_State]:
-        """Yields the states that read the item. A request begins only if no open one reads it."""
-        if max(starts[: self.rate + 1]) != CLOSED:
-            yield total, starts, done
+def _end(
+    starts: _Starts, done: _Closed | None, rate: int, item: int, rates: Sequence[float]
+) -> tuple[_Starts, _Closed | None]:
+    closed = (starts[rate], item - 1, rates[rate], done)
+    return (*starts[:rate], CLOSED, *starts[rate + 1 :]), closed
+
+
+def _read(
+    found: dict[_Starts, _State],
+    total: float,
+    starts: _Starts,
+    done: _Closed | None,
+    item: int,
+    rank: int,
+    fresh: Sequence[float],
+) -> None:
+    """Adds the states that read the item. A request begins only if no open one reads it."""
+    for start in starts[: rank + 1]:
+        if start != CLOSED:
+            known = found.get(starts)
+            if known is None or total < known[0] - _TINY:
+                found[starts] = (total, starts, done)
             return
-        for rate in range(self.rate + 1):
-            began = (*starts[:rate], self.item, *starts[rate + 1 :])
-            yield total + self.fresh[rate], began, done
+    for rate in range(rank + 1):
+        began = (*starts[:rate], item, *starts[rate + 1 :])
+        cost = total + fresh[rate]
+        known = found.get(began)
+        if known is None or cost < known[0] - _TINY:
+            found[began] = (cost, began, done)
 
 
-def _total(state: _State) -> float:
-    return state[0]
+_total: Callable[[_State], float] = itemgetter(0)
 
 
 def _contenders(states: list[_State], fresh: Sequence[float]) -> list[_State]:
@@ -176,10 +184,13 @@ def _undominated(states: list[_State], fresh: Sequence[float]) -> list[_State]:
     whole; the three sequences have one entry for each interval.
     """
     kept: list[_State] = []
+    everything = sum(fresh) + _TINY
     for state in sorted(states, key=_total):
         limit, wanted = state[0] + _TINY, state[1]
         for total, starts, _ in kept:
             left = limit - total
+            if left > everything:
+                break
             for start, want, price in zip(starts, wanted, fresh):  # noqa: B905  (see above)
                 if want > start:  # CLOSED is below every start
                     left -= price
@@ -203,6 +214,6 @@ def _requests(
         if start != CLOSED
     ]
     while done is not None:
-        found.append(done.request)
-        done = done.before
+        first, end, every, done = done
+        found.append(Request(first, end, every))
     return sorted(found)

@@ -5,7 +5,8 @@ A PLC keeps one list, so the planner chooses the list that saves the most wire t
 
 from collections.abc import Collection, Sequence
 
-from gateway.planning.planner import Block, Seconds
+from gateway.planning.planner import Block
+from gateway.planning.rows import Seconds
 from gateway.protocols.driver import AnyDriver, Monitor, Span, Unit
 
 

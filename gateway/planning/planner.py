@@ -13,14 +13,14 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 
 from gateway.errors import ConfigError
-from gateway.planning.coalesce import Request, coalesce
-from gateway.protocols.driver import AnyDriver, Cost, Span, Unit
+from gateway.planning.coalesce import Request
+from gateway.planning.rows import Row, Seconds, requests_of
+from gateway.protocols.driver import AnyDriver, Cost, Span
+from gateway.protocols.models import Model, model_of
 from gateway.tags import Publish, Quality, Reason, Sample, Tag, bad, of_field
 from gateway.values import Value
 
-Seconds = Callable[[Cost], float]
 Decode = Callable[[Sequence[int]], Value | None]
-LONG_ROW = 300  # items of one area
 Cuts = frozenset[tuple[str, int]]  # (area, n): no block may hold both n - 1 and n
 
 
@@ -90,39 +90,55 @@ def plan(
     The blocks are in the order of areas and addresses; equal arguments give equal blocks. Raises
     `ConfigError` for a tag that does not fit one request.
     """
-    areas: dict[str, list[Tag]] = defaultdict(list)
-    for tag in tags:
-        if driver.areas[tag.span.area].readable:
-            areas[tag.span.area].append(tag)
+    model = model_of(driver)
     blocks: list[Block] = []
-    for area in sorted(areas):
-        blocks += _plan_area(area, areas[area], driver, seconds, cuts)
+    for area, some in _by_area(tags, driver):
+        items = items_of(some)
+        requests = _cover(model, area, items, seconds, cuts)
+        blocks += _blocks(area, items, requests, driver)
     return tuple(blocks)
 
 
-def _plan_area(
-    area: str, tags: list[Tag], driver: AnyDriver, seconds: Seconds, cuts: Cuts
-) -> list[Block]:
-    items = items_of(tags)
+def shortest_round(
+    tags: Iterable[Tag], driver: AnyDriver, seconds: Seconds, cuts: Cuts = frozenset()
+) -> float:
+    """Returns the least seconds in which all readable tags can be read once."""
+    model, total = model_of(driver), 0.0
+    for area, some in _by_area(tags, driver):
+        items = items_of(some)
+        for item in items:
+            item.every = 1.0
+        for request in _cover(model, area, items, seconds, cuts):
+            cost = driver.cost(_span(area, items, request))
+            total += 0.0 if cost is None else seconds(cost)
+    return total
+
+
+def _by_area(tags: Iterable[Tag], driver: AnyDriver) -> list[tuple[str, list[Tag]]]:
+    found: dict[str, list[Tag]] = defaultdict(list)
+    for tag in tags:
+        found[tag.span.area].append(tag)
+    return [(area, found[area]) for area in sorted(found) if driver.areas[area].readable]
+
+
+def _cover(
+    model: Model, area: str, items: Sequence[Item], seconds: Seconds, cuts: Cuts
+) -> Sequence[Request]:
+    """Returns the requests of least wire time for the items of one area. Raises `ConfigError`."""
     fences = sorted(n for name, n in cuts if name == area)
-    splits = frozenset(
-        i + 1 for i, (a, b) in enumerate(pairwise(items)) if _between(a.end, b.start, fences)
-    )
-
-    def transaction(first: int, last: int) -> float | None:
-        start = items[first].start
-        cost = driver.cost(Span(area, start, items[last].end - start))
-        return None if cost is None else seconds(cost)
-
-    # Bits are packed and so not even. For a very long row speed counts more: there a request may
-    # cost one character more than the least.
-    even = driver.areas[area].unit is not Unit.BIT or len(items) > LONG_ROW
+    splits = (i + 1 for i, (a, b) in enumerate(pairwise(items)) if _between(a.end, b.start, fences))
+    starts, ends, every = zip(*((item.start, item.end, item.every) for item in items), strict=True)
+    row = Row(area, starts, ends, every, frozenset(splits if fences else ()))
     try:
-        requests = coalesce([item.every for item in items], transaction, splits, even=even)
+        return requests_of(row, model, seconds)
     except ValueError as error:
         address = items[error.args[0]].tags[0].text
         raise ConfigError(f"{address} cannot be read in one request") from None
-    return list(_blocks(area, items, requests, driver))
+
+
+def _span(area: str, items: Sequence[Item], request: Request) -> Span:
+    start = items[request.first].start
+    return Span(area, start, items[request.last].end - start)
 
 
 def _blocks(
@@ -138,8 +154,7 @@ def _blocks(
             over.append(waiting.popleft())
         members[min(over, key=lambda request: request.every)] += item.tags
     for request, tags in members.items():
-        start = items[request.first].start
-        span = Span(area, start, items[request.last].end - start)
+        span = _span(area, items, request)
         cost = driver.cost(span)
         if cost is not None and tags:
             yield Block(span, request.every, tuple(tags), cost)

@@ -32,6 +32,19 @@ class WireTiming:
         return self.silence(timing) + (cost.request + cost.reply) * self.character + wait
 
 
+@dataclass(frozen=True, slots=True)
+class Transactions:
+    """The durations of transactions with one station. Equal for equal stations of equal lines."""
+
+    wire: WireTiming
+    timing: Timing
+    turnaround: float | None = None  # the measured one; None: the default of the protocol
+
+    def __call__(self, cost: Cost) -> float:
+        """Returns the seconds of one transaction."""
+        return self.wire.transaction(cost, self.timing, self.turnaround)
+
+
 def character_bits(serial_format: str) -> int:
     """The bits per character on the wire of a format like `7E1`, including the start bit."""
     data, parity, stop = int(serial_format[0]), serial_format[1], int(serial_format[2])

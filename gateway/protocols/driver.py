@@ -173,7 +173,8 @@ class Driver(Protocol[F]):
         """Returns the cost of reading `span` in one request; None if that is impossible.
 
         Exact, with all that must be read around the span (bits are read in eights). If a span
-        cannot be read in one request, no longer span around it can.
+        cannot be read in one request, no longer span around it can. For words inside their area
+        only the size counts. The station number counts only where it changes the areas.
         """
 
     def write_cost(self, span: Span) -> Cost | None:

@@ -2,6 +2,8 @@
 
 import math
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import lru_cache
 
 from gateway.errors import BadValue
 from gateway.protocols.driver import AnyDriver
@@ -36,29 +38,47 @@ def _animate(memory: Memory, tag: Tag, number: int) -> None:
         memory.write(area, start, units)
         return
     for i in range(size):
-        memory.animate(area, start + i, _unit(tag, motion, i))
+        memory.animate(area, start + i, _Unit(tag, motion, i))
 
 
-def _unit(tag: Tag, motion: Callable[[float], Value], i: int) -> Callable[[float], int]:
-    return lambda now: tag.encode(motion(now))[i]
+@dataclass(frozen=True, slots=True, eq=False)
+class _Unit:
+    """One unit of a value that moves."""
+
+    tag: Tag
+    motion: Callable[[float], Value]
+    place: int
+
+    def __call__(self, now: float) -> int:
+        return self.tag.encode(self.motion(now))[self.place]
 
 
 def _motion(tag: Tag, number: int) -> Callable[[float], Value]:
     """Returns the value of the tag as a function of time; each tag moves differently."""
-    period = 20.0 + 7 * (number % 11)
     kind = tag.layout.type.kind
     if kind is Kind.STRING:
         return lambda now: "SIMULATED"[: tag.layout.type.length]
     if kind is Kind.BOOL:
-        return lambda now: int(now / (period / 8)) % 2 == 1
+        return lambda now: int(now / (_period(number) / 8)) % 2 == 1
     low, high = 10.0, 90.0
     if tag.write is not None:
         low = low if tag.write.min is None else tag.write.min
         high = max(low, high if tag.write.max is None else tag.write.max)
+    whole = not kind.value.startswith("float") and tag.scale == 1
+    return _wave(low, high, number, whole=whole)
+
+
+def _period(number: int) -> float:
+    return 20.0 + 7 * (number % 11)
+
+
+@lru_cache(maxsize=1024)
+def _wave(low: float, high: float, number: int, *, whole: bool) -> Callable[[float], Value]:
+    """Returns a sine between the limits, shared by tags of the same number of all devices."""
+    period, digits = _period(number), None if whole else 3
 
     def wave(now: float) -> Value:
         value = low + (high - low) * (0.5 + 0.5 * math.sin(2 * math.pi * now / period + number))
-        whole = not kind.value.startswith("float") and tag.scale == 1
-        return round(value) if whole else round(value, 3)
+        return round(value, digits)
 
     return wave

@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from gateway.app import line_of
 from gateway.config import load
 from gateway.engine.device import Device
+from gateway.line.build import line_of
 from gateway.line.line import Line
 from gateway.tags import Quality, Sample
 

@@ -12,7 +12,7 @@ from tests.e2e.processes import Done, plc_gateway
 
 COMMANDS = [
     *("run", "check", "read", "write", "control", "watch", "scan", "simulate"),
-    *("health", "schema", "version"),
+    *("status", "health", "schema", "version"),
 ]
 
 
@@ -57,6 +57,7 @@ def test_wrong_usage_ends_with_2(command: Command, arguments: list[str], says: s
         ("control", ["mixer", "stop"]),
         ("watch", []),
         ("simulate", []),
+        ("status", []),
         ("health", []),
     ],
 )
@@ -96,7 +97,7 @@ def test_the_version_is_an_option_and_a_command(command: Command) -> None:
 
 
 @pytest.mark.parametrize(
-    "arguments", [["read"], ["write", "mixer/trim", "1"], ["watch"], ["health"]]
+    "arguments", [["read"], ["write", "mixer/trim", "1"], ["watch"], ["status"], ["health"]]
 )
 def test_without_a_gateway_commands_end_with_1(config: Path, arguments: list[str]) -> None:
     name, *more = arguments

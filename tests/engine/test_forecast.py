@@ -5,6 +5,7 @@ that takes 5 ms to answer.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,9 @@ from gateway.config import load
 from gateway.engine.device import Device
 from gateway.engine.forecast import LineForecast, forecast
 from gateway.engine.reply_shapes import MARK_LONGEST
+from gateway.planning.planner import shortest_round
 from gateway.planning.wire_timing import WireTiming
+from gateway.tags import Tag
 from tests.e2e.processes import vigor_line, write_config
 from tests.sim.plant import device, words
 from tests.vectors import vectors
@@ -172,3 +175,25 @@ def test_on_an_overloaded_line_it_is_seen_later() -> None:
     found = forecast("line", devices, devices[0].wire)
     assert found.overloaded
     assert found.seen_at_worst > 2 * found.seen_within
+
+
+@pytest.mark.parametrize(
+    ("intervals", "plans"), [((0.001, 0.001), 0), ((0.001, 0.002), 1), ((60.0, 30.0), 0)]
+)
+def test_a_round_is_planned_only_where_it_can_differ(
+    intervals: tuple[float, float], plans: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On an overloaded line, for a device with several intervals."""
+    made: list[object] = []
+
+    def counted(tags: Sequence[Tag], *rest: Any) -> float:
+        made.append(tags)
+        return shortest_round(tags, *rest)
+
+    monkeypatch.setattr("gateway.engine.forecast.shortest_round", counted)
+    tags = [*words(0, 5, every=intervals[0]), *words(200, 5, every=intervals[1])]
+    line = forecast("hall", [device(tags)], WireTiming(9600, 10))
+    assert len(made) == plans
+    if line.overloaded:
+        one = device([replace(tag, every=1.0) for tag in tags])
+        assert line.shortest == pytest.approx(sum(one.seconds(block.cost) for block in one.blocks))

@@ -46,6 +46,18 @@ def test_refused_addresses_are_avoided_after_a_restart(tmp_path: Path) -> None:
     assert (bad.since, bad.code, [tag.text for tag in bad.tags]) == (1_000, "28", ["D7"])
 
 
+def test_a_device_without_a_plan_is_planned_later(tmp_path: Path) -> None:
+    """At the start of a large plant a thread plans, beside the event loop."""
+    before = searched(range(20), 7)
+    state_file = StateFile(tmp_path / "state.json")
+    state_file.save(state_file.snapshot([before]))
+    after = Device(before.settings, before.wire, plan_now=False)
+    state_file.restore([after])
+    assert not after.blocks
+    after.plan()
+    assert [block.span for block in after.blocks] == [block.span for block in before.blocks]
+
+
 def test_addresses_without_a_tag_are_forgotten(tmp_path: Path) -> None:
     state_file = StateFile(tmp_path / "state.json")
     state_file.save(state_file.snapshot([searched(range(20), 7)]))

@@ -6,7 +6,7 @@ from typing import Self, cast
 
 import zenoh
 
-from gateway.northbound.answers import AnswerPool
+from gateway.northbound.answers import REFUSALS_LIMIT, AnswerPool
 from gateway.northbound.workers import Workers
 
 PATIENCE = 10.0  # seconds
@@ -61,3 +61,27 @@ def test_work_that_blocks_gets_more_threads_up_to_the_limit() -> None:
     go.set()
     assert begun.acquire(timeout=PATIENCE)
     workers.end()
+
+
+async def test_a_query_without_an_answer_does_not_wait_on_the_loop_for_its_client() -> None:
+    """Its end is a message too: it has no room on the link of a client that does not receive."""
+    receives, ended = threading.Event(), threading.Semaphore(0)
+
+    class Deaf(Query):
+        def __exit__(self, *_error: object) -> None:
+            self.drop()
+
+        def drop(self) -> None:
+            assert receives.wait(PATIENCE)
+            ended.release()
+
+    pool = AnswerPool(lambda _: None)
+    most = REFUSALS_LIMIT + 2
+    for _ in range(most):
+        pool.refuse(cast("zenoh.Query", Deaf()))
+    assert pool.counters.unanswered == 2
+    pool.dismiss(cast("zenoh.Query", Deaf()))
+    receives.set()
+    for _ in range(most + 1):
+        assert await asyncio.to_thread(ended.acquire, timeout=PATIENCE)
+    pool.end()

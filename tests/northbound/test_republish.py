@@ -3,6 +3,7 @@
 import asyncio
 import time
 from collections.abc import Sequence
+from contextlib import AsyncExitStack
 from typing import Any
 
 import pytest
@@ -18,9 +19,9 @@ from gateway.tags import Reason, Sample, bad
 from tests.northbound.plant import (
     PlainDevice,
     PlainPlant,
-    gateway_and_client,
     has_value,
     mixer,
+    serving,
     tag,
 )
 from tests.sim.virtual import now, on_virtual_time
@@ -28,27 +29,23 @@ from tests.zenoh_peer import ZenohPeer, free_endpoint
 
 
 @pytest.mark.parametrize("event", [False, True])
-async def test_a_bad_value_is_repeated_with_its_heartbeat_and_keeps_its_time(event: bool) -> None:
-    repeated = tag("mixer", "speed", heartbeat=0.5, event=event)
-    plant = PlainPlant(PlainDevice("mixer", (repeated, tag("mixer", "level"))))
-    async with gateway_and_client(plant) as (northbound, client):
-        speed, level = (plant.tag(f"mixer/{name}") for name in ("speed", "level"))
-        assert speed is not None
-        assert level is not None
-        received = await client.subscribe("plant/mixer/*")
-        down = [bad(of, Reason.NO_REPLY, time.time_ns()) for of in (speed, level)]
-        plant.samples |= {sample.tag.key: sample for sample in down}
-        northbound.publish(down)
-        await received.next(lambda sample: sample.key.endswith("level"))
-        first = await received.next(lambda sample: sample.key.endswith("speed"))
-        received.forget()
-        for _ in range(2):
-            again = await received.next(lambda _: True)
-            assert again.key == "plant/mixer/speed"  # the other has no heartbeat
-            assert again.json == first.json
-            received.forget()
-        northbound.publish([plant.now("mixer/speed", 7)])
-        assert (await received.next(lambda _: True)).json["value"] == 7
+def test_a_bad_value_is_repeated_with_its_heartbeat_and_keeps_its_time(event: bool) -> None:
+    @on_virtual_time
+    async def repeats() -> None:
+        repeated = tag("mixer", "speed", heartbeat=0.5, event=event)
+        other = tag("mixer", "level")  # without a heartbeat
+        plant, published = PlainPlant(PlainDevice("mixer", (repeated, other))), list[Sample]()
+        down = {of.key: bad(of, Reason.NO_REPLY, time.time_ns()) for of in (repeated, other)}
+        plant.samples |= down
+        task = asyncio.create_task(republisher(plant, published).run())
+        await asyncio.sleep(3.5)
+        assert published == [down[repeated.key]] * 2
+        plant.now(repeated.key, 7)
+        await asyncio.sleep(3.0)
+        assert len(published) == 2
+        task.cancel()
+
+    repeats()
 
 
 async def test_an_event_is_published_once_but_its_bad_quality_again() -> None:
@@ -112,6 +109,21 @@ async def test_after_a_router_was_killed_and_returned_everything_is_published_ag
     finally:
         serves.cancel()
         await asyncio.wait([serves], timeout=5)
+
+
+async def test_a_client_of_the_process_before_gets_all_values_of_the_next() -> None:
+    plant, settings = mixer(), ZenohConfig(listen=(free_endpoint(),))
+    async with AsyncExitStack() as peers:
+        async with serving(plant, settings) as northbound:
+            client = ZenohPeer("client", connect=settings.listen)
+            received = await (await peers.enter_async_context(client)).subscribe("plant/**")
+            northbound.publish([plant.now("mixer/speed", 1)])
+            await received.next(has_value("plant/mixer/speed", 1))
+            received.forget()
+        plant.now("mixer/speed", 2)
+        async with serving(plant, settings):  # it has published all before the client is linked
+            await received.next(has_value("plant/mixer/speed", 2))
+            await received.until(lambda of: len(of.latest()) == 4)
 
 
 def republisher(plant: PlainPlant, published: list[Sample], **how: Any) -> Republisher:

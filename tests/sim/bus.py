@@ -142,6 +142,8 @@ class Bus:
             return
         if device.state in (State.OFFLINE, State.STARTING):
             return  # the line does not wait for late replies to a probe
+        if self._late_in_another_protocol(device):
+            return  # such a reply is noise to the driver that waits for another
         self.broke(f"{self.config.name}: spoke while {device.name} did")
 
     def damaged(self, way: str) -> None:
@@ -233,6 +235,17 @@ class Bus:
         """
         return any(
             e.kind in UNTIMELY and e.end > since and e.start <= self.now() - self.began
+            for e in self.episodes
+        )
+
+    def _late_in_another_protocol(self, device: Device) -> bool:
+        """On the line, a device of another protocol replies late, or did recently."""
+        now = self.now() - self.began
+        other = {
+            d.name for d in self.line.engine.devices if d.driver.protocol != device.driver.protocol
+        }
+        return any(
+            e.kind == "late" and e.device in ("", *other) and e.start <= now < e.end + 30.0
             for e in self.episodes
         )
 

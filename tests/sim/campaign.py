@@ -18,11 +18,15 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
+from tests.sim import north
 from tests.sim.draw import PACES
 from tests.sim.story import Story
 from tests.sim.world import run
 
+NORTH = "north"  # the pace of the world of `north.py`
 MOST = ("most timers", "most open")  # counts of which the largest is printed
+WORDS = ("frames", "good samples", "foreign answers")  # counts in the total
+NORTH_WORDS = ("published", "received", "lost by congestion", "answers", "pages", "executed")
 
 
 @dataclass
@@ -46,10 +50,10 @@ class Total:
 
     def __str__(self) -> str:
         broken = ", ".join(f"{rule}: {seeds}" for rule, seeds in self.rules.most_common())
+        counted = WORDS if self.counts["frames"] else NORTH_WORDS
+        numbers = "".join(f"{self.counts[word]} {word}, " for word in counted)
         return (
-            f"{self.seeds} seeds, {self.hours:g} hours, {self.counts['frames']} frames, "
-            f"{self.counts['good samples']} good samples, "
-            f"{self.counts['foreign answers']} foreign answers, "
+            f"{self.seeds} seeds, {self.hours:g} hours, {numbers}"
             f"{self.broken} seeds with a broken rule {broken and f'({broken})'}"
         ).rstrip()
 
@@ -81,7 +85,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=seeds, default=seeds("0-19"), metavar="0-19")
     parser.add_argument("--hours", type=float, default=1.0)
-    parser.add_argument("--pace", choices=sorted(PACES), default="busy")
+    parser.add_argument("--pace", choices=sorted([*PACES, NORTH]), default="busy")
     parser.add_argument("--only", default="", help="kinds of faults, with commas")
     parser.add_argument("--workers", type=int, default=multiprocessing.cpu_count())
     parser.add_argument("--part", type=part, default=(1, 1), metavar="1/4")
@@ -103,7 +107,8 @@ def main() -> int:
     began = time.monotonic()
     gc.set_threshold(100_000)
     with multiprocessing.Pool(chosen.workers, maxtasksperchild=20) as pool:
-        task = partial(run, hours=chosen.hours, pace=chosen.pace, only=only, traced=False)
+        run_one = north.run if chosen.pace == NORTH else run
+        task = partial(run_one, hours=chosen.hours, pace=chosen.pace, only=only, traced=False)
         for story in pool.imap_unordered(task, left):
             known.append(story)
             if chosen.result:

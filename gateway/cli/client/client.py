@@ -6,6 +6,7 @@ from contextlib import AbstractContextManager, ExitStack, suppress
 from functools import partial
 from itertools import pairwise
 from queue import SimpleQueue
+from typing import Any
 
 import orjson
 import zenoh
@@ -88,6 +89,25 @@ class Client:
             if reply.ok is not None:
                 return document(reply.ok.payload.to_bytes())
         raise GatewayError(self.no_reply)
+
+    def documents(self) -> dict[str, dict[str, Any]]:
+        """Returns all status documents by path: `status`, `lines/<line>`, `devices/<device>`."""
+        stem = self._keys.status("")
+        found = {
+            str(reply.ok.key_expr).removeprefix(stem): document(reply.ok.payload.to_bytes())
+            for reply in self._query(self._keys.statuses)
+            if reply.ok is not None
+        }
+        if "status" not in found:
+            raise GatewayError(self.no_reply)
+        return found
+
+    def outcomes(self, since: str) -> list[dict[str, Any]] | None:
+        """Returns the outcomes of writes since a time as in `_time`; None without history."""
+        replies = self._query(f"{self._keys.writes}?_time=[{since}..]")
+        if any(reply.err is not None for reply in replies):
+            return None
+        return [document(reply.ok.payload.to_bytes()) for reply in replies if reply.ok is not None]
 
     def write(self, tag: str, value: Value) -> dict[str, object]:
         """Returns the outcome as the gateway sends it: `value ...` or `error ...`.

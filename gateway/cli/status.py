@@ -1,0 +1,204 @@
+"""The `status` command: lines, devices, connections, history and what is wrong, in one view."""
+
+import json
+import sys
+import time
+from collections import Counter
+from collections.abc import Mapping
+from contextlib import nullcontext, suppress
+from typing import Annotated, Any
+
+import typer
+from rich.console import Group, RenderableType
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from gateway.cli.client import Client, connected
+from gateway.cli.faults import Documents, below, faults, warnings
+from gateway.cli.terminal import FAILED, AsJson, ConfigPath, err, out, printable
+from gateway.config import load
+from gateway.errors import GatewayError
+
+EVERY = 1.0  # seconds between two views of --watch
+HOUR = "now(-1h)"
+_STYLES = {"up": "green", "open": "green", "silent": "red", "down": "red", "failing": "yellow"}
+
+
+def status(
+    config: ConfigPath,
+    watch: Annotated[
+        bool, typer.Option("--watch", help="Show it again every second. Ctrl-C ends it.")
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Print lines, devices, history and what is wrong, from the running gateway."""
+    loaded = load(config)
+    with connected(loaded, err.print) as client:
+        if watch and not as_json:
+            with suppress(KeyboardInterrupt):
+                _follow(client)
+            return
+        documents = client.documents()
+        if as_json:
+            print(json.dumps(documents))
+        else:
+            out.print(view(documents, client.outcomes(HOUR)))
+        if any(faults(documents)):
+            sys.exit(FAILED)
+
+
+def health(
+    config: ConfigPath,
+    strict: Annotated[
+        bool,
+        typer.Option(
+            "--strict", help="Fail also on a silent device, a line down, history not written."
+        ),
+    ] = False,
+) -> None:
+    """Print the status of the running gateway. Exit code 0 if it replies (for containers)."""
+    with connected(load(config), err.print) as client:
+        if not strict:
+            print(json.dumps(client.status()))
+            return
+        documents = client.documents()
+        print(json.dumps(documents["status"]))
+        found = list(faults(documents))
+        for sentence in found:
+            err.print(printable(sentence))
+        if found:
+            sys.exit(FAILED)
+
+
+def _follow(client: Client) -> None:
+    """Shows the view again every second, without end. A gateway that has gone is shown too."""
+    with Live(console=out, auto_refresh=False) if out.is_terminal else nullcontext() as live:
+        while True:
+            shown: RenderableType
+            try:
+                shown = view(client.documents(), client.outcomes(HOUR))
+            except GatewayError as error:
+                shown = Text(printable(str(error)), style="red")
+            if live is None:
+                out.print(shown)
+            else:
+                live.update(shown, refresh=True)
+            time.sleep(EVERY)
+
+
+def view(documents: Documents, outcomes: list[dict[str, Any]] | None) -> RenderableType:
+    """Returns the whole status. `outcomes` of the last hour; None without history."""
+    gateway = documents["status"]
+    title = f"{gateway['name']} {gateway['version']}, up {span(gateway['up'])}"
+    parts: list[RenderableType] = [
+        Text(printable(f"{title}, {gateway['tags']} tags{_standby(documents)}")),
+        Text(),
+        _lines(documents),
+        Text(),
+        _devices(documents),
+        Text(),
+        _services(documents, outcomes),
+    ]
+    for heading, style, found in (
+        ("wrong", "red", list(faults(documents))),
+        ("to look at", "yellow", list(warnings(documents))),
+    ):
+        if found:
+            parts += [Text(), Text(f"{heading}:")]
+            parts += [Text(printable(f"  {sentence}"), style=style) for sentence in found]
+    return Group(*parts)
+
+
+def _standby(documents: Documents) -> str:
+    standby = documents.get("standby")
+    return "" if standby is None else f", {standby['stand']} in group {standby['group']}"
+
+
+def _lines(documents: Documents) -> Table:
+    table = _table("line", "state", "open for", "load", "expected", "requests/s", "slowest write")
+    for name, document in below("lines/", documents):
+        measured, expected = document["measured"], document["expected"]
+        table.add_row(
+            Text(name),
+            _state("open" if document["open"] else "down"),
+            Text(span(document["open_for"])),
+            Text(_share(measured["load"])),
+            Text(_share(expected["load"])),
+            Text(_number(measured["requests_per_second"])),
+            Text(f"{measured['slowest_write']:.2f} s"),
+        )
+    return table
+
+
+def _devices(documents: Documents) -> Table:
+    table = _table("device", "line", "state", "turnaround", "longest gap", "failures", "refused")
+    lines = {
+        device: line
+        for line, document in below("lines/", documents)
+        for device in document["devices"]
+    }
+    for name, document in below("devices/", documents):
+        turnaround = document["turnaround"]
+        gaps = [one["worst_age"] for one in document["requests"] if one["worst_age"] is not None]
+        table.add_row(
+            Text(name),
+            Text(lines.get(name, "")),
+            _state(document["standing"]),
+            Text("-" if turnaround is None else f"{turnaround * 1000:.0f} ms"),
+            Text(f"{max(gaps):.2f} s" if gaps else "-"),
+            Text(_counts(document["failures"])),
+            Text(_counts(document["refusals"])),
+        )
+    return table
+
+
+def _services(documents: Documents, outcomes: list[dict[str, Any]] | None) -> Table:
+    table = Table(box=None, pad_edge=False, show_header=False)
+    zenoh = documents.get("zenoh", {})
+    links: Counter[str] = Counter(zenoh.get("to", ()))
+    to = ", ".join(f"{number} {kind}" for kind, number in links.items()) or "no connection"
+    table.add_row(
+        "Zenoh", Text(printable(f"{to}; {zenoh.get('congested', 0)} puts met a full link"))
+    )
+    history = documents.get("history")
+    text = "not kept" if history is None else f"{history['state']}, {history['waiting']} waiting"
+    table.add_row("history", Text(printable(text)))
+    if outcomes is not None:
+        known = Counter(str(outcome.get("outcome")) for outcome in outcomes)
+        text = ", ".join(f"{number} {outcome}" for outcome, number in known.most_common())
+        table.add_row("writes", Text(printable(f"{text or 'none'} in the last hour")))
+    return table
+
+
+def _table(*columns: str) -> Table:
+    table = Table(box=None, pad_edge=False)
+    for column in columns:
+        table.add_column(column)
+    return table
+
+
+def _state(text: str) -> Text:
+    return Text(text, style=_STYLES.get(text, ""))
+
+
+def _share(load: float | None) -> str:
+    return "-" if load is None else f"{load * 100:.0f} %"
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.1f}"
+
+
+def _counts(counts: Mapping[str, int]) -> str:
+    return printable(", ".join(f"{number} {kind}" for kind, number in counts.items())) or "-"
+
+
+def span(seconds: float) -> str:
+    """Returns `12 s`, `5 min`, `3 h 20 min` or `4 d 2 h`."""
+    minutes, hours, days = int(seconds // 60), int(seconds // 3600), int(seconds // 86400)
+    if days:
+        return f"{days} d {hours % 24} h"
+    if hours:
+        return f"{hours} h {minutes % 60} min"
+    return f"{minutes} min" if minutes else f"{seconds:.0f} s"

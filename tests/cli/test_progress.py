@@ -1,0 +1,101 @@
+"""The progress bar: on a terminal, from the second second on."""
+
+import io
+import os
+import pty
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+from rich.console import Console
+
+from gateway.cli.progress import AFTER, progress
+from tests.e2e.processes import ROOT
+
+PLANT = """\
+zenoh: {listen: [tcp/127.0.0.1:7447]}
+lines:
+  hall:
+    port: simulator
+    devices: {plc: {protocol: vigor, station: 1, tags: {a: {address: D1}}}}
+"""
+
+
+def test_a_long_check_shows_a_bar_and_removes_it(tmp_path: Path) -> None:
+    """The file is a pipe: reading takes until the test writes it."""
+    path = tmp_path / "plant.yaml"
+    os.mkfifo(path)
+    near, far = pty.openpty()
+    begun = time.monotonic()
+    program = subprocess.Popen(
+        [sys.executable, "-m", "gateway", "check", path],
+        stdout=subprocess.PIPE,
+        stderr=far,
+        cwd=ROOT,
+        env={**os.environ, "TERM": "xterm", "COLUMNS": "80"},
+        text=True,
+    )
+    os.close(far)
+    shown = b""
+    while b"%" not in shown:
+        shown += os.read(near, 1024)
+    assert time.monotonic() - begun >= AFTER
+    assert b"starting" in shown
+    path.write_text(PLANT)
+    out, _ = program.communicate(timeout=20)
+    shown += _rest(near)
+    assert program.returncode == 0
+    assert f"{path}: good, 1 tag on 1 line" in out
+    assert "starting" not in out
+    assert shown.rstrip().endswith((b"\x1b[2K", b"\x1b[?25h"))  # the row is empty again
+
+
+def _rest(terminal: int) -> bytes:
+    found = b""
+    try:
+        while more := os.read(terminal, 1024):
+            found += more
+    except OSError:  # its other end is closed
+        pass
+    finally:
+        os.close(terminal)
+    return found
+
+
+def _console(*, terminal: bool, term: str = "xterm") -> tuple[Console, io.StringIO]:
+    text = io.StringIO()
+    return Console(file=text, force_terminal=terminal, _environ={"TERM": term}), text
+
+
+def test_without_a_terminal_there_is_no_bar() -> None:
+    console, text = _console(terminal=False)
+    before = threading.active_count()
+    with progress(console, 0.0) as report:
+        assert threading.active_count() == before  # nothing will show it later
+        report("reading", 0.5)
+    assert text.getvalue() == ""
+
+
+def test_a_terminal_without_a_cursor_gets_no_bar() -> None:
+    console, text = _console(terminal=True, term="dumb")
+    with progress(console, 0.0) as report:
+        report("reading", 0.5)
+    assert text.getvalue() == ""
+
+
+def test_quick_work_shows_nothing() -> None:
+    console, text = _console(terminal=True)
+    with progress(console, 1000.0) as report:
+        report("reading", 0.5)
+    assert text.getvalue() == ""
+
+
+def test_the_bar_says_what_is_done_and_how_much() -> None:
+    console, text = _console(terminal=True)
+    with progress(console, 0.0) as report:
+        report("reading plant.yaml", 0.5)
+        while "50%" not in text.getvalue():  # a thread draws it
+            time.sleep(0.01)
+    assert "reading plant.yaml" in text.getvalue()

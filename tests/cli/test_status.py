@@ -1,0 +1,144 @@
+"""The commands `status` and `health`."""
+
+import copy
+import io
+import json
+import re
+import signal
+import socket
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from gateway.cli.faults import faults, warnings
+from gateway.cli.status import span, view
+from tests.e2e.processes import Done, gateway, plc_gateway, started, vigor_line, write_config
+from tests.zenoh_peer import free_endpoint
+
+
+def device_on(port: str, name: str) -> dict[str, Any]:
+    line = vigor_line(port, {"level": {"address": "D10"}}, reply_timeout="50ms", retries=0)
+    return {**line, "devices": {name: line["devices"]["mixer"]}}
+
+
+def until_exit(code: int, *arguments: object) -> Done:
+    """Runs a command until it ends with this code; the test's own time-out bounds it."""
+    while (done := plc_gateway(*arguments)).code != code:
+        pass
+    return done
+
+
+def test_a_healthy_gateway(running: Path) -> None:
+    done = plc_gateway("status", running)
+    assert (done.code, done.err) == (0, "")
+    assert re.search(r"^demo \S+, up \d+ (s|min), 7 tags$", done.out, re.MULTILINE)
+    assert re.search(r"^hall +open +\d", done.out, re.MULTILINE)
+    assert re.search(r"^mixer +hall +up +\d+ ms", done.out, re.MULTILINE)
+    assert re.search(r"^Zenoh +\d client", done.out, re.MULTILINE)
+    assert re.search(r"^history +not kept", done.out, re.MULTILINE)
+    assert "wrong" not in done.out
+    assert plc_gateway("health", "--strict", running).code == 0
+
+
+def test_as_json_it_is_every_document(running: Path) -> None:
+    documents = json.loads(plc_gateway("status", "--json", running).out)
+    assert documents["status"]["devices"] == {"mixer": "up"}
+    assert documents["lines/hall"]["open"] is True
+    assert documents["devices/mixer"]["station"] == 1
+
+
+def test_what_is_wrong_is_said_and_fails(tmp_path: Path) -> None:
+    with ExitStack() as stack:
+        deaf = stack.enter_context(socket.create_server(("127.0.0.1", 0)))  # accepts, says nothing
+        lines = {
+            "hall": vigor_line("simulator", {"trim": {"address": "D500", "write": True}}),
+            "yard": device_on(str(tmp_path / "no-port"), "oven"),
+            "roof": device_on(f"tcp://127.0.0.1:{deaf.getsockname()[1]}", "pump"),
+        }
+        history = {"path": str(tmp_path / "h.db")}
+        config = write_config(tmp_path / "c.yaml", free_endpoint(), lines, history=history)
+        program = stack.enter_context(started(config))
+        program.says("device offline", "pump")
+        until_exit(0, "write", config, "mixer/trim", "5")
+        done = until_exit(1, "status", config)
+        assert f"line yard is down: {tmp_path / 'no-port'}: no such port" in done.out
+        assert re.search(r"pump is silent: .*power", done.out)
+        assert "oven" not in done.out[done.out.index("wrong:") :]  # its line says why
+        assert re.search(r"^writes +1 written in the last hour", done.out, re.MULTILINE)
+        strict = plc_gateway("health", "--strict", config)
+        assert strict.code == 1
+        assert json.loads(strict.out)["devices"]["mixer"] == "up"
+        assert strict.err.splitlines()[0].startswith("line yard is down:")
+        assert plc_gateway("health", config).code == 0  # it is there
+
+
+def test_watch_follows_and_shows_a_gateway_that_has_gone(tmp_path: Path) -> None:
+    lines = {"hall": vigor_line("simulator", {"level": {"address": "D10"}})}
+    config = write_config(tmp_path / "c.yaml", free_endpoint(), lines)
+    with started(config) as program, gateway("status", "--watch", config) as watch:
+        watch.says("mixer", "up")
+        program.end(signal.SIGKILL)
+        watch.says("no reply: is the gateway of this file running?")
+        assert watch.end(signal.SIGINT) == 0
+
+
+@pytest.fixture(scope="module")
+def healthy(running: Path) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(plc_gateway("status", "--json", running).out)
+    return found
+
+
+def changed(healthy: dict[str, Any], path: str, **fields: object) -> dict[str, Any]:
+    documents = copy.deepcopy(healthy)
+    documents.setdefault(path, {}).update(fields)
+    return documents
+
+
+def test_history_that_is_not_written_is_a_fault(healthy: dict[str, Any]) -> None:
+    full = changed(healthy, "history", state="the disk is full", waiting=3, lost=2)
+    assert list(faults(full)) == ["history: the disk is full"]
+    assert "history: 2 samples were lost since the start" in list(warnings(full))
+
+
+@pytest.mark.parametrize(
+    ("path", "fields", "says"),
+    [
+        ("devices/mixer", {"diagnosis": "Answers twice"}, "mixer: Answers twice"),
+        ("devices/mixer", {"refused_addresses": ["D9 of mixer: refused"]}, "D9 of mixer: refused"),
+        ("lines/hall", {"expected": {"load": 1.84}}, "line hall is asked for 1.8 times what"),
+        ("status", {"refused_devices": {"oven": "other"}}, "oven is served by another gateway"),
+    ],
+)
+def test_what_is_no_fault_is_told(
+    healthy: dict[str, Any], path: str, fields: dict[str, Any], says: str
+) -> None:
+    documents = changed(healthy, path, **fields)
+    assert list(faults(documents)) == []
+    [sentence] = warnings(documents)
+    assert sentence.startswith(says)
+
+
+def test_control_characters_of_a_device_do_not_reach_the_terminal(healthy: dict[str, Any]) -> None:
+    evil = changed(healthy, "devices/mixer", standing="silent", diagnosis="a\x1b[2Jb\nc")
+    screen = Console(width=200, record=True, file=io.StringIO())
+    screen.print(view(evil, None))
+    shown = screen.export_text()
+    assert "\x1b" not in shown
+    assert r"a\x1b[2Jb\nc" in shown
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [
+        (0.4, "0 s"),
+        (59.9, "60 s"),
+        (61, "1 min"),
+        (3600, "1 h 0 min"),
+        (93600, "1 d 2 h"),
+    ],
+)
+def test_a_span_of_time(seconds: float, text: str) -> None:
+    assert span(seconds) == text
