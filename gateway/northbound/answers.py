@@ -27,7 +27,7 @@ WIDE_LIMIT = 64  # of these, wildcards
 HISTORY_LIMIT = 16  # of these, history
 _NARROW_THREADS = 32
 _WAIT_OF_BATCH = 0.05  # seconds until another thread goes on with a batch
-REFUSALS_LIMIT = 256  # error replies in progress; beyond, a query ends without a reply
+REFUSALS_LIMIT = 256  # error replies in progress; beyond, one thread sends them in turn
 CLOSE_TIMEOUT = 0.5  # seconds for the replies in progress when the gateway ends
 
 
@@ -37,7 +37,6 @@ class QueryCounters:
 
     queries: int = 0
     refused: int = 0  # because too many queries were open
-    unanswered: int = 0  # refused without an error reply
 
 
 class AnswerPool:
@@ -135,29 +134,33 @@ class AnswerPool:
     # -- any thread --
 
     def refuse(self, query: zenoh.Query) -> None:
-        """Replies busy, or ends the query without a reply if too many error replies wait."""
+        """Replies busy. Never waits."""
         self.counters.refused += 1
-        if self._closing or not self._refusals.acquire(blocking=False):
-            self.counters.unanswered += 1
-            self._ends.submit(_end, query)
-            return
-        self._narrow.submit(self._refuse, query, self._reply_busy)
+        if self._refusals.acquire(blocking=False):
+            self._narrow.submit(self._refuse, query, self._reply_busy, self._refusals)
+        else:
+            self._ends.submit(self._refuse, query, self._reply_busy)
 
     def dismiss(self, query: zenoh.Query) -> None:
         """Ends a query without a reply: it is for another gateway."""
         if self._closing or not self._refusals.acquire(blocking=False):
             self._ends.submit(_end, query)
             return
-        self._narrow.submit(self._refuse, query, _no_reply)
+        self._narrow.submit(self._refuse, query, _no_reply, self._refusals)
 
     # -- answering threads --
 
-    def _refuse(self, query: zenoh.Query, reply: Answer) -> None:
+    def _refuse(
+        self, query: zenoh.Query, reply: Answer, room: threading.Semaphore | None = None
+    ) -> None:
         try:
             with query:
                 reply(query)
+        except zenoh.ZError as error:
+            log.debug("refusal failed", error=str(error))
         finally:
-            self._refusals.release()
+            if room is not None:
+                room.release()
 
     def _finish_all(self, batch: deque[tuple[zenoh.Query, Answer]]) -> None:
         while True:

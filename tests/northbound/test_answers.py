@@ -63,9 +63,9 @@ def test_work_that_blocks_gets_more_threads_up_to_the_limit() -> None:
     workers.end()
 
 
-async def test_a_query_without_an_answer_does_not_wait_on_the_loop_for_its_client() -> None:
-    """Its end is a message too: it has no room on the link of a client that does not receive."""
-    receives, ended = threading.Event(), threading.Semaphore(0)
+async def test_refusals_do_not_wait_on_the_loop_for_a_client_and_each_gets_its_error() -> None:
+    """The end of a query is a message too: it has no room on the link of a deaf client."""
+    receives, ended, refused = threading.Event(), threading.Semaphore(0), threading.Semaphore(0)
 
     class Deaf(Query):
         def __exit__(self, *_error: object) -> None:
@@ -75,13 +75,27 @@ async def test_a_query_without_an_answer_does_not_wait_on_the_loop_for_its_clien
             assert receives.wait(PATIENCE)
             ended.release()
 
-    pool = AnswerPool(lambda _: None)
+    pool = AnswerPool(lambda _: refused.release())
     most = REFUSALS_LIMIT + 2
     for _ in range(most):
         pool.refuse(cast("zenoh.Query", Deaf()))
-    assert pool.counters.unanswered == 2
     pool.dismiss(cast("zenoh.Query", Deaf()))
     receives.set()
     for _ in range(most + 1):
         assert await asyncio.to_thread(ended.acquire, timeout=PATIENCE)
+    for _ in range(most):
+        assert refused.acquire(blocking=False)
+    pool.end()
+
+
+async def test_a_refusal_after_the_session_has_closed_ends_no_thread() -> None:
+    replied = threading.Semaphore(0)
+
+    def closed(_: zenoh.Query) -> None:
+        replied.release()
+        raise zenoh.ZError("session closed")
+
+    pool = AnswerPool(closed)
+    pool.refuse(query())
+    assert await asyncio.to_thread(replied.acquire, timeout=PATIENCE)
     pool.end()

@@ -59,14 +59,14 @@ async def test_a_flood_of_everything_costs_little_memory_and_no_poll() -> None:
         # It received many of them, and refused those beyond its limits.
         assert int(results[0]) > 0
         assert counters["queries"] > 0
-        # Each query ended: with an answer, with an error, or without a reply.
+        # Each query ended with an answer or an error.
         ended: Counter[str] = Counter()
         for result in map(json.loads, results[1:]):
             assert sum(result["ended"].values()) == result["asked"]
             ended += Counter(result["ended"])
         assert ended["answered"] > 0
         assert ended["an error"] > 0
-        assert ended["silent"] <= counters["unanswered"]
+        assert not ended["silent"]
         assert most - before < 150.0, f"{before:.0f} MB grew to {most:.0f} MB"
         # A line's task would have been as late. On a busy machine the loop of an idle process is
         # late too.
