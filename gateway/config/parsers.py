@@ -196,10 +196,7 @@ def port(text: object) -> PortAddress:
         host = match[1] or "host"
         raise ConfigError(f"{text} is no port: for a device server write tcp://{host}:{match[2]}")
     if _HOST.match(text):
-        raise ConfigError(
-            f"{text} is no port: for a device server write tcp://{text}:4001, with the port number "
-            "of its serial port"
-        )
+        raise ConfigError(f"{text} is no port: write tcp://{text}:4001, with its port number")
     found = parse_port(text)
     if isinstance(found, SerialPath) and os.name == "posix" and "/" not in text:
         if _WINDOWS.match(text):

@@ -30,8 +30,7 @@ def devices(tag: str) -> str:
         (r"\\.\COM12", r"\\.\COM12 is a port of Windows: here it is a path like /dev/ttyUSB0"),
         (
             "192.168.0.7",
-            "192.168.0.7 is no port: for a device server write tcp://192.168.0.7:4001, "
-            + "with the port number of its serial port",
+            "192.168.0.7 is no port: write tcp://192.168.0.7:4001, with its port number",
         ),
     ],
 )
