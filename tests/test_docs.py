@@ -160,7 +160,7 @@ def test_a_device_in_the_pages_loads_on_a_line_of_its_own(block: Block, tmp_path
     assert {device["protocol"] for device in devices.values()} == {"frames"}
     serial = {"baudrate": 9600, "format": "8N1"}
     lines = {
-        name: {**serial, "port": f"COM{number}", "devices": {name: made}}
+        name: {**serial, "port": f"/dev/ttyS{number}", "devices": {name: made}}
         for number, (name, made) in enumerate(devices.items())
     }
     assert len(loaded(json.dumps({"lines": lines}), tmp_path).devices) == len(devices)
@@ -271,7 +271,7 @@ def _plant(section: str, name: str, text: str) -> dict[str, Any]:
                 device = {"protocol": protocol, "framing": {"ending": "CR"}, "ask": ask}
                 tag["address"] = "f"
                 del tag["write"]
-                line["port"] = "COM1"
+                line["port"] = "/dev/ttyS1"
     return {
         **top,
         "lines": {"hall": {**line, "devices": {"plc": {**device, "tags": {"tag": tag}}}}},

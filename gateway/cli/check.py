@@ -1,5 +1,6 @@
 """The `check` command: validates the file and prints the plan of each line."""
 
+import sys
 from collections.abc import Sequence
 from typing import Annotated
 
@@ -10,7 +11,7 @@ from rich.text import Text
 
 from gateway import app, northbound
 from gateway.cli.progress import progress
-from gateway.cli.terminal import ConfigPath, err, out
+from gateway.cli.terminal import FAILED, ConfigPath, err, out
 from gateway.config import Config, load
 from gateway.engine.forecast import LineForecast
 from gateway.planning.planner import describe
@@ -23,6 +24,9 @@ def check(
         bool | None,
         typer.Option("--blocks/--no-blocks", help="Every request (default: if at most 100)"),
     ] = None,
+    strict: Annotated[
+        bool, typer.Option("--strict", help="End with 1 if a line is overloaded.")
+    ] = False,
 ) -> None:
     """Validate the file and print the plan of each line. Sends nothing."""
     with progress(err) as report:
@@ -50,6 +54,8 @@ def check(
     for warning in warnings:
         err.print(f"warning: {warning}")
     print(f"{config}: good, {size(loaded)}")
+    if strict and any(line.overloaded for line in lines):
+        sys.exit(FAILED)
 
 
 def size(config: Config) -> str:

@@ -9,7 +9,7 @@ import orjson
 import typer
 
 from gateway.cli import direct
-from gateway.cli.client import connected, parse_value, tags_by_key
+from gateway.cli.client import connected, parse_value, suggestion, tags_by_key
 from gateway.cli.logs import LogFormat, LogLevel, set_up
 from gateway.cli.tables import value_text
 from gateway.cli.terminal import FAILED, USER_MISTAKE, AsJson, ConfigPath, Direct, err, printable
@@ -20,13 +20,16 @@ from gateway.northbound.payload import Problem
 from gateway.tags import Tag
 from gateway.values import Kind, Value
 
+_SWITCH: dict[str, Value] = {"on": True, "off": False}
 _USER_MISTAKES = {Problem.BAD_VALUE, Problem.NOT_WRITABLE, Problem.UNKNOWN_TAG}
 
 
 def write(
     config: ConfigPath,
     tag: Annotated[str, typer.Argument(metavar="TAG", help="device/tag")],
-    value: Annotated[str, typer.Argument(metavar="VALUE", help="JSON: true, 12.5, AB")],
+    value: Annotated[
+        str, typer.Argument(metavar="VALUE", help="JSON: true, 12.5, AB; on and off for bits")
+    ],
     without_gateway: Direct = False,
     as_json: AsJson = False,
 ) -> None:
@@ -34,11 +37,16 @@ def write(
     loaded = load(config)
     target = tags_by_key(loaded).get(tag)
     if target is None:
-        raise ConfigError(f"there is no tag {tag} in {config}")
+        raise ConfigError(
+            f"there is no tag {tag} in {config}{suggestion(tag, tags_by_key(loaded))}"
+        )
     if target.write is None:
         raise ConfigError(f"{tag} cannot be written: it has no `write: true` in {config}")
     parsed = parse_value(value)
-    if target.layout.type.kind is Kind.STRING and not isinstance(parsed, str):
+    kind = target.layout.type.kind
+    if kind is Kind.BOOL and value.lower() in _SWITCH:
+        parsed = _SWITCH[value.lower()]
+    if kind is Kind.STRING and not isinstance(parsed, str):
         parsed = value  # 12 is a text for this tag
     try:
         target.encode(parsed)

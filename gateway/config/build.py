@@ -37,6 +37,7 @@ from gateway.engine.device import DeviceSettings
 from gateway.errors import ConfigError
 from gateway.protocols.driver import AnyDriver, Timing
 from gateway.protocols.registry import PROTOCOLS
+from gateway.transport.port import SerialPath
 
 
 @dataclass(slots=True)
@@ -191,7 +192,8 @@ class Builder:
         for line in lines:
             if line.simulated:
                 continue
-            other = ports.setdefault(line.port, line.name)
+            known = realpath(line.port.path) if isinstance(line.port, SerialPath) else line.port
+            other = ports.setdefault(known, line.name)
             if other != line.name:
                 self.mistakes.add(
                     ("lines", line.name, "port"),

@@ -1,13 +1,18 @@
 """Mistakes in the file, reported all at once, each with its place."""
 
-from collections.abc import Iterable, Sequence
+import re
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from gateway.errors import ConfigError
 
 Path = tuple[str | int, ...]
+MOST_ALIKE = 10  # mistakes of one kind that are shown one by one
+_VALUE = re.compile(r"'[^']*'|[0-9]+")
+_MEANT = re.compile(r"did you mean (\w+)\?")
 
 
 class ConfigErrors(ConfigError):
@@ -28,19 +33,28 @@ class Places(Protocol):
         """Returns the line, from 1, of the deepest part of `path` in the file."""
 
 
+class Mistake(NamedTuple):
+    line: int
+    path: Path
+    what: str
+
+    @property
+    def kind(self) -> tuple[object, str]:
+        """Equal for mistakes with one cause: the same setting, and the same words."""
+        return self.path[-1:], _VALUE.sub("", self.what)
+
+
 @dataclass(slots=True)
 class Mistakes:
     """The mistakes found so far in one file."""
 
     places: Places
-    _found: list[tuple[int, str]] = field(default_factory=list)
+    _found: list[Mistake] = field(default_factory=list)
 
     def add(self, path: Path, what: str) -> None:
-        line = self.places.line(path)
-        where = f"{dotted(path)}: " if path else ""
-        entry = (line, f"{self.places.name}:{line}: {where}{what}")
-        if entry not in self._found[-20:]:
-            self._found.append(entry)
+        mistake = Mistake(self.places.line(path), path, what)
+        if mistake not in self._found[-20:]:
+            self._found.append(mistake)
 
     def __len__(self) -> int:
         return len(self._found)
@@ -48,8 +62,23 @@ class Mistakes:
     def raise_all(self) -> None:
         """Raises `ConfigErrors` if there was any mistake."""
         if self._found:
-            self._found.sort(key=lambda entry: entry[0])
-            raise ConfigErrors([message for _, message in self._found])
+            raise ConfigErrors(list(self._messages()))
+
+    def _messages(self) -> Iterator[str]:
+        """Yields the mistakes by line; of many alike the first ten, and the number of others."""
+        misspelt = {
+            (*path[:-1], m[1]) for _, path, what in self._found if (m := _MEANT.search(what))
+        }
+        kinds = defaultdict[object, list[Mistake]](list)
+        for mistake in sorted(self._found, key=lambda mistake: mistake.line):
+            if not (mistake.path in misspelt and mistake.what.startswith("missing")):
+                kinds[mistake.kind].append(mistake)
+        shown = [m for alike in kinds.values() for m in alike[:MOST_ALIKE]]
+        for line, path, what in sorted(shown, key=lambda mistake: mistake.line):
+            yield f"{self.places.name}:{line}: {dotted(path) + ': ' if path else ''}{what}"
+        for alike in kinds.values():
+            if more := alike[MOST_ALIKE:]:
+                yield f"{self.places.name}:{more[0].line}: {len(more)} more like: {alike[0].what}"
 
 
 def dotted(path: Path) -> str:

@@ -4,6 +4,7 @@ Each takes a value of the file, of any type, and raises `ConfigError` with a cor
 """
 
 import math
+import os
 import re
 import unicodedata
 from collections.abc import Callable
@@ -13,10 +14,11 @@ from typing import Literal
 from gateway.config.messages import one_of, shown
 from gateway.errors import ConfigError
 from gateway.tags import Deadband, Form, Publish
-from gateway.transport.port import PortAddress, parse_port
+from gateway.transport.port import PortAddress, SerialPath, parse_port
 from gateway.values import Order, ValueType, parse_type
 
 _DURATION = re.compile(r"([0-9]+(?:\.[0-9]+)?) ?([A-Za-zµ]+)\Z")
+_COMMA = re.compile(r"-?[0-9]+,[0-9]+ ?[A-Za-zµ%]*\Z")
 SECONDS = {"ms": 0.001, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
 _SIZE = re.compile(r"([0-9]+(?:\.[0-9]+)?) ?([kKMGT]B)\Z")
 BYTES = {"kB": 10**3, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
@@ -25,6 +27,8 @@ _WEB = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[^\[\]/:\s]+):([0-9]{1,5})\Z")
 _ENDPOINT = re.compile(r"[a-z][a-z0-9_-]*/[^\s/]\S*\Z")
 _WITH_PORT = ("tcp", "udp", "tls", "quic", "ws")
 _SERVER = re.compile(r"(?:([^/\\:\s]+):)?([0-9]+)\Z")  # as in its manual: `4001`, `10.0.0.7:4001`
+_HOST = re.compile(r"[0-9]{1,3}(?:\.[0-9]{1,3}){3}\Z")
+_WINDOWS = re.compile(r"(?:\\\\\.\\)?COM[0-9]+\Z", re.IGNORECASE)
 _FORMAT = re.compile(r"[78][NEO][12]\Z")
 # Rates of serial ports and PLCs; a typing mistake is rarely one of them.
 BAUDRATES = (
@@ -44,7 +48,8 @@ def duration(text: object) -> float:
         raise ConfigError(f"{number} has no unit: write {number}s or {number}ms")
     match = _DURATION.match(text) if isinstance(text, str) else None
     if match is None:
-        raise ConfigError(f"{shown(text)} is no duration: write {DURATIONS}")
+        write = with_point(text) or DURATIONS
+        raise ConfigError(f"{shown(text)} is no duration: write {write}")
     if match[2] not in SECONDS:
         hint = f"{match[1]}min for minutes" if match[2] in "mM" else one_of(SECONDS)
         raise ConfigError(f"{text}: {match[2]} is no unit of time: use {hint}")
@@ -53,6 +58,13 @@ def duration(text: object) -> float:
     if seconds > _LONGEST_TIME:
         raise ConfigError(f"{text} is longer than ten years")
     return seconds
+
+
+def with_point(text: object) -> str | None:
+    """Returns a number with a decimal comma as the file needs it, with a point; else None."""
+    if isinstance(text, str) and _COMMA.match(text):
+        return text.replace(",", ".")
+    return None
 
 
 def interval(text: object) -> float:
@@ -183,7 +195,14 @@ def port(text: object) -> PortAddress:
     if match := _SERVER.match(text):
         host = match[1] or "host"
         raise ConfigError(f"{text} is no port: for a device server write tcp://{host}:{match[2]}")
-    return parse_port(text)
+    if _HOST.match(text):
+        raise ConfigError(f"{text} is no port: write tcp://{text}:4001, with its port number")
+    found = parse_port(text)
+    if isinstance(found, SerialPath) and os.name == "posix" and "/" not in text:
+        if _WINDOWS.match(text):
+            raise ConfigError(f"{text} is a port of Windows: here it is a path like /dev/ttyUSB0")
+        raise ConfigError(f"{text} is no port: did you mean /dev/{text}?")
+    return found
 
 
 def baudrate(value: object) -> int:

@@ -9,6 +9,7 @@ from typing import Any, TypeVar, get_args
 from pydantic import TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
 
+from gateway.config import parsers
 from gateway.config.driver_settings import dataclasses_in, plain_settings
 from gateway.config.messages import Mistakes, Path, meant, one_of, shown
 from gateway.config.model import Section
@@ -146,6 +147,8 @@ def _sentence(detail: ErrorDetails, called: str, known: Collection[str]) -> str:
             return f"{value} is below {context['ge']}"
         case "less_than_equal":
             return f"{value} is above {context['le']}"
+        case "float_type" if number := parsers.with_point(detail["input"]):
+            return f"{value} is no number: write {number}"
         case other if other in _NOT:
             return f"{value} {_NOT[other]}"
     return f"{value}: {detail['msg']}"

@@ -57,7 +57,7 @@ class Device:
     bad_addresses: BadAddresses = field(init=False)
     turnaround: Turnaround = field(init=False)
     blocks: tuple[Block, ...] = ()
-    last_read: Span | None = None  # the last block that was read: the device has it
+    last_read: Span | None = None  # the last block that was read
     monitor: MonitorList = field(default_factory=MonitorList)
     window: int = field(init=False)  # requests that may be outstanding at once
     silence: float = field(init=False)  # seconds before each request
@@ -278,6 +278,10 @@ class Device:
             silent = sum(other.silent for other in known.values())
             pause = max(pause, silent * self.longest_reply / SILENT_SHARE)
         return max(pause, block.every)
+
+    def was_read(self, span: Span) -> None:
+        """Notes a good read: the device has these addresses."""
+        self.last_read = span
 
     @property
     def probe_spans(self) -> Sequence[Span]:

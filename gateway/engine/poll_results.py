@@ -56,7 +56,7 @@ class PollResults:
         counts.reads += 1
         last.at, last.ever = now, True
         if not block.listed:
-            device.last_read = block.span
+            device.was_read(block.span)
         self._effects.collected.append(Samples(self._samples(poll, units, time)))
         if block.of_fields:
             self._count_garbled(device, units)

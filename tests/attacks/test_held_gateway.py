@@ -10,6 +10,7 @@ from pathlib import Path
 
 from gateway.line.arrival import HELD
 from gateway.line.duty import SETTLE
+from gateway.northbound.election import LONGEST_PAUSE
 from tests.attacks.tcp_peer import peer, tcp_reply
 from tests.e2e.processes import Program, free_port, started, station, vigor_line, write_config
 from tests.zenoh_peer import ZenohPeer, free_endpoint
@@ -145,10 +146,12 @@ async def test_the_woken_gateway_of_a_group_does_not_write_over_the_new_active_o
                     await client.put(RECIPE, b"%d" % value)
                 await plc.written.wait()
                 with held(a):
+                    held_long_enough = asyncio.create_task(asyncio.sleep(LONGEST_PAUSE + 0.3))
                     plc.acknowledges.set()
                     await asyncio.to_thread(b.says, "device online")
                     [reply] = await client.get(RECIPE, b"50")
                     assert reply.ok
+                    await held_long_enough
                 await asyncio.to_thread(a.says, "gateway replaced")
                 await asyncio.to_thread(a.says, "gateway starts over")
                 assert plc.value == 50

@@ -35,7 +35,7 @@ def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Con
 
 def on_line(rows: str) -> str:
     """A file with one line `hall`; `rows`, its devices, begin in line 5."""
-    return "lines:\n  hall:\n    port: COM1\n    devices:\n" + textwrap.indent(
+    return "lines:\n  hall:\n    port: /dev/ttyS1\n    devices:\n" + textwrap.indent(
         textwrap.dedent(rows), "      "
     )
 
@@ -209,7 +209,7 @@ MISTAKES = {
         f"7: {M}.framing: error 9: the first byte of terminator 'AB' is not 01h..1Fh",
     ),
     "a simulated one": (
-        scale("a: {address: weight}").replace("COM1", "simulator"),
+        scale("a: {address: weight}").replace("/dev/ttyS1", "simulator"),
         "3: lines.hall.port: scale cannot be simulated: there is no station for frames",
     ),
     "two that send unsolicited frames": (

@@ -288,7 +288,7 @@ async def test_a_device_that_sends_nothing_costs_nothing() -> None:
 async def test_a_frame_ended_by_silence_is_read_after_the_silence(tmp_path: Path) -> None:
     path = tmp_path / "plant.yaml"
     path.write_text(
-        "lines: {hall: {port: COM1, devices: {scale: {protocol: frames, framing: {gap: 50ms},"
+        "lines: {hall: {port: /dev/ttyS1, devices: {scale: {protocol: frames, framing: {gap: 50ms},"
         " listen: {w: {match: 'W(?P<w>[0-9]{1,5})', fields: {w: {type: integer}}}},"
         " tags: {w: {address: w}}}}}}"
     )
@@ -338,7 +338,7 @@ async def test_the_echo_of_a_reply_is_no_frame_of_the_device() -> None:
 async def test_a_reply_that_its_framing_cannot_carry_is_not_sent(tmp_path: Path) -> None:
     path = tmp_path / "plant.yaml"
     path.write_text(
-        "lines: {hall: {port: COM1, devices: {plc: {protocol: frames,"
+        "lines: {hall: {port: /dev/ttyS1, devices: {plc: {protocol: frames,"
         " framing: {header: '<STX>', terminator: '<ETX>'}, send_framing: {terminator: '!'},"
         " listen: {w: {match: '(?P<w>.{1,5})', fields: {w: {type: text}}, answer: 'OK{w}'}},"
         " tags: {w: {address: w}}}}}}"
@@ -470,7 +470,7 @@ async def test_b_4_5_both_programs_read_d0_and_write_d1_by_configuration_alone(n
 READ_BACK = """
 lines:
   hall:
-    port: COM1
+    port: /dev/ttyS1
     devices:
       drive:
         protocol: frames
@@ -512,7 +512,7 @@ async def test_a_reply_ends_by_a_silence_and_a_write_is_read_back(tmp_path: Path
 PRINTER = """
 lines:
   hall:
-    port: COM1
+    port: /dev/ttyS1
     devices:
       printer:
         protocol: frames
@@ -554,7 +554,7 @@ async def test_a_device_without_polls_is_written_but_never_probed(tmp_path: Path
 POLLED_AND_UNSOLICITED = """
 lines:
   hall:
-    port: COM1
+    port: /dev/ttyS1
     devices:
       scale:
         protocol: frames
@@ -607,7 +607,7 @@ async def test_an_unsolicited_frame_during_a_poll_of_another_device_is_not_lost(
 SHARED = """
 lines:
   hall:
-    port: COM1
+    port: /dev/ttyS1
     baudrate: 9600
     format: 8N1
     devices:

@@ -1,6 +1,12 @@
 """The client of a running gateway, over Zenoh."""
 
-from gateway.cli.client.arguments import matches, parse_value, tags_by_key, wanted_keys
+from gateway.cli.client.arguments import (
+    matches,
+    parse_value,
+    suggestion,
+    tags_by_key,
+    wanted_keys,
+)
 from gateway.cli.client.client import Client
 from gateway.cli.client.connection import connected
 from gateway.cli.client.rows import Row
@@ -11,6 +17,7 @@ __all__ = [
     "connected",
     "matches",
     "parse_value",
+    "suggestion",
     "tags_by_key",
     "wanted_keys",
 ]

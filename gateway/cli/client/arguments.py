@@ -2,6 +2,8 @@
 
 import json
 import math
+from collections.abc import Iterable
+from difflib import get_close_matches
 
 import zenoh
 
@@ -33,9 +35,16 @@ def wanted_keys(config: Config, names: list[str] | None) -> list[str]:
         except zenoh.ZError:
             raise ConfigError(f"{key} is not a tag, and not a wildcard like 'mixer/**'") from None
         if not found:
-            raise ConfigError(f"there is no tag or device {key}")
+            more = suggestion(name, [*known, *devices])
+            raise ConfigError(f"there is no tag or device {key}{more}")
         wanted.append(key)
     return wanted
+
+
+def suggestion(name: str, known: Iterable[str]) -> str:
+    """Returns `: did you mean ...?` with the most similar name, or nothing."""
+    close = get_close_matches(name, known, n=1, cutoff=0.7)
+    return f": did you mean {close[0]}?" if close else ""
 
 
 def matches(key: str, wanted: list[str]) -> bool:
