@@ -271,7 +271,7 @@ async def test_fresh_returns_the_last_sample_of_an_unsolicited_tag_at_once(tmp_p
         "listen": {"scan": {"match": "(?P<code>[0-9]+)", "fields": {"code": {"type": "text"}}}},
         "tags": {"code": {"address": "code", "event": True}},
     }
-    lines = {"door": {"port": "COM1", "devices": {"reader": reader}}}
+    lines = {"door": {"port": "/dev/ttyS1", "devices": {"reader": reader}}}
     path = write_config(tmp_path / "c.yaml", "tcp/127.0.0.1:7447", lines)
     receivers: list[Receiver] = []
 

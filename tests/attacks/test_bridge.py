@@ -63,7 +63,7 @@ async def test_a_dead_unit_behind_a_bridge_leaves_the_other_good(
         name: {
             "protocol": "modbus-tcp",
             "station": unit,
-            "reply_timeout": "100ms",
+            "reply_timeout": "250ms",
             "tags": {"level": {"address": "holding:1"}},
         }
         for unit, name in enumerate(("alive", "dead"), 1)

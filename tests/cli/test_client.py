@@ -460,7 +460,7 @@ def test_an_event_of_a_device_that_publishes_only_blocks_is_shown_once(tmp_path:
         "blocks": "only",
         "tags": {"code": {"address": "code", "event": True}},
     }
-    line = {"port": "COM9", "baudrate": 9600, "format": "8N1", "devices": {"reader": reader}}
+    line = {"port": "/dev/ttyS9", "baudrate": 9600, "format": "8N1", "devices": {"reader": reader}}
     path = write_config(tmp_path / "config.yaml", free_endpoint(), {"conveyor": line})
     first = saying(("reader/code", good("1"), None))
     with (

@@ -197,7 +197,7 @@ def test_the_toy_is_a_driver() -> None:
 
 
 def test_its_settings_are_read_from_the_file_and_the_rest_are_its_defaults(tmp_path: Path) -> None:
-    [line] = load(plant(tmp_path, "COM3", upper=False)).lines
+    [line] = load(plant(tmp_path, "/dev/ttyS3", upper=False)).lines
     [device] = line.devices
     assert device.driver == Toy(station=4, upper=False)
     assert (line.serial.baudrate, line.serial.format) == (4800, "8E2")
@@ -234,7 +234,7 @@ def test_the_schema_has_its_settings() -> None:
 def test_check_forecasts_its_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(sys, "argv", ["plc-gateway", "check", str(plant(tmp_path, "COM3"))])
+    monkeypatch.setattr(sys, "argv", ["plc-gateway", "check", str(plant(tmp_path, "/dev/ttyS3"))])
     with pytest.raises(SystemExit) as ended:
         main()
     assert ended.value.code in (0, None)
