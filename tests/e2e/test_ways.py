@@ -39,7 +39,9 @@ OpenPort = Callable[[ExitStack, Path], str]
 
 def _simulated_on_pty(stack: ExitStack, folder: Path) -> Path:
     """Simulates the same devices. Returns the link to their pty."""
-    plan = write_config(folder / "plc.yaml", free_endpoint(), {"hall": vigor_line("/dev/ttyS1", TAGS)})
+    plan = write_config(
+        folder / "plc.yaml", free_endpoint(), {"hall": vigor_line("/dev/ttyS1", TAGS)}
+    )
     simulated = stack.enter_context(gateway("simulate", plan, "--links", folder))
     assert str(folder / "hall") in simulated.says("line hall: stations 1 at")
     simulated.says("Ctrl-C")
@@ -58,7 +60,9 @@ def _cable(stack: ExitStack, folder: Path) -> str:
 
 
 def _tcp(stack: ExitStack, folder: Path) -> str:
-    plan = write_config(folder / "plc.yaml", free_endpoint(), {"hall": vigor_line("/dev/ttyS1", TAGS)})
+    plan = write_config(
+        folder / "plc.yaml", free_endpoint(), {"hall": vigor_line("/dev/ttyS1", TAGS)}
+    )
     number = free_port()
     simulated = stack.enter_context(gateway("simulate", plan, "--tcp", f"127.0.0.1:{number}"))
     assert f"tcp://127.0.0.1:{number}" in simulated.says("line hall: stations 1 at")
