@@ -1,9 +1,12 @@
 """The `run` command: the service."""
 
 import asyncio
+import logging
+import os
 import shlex
 import shutil
 import sys
+import threading
 from pathlib import Path
 from typing import Annotated
 
@@ -34,6 +37,18 @@ def run(
     hint = next_steps(loaded, config, program())
     with asyncio.Runner(loop_factory=new_event_loop) as runner:
         runner.run(service.run(loaded, lambda: say(hint)))
+    end_beside_zenoh()
+
+
+def end_beside_zenoh() -> None:
+    """Ends the process without Python's own end, if a thread still waits in Zenoh for a client.
+
+    Python would end that thread inside Zenoh's code, which aborts the process.
+    """
+    if any(thread.name.startswith("zenoh") for thread in threading.enumerate()):
+        logging.shutdown()
+        sys.stdout.flush()
+        os._exit(0)
 
 
 def program() -> str:

@@ -1,6 +1,7 @@
 """The commands that `run` proposes."""
 
 import json
+import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -66,3 +67,17 @@ def test_the_proposed_commands_begin_as_this_program_was_started(
     monkeypatch.setattr(sys, "argv", [started])
     monkeypatch.setattr("shutil.which", lambda name: found)
     assert program() == typed
+
+
+WAITING = """
+import atexit, threading
+from gateway.cli.run import end_beside_zenoh
+atexit.register(print, "Python's own end")
+threading.Thread(target=threading.Event().wait, name="zenoh answers", daemon=True).start()
+end_beside_zenoh()
+"""
+
+
+def test_a_thread_that_waits_in_zenoh_is_not_ended_by_python() -> None:
+    done = subprocess.run([sys.executable, "-c", WAITING], capture_output=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, b"", b"")

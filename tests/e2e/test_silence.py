@@ -99,7 +99,7 @@ async def test_quality_goes_bad_within_two_intervals_and_good_again(plant: Plant
         await heard.next(lambda s: s.key == "plant/mixer/fault" and _good(s))
         came = await alive.next(lambda t: t.kind == "PUT")
         assert came.key == f"{ALIVE}/mixer"
-        assert await client.tokens(f"{ALIVE}/*") == [f"{ALIVE}/mixer", f"{ALIVE}/oven"]
+        await client.until_alive(f"{ALIVE}/*", [f"{ALIVE}/mixer", f"{ALIVE}/oven"])
         [device] = await client.get("plant/@gateway/demo/devices/mixer")
         assert device.json["failures"]["silence"] >= 3
 

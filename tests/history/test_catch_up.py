@@ -396,5 +396,5 @@ async def test_a_killed_consumer_continues_from_its_last_sample(tmp_path: Path) 
         assert poll.northbound is not None
         async with ZenohPeer("client", connect=[endpoint]) as client:
             assert len(await client.get("plant/**")) == 3  # and it answers as before
-            assert await client.tokens("plant/@gateway/*") == ["plant/@gateway/demo"]
+            await client.until_alive("plant/@gateway/*", ["plant/@gateway/demo"])
     nothing_lost_and_nothing_twice(known)
