@@ -3,6 +3,7 @@
 import asyncio
 import errno
 import json
+import os
 import threading
 from collections.abc import Callable
 from contextlib import suppress
@@ -20,6 +21,9 @@ log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 
 T = TypeVar("T")
 CLOSE_WITHIN = 2.0  # seconds
+# Zenoh reads the variable when it opens its first session. By default one thread sends on all
+# links: a link that is closed while answers wait for it holds up all others for seconds.
+_RUNTIME = "ZENOH_RUNTIME", "(tx: (worker_threads: 4))"
 _SHORTEST_RETRY, _LONGEST_RETRY = 0.5, 5.0  # seconds between two attempts of a client
 
 
@@ -159,6 +163,7 @@ async def open_session(config: zenoh.Config, *, retry: bool) -> zenoh.Session:
 
     Raises `GatewayError` when it cannot be opened, a port in use for instance.
     """
+    os.environ.setdefault(*_RUNTIME)
     pause = _SHORTEST_RETRY
     while True:
         opening = asyncio.ensure_future(off_loop(zenoh.open, config))

@@ -5,7 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from tests.e2e.processes import started, write_config
+from tests.e2e.processes import started, vigor_line, write_config
 from tests.zenoh_peer import ZenohPeer, free_endpoint
 
 DEAF = Path(__file__).with_name("deaf_client.py")
@@ -37,3 +37,14 @@ async def test_a_client_that_receives_nothing_does_not_stop_the_gateway(tmp_path
             finally:
                 deaf.kill()
                 deaf.wait()
+
+
+async def test_several_threads_send_so_that_one_link_holds_up_no_other(tmp_path: Path) -> None:
+    endpoint, line = free_endpoint(), vigor_line("simulator", {"level": {"address": "D10"}})
+    file = write_config(tmp_path / "c.yaml", endpoint, {"hall": line})
+    with await asyncio.to_thread(started, file) as gateway:
+        async with ZenohPeer("client", connect=[endpoint]) as client:
+            assert await client.get("plant/**")  # a link: Zenoh starts these threads with the first
+            threads = Path(f"/proc/{gateway.pid}/task").glob("*/comm")
+            names = {path.read_text().strip() for path in threads}
+            assert {"tx-0", "tx-1", "tx-2", "tx-3"} <= names

@@ -1492,4 +1492,11 @@ MUTANTS = (
         "",
         "tests/cli/test_run.py",
     ),
+    Mutant(
+        "one thread sends on all links",
+        "northbound/session.py",
+        "    os.environ.setdefault(*_RUNTIME)\n",
+        "",
+        "tests/attacks/test_client_that_receives_nothing.py",
+    ),
 )
