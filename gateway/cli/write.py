@@ -35,11 +35,10 @@ def write(
 ) -> None:
     """Write one tag and print the reply of the PLC."""
     loaded = load(config)
-    target = tags_by_key(loaded).get(tag)
+    known = tags_by_key(loaded)
+    target = known.get(tag)
     if target is None:
-        raise ConfigError(
-            f"there is no tag {tag} in {config}{suggestion(tag, tags_by_key(loaded))}"
-        )
+        raise ConfigError(f"there is no tag {tag} in {config}{suggestion(tag, known)}")
     if target.write is None:
         raise ConfigError(f"{tag} cannot be written: it has no `write: true` in {config}")
     parsed = parse_value(value)

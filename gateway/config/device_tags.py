@@ -1,6 +1,5 @@
 """Builds the tags of devices. Tags that are written alike are built once and copied."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from gateway.config import parsers
@@ -40,17 +39,7 @@ class DeviceTags:
         alike: _Alike = {}
         if driver is not None:
             alike = self._built.setdefault((model_of(driver), repr(defaults)), alike)
-        return tuple(self._tags(device, raw_tags, path, defaults, driver, alike))
-
-    def _tags(
-        self,
-        device: str,
-        raw_tags: object,
-        path: Path,
-        defaults: TagDefaults,
-        driver: AnyDriver | None,
-        alike: _Alike,
-    ) -> Iterator[Tag]:
+        tags: list[Tag] = []
         seen: set[str] = set()
         for raw_name, raw in mapping(raw_tags):
             name = self._names.get(raw_name) or self._name(raw_name, (*path, raw_name))
@@ -69,7 +58,8 @@ class DeviceTags:
             if tag is not None:
                 if tag.history and self.recorded is None:
                     self.recorded = (*path, raw_name)
-                yield tag
+                tags.append(tag)
+        return tuple(tags)
 
     def _tag(
         self,

@@ -99,12 +99,17 @@ def meant(name: str, known: Iterable[str]) -> str:
     """Suggests the most similar name, or all names."""
     choices, lower = list(known), name.lower()
     for spelt in (lower, lower.replace("-", "_")):
-        if close := get_close_matches(spelt, choices, n=1, cutoff=0.7):
-            return f"did you mean {close[0]}?"
+        if close := similar(spelt, choices):
+            return f"did you mean {close}?"
     whole = [choice for choice in choices if choice.startswith(lower) or lower.startswith(choice)]
     if lower and len(whole) == 1:
         return f"did you mean {whole[0]}?"
     return f"use {one_of(choices)}"
+
+
+def similar(name: str, known: Iterable[str]) -> str | None:
+    """Returns the most similar name, if one is similar enough to be meant."""
+    return next(iter(get_close_matches(name, known, n=1, cutoff=0.7)), None)
 
 
 def shown(value: object) -> str:

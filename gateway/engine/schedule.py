@@ -154,8 +154,7 @@ class Schedule:
     # The next job
 
     def next(self, now: float) -> Request | Probe | Poll | Idle:
-        if now >= self._on_demand_at or self._queue.expedited:
-            self._share_on_demand(now)
+        self._share_on_demand(now)
         due = self._queue.ripen(now)
         waiting = self._queue.waiting
         until = waiting[0][0] if waiting else NEVER

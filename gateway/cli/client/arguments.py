@@ -3,11 +3,11 @@
 import json
 import math
 from collections.abc import Iterable
-from difflib import get_close_matches
 
 import zenoh
 
 from gateway.config import Config
+from gateway.config.messages import similar
 from gateway.errors import ConfigError
 from gateway.tags import Tag
 from gateway.values import Value, parse_decimal
@@ -43,8 +43,8 @@ def wanted_keys(config: Config, names: list[str] | None) -> list[str]:
 
 def suggestion(name: str, known: Iterable[str]) -> str:
     """Returns `: did you mean ...?` with the most similar name, or nothing."""
-    close = get_close_matches(name, known, n=1, cutoff=0.7)
-    return f": did you mean {close[0]}?" if close else ""
+    close = similar(name, known)
+    return f": did you mean {close}?" if close else ""
 
 
 def matches(key: str, wanted: list[str]) -> bool:
