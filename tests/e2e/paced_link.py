@@ -36,17 +36,16 @@ class PacedLink:
     _chance: random.Random = field(default_factory=lambda: random.Random(1))
     _tasks: set["asyncio.Task[None]"] = field(default_factory=set)
 
-    async def serve(self, listener: socket.socket) -> None:
-        loop = asyncio.get_running_loop()
-        while True:
-            client, _ = await loop.sock_accept(listener)
-            self.connections += 1
-            task = loop.create_task(self._connect(client))
-            self._tasks.add(task)
-            task.add_done_callback(self._tasks.discard)
+    def accept(self, listener: socket.socket) -> None:
+        client, _ = listener.accept()
+        self.connections += 1
+        task = asyncio.get_running_loop().create_task(self._connect(client))
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+        task.add_done_callback(lambda _: client.close())  # a task may end before it begins
 
     async def _connect(self, client: socket.socket) -> None:
-        with suppress(ConnectionRefusedError), client, _small(socket.socket()) as server:
+        with suppress(ConnectionRefusedError), _small(socket.socket()) as server:
             await asyncio.get_running_loop().sock_connect(server, self.target)
             client.setblocking(False)
             directions = [
@@ -124,10 +123,10 @@ async def paced_link(
         listener.listen()
         here = f"tcp/127.0.0.1:{listener.getsockname()[1]}"
         link = PacedLink(here, (host, int(port)), rate, delay, loss)
-        serving = asyncio.create_task(link.serve(listener))
+        loop = asyncio.get_running_loop()
+        loop.add_reader(listener, link.accept, listener)
         try:
             yield link
         finally:
-            serving.cancel()
+            loop.remove_reader(listener)
             await link.cut()
-            await asyncio.wait([serving])
