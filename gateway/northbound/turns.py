@@ -54,19 +54,19 @@ class Turns:
             nonlocal turn
             lost = self._holder is not turn
             if lost or (self._clock() - turn.since >= SLICE and any(self._waiting.values())):
-                self._give_back(turn)
-                turn = self._take(rank)
+                turn = self._take(rank, turn)
 
         try:
             yield pause
         finally:
             self._give_back(turn)
 
-    def _take(self, rank: Rank) -> _Turn:
+    def _take(self, rank: Rank, last: _Turn | None = None) -> _Turn:
+        """Waits for a turn; `last`: the turn that this answer had before and gives back."""
         turn = _Turn()
         with self._lock:
             self._waiting[rank].append(turn)
-            if self._holder is None:
+            if self._holder in (None, last):
                 self._pass_on()
         while not turn.begins.wait(_BLOCKED):
             with self._lock:
