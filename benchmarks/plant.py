@@ -126,6 +126,8 @@ class Plant:
         group = f", standby: {plain}" if standby else ""
         connect = ", ".join(self.near(place))
         defaults = f"every: {sizes.every}s, publish: always, history: true, type: uint16"
+        # A patient time-out: the simulated PLCs are slow while the machine is overloaded.
+        vigor = "protocol: vigor, reply_timeout: 2s"
         rows = [
             f"gateway: {{name: {name}{group}}}",
             f"zenoh: {{mode: client, listen: [], connect: [{connect}]}}",
@@ -137,8 +139,8 @@ class Plant:
             rows.append(f"  line{line}: {{port: simulator, baudrate: 19200, devices: {{")
             for device in range(sizes.devices):
                 tags = ", ".join(f"t{n}: {{address: D{n}}}" for n in range(sizes.tags))
-                rows.append(f"    {plain}-{line}-{device}: {{protocol: vigor, "
-                            f"station: {device + 1}, reply_timeout: 2s, tags: {{{tags}}}}},")  # fmt: skip
+                rows.append(f"    {plain}-{line}-{device}: {{{vigor}, "
+                            f"station: {device + 1}, tags: {{{tags}}}}},")  # fmt: skip
             rows.append("  }}")
         return rows
 

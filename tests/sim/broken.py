@@ -1499,4 +1499,11 @@ MUTANTS = (
         "",
         "tests/attacks/test_client_that_receives_nothing.py",
     ),
+    Mutant(
+        "a gateway that leaves standby stamps its values with its start",
+        "tags/mirror.py",
+        "{tag: s._replace(time=now) for tag, s in self._current.items()}",
+        "dict(self._current)",
+        "tests/tags/test_mirror.py",
+    ),
 )
