@@ -1506,4 +1506,11 @@ MUTANTS = (
         "dict(self._current)",
         "tests/tags/test_mirror.py",
     ),
+    Mutant(
+        "a peer of several routers is not warned of",
+        "northbound/link_monitor.py",
+        '.count("router") == 2:\n',
+        '.count("router") == 99:\n',
+        "tests/northbound/test_link_monitor.py",
+    ),
 )
