@@ -1021,6 +1021,13 @@ MUTANTS = (
         "tests/northbound/test_turns.py",
     ),
     Mutant(
+        "history has every second slice",
+        "northbound/turns.py",
+        "                turn = self._take(rank, turn)\n",
+        "                self._give_back(turn)\n                turn = self._take(rank)\n",
+        "tests/northbound/test_turns.py",
+    ),
+    Mutant(
         "history goes before current values",
         "northbound/turns.py",
         "        if not current or self._in_a_row >= _SHARE_OF_HISTORY:\n",
