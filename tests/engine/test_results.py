@@ -6,9 +6,8 @@ from dataclasses import replace
 import pytest
 
 from gateway.engine.device import SILENT_SHARE
-from gateway.engine.health import State
+from gateway.engine.health import PAUSE_LONGEST, State
 from gateway.engine.jobs import (
-    PAUSE_LONGEST,
     Idle,
     Poll,
     Probe,
