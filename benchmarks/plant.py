@@ -26,7 +26,7 @@ from typing import Any, NamedTuple, Self
 from tests.e2e.processes import ROOT, Program, gateway
 from tests.zenoh_peer import ZenohPeer, free_endpoint
 
-PATIENCE = 180.0  # seconds for anything
+PATIENCE = 300.0  # seconds for anything
 RESTART = 1.0  # seconds from the end of a gateway to its next start, as a service manager waits
 MB = 1e6
 

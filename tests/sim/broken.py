@@ -1527,4 +1527,11 @@ MUTANTS = (
         '.count("router") == 99:\n',
         "tests/northbound/test_link_monitor.py",
     ),
+    Mutant(
+        "a client tries only its first router",
+        "northbound/session.py",
+        "            _begin_with_next(config)\n",
+        "",
+        "tests/northbound/test_session.py",
+    ),
 )
