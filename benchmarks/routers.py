@@ -8,7 +8,7 @@ client missed values for three seconds, received values twice, or did not see th
 
 import argparse
 import asyncio
-from contextlib import AsyncExitStack, suppress
+from contextlib import AsyncExitStack
 from typing import NamedTuple
 
 from tests.zenoh_peer import ZenohPeer, free_endpoint
@@ -35,9 +35,11 @@ async def play(mode: str, known: int) -> Round:
         await source.declare_token("alive")
         tokens, values = await client.liveliness("alive"), await client.subscribe("value")
 
+        ended = asyncio.Event()
+
         async def publish() -> None:
             number = 0
-            while True:
+            while not ended.is_set():
                 number += 1
                 await source.put("value", str(number).encode())
                 await asyncio.sleep(EVERY)
@@ -51,9 +53,8 @@ async def play(mode: str, known: int) -> Round:
         stopped = len(values.samples) - before < DEAD / EVERY / 2
         await start(ZenohPeer("router", ends[:1], ends[1:]))
         await asyncio.sleep(BACK)
-        publishing.cancel()
-        with suppress(asyncio.CancelledError):
-            await publishing
+        ended.set()
+        await publishing
         numbers = [sample.payload for sample in values.samples]
         is_alive = tokens.samples[-1].kind == "PUT"
         return Round(stopped, len(numbers) > len(set(numbers)), not is_alive)
