@@ -224,9 +224,9 @@ class Seen(NamedTuple):
 
     @property
     def late(self) -> tuple[float, float, float]:
-        """Returns the largest of the medians, of the 99th percentiles, and of all."""
+        """Returns the usual median of a report, the largest 99th percentile, the largest of all."""
         median, most, longest = zip(*(r["late"] for r in self.reports), strict=True)
-        return max(median), max(most), max(longest)
+        return sorted(median)[len(median) // 2], max(most), max(longest)
 
     @property
     def oldest(self) -> float:
@@ -411,7 +411,7 @@ def shown(result: Result, sizes: Sizes) -> Iterator[str]:
     rate = steady.arrived() / result.seconds
     yield f"\nSteady state, {result.seconds:.0f} s: {rate:,.0f} values/s"
     median, most, longest = steady.late
-    yield (f"late at the consumer: median {median * 1e3:.0f} ms, 99th percentile "
+    yield (f"late at the consumer: usually {median * 1e3:.0f} ms, 99th percentile at most "
            f"{most * 1e3:.0f} ms, longest {longest * 1e3:.0f} ms; oldest shown value "
            f"{steady.oldest:.1f} s")  # fmt: skip
     yield "\n| process | number | % of a core, each | memory, MB each |\n|---|---|---|---|"
