@@ -1,7 +1,7 @@
 """The configuration: one YAML file, checked as a whole, every mistake named with its line."""
 
 import gc
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -19,6 +19,7 @@ from gateway.config.records import (
     ZenohMode,
 )
 from gateway.config.schema import schema
+from gateway.config.sheet_tags import SheetUse
 from gateway.config.yaml_file import read_yaml
 
 __all__ = [
@@ -28,6 +29,7 @@ __all__ = [
     "LineConfig",
     "TlsConfig",
     "WebConfig",
+    "SheetUse",
     "ZenohConfig",
     "ZenohMode",
     "load",
@@ -38,17 +40,21 @@ __all__ = [
 _TEXTS = frozenset({"address", "description", "format", "name", "port", "prefix", "unit"})
 
 
-def load(path: str | Path, report: Callable[[str, float], None] | None = None) -> Config:
+def load(
+    path: str | Path,
+    report: Callable[[str, float], None] | None = None,
+    imports: Mapping[str, Path] | None = None,
+) -> Config:
     """Reads and checks the file. Paths in it are relative to its folder.
 
-    `report` receives the name of each step and the share of it that is done. Raises `ConfigErrors`
-    with every mistake.
+    `report` receives the name of each step and the share of it that is done. `imports`: a sheet
+    with more tags, by device. Raises `ConfigErrors` with every mistake.
     """
     read = None if report is None else partial(report, f"reading {Path(path).name}")
     checked = None if report is None else partial(report, "checking the tags")
     with _without_gc():
         file, mistakes = read_yaml(Path(path), _TEXTS, read)
-        config = Builder(mistakes, Path(path).parent, checked).config(file.data)
+        config = Builder(mistakes, Path(path).parent, checked, imports or {}).config(file.data)
         if config is not None:
             check_files(config, Path(path), mistakes)
     mistakes.raise_all()
