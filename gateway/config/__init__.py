@@ -8,7 +8,7 @@ from pathlib import Path
 
 from gateway.config.build import Builder
 from gateway.config.file_rules import check_files
-from gateway.config.messages import ConfigErrors
+from gateway.config.messages import ConfigErrors, Mistakes, OptionPlaces
 from gateway.config.records import (
     Config,
     HistoryConfig,
@@ -32,6 +32,7 @@ __all__ = [
     "SheetUse",
     "ZenohConfig",
     "ZenohMode",
+    "built",
     "load",
     "schema",
 ]
@@ -60,6 +61,16 @@ def load(
     mistakes.raise_all()
     if config is None:
         raise AssertionError(f"{path}: no configuration, and no mistake either")
+    return config
+
+
+def built(data: Mapping[str, object], folder: Path | None = None) -> Config:
+    """Returns the configuration of data that is in no file. Raises `ConfigErrors`."""
+    mistakes = Mistakes(OptionPlaces())
+    config = Builder(mistakes, folder or Path()).config(data)
+    mistakes.raise_all()
+    if config is None:
+        raise AssertionError(f"{data}: no configuration, and no mistake either")
     return config
 
 

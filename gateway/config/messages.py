@@ -40,6 +40,18 @@ class Places(Protocol):
         """Returns the beginning of a message: file, line and path, with a colon behind them."""
 
 
+class OptionPlaces:
+    """The places of settings that are options of a command."""
+
+    name = "options"
+
+    def line(self, path: Path) -> int:
+        return len(path)
+
+    def at(self, line: int, path: Path) -> str:
+        return f"{path[-1]}: " if path else ""
+
+
 class Mistake(NamedTuple):
     line: int
     path: Path
