@@ -53,8 +53,10 @@ def read_file(path: Path) -> bytes:
         raise ConfigError(f"{path} cannot be read: {error.strerror}") from None
 
 
-def add_tags(sheet: Path, into: Path, devices: list[str]) -> list[str]:
+def add_tags(sheet: Path, into: Path, devices: list[str], *, backup: bool = True) -> list[str]:
     """Adds the tags of a sheet to the file. Returns sentences about it.
+
+    `backup`: the file as it was stays beside it.
 
     Raises `ConfigErrors` with every mistake; then the file is as before.
     """
@@ -75,10 +77,12 @@ def add_tags(sheet: Path, into: Path, devices: list[str]) -> list[str]:
         text = with_tags(str(into), text, use.device, use.raw, comment)
     if missing:
         with_tags(str(into), text, missing.pop(), {}, "")  # raises: names the devices of the file
-    _replace(into, before, (_BOM if before.startswith(_BOM) else b"") + text.encode(), wanted)
+    after = (_BOM if before.startswith(_BOM) else b"") + text.encode()
+    _replace(into, before, after, wanted, _backup(into) if backup else None)
     for use in uses:
         print_notes(sheet, use.notes)
-    return [*(_said(sheet, into, use) for use in uses), f"the file before is {_backup(into).name}"]
+    said = [_said(sheet, into, use) for use in uses]
+    return [*said, f"the file before is {_backup(into).name}"] if backup else said
 
 
 def _said(sheet: Path, into: Path, use: SheetUse) -> str:
@@ -97,7 +101,7 @@ def _only_device(into: Path) -> list[str]:
     return names
 
 
-def _replace(into: Path, before: bytes, after: bytes, wanted: Config) -> None:
+def _replace(into: Path, before: bytes, after: bytes, wanted: Config, backup: Path | None) -> None:
     """Replaces the file at once, after the new text was read back and means what was wanted."""
     new = into.with_name(f"{into.name}.new")
     try:
@@ -110,7 +114,8 @@ def _replace(into: Path, before: bytes, after: bytes, wanted: Config) -> None:
         shutil.copymode(into, new)
         if into.read_bytes() != before:
             raise ConfigError(f"{into.name} was changed meanwhile: import again")
-        shutil.copy2(into, _backup(into))
+        if backup is not None:
+            shutil.copy2(into, backup)
         new.replace(into)
     except OSError as error:
         raise ConfigError(f"{into} cannot be written: {error.strerror}") from None

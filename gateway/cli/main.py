@@ -16,6 +16,7 @@ from gateway.cli import (
     control,
     export,
     import_command,
+    new,
     peek,
     read,
     run,
@@ -100,6 +101,7 @@ cli.command(context_settings={"ignore_unknown_options": True})(control.control)
 cli.command()(watch.watch)
 cli.command()(scan_command.scan)
 cli.command()(peek.peek)
+cli.command()(new.new)
 cli.command("import")(import_command.import_)
 cli.command()(export.export)
 cli.command()(simulate.simulate)

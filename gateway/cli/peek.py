@@ -188,7 +188,7 @@ def view_of(config: Config, text: str, every: float = 1.0) -> View:
     layout = Layout(ValueType(_TYPES[unit]))
     tags = [_tag(device, Address(area, number), unit, layout, every) for number in numbers]
     names = {
-        number: tag.key
+        number: tag.name
         for tag in reversed(device.tags)
         if tag.span.area == area
         for number in range(tag.span.start, tag.span.start + tag.span.size)

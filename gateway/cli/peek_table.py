@@ -1,6 +1,5 @@
 """Words of a device in every type and word order, side by side."""
 
-import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -12,8 +11,11 @@ from gateway.protocols.driver import Unit
 from gateway.values import Kind, Layout, Order, Value, ValueType, from_words
 
 BITS_IN_ROW = 8
-WIDE, MEDIUM = 128, 104  # characters that the columns need: all of them, or without uint32
+# Characters of a terminal for all columns; without uint32; also without bits. Else without text.
+WIDE, MEDIUM, NARROW = 140, 116, 92
+_SPARE = 6  # characters that are left for notes in the narrowest table
 CHANGED = "bold reverse"
+_WIDTHS = {"hex": 4, "bits 15..0": 19, "uint16": 6, "int16": 6, "text": 4}
 _LOW, _HIGH = Order.LOW_FIRST, Order.HIGH_FIRST
 _PLAUSIBLE = (1e-4, 1e8)  # amounts of floats that a process has
 
@@ -39,17 +41,18 @@ def table_of(cells: Sequence[Cell], unit: Unit, text_order: Order, width: int) -
         return _bits(cells)
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))
     columns = _columns(unit, text_order, width)
-    table.add_column("address")
+    table.add_column("address", no_wrap=True)
     for column in columns:
         table.add_column(column.title, justify="right", no_wrap=True)
     table.add_column("", no_wrap=True)
+    room = max(_SPARE, width - 9 - sum(_WIDTHS.get(column.title, 13) + 1 for column in columns))
     for number, cell in enumerate(cells):
         row = [
             _text(column, [one.raw for one in cells[number : number + column.words]], cell)
             for column in columns
         ]
         mark = "* " if cell.changed else ""
-        table.add_row(Text(cell.address), *row, Text(mark + printable(cell.note)))
+        table.add_row(Text(cell.address), *row, Text((mark + printable(cell.note))[:room]))
     return table
 
 
@@ -77,8 +80,9 @@ def _columns(unit: Unit, text_order: Order, width: int) -> list[Column]:
     columns += [
         Column("uint16", 1, lambda words: str(words[0])),
         Column("int16", 1, _as(Kind.INT16, _LOW)),
-        Column("text", 1, lambda words: _letters(words[0], text_order)),
     ]
+    if width >= NARROW:
+        columns.append(Column("text", 1, lambda words: _letters(words[0], text_order)))
     for order, title in ((_LOW, "low"), (_HIGH, "high")):
         if width >= WIDE:
             columns.append(Column(f"{title} uint32", 2, _as(Kind.UINT32, order)))
@@ -107,7 +111,7 @@ def number_text(value: Value | None) -> str:
         return str(value)
     least, most = _PLAUSIBLE
     doubtful = value != 0 and not least <= abs(value) < most
-    return f"{value:.7g}{'?' if doubtful or not math.isfinite(value) else ''}"
+    return f"{value:.3g}?" if doubtful else f"{value:.7g}"
 
 
 def _binary(words: Sequence[int]) -> str:

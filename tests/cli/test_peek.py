@@ -153,7 +153,7 @@ def test_a_range_of_a_device_in_a_file_shows_its_tags(config: Path) -> None:
     assert done.code == 0
     rows = [line.split() for line in done.out.splitlines()]
     assert [row[0] for row in rows] == ["address", "D9", "D10", "D11"]
-    assert rows[2][-1] == "mixer/speed"
+    assert rows[2][-1] == "speed"
     assert int(rows[2][1], 16) == int(rows[2][6])
 
 
