@@ -11,13 +11,13 @@ from typing import Annotated
 import typer
 
 from gateway.cli import scan as scanning
-from gateway.cli.check import check
+from gateway.cli.check import check, size
 from gateway.cli.import_command import add_tags
 from gateway.cli.logs import LogFormat, LogLevel, set_up
 from gateway.cli.scan import Found
 from gateway.cli.scan_command import noises
 from gateway.cli.terminal import FAILED, end, err
-from gateway.config import parsers
+from gateway.config import load, parsers
 from gateway.config.messages import one_of
 from gateway.config.yaml_insert import written
 from gateway.errors import ConfigError
@@ -109,8 +109,12 @@ def new(
     print(f"{file}: written")
     for sheet, wanted in sheets:
         _import(sheet, file, wanted)
-    check(file)
-    print(f"next: plc-gateway read {file} --direct, then plc-gateway run {file}")
+    if sheets:
+        check(file)
+        print(f"next: plc-gateway read {file} --direct, then plc-gateway run {file}")
+    else:
+        print(f"{file}: good, {size(load(file))}")
+        print(f"next: plc-gateway import SHEET --into {file}, or plc-gateway peek {file} ...")
 
 
 @dataclass(frozen=True, slots=True)

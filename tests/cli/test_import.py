@@ -75,6 +75,23 @@ def test_with_one_mistake_nothing_is_written(command: Command, plant_file: Path)
     assert files(plant_file.parent) == ["plant.yaml", "tags.csv"]
 
 
+def test_an_insertion_that_would_change_other_tags_is_not_written(
+    command: Command, plant_file: Path
+) -> None:
+    """The own `tags` of a device hide those that it merges."""
+    merged = FILE.replace(
+        "{protocol: vigor, station: 1, tags: {}}",
+        "\n        <<: {tags: {b: {address: D9}}}\n        protocol: vigor\n        station: 1",
+    )
+    plant_file.write_text(merged, encoding="utf-8")
+    tags = sheet(plant_file.parent, "Name,Address\na,D1\n")
+    done = command("import", tags, "--into", plant_file)
+    assert done.code == 2
+    assert "the tags cannot be inserted into plant.yaml as it is written" in done.err
+    assert plant_file.read_text("utf-8") == merged
+    assert files(plant_file.parent) == ["plant.yaml", "tags.csv"]
+
+
 def test_the_device_is_named_or_the_only_one_or_in_the_sheet(
     command: Command, plant_file: Path
 ) -> None:

@@ -166,10 +166,3 @@ def test_mistakes_of_the_command_end_with_2(command: Command, config: Path) -> N
     ):
         done = command("peek", *arguments)
         assert (done.code, problem in done.err) == (2, True), done
-
-
-def test_a_device_that_does_not_reply_ends_with_1() -> None:
-    done = plc_gateway("peek", "D1..D3", "--port", "/dev/ttyS-none", "--protocol", "vigor")
-    assert done.code == 1
-    assert done.err.endswith("nothing of D1..D3 could be read: line-down\n")
-    assert not done.out
