@@ -133,7 +133,7 @@ def test_every_page_with_files_is_checked() -> None:
     counted = Counter(block.page for block in FILES)
     assert set(counted) == {
         *("/README.md", "configuration.md", "vigor.md", "computer-link.md", "modbus.md"),
-        *("first-plant.md", "systems.md"),
+        *("first-plant.md", "import.md", "peek.md", "systems.md"),
     }
     assert sum(counted.values()) >= 11
     assert {block.page for block in DEVICES} == {OF_DEVICES}
@@ -143,6 +143,8 @@ def test_every_page_with_files_is_checked() -> None:
 
 @pytest.mark.parametrize("block", FILES, ids=str)
 def test_a_file_in_the_pages_loads(block: Block, tmp_path: Path) -> None:
+    for name in re.findall(r"[\w.-]+\.csv\b", block.text):
+        (tmp_path / name).write_text("Name,Address\nspeed,D100\n")  # sheets of tags
     assert loaded(block.text, tmp_path).devices
 
 

@@ -1,7 +1,7 @@
 """The `check` command: validates the file and prints the plan of each line."""
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Annotated
 
 import typer
@@ -35,19 +35,8 @@ def check(
         lines = app.forecasts(loaded, report)
     few = sum(len(line.blocks) for line in lines) <= 100
     out.print(plan(lines, every_block=few if blocks is None else blocks))
-    for tag in (tag for device in loaded.devices for tag in device.tags):
-        if tag.write is not None and tag.address.bit is not None:
-            err.print(
-                f"note: writing {tag.key} ({tag.text}) reads the word, changes one bit and writes "
-                "the word back; changes by the PLC in between are lost"
-            )
-    for tag in (tag for device in loaded.devices for tag in device.tags):
-        if (limit := tag.exact_below) is not None:
-            err.print(
-                f"note: {tag.key} ({tag.text}): a JSON number has 53 bits. Beyond {limit:.4g}"
-                " either way two values of the device can look equal, and a write can be one"
-                " step off"
-            )
+    for note in _notes(loaded):
+        err.print(f"note: {note}")
     for line in lines:
         if line.overloaded:
             err.print(f"warning: {line.advice()}")
@@ -56,6 +45,24 @@ def check(
     print(f"{config}: good, {size(loaded)}")
     if strict and any(line.overloaded for line in lines):
         sys.exit(FAILED)
+
+
+def _notes(config: Config) -> Iterator[str]:
+    for tag in (tag for device in config.devices for tag in device.tags):
+        if tag.write is not None and tag.address.bit is not None:
+            yield (
+                f"writing {tag.key} ({tag.text}) reads the word, changes one bit and writes "
+                "the word back; changes by the PLC in between are lost"
+            )
+    for tag in (tag for device in config.devices for tag in device.tags):
+        if (limit := tag.exact_below) is not None:
+            yield (
+                f"{tag.key} ({tag.text}): a JSON number has 53 bits. Beyond {limit:.4g}"
+                " either way two values of the device can look equal, and a write can be one"
+                " step off"
+            )
+    for sheet in config.sheets:
+        yield from (f"{sheet.file.name}: {note}" for note in sheet.notes)
 
 
 def size(config: Config) -> str:

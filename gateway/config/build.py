@@ -25,6 +25,7 @@ from gateway.config.records import (
     ZenohConfig,
     ZenohMode,
 )
+from gateway.config.sheet_tags import SheetTags
 from gateway.config.tag_rules import inherit
 from gateway.config.validate import (
     driver_of,
@@ -47,12 +48,15 @@ class Builder:
     mistakes: Mistakes
     folder: FilePath
     report: Callable[[float], None] | None = None  # receives the share of the devices that is built
+    imports: Mapping[str, FilePath] = field(default_factory=dict)  # one more sheet of a device
     _devices: dict[str, str] = field(default_factory=dict)  # name -> its line
     _count: int = 0  # devices in the file
     _tags: DeviceTags = field(init=False)
+    _sheets: SheetTags = field(init=False)
 
     def __post_init__(self) -> None:
         self._tags = DeviceTags(self.mistakes)
+        self._sheets = SheetTags(self.mistakes, self.folder)
 
     def config(self, data: Mapping[str, Any]) -> Config | None:
         """Returns the whole file; None, after mistakes, where no part could be made."""
@@ -83,6 +87,7 @@ class Builder:
             history=self._history(top),
             web=WebConfig(host=top.web.listen[0], port=top.web.listen[1]) if top.web else None,
             lines=tuple(lines),
+            sheets=tuple(self._sheets.used),
         )
 
     def _line(self, name: str, raw: object, path: Path, outer: TagDefaults) -> LineConfig | None:
@@ -133,6 +138,10 @@ class Builder:
         driver = self._driver(raw.get("protocol"), own, path)
         defaults = self._defaults(raw, path, outer)
         tags = self._tags.build(name, raw.get("tags"), (*path, "tags"), defaults, driver)
+        own_sheet = None if settings is None else settings.tags_from
+        for sheet in filter(None, (own_sheet, self.imports.get(name))):
+            place, taken = (*path, "tags_from"), {tag.name for tag in tags}
+            tags += self._sheets.build(name, sheet, place, defaults, driver, taken)
         if settings is None or driver is None:
             return None
         default = driver.timing
@@ -202,9 +211,10 @@ class Builder:
                 )
 
     def _check_history(self, top: FileSection) -> None:
-        if self._tags.recorded is not None and top.history is None:
+        recorded = self._tags.recorded or self._sheets.recorded
+        if recorded is not None and top.history is None:
             self.mistakes.add(
-                (*self._tags.recorded, "history"),
+                (*recorded, "history"),
                 "the file has no `history:` section: write `history: {path: history.db}` beside "
                 "`lines:`",
             )

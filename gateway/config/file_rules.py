@@ -51,6 +51,7 @@ def _read(config: Config, own: FilePath) -> Iterator[tuple[str, FilePath]]:
         files |= {"zenoh.tls.ca": tls.ca, "zenoh.tls.key": tls.key}
         files |= {"zenoh.tls.certificate": tls.certificate}
     yield from ((what, file) for what, file in files.items() if file is not None)
+    yield from (("a sheet of tags", sheet.file) for sheet in config.sheets)
 
 
 def _same(file: FilePath, other: FilePath) -> bool:

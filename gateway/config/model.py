@@ -268,6 +268,8 @@ class DeviceSection(Section):
     defaults: dict[str, Any] = {}
     tags: dict[str, Any] = {}
     """The values of the device, by name."""
+    tags_from: FilePath | None = None
+    """A sheet with more tags of the device, CSV or .xlsx: docs/import.md."""
 
 
 class LineSection(Section):

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
 
+from gateway.config.sheet_tags import SheetUse
 from gateway.engine.device import DeviceSettings
 from gateway.planning.wire_timing import WireTiming
 from gateway.tags import Tag
@@ -98,6 +99,7 @@ class Config:
     history: HistoryConfig | None
     web: WebConfig | None
     lines: tuple[LineConfig, ...]
+    sheets: tuple[SheetUse, ...] = ()  # files that the tags of some devices come from
 
     @property
     def devices(self) -> tuple[DeviceSettings, ...]:

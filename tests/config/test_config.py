@@ -458,8 +458,8 @@ DEVICES = [
         "another protocol's setting",
         on_mixer("protocol: vigor\nframe_format: 4"),
         f"7: {M}.frame_format: no setting of a vigor device: use blocks, control, defaults, "
-        "enabled, late_guard, reply_timeout, retries, silence, station, tags, turnaround or "
-        "verify_reads",
+        "enabled, late_guard, reply_timeout, retries, silence, station, tags, tags_from, "
+        "turnaround or verify_reads",
     ),
     bad(
         "a protocol's own settings",

@@ -1513,4 +1513,47 @@ MUTANTS = (
         "",
         "tests/attacks/test_client_that_receives_nothing.py",
     ),
+    Mutant(
+        "a number with two meanings in a sheet is a decimal",
+        "sheets/cells.py",
+        "    if ambiguous and ambiguous[1] != decimal:\n",
+        "    if False:\n",
+        "tests/sheets/test_sheets.py",
+    ),
+    Mutant(
+        "a misspelt title of a sheet is only left out",
+        "sheets/columns.py",
+        "    if close:\n        found.mistakes",
+        "    if False:\n        found.mistakes",
+        "tests/sheets/test_sheets.py",
+    ),
+    Mutant(
+        "the error of a formula is a text",
+        "sheets/cells.py",
+        "    if _SPREADSHEET_ERROR.match(text):\n",
+        "    if False:\n",
+        "tests/sheets/test_sheets.py",
+    ),
+    Mutant(
+        "a tag that a sheet makes read-only takes the default",
+        "sheets/sheet.py",
+        '                yield "write", (rules or True) if write else False\n',
+        '                if write:\n                    yield "write", rules or True\n',
+        "tests/sheets/test_sheets.py",
+    ),
+    Mutant(
+        "an import is written although it changes other tags",
+        "cli/import_command.py",
+        "        if _meaning(load(new)) != _meaning(wanted):\n",
+        "        if load(new) is None:\n",
+        "tests/cli/test_import.py",
+    ),
+    Mutant(
+        "peek shows the last value of a register that fails",
+        "cli/peek.py",
+        "            self.newest[sample.tag] = sample\n",
+        "            if sample.quality is Quality.GOOD:\n"
+        "                self.newest[sample.tag] = sample\n",
+        "tests/cli/test_peek.py",
+    ),
 )
