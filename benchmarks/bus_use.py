@@ -84,6 +84,7 @@ class Result:
     cycle: float
     predicted: float
     exchanges: int
+    blocks: int = BLOCKS
     write: float = 0.0
     bound: float = 0.0
 
@@ -105,10 +106,19 @@ async def writing(line: Line, device: Device, tag: Tag, took: list[float]) -> No
             took.append((await line.write(device, tag, tag.encode(number))).took)
 
 
-async def measure(name: str, baud: int, seconds: float, *, writes: bool = False) -> Result:
+async def measure(
+    name: str,
+    baud: int,
+    seconds: float,
+    *,
+    writes: bool = False,
+    turnaround: float = TURNAROUND,
+    chosen: tuple[Tag, ...] | None = None,
+) -> Result:
+    """`chosen`: other tags than the four full blocks."""
     setting = SETTINGS[name]
     child = subprocess.Popen(
-        [sys.executable, "-m", "benchmarks.paced_wire", name, str(baud), str(TURNAROUND)],
+        [sys.executable, "-m", "benchmarks.paced_wire", name, str(baud), str(turnaround)],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
@@ -121,8 +131,8 @@ async def measure(name: str, baud: int, seconds: float, *, writes: bool = False)
         name="plc",
         driver=driver,
         timing=driver.timing,
-        turnaround=TURNAROUND,
-        tags=tags(setting.area),
+        turnaround=turnaround,
+        tags=chosen or tags(setting.area),
     )
     device = Device(settings, wire)
     # 8N1 on the pty whatever the format: a pty cannot do parity.
@@ -155,6 +165,7 @@ async def measure(name: str, baud: int, seconds: float, *, writes: bool = False)
         cycle=passed["elapsed"] / exchanges * len(device.blocks),
         predicted=promised.cycle,
         exchanges=exchanges,
+        blocks=len(device.blocks),
     )
 
 

@@ -236,29 +236,31 @@ def _sample(key: str, received: zenoh.Sample) -> Sample:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--connect", required=True, help="e.g. tcp/127.0.0.1:7447")
+    parser.add_argument(
+        "--connect", required=True, nargs="+", help="e.g. tcp/127.0.0.1:7447; others are spare"
+    )
     parser.add_argument("--prefix", default="plant")
     parser.add_argument("--since", help="e.g. 2026-11-20T12:00:00Z (now, when left out)")
     given = parser.parse_args()
     since = given.since or datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
-    with opened(given.connect) as session:
+    with opened(*given.connect) as session:
         for sample in CatchUp(session, given.prefix, since).samples():
             late = " late" if sample.late else ""
             print(f"{sample.time} {sample.key} {sample.value}{late}", flush=True)
 
 
-def opened(endpoint: str) -> zenoh.Session:
-    """Opens a session, and waits for the router. Zenoh reconnects an open session by itself."""
+def opened(*endpoints: str) -> zenoh.Session:
+    """Opens a session, and waits for a router. Zenoh reconnects an open session by itself."""
     config = zenoh.Config()
     config.insert_json5("mode", '"client"')
-    config.insert_json5("connect/endpoints", json.dumps([endpoint]))
+    config.insert_json5("connect/endpoints", json.dumps(endpoints))
     config.insert_json5("connect/retry", '{"period_init_ms": 500, "period_max_ms": 2000}')
     config.insert_json5("scouting/multicast/enabled", "false")
     while True:
         try:
             return zenoh.open(config)
         except zenoh.ZError as error:
-            print(f"waiting for {endpoint}: {error}", file=sys.stderr)
+            print(f"waiting for {endpoints}: {error}", file=sys.stderr)
             time.sleep(RETRY_EVERY)
 
 

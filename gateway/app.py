@@ -93,6 +93,11 @@ class Gateway:
             if not device.enabled:
                 self.mirror.update(bad(tag, Reason.DISABLED, wall()) for tag in device.tags)
 
+    def begin(self) -> None:
+        """Stamps the first samples again: this gateway may have been in standby for months."""
+        if self.config.standby is not None:
+            self.mirror.begin(self._wall())
+
     def _add_line(self, config: LineConfig, open_port: OpenPort, seed: int) -> None:
         devices = [device for device in config.devices if device.enabled]
         line = line_of(

@@ -165,6 +165,7 @@ async def _start_lines(
     state_file: StateFile | None,
     cleanup: AsyncExitStack,
 ) -> list[asyncio.Task[None]]:
+    gateway.begin()
     if history is not None:
         history.record(gateway.mirror.samples())  # "starting" marks the restart
     if state_file is not None:

@@ -206,6 +206,7 @@ class Northbound:
             tasks.create_task(self._admission.run(session))
             tasks.create_task(self._status.run())
             await self._admission.active.wait()
+            self._plant.begin()
             self._incoming.begin()
             self._declared += await off_loop(self._declare_plant, declarations)
             await self._republisher.publish_all()

@@ -18,9 +18,20 @@ class Mirror:
         """`now`: nanoseconds since 1970."""
         self._current = {tag: bad(tag, Reason.STARTING, now) for tag in tags}
         self._published: dict[Tag, Sample] = {}
+        self._begun = False
         # Tags of repeated equal reads. Sample and `Unchanged` are in one entry: another thread gets
         # both by one look-up and never combines a value with the time of another.
         self._unchanged: dict[Tag, tuple[Sample, Unchanged]] = {}
+
+    def begin(self, now: int) -> None:
+        """Gives the first samples another time, once. Call it before the lines begin.
+
+        A client keeps the later of two samples. With the time of the creation of this mirror it
+        would keep the last value of the gateway that was active before.
+        """
+        if not self._begun:
+            self._begun = True
+            self._current = {tag: s._replace(time=now) for tag, s in self._current.items()}
 
     def __getitem__(self, tag: Tag) -> Sample:
         entry = self._unchanged.get(tag)

@@ -66,6 +66,9 @@ class PlainPlant:
     def devices(self) -> Iterable[PlainDevice]:
         return self._devices
 
+    def begin(self) -> None:
+        pass
+
     def tag(self, key: str) -> Tag | None:
         return self._tags.get(key)
 

@@ -1556,4 +1556,11 @@ MUTANTS = (
         "                self.newest[sample.tag] = sample\n",
         "tests/cli/test_peek.py",
     ),
+    Mutant(
+        "a gateway that leaves standby stamps its values with its start",
+        "tags/mirror.py",
+        "{tag: s._replace(time=now) for tag, s in self._current.items()}",
+        "dict(self._current)",
+        "tests/tags/test_mirror.py",
+    ),
 )
