@@ -11,7 +11,18 @@ from typing import Annotated, NoReturn
 import typer
 
 from gateway import __version__
-from gateway.cli import check, control, read, run, scan_command, simulate, status, watch, write
+from gateway.cli import (
+    backup,
+    check,
+    control,
+    read,
+    run,
+    scan_command,
+    simulate,
+    status,
+    watch,
+    write,
+)
 from gateway.cli.terminal import FAILED, USER_MISTAKE, end
 from gateway.config import schema as config_schema
 from gateway.errors import BadValue, ConfigError, GatewayError
@@ -89,6 +100,7 @@ cli.command()(scan_command.scan)
 cli.command()(simulate.simulate)
 cli.command()(status.status)
 cli.command()(status.health)
+cli.command()(backup.backup)
 
 
 @cli.command()
