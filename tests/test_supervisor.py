@@ -30,6 +30,12 @@ def heard(systemd: socket.socket) -> list[str]:
             return found
 
 
+async def hears(systemd: socket.socket, text: str) -> None:
+    async with asyncio.timeout(10):
+        while text not in heard(systemd):
+            await asyncio.sleep(0.005)
+
+
 def variables(systemd: socket.socket, **others: str) -> dict[str, str]:
     return {"NOTIFY_SOCKET": systemd.getsockname(), "WATCHDOG_USEC": "30000", **others}
 
@@ -46,13 +52,11 @@ async def test_ready_status_and_stop_are_reported(systemd: socket.socket) -> Non
 
 async def test_a_loop_that_stands_still_gives_no_sign_of_life(systemd: socket.socket) -> None:
     with Supervisor(variables(systemd)).informed():
-        while len(heard(systemd)) == 0:
-            await asyncio.sleep(0.005)
+        await hears(systemd, "WATCHDOG=1")
         heard(systemd)
         time.sleep(0.1)  # the attack itself
         assert heard(systemd) == []
-        while len(heard(systemd)) == 0:
-            await asyncio.sleep(0.005)
+        await hears(systemd, "WATCHDOG=1")
     heard(systemd)
     await asyncio.sleep(0.04)
     assert heard(systemd) == []  # the service has ended
@@ -75,8 +79,7 @@ async def test_a_supervisor_that_reads_late_gets_the_report(systemd: socket.sock
         supervisor = Supervisor(variables(systemd))
         with supervisor.informed():
             supervisor.ready()
-            while "READY=1" not in heard(systemd):
-                await asyncio.sleep(0.01)
+            await hears(systemd, "READY=1")
 
 
 async def test_without_a_supervisor_nothing_happens(systemd: socket.socket, tmp_path: Path) -> None:
