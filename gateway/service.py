@@ -21,6 +21,7 @@ from gateway.line.duty import Duty
 from gateway.line.line import Line
 from gateway.northbound import Northbound, group_settings
 from gateway.northbound.session import off_loop
+from gateway.supervisor import Supervisor
 from gateway.tags import Sample
 
 log = structlog.get_logger("gateway")
@@ -45,25 +46,41 @@ async def run(config: Config, started: Callable[[], None] = lambda: None) -> Non
     sys.setswitchinterval(THREAD_SWITCH)
     gc.set_threshold(*GC_THRESHOLDS)
     stop = asyncio.Event()
+    supervisor = Supervisor()
     loop = asyncio.get_running_loop()
+
+    def end() -> None:
+        supervisor.stopping()
+        stop.set()
+
     for number in (signal.SIGTERM, signal.SIGINT):
-        loop.add_signal_handler(number, stop.set)
+        loop.add_signal_handler(number, end)
+    loop.add_signal_handler(signal.SIGHUP, end if sys.stderr.isatty() else _ignore_hangup)
     withheld: Mapping[str, str] = {}
-    while (now_withheld := await _serve(config, withheld, stop, started)) is not None:
-        withheld = now_withheld
-        gc.unfreeze()  # the tags of the ended gateway
-        gc.collect()
-        if withheld and len(withheld) == len(config.devices):
-            others = " and ".join(sorted(set(withheld.values())))
-            raise GatewayError(
-                f"gateway {others} serves every device of this file already: a device belongs to "
-                "one gateway, or to the gateways of one standby group"
-            )
-        log.warning("gateway starts over")  # the entry before says why
+    with supervisor.informed():
+        while (left := await _serve(config, withheld, stop, started, supervisor)) is not None:
+            withheld = left
+            gc.unfreeze()  # the tags of the ended gateway
+            gc.collect()
+            if withheld and len(withheld) == len(config.devices):
+                others = " and ".join(sorted(set(withheld.values())))
+                raise GatewayError(
+                    f"gateway {others} serves every device of this file already: a device belongs "
+                    "to one gateway, or to the gateways of one standby group"
+                )
+            log.warning("gateway starts over")  # the entry before says why
+
+
+def _ignore_hangup() -> None:
+    log.warning("signal ignored", signal="SIGHUP", so="a changed file counts after a restart")
 
 
 async def _serve(
-    file: Config, withheld: Mapping[str, str], stop: asyncio.Event, started: Callable[[], None]
+    file: Config,
+    withheld: Mapping[str, str],
+    stop: asyncio.Event,
+    started: Callable[[], None],
+    supervisor: Supervisor,
 ) -> Mapping[str, str] | None:
     """Runs one gateway until `stop`, or until another gateway serves devices of the file.
 
@@ -110,8 +127,11 @@ async def _serve(
         if exclusive.done():  # otherwise another process may have this file and these lines
             if history is not None:
                 history.start()
+            supervisor.ready()  # also a standby, and a client that waits for its router
+            supervisor.says("waiting for the network, or as standby")
             await _first(active, zenoh, stopping, replaced)
             if active.done():
+                supervisor.says(f"serving {len(config.devices)} devices")
                 lines = await _start_lines(gateway, plans, history, state_file, cleanup)
         await _first(opened, zenoh, stopping, replaced)
         if opened.done():

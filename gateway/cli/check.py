@@ -12,8 +12,9 @@ from rich.text import Text
 from gateway import app, northbound
 from gateway.cli.progress import progress
 from gateway.cli.terminal import FAILED, ConfigPath, err, out
-from gateway.config import Config, load
+from gateway.config import Config, load, state_folder
 from gateway.engine.forecast import LineForecast
+from gateway.history.place import trouble
 from gateway.planning.planner import describe
 from gateway.planning.wire_timing import NETWORK_BAUD, WireTiming
 
@@ -42,19 +43,24 @@ def check(
             err.print(f"warning: {line.advice()}")
     for warning in warnings:
         err.print(f"warning: {warning}")
+    if unwritable := list(_unwritable(loaded)):
+        for sentence in unwritable:
+            err.print(f"error: {sentence}")
+        sys.exit(FAILED)
     print(f"{config}: good, {size(loaded)}")
     if strict and any(line.overloaded for line in lines):
         sys.exit(FAILED)
 
 
 def _notes(config: Config) -> Iterator[str]:
-    for tag in (tag for device in config.devices for tag in device.tags):
+    tags = [tag for device in config.devices for tag in device.tags]
+    for tag in tags:
         if tag.write is not None and tag.address.bit is not None:
             yield (
                 f"writing {tag.key} ({tag.text}) reads the word, changes one bit and writes "
                 "the word back; changes by the PLC in between are lost"
             )
-    for tag in (tag for device in config.devices for tag in device.tags):
+    for tag in tags:
         if (limit := tag.exact_below) is not None:
             yield (
                 f"{tag.key} ({tag.text}): a JSON number has 53 bits. Beyond {limit:.4g}"
@@ -63,6 +69,21 @@ def _notes(config: Config) -> Iterator[str]:
             )
     for sheet in config.sheets:
         yield from (f"{sheet.file.name}: {note}" for note in sheet.notes)
+
+
+def _unwritable(config: Config) -> Iterator[str]:
+    """Yields a sentence for each file that the gateway could not write."""
+    kept = config.history
+    below = "set" if state_folder() else "not set"
+    for setting, file in (
+        ("history.path", None if kept is None else kept.path),
+        ("gateway.state", config.state_file),
+    ):
+        if file is not None and (why := trouble(file)) is not None:
+            yield (
+                f"{setting}: {file} cannot be written: {why}. Check as the user of the service, "
+                f"with its $STATE_DIRECTORY ({below} here)"
+            )
 
 
 def size(config: Config) -> str:

@@ -12,6 +12,7 @@ import typer
 
 from gateway import __version__
 from gateway.cli import (
+    backup,
     check,
     control,
     export,
@@ -107,6 +108,7 @@ cli.command()(export.export)
 cli.command()(simulate.simulate)
 cli.command()(status.status)
 cli.command()(status.health)
+cli.command()(backup.backup)
 
 
 @cli.command()

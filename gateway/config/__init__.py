@@ -1,6 +1,7 @@
 """The configuration: one YAML file, checked as a whole, every mistake named with its line."""
 
 import gc
+import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
@@ -34,9 +35,11 @@ __all__ = [
     "ZenohMode",
     "built",
     "load",
+    "state_folder",
     "schema",
 ]
 
+STATE_VARIABLE = "STATE_DIRECTORY"  # systemd sets it, with one or more folders
 # Settings that are texts even where YAML sees a number: `7E1`, `40101`, `unit: 1`.
 _TEXTS = frozenset({"address", "description", "format", "name", "port", "prefix", "unit"})
 
@@ -46,7 +49,8 @@ def load(
     report: Callable[[str, float], None] | None = None,
     imports: Mapping[str, Path] | None = None,
 ) -> Config:
-    """Reads and checks the file. Paths in it are relative to its folder.
+    """Reads and checks the file. Paths in it are relative to its folder; those of files that the
+    gateway writes are relative to `state_folder()`, if there is one.
 
     `report` receives the name of each step and the share of it that is done. `imports`: a sheet
     with more tags, by device. Raises `ConfigErrors` with every mistake.
@@ -55,7 +59,8 @@ def load(
     checked = None if report is None else partial(report, "checking the tags")
     with _without_gc():
         file, mistakes = read_yaml(Path(path), _TEXTS, read)
-        config = Builder(mistakes, Path(path).parent, checked, imports or {}).config(file.data)
+        builder = Builder(mistakes, Path(path).parent, state_folder(), checked, imports or {})
+        config = builder.config(file.data)
         if config is not None:
             check_files(config, Path(path), mistakes)
     mistakes.raise_all()
@@ -72,6 +77,13 @@ def built(data: Mapping[str, object], folder: Path | None = None) -> Config:
     if config is None:
         raise AssertionError(f"{data}: no configuration, and no mistake either")
     return config
+
+
+def state_folder() -> Path | None:
+    """Returns the folder for the files that the gateway writes: systemd's StateDirectory, or that
+    of a container. None: beside the configuration file."""
+    first = os.environ.get(STATE_VARIABLE, "").partition(":")[0]
+    return Path(first) if first else None
 
 
 @contextmanager

@@ -40,13 +40,17 @@ from gateway.protocols.driver import AnyDriver, Timing
 from gateway.protocols.registry import PROTOCOLS
 from gateway.transport.port import SerialPath
 
+STATE_FILE = FilePath("state.json")  # where there is a folder for it
+
 
 @dataclass(slots=True)
 class Builder:
-    """Builds one `Config`. Paths in the file are relative to `folder`."""
+    """Builds one `Config`. Paths in the file are relative to `folder`; those of the files that the
+    gateway writes to `state_folder`, if there is one."""
 
     mistakes: Mistakes
     folder: FilePath
+    state_folder: FilePath | None = None
     report: Callable[[float], None] | None = None  # receives the share of the devices that is built
     imports: Mapping[str, FilePath] = field(default_factory=dict)  # one more sheet of a device
     _devices: dict[str, str] = field(default_factory=dict)  # name -> its line
@@ -78,7 +82,7 @@ class Builder:
         self._check_history(top)
         return Config(
             name=top.gateway.name,
-            state_file=None if top.gateway.state is None else self.folder / top.gateway.state,
+            state_file=self._state_file(top),
             standby=top.gateway.standby,
             standby_alone=top.gateway.standby_alone,
             secret_file=self._file(top.gateway.secret_file, ("gateway", "secret_file")),
@@ -218,10 +222,10 @@ class Builder:
                 "the file has no `history:` section: write `history: {path: history.db}` beside "
                 "`lines:`",
             )
-        if top.history is None or top.gateway.state is None:
+        state = self._state_file(top)
+        if top.history is None or state is None:
             return
-        history, state = self.folder / top.history.path, self.folder / top.gateway.state
-        if realpath(history) == realpath(state):
+        if realpath(self._written(top.history.path)) == realpath(state):
             self.mistakes.add(
                 ("gateway", "state"),
                 f"history is kept in {top.history.path}: two files are needed, such as "
@@ -260,11 +264,21 @@ class Builder:
             self.mistakes.add(path, f"there is no file {file}")
         return file
 
+    def _written(self, name: FilePath) -> FilePath:
+        """Returns the path of a file that the gateway writes."""
+        return (self.state_folder or self.folder) / name
+
+    def _state_file(self, top: FileSection) -> FilePath | None:
+        name = top.gateway.state
+        if name is None and self.state_folder is not None:
+            name = STATE_FILE
+        return None if name is None else self._written(name)
+
     def _history(self, top: FileSection) -> HistoryConfig | None:
         if top.history is None:
             return None
         return HistoryConfig(
-            path=self.folder / top.history.path,
+            path=self._written(top.history.path),
             keep=top.history.keep,
             max_size=top.history.max_size,
         )

@@ -62,7 +62,7 @@ class GatewaySection(Section):
     name: Name = "gateway"
     """The chunk of this gateway in the keys."""
     state: FilePath | None = None
-    """The file that keeps learned properties of the devices (refused addresses) across restarts."""
+    """Keeps refused addresses across restarts; with $STATE_DIRECTORY left out: state.json there."""
     standby: Group | None = None
     """A name shared by two gateways of one plant: one is active, the other is the standby."""
     standby_alone: Interval | None = None
@@ -140,7 +140,7 @@ class HistorySection(Section):
     """Samples kept on disk, for tags with `history: true`."""
 
     path: FilePath = Path("history.db")
-    """The SQLite file, relative to this file's folder."""
+    """The SQLite file, relative to $STATE_DIRECTORY, else to this file's folder."""
     keep: Interval = 7 * 86400.0
     """Older samples are deleted."""
     max_size: Annotated[
