@@ -280,5 +280,5 @@ class Gateway:
             documents[f"lines/{engine.name}"] = line_document(engine, expected, now)
         for name, (line, device) in self._places.items():
             polls = line.engine.schedule.polls(device)
-            documents[f"devices/{name}"] = device_document(device, polls)
+            documents[f"devices/{name}"] = device_document(device, polls, now)
         return documents | {path: document() for path, document in self._documents.items()}

@@ -1499,4 +1499,32 @@ MUTANTS = (
         "",
         "tests/attacks/test_client_that_receives_nothing.py",
     ),
+    Mutant(
+        "a page of another name is answered",
+        "web/guard.py",
+        "            return name in self._names\n",
+        "            return True\n",
+        "tests/web/test_guard.py",
+    ),
+    Mutant(
+        "pages of other sites are answered",
+        "web/guard.py",
+        '    return scheme in ("http", "https") and host.lower() == request.host.lower()\n',
+        "    return True\n",
+        "tests/web/test_guard.py",
+    ),
+    Mutant(
+        "other machines read without a token",
+        "web/guard.py",
+        "        self._reads_need_token = not config.is_local\n",
+        "        self._reads_need_token = False\n",
+        "tests/web/test_guard.py",
+    ),
+    Mutant(
+        "connections to the web page are not limited",
+        "web/server.py",
+        "if len(handlers.connections) < MOST_CONNECTIONS else _Refused()",
+        "if handlers.connections is not None else _Refused()",
+        "tests/web/test_guard.py",
+    ),
 )
