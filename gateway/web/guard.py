@@ -50,13 +50,11 @@ class Guard:
                 return refusal
             self._open += 1
             try:
-                response = await handler(request)
+                return await handler(request)
             except web.HTTPException as error:
-                response = answer(error.status, error.reason)
+                return answer(error.status, error.reason)
             finally:
                 self._open -= 1
-            response.headers.update(_HEADERS)
-            return response
 
         return guarded
 
@@ -111,6 +109,11 @@ def _is_same_site(request: web.Request) -> bool:
     return scheme in ("http", "https") and host.lower() == request.host.lower()
 
 
+async def add_headers(_: web.Request, response: web.StreamResponse) -> None:
+    """Called before the headers of each answer are sent."""
+    response.headers.update(_HEADERS)
+
+
 def answer(status: int, error: str) -> web.Response:
     """Returns an error as JSON."""
-    return web.json_response({"error": error}, status=status, headers=_HEADERS)
+    return web.json_response({"error": error}, status=status)

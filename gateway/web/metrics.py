@@ -34,7 +34,7 @@ _LINE = (
     ("line_busy_seconds_total", "busy_time", "Seconds in which the wire was used"),
     ("line_unasked_bytes_total", "unasked_bytes", "Bytes that belong to no request"),
 )
-_DEVICE = (
+DEVICE = (
     ("device_exchanges_total", "exchanges", "Requests with a reply"),
     ("device_writes_total", "writes", "Writes that reached the device"),
     ("device_retries_total", "retries", "Failed reads that were repeated"),
@@ -137,7 +137,7 @@ def _devices(documents: Documents, plant: Plant) -> Iterator[Metric]:
         for code, count in document["refusals"].items():
             refusals.add_metric([*place, code], count)
     yield from (states, failures, refusals)
-    for metric, field, text in _DEVICE:
+    for metric, field, text in DEVICE:
         family = _family(metric, text, *labels)
         for place, document in devices:
             if document[field] is not None:

@@ -13,8 +13,10 @@ from aiohttp import web
 
 from gateway.config import WebConfig
 from gateway.northbound.session import off_loop
-from gateway.web import metrics
-from gateway.web.guard import Guard
+from gateway.web import assets, metrics
+from gateway.web.api import Api
+from gateway.web.events import Events, Loads
+from gateway.web.guard import Guard, add_headers
 from gateway.web.sources import Sources
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
@@ -34,16 +36,27 @@ class Server:
     def __init__(self, config: WebConfig, sources: Sources) -> None:
         self._config = config
         self._sources = sources
+        self._api = Api(sources)
+        self._loads = Loads(sources)
         self._app = web.Application(
             middlewares=[Guard(config).middleware()], client_max_size=64 * 1024
         )
+        self._app.on_response_prepare.append(add_headers)
         self._app.add_routes(
             [
+                *self._api.routes(),
+                *assets.routes(),
+                web.get("/api/events", Events(sources, self._api, self._loads).handle),
                 web.get("/healthz", self._health),
                 web.get("/readyz", self._ready),
                 web.get("/metrics", self._metrics),
             ]
         )
+
+    def addresses(self) -> list[tuple[str, str]]:
+        """Returns each path that is answered, with its method."""
+        routes = self._app.router.routes()
+        return [(one.resource.canonical, one.method) for one in routes if one.resource is not None]
 
     async def run(self) -> None:
         """Serves until cancelled. Tries again if the address cannot be used: lines are more
@@ -58,6 +71,7 @@ class Server:
             max_field_size=_HEADER,
         )
         await runner.setup()
+        loads = asyncio.create_task(self._loads.run(), name="loads")
         try:
             server = await self._bound(runner)
             try:
@@ -66,6 +80,7 @@ class Server:
             finally:
                 server.close()
         finally:
+            loads.cancel()
             await runner.cleanup()
 
     @property

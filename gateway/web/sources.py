@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+from gateway.line.line import Watcher
 from gateway.northbound.interfaces import Device, History
 from gateway.northbound.payload import Failure
 from gateway.tags import Sample, Tag, WriteResult
@@ -21,6 +22,9 @@ class Plant(Protocol):
 
     def sample(self, tag: Tag) -> Sample:
         """Returns the current sample; any thread may call it."""
+
+    def watch(self, line: str, watcher: Watcher | None) -> bool:
+        """Sets or removes the watcher of a line. False: there is no such line."""
 
 
 class North(Protocol):

@@ -1,11 +1,13 @@
-"""The HTTP side of a real gateway: metrics, alert rules, and what other programs may do there."""
+"""The HTTP side of a real gateway: metrics, alert rules, the API, and the page in a browser."""
 
 import json
 import re
+import signal
 import subprocess
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,6 +24,7 @@ from tests.e2e.processes import (
     vigor_line,
     write_config,
 )
+from tests.web.browser import browser
 from tests.web.serving import TOKEN
 from tests.zenoh_peer import free_endpoint
 
@@ -55,9 +58,22 @@ class Page(NamedTuple):
 
 
 @pytest.fixture(scope="module")
-def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
-    folder, port = tmp_path_factory.mktemp("web"), free_port()
-    tokens = folder / "tokens.txt"
+def pages() -> Iterator[tuple[ExitStack, list[Page]]]:
+    with ExitStack() as stack:
+        yield stack, []
+
+
+@pytest.fixture
+def page(pages: tuple[ExitStack, list[Page]], tmp_path_factory: pytest.TempPathFactory) -> Page:
+    """The gateway of the test before, if it still runs."""
+    stack, known = pages
+    if not known or not known[-1].program.running:
+        known.append(begun(stack, tmp_path_factory.mktemp("web")))
+    return known[-1]
+
+
+def begun(stack: ExitStack, folder: Path) -> Page:
+    port, tokens = free_port(), folder / "tokens.txt"
     tokens.write_text(f"alice:{TOKEN}\n")
     tokens.chmod(0o600)
     silent = vigor_line(str(folder / "no-port"), {"level": {"address": "D10"}})
@@ -69,11 +85,10 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
         history={"path": "history.db"},
         web={"listen": f"127.0.0.1:{port}", "tokens_file": "tokens.txt"},
     )
-    with started(config) as program:
-        program.says("device online")
-        page = Page(program, port)
-        until(lambda: "last_good_seconds{" in page.ask("/metrics")[1], "the mixer was read")
-        yield page
+    page = Page(stack.enter_context(started(config)), port)
+    page.program.says("device online")
+    until(lambda: "last_good_seconds{" in page.ask("/metrics")[1], "the mixer was read")
+    return page
 
 
 def test_promtool_finds_nothing_wrong_with_the_metrics(page: Page) -> None:
@@ -115,3 +130,49 @@ def test_probes_and_foreign_names(page: Page) -> None:
     assert page.ask("/readyz") == (200, "ready\n")
     assert page.ask("/metrics", Host="evil.example")[0] == 421
     assert page.ask("/metrics", Origin="http://evil.example")[0] == 403
+
+
+def test_a_write_over_http_is_done_and_recorded_with_its_name(page: Page) -> None:
+    kind = {"Content_Type": "application/json"}
+    address = "/api/write?tag=mixer/recipe"
+    assert page.ask(address, b"7", **kind)[0] == 401
+    token = {**kind, "Authorization": f"Bearer {TOKEN}"}
+    assert page.ask(address, b"41", **token)[0] == 400
+    status, found = page.ask(address, b"7", **token)
+    assert (status, found["value"], found["verified"]) == (200, 7, True)
+    page.program.says("tag written", "web alice", "mixer/recipe")
+    assert re.search(r'writes_total{outcome="written"} [1-9]', page.ask("/metrics")[1])
+
+
+VALUES = '[...document.querySelectorAll("#values tr")].map((row) => row.cells[1].textContent)'
+QUALITIES = '[...document.querySelectorAll("#values tr")].map((row) => row.cells[3].textContent)'
+
+
+async def test_the_page_is_live_and_turns_grey_at_once_when_the_gateway_ends(
+    page: Page, tmp_path: Path
+) -> None:
+    async with browser(needs("chromium"), tmp_path) as tab:
+        await tab.open(f"http://127.0.0.1:{page.port}/#line=hall")
+        await tab.until(
+            'document.body?.className === "" && !!document.querySelector("#devices tr")'
+        )
+        assert "line yard is down" in await tab.value('document.querySelector("#wrong").innerText')
+        # By keyboard: the skip button leads to the devices, the button of the mixer to its values.
+        await tab.value('document.querySelector("[data-device=mixer]").focus()')
+        await tab.press("Enter")
+        await tab.until(
+            f'{QUALITIES}.join() === "good,good,good" && document.body.className === ""'
+        )
+        assert (await tab.value(VALUES))[2].isdigit()
+        await tab.until(
+            '/^[1-9]\\d* exchanges/.test(document.querySelector("#wire-sum").innerText)'
+        )
+        for width, height in ((1200, 900), (390, 800)):
+            await tab.look(width, height, dark=width < 600)
+            wide = await tab.value("document.documentElement.scrollWidth")
+            assert wide <= width  # no sideways scrolling
+        assert tab.errors == []
+        page.program.end(signal.SIGKILL)
+        await tab.until('document.body.className === "stale"')
+        assert await tab.value(QUALITIES) == 3 * ["not live"]
+        assert "not live since" in await tab.value('document.querySelector("#live").innerText')

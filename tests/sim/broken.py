@@ -355,7 +355,7 @@ MUTANTS = (
     Mutant(
         "the line ignores the engine's deadline",
         "line/line.py",
-        "        if self.engine.deadline != self._armed:\n",
+        "        if self.engine.deadline != self._expiry.at:\n",
         "        if False:\n",
         "tests/line/test_requests.py tests/line/test_stalled_link.py",
     ),

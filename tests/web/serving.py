@@ -10,6 +10,7 @@ from gateway.config import WebConfig
 from gateway.northbound.audit import Counts
 from gateway.northbound.payload import Failure, Problem
 from gateway.tags import WriteResult
+from gateway.web import metrics
 from gateway.web.server import Server
 from gateway.web.sources import Documents, Sources
 from tests.e2e.processes import free_port
@@ -19,6 +20,37 @@ TOKEN = "0123456789-0123456789"  # noqa: S105  (of these tests only)
 ZENOH = {"to": ["client"], "published": 7}
 
 
+DOCUMENTS: Mapping[str, Mapping[str, Any]] = {
+    "lines/hall": {
+        "open": True,
+        "trouble": "",
+        "opened": 1,
+        "open_time": 5.0,
+        "busy_time": 1.0,
+        "unasked_bytes": 0,
+        "devices": {"mixer": "up", "oven": "silent"},
+        "expected": {"load": 0.3},
+        "measured": {"load": 0.2, "requests_per_second": 5.0},
+    },
+    **{
+        f"devices/{name}": {
+            "protocol": "vigor",
+            "standing": standing,
+            "diagnosis": diagnosis,
+            "failures": {"silence": 2},
+            "refusals": {},
+            "refused_addresses": [],
+            "requests": [],
+            **dict.fromkeys([field for _, field, _ in metrics.DEVICE], 1),
+        }
+        for name, standing, diagnosis in (
+            ("mixer", "up", ""),
+            ("oven", "silent", "No byte came back: check power, wiring and station number"),
+        )
+    },
+}
+
+
 class PlainNorth:
     """Documents from a dict, and writes that end as `endings` says for their payload."""
 
@@ -26,6 +58,9 @@ class PlainNorth:
         self.changed: dict[str, Mapping[str, Any]] = {}
         self.endings: dict[bytes, WriteResult | Failure] = {}
         self.written: list[tuple[str, bytes, str]] = []
+        self.began = asyncio.Event()
+        self.gate = asyncio.Event()  # writes wait for it
+        self.gate.set()
 
     async def documents(self, max_age: float) -> Documents:
         status = {"name": "demo", "version": "1", "up": 5.0, "tags": 4, "refused_devices": {}}
@@ -33,10 +68,13 @@ class PlainNorth:
             "status": status,
             "zenoh": ZENOH,
             "outcomes": Counts().document(),
+            **DOCUMENTS,
             **self.changed,
         }
 
     async def write(self, tag: str, data: bytes, by: str, arrived: float) -> WriteResult | Failure:
+        self.began.set()
+        await self.gate.wait()
         self.written.append((tag, data, by))
         return self.endings.get(data, Failure(Problem.UNKNOWN_TAG, "no such tag"))
 
@@ -81,12 +119,15 @@ class Client:
         return Answer(int(first.split()[1]), found, rest)
 
 
+def local(**settings: Any) -> WebConfig:
+    return WebConfig(**{"host": "127.0.0.1", "port": free_port(), **settings})
+
+
 @asynccontextmanager
 async def serving(**settings: Any) -> AsyncIterator[Client]:
-    """Serves at a free port; `settings`: those of `WebConfig`, and `history`."""
-    history = settings.pop("history", None)
-    config = WebConfig(**{"host": "127.0.0.1", "port": free_port(), **settings})
-    north, plant = PlainNorth(), mixer()
+    """Serves at a free port; `settings`: those of `WebConfig`, `history`, `plant`."""
+    history, plant = settings.pop("history", None), settings.pop("plant", None) or mixer()
+    config, north = local(**settings), PlainNorth()
     server = Server(config, Sources(plant, north, history, lambda: True))
     serves = asyncio.create_task(server.run())
     binds = asyncio.create_task(_until_bound(config.port))

@@ -48,11 +48,13 @@ async def test_history_that_is_not_written_is_not_ok() -> None:
     north.changed["history"] = {"state": "no space left on device", **dict.fromkeys(fields, 3)}
     found = await scraped(north)
     assert found["plc_gateway_history_ok",] == 0
-    assert found["plc_gateway_faults",] == 1
+    assert found["plc_gateway_faults",] == 2  # that, and the silent oven
     assert found["plc_gateway_history_lost_total",] == 3
 
 
 async def test_values_are_counted_by_quality() -> None:
     found = await scraped(PlainNorth())
-    assert found["plc_gateway_device_tags", "mixer", "", "bad"] == 3
-    assert found["plc_gateway_device_tags", "mixer", "", "good"] == 0
+    assert found["plc_gateway_device_tags", "mixer", "hall", "bad"] == 3
+    assert found["plc_gateway_device_tags", "mixer", "hall", "good"] == 0
+    assert found["plc_gateway_device_state", "oven", "hall", "silent"] == 1
+    assert found["plc_gateway_device_failures_total", "mixer", "silence", "hall"] == 2
