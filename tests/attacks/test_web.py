@@ -141,7 +141,8 @@ def test_a_write_over_http_is_done_and_recorded_with_its_name(page: Page) -> Non
     status, found = page.ask(address, b"7", **token)
     assert (status, found["value"], found["verified"]) == (200, 7, True)
     page.program.says("tag written", "web alice", "mixer/recipe")
-    assert re.search(r'writes_total{outcome="written"} [1-9]', page.ask("/metrics")[1])
+    written = re.compile(r'writes_total{outcome="written"} [1-9]')
+    until(lambda: bool(written.search(page.ask("/metrics")[1])), "the write is counted")
 
 
 VALUES = '[...document.querySelectorAll("#values tr")].map((row) => row.cells[1].textContent)'
