@@ -5,7 +5,7 @@ import gc
 import signal
 import sys
 import time
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Coroutine, Mapping, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager
 from typing import Any
 
@@ -97,6 +97,7 @@ async def _serve(
     history = _history(config)
     northbound = _northbound(config, gateway, history)
     northbound.withhold(withheld)
+    web = _web(config, gateway, northbound, history)
     state_file = None if config.state_file is None else StateFile(config.state_file)
     if state_file is not None:
         state_file.restore(gateway.enabled_devices)
@@ -129,6 +130,8 @@ async def _serve(
                 history.start()
             supervisor.ready()  # also a standby, and a client that waits for its router
             supervisor.says("waiting for the network, or as standby")
+            if web is not None:
+                _start_web(web, cleanup)
             await _first(active, zenoh, stopping, replaced)
             if active.done():
                 supervisor.says(f"serving {len(config.devices)} devices")
@@ -158,6 +161,24 @@ def _northbound(config: Config, gateway: Gateway, history: Historian | None) -> 
         writers=config.writers_file,
         group=group_settings(config),
     )
+
+
+def _web(
+    config: Config, gateway: Gateway, northbound: Northbound, history: Historian | None
+) -> Callable[[], Coroutine[Any, Any, None]] | None:
+    """Returns the program of the HTTP side; None without `web` in the file."""
+    if config.web is None:
+        return None
+    from gateway.web.server import Server  # imported only here: it costs time and memory
+    from gateway.web.sources import Sources
+
+    sources = Sources(gateway, northbound, history, northbound.opened.is_set)
+    return Server(config.web, sources).run
+
+
+def _start_web(web: Callable[[], Coroutine[Any, Any, None]], cleanup: AsyncExitStack) -> None:
+    serving = asyncio.create_task(web(), name="web")
+    cleanup.push_async_callback(_end, [serving])
 
 
 def _plan_lines(gateway: Gateway, cleanup: AsyncExitStack) -> list[asyncio.Task[None]]:

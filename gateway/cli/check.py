@@ -17,6 +17,7 @@ from gateway.engine.forecast import LineForecast
 from gateway.history.place import trouble
 from gateway.planning.planner import describe
 from gateway.planning.wire_timing import NETWORK_BAUD, WireTiming
+from gateway.web import exposure
 
 
 def check(
@@ -32,7 +33,7 @@ def check(
     """Validate the file and print the plan of each line. Sends nothing."""
     with progress(err) as report:
         loaded = load(config, report)
-        warnings = northbound.check(loaded)
+        warnings = northbound.check(loaded) + exposure.check(loaded)
         lines = app.forecasts(loaded, report)
     few = sum(len(line.blocks) for line in lines) <= 100
     out.print(plan(lines, every_block=few if blocks is None else blocks))

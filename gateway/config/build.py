@@ -89,7 +89,7 @@ class Builder:
             writers_file=self._file(top.writers.file, ("writers", "file")) if top.writers else None,
             zenoh=self._zenoh(top),
             history=self._history(top),
-            web=WebConfig(host=top.web.listen[0], port=top.web.listen[1]) if top.web else None,
+            web=self._web(top),
             lines=tuple(lines),
             sheets=tuple(self._sheets.used),
         )
@@ -273,6 +273,24 @@ class Builder:
         if name is None and self.state_folder is not None:
             name = STATE_FILE
         return None if name is None else self._written(name)
+
+    def _web(self, top: FileSection) -> WebConfig | None:
+        if top.web is None:
+            return None
+        (host, port), place = top.web.listen, ("web", "tokens_file")
+        web = WebConfig(
+            host=host,
+            port=port,
+            tokens_file=self._file(top.web.tokens_file, place),
+            names=tuple(top.web.names),
+        )
+        if web.tokens_file is None and not web.is_local:
+            self.mistakes.add(
+                ("web", "listen"),
+                f"other machines can reach {host}: name a tokens_file too (see docs/page.md), or "
+                f"listen on 127.0.0.1:{port}",
+            )
+        return web
 
     def _history(self, top: FileSection) -> HistoryConfig | None:
         if top.history is None:

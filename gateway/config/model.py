@@ -32,6 +32,7 @@ from gateway.config.setting_types import (
     FilePath,
     Finite,
     Group,
+    HostName,
     Interval,
     Name,
     OrderName,
@@ -156,6 +157,10 @@ class WebSection(Section):
 
     listen: WebAddress = ("127.0.0.1", 8080)
     """The address of the page."""
+    tokens_file: FilePath | None = None
+    """One line `name:token` for each client; without it nothing can be written."""
+    names: list[HostName] = []
+    """Names of this machine in a browser's address, besides `localhost` and its host name."""
 
 
 class WriteSection(Section):

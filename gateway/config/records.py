@@ -3,6 +3,7 @@
 from collections.abc import Container
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from ipaddress import ip_address
 from pathlib import Path
 
 from gateway.config.sheet_tags import SheetUse
@@ -59,10 +60,20 @@ class HistoryConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WebConfig:
-    """The address of the status page."""
+    """The address of the status page, and who may use it."""
 
     host: str
     port: int
+    tokens_file: Path | None = None  # None: nothing can be written
+    names: tuple[str, ...] = ()  # of this machine, in the address of a browser
+
+    @property
+    def is_local(self) -> bool:
+        """True if other machines cannot reach the address."""
+        try:
+            return ip_address(self.host).is_loopback
+        except ValueError:
+            return self.host == "localhost"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

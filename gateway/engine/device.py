@@ -126,10 +126,12 @@ class Device:
     def diagnosis(self) -> str:
         """Returns the likely cause of its trouble as a sentence; empty when there is none."""
         driver = self.driver
-        if self.health.trouble is None and self.shapes is not None and self.shapes.answers_twice:
-            return ANSWERS_TWICE.format(station=driver.station)
-        if self.one_at_a_time and self.health.trouble is None:
-            return f"It takes one request at a time, not {self.window}: set `window: 1`"
+        if self.health.trouble is None:
+            if self.shapes is not None and self.shapes.answers_twice:
+                return ANSWERS_TWICE.format(station=driver.station)
+            if self.one_at_a_time:
+                return f"It takes one request at a time, not {self.window}: set `window: 1`"
+            return ""
         causes = driver.no_reply_causes if isinstance(driver, NoReplyCauses) else ""
         return diagnosis(self.health.trouble, causes)
 

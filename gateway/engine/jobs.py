@@ -55,6 +55,7 @@ class Poll:
         """Forgets the last read, because its values turn bad. Returns their age."""
         age = 0.0 if self.last.at is None else now - self.last.at
         self.counts.worst_gap = max(self.counts.worst_gap, age)
+        self.device.record.was_good(self.last.at)
         self.last.at = None
         return age
 

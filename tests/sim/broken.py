@@ -355,7 +355,7 @@ MUTANTS = (
     Mutant(
         "the line ignores the engine's deadline",
         "line/line.py",
-        "        if self.engine.deadline != self._armed:\n",
+        "        if self.engine.deadline != self._expiry.at:\n",
         "        if False:\n",
         "tests/line/test_requests.py tests/line/test_stalled_link.py",
     ),
@@ -1604,5 +1604,33 @@ MUTANTS = (
         "    if copy.exists():\n",
         "    if False:\n",
         "tests/history/test_backup.py",
+    ),
+    Mutant(
+        "a page of another name is answered",
+        "web/guard.py",
+        "            return name in self._names\n",
+        "            return True\n",
+        "tests/web/test_guard.py",
+    ),
+    Mutant(
+        "pages of other sites are answered",
+        "web/guard.py",
+        '    return scheme in ("http", "https") and host.lower() == request.host.lower()\n',
+        "    return True\n",
+        "tests/web/test_guard.py",
+    ),
+    Mutant(
+        "other machines read without a token",
+        "web/guard.py",
+        "        self._reads_need_token = not config.is_local\n",
+        "        self._reads_need_token = False\n",
+        "tests/web/test_guard.py",
+    ),
+    Mutant(
+        "connections to the web page are not limited",
+        "web/server.py",
+        "if len(handlers.connections) < MOST_CONNECTIONS else _Refused()",
+        "if handlers.connections is not None else _Refused()",
+        "tests/web/test_guard.py",
     ),
 )
