@@ -37,6 +37,7 @@ class ShorterSilences:
     __slots__ = (
         "_devices",
         "_effects",
+        "_held",
         "_learning",
         "_line",
         "_losses",
@@ -46,6 +47,7 @@ class ShorterSilences:
         "answered",
         "look_at",
         "needed",
+        "pause",
         "proof",
         "spoke",
         "step",
@@ -58,13 +60,14 @@ class ShorterSilences:
         self._learning = [device for device in devices if device.silence.learns]
         if any(isinstance(d.driver, Unsolicited) and d.driver.sends_unsolicited for d in devices):
             self._learning.clear()  # the silence lets their frames begin
-        self.needed, self.proof = NEEDED, PROOF
+        self.needed, self.proof, self.pause = NEEDED, PROOF, PAUSE
         self.step = 0  # so many times the safe silences are halved
         self.answered = 0  # polls at this step, after its silence
         self.look_at = float(PROOF) if self._learning else math.inf
         self.spoke: Device | None = None  # its good reply to a poll is the last frame on the wire
         self.suspects: tuple[Device, ...] = ()  # a request was lost between these,
         self._silence = 0.0  # after so many seconds
+        self._held = 0  # polls at shorter silences without a loss
         self._losses = 0
         self._next = -math.inf  # when the next step may be taken
         self._shape: Hashable = None  # of the last reply to a poll; None: unknown
@@ -86,17 +89,14 @@ class ShorterSilences:
 
     def look(self, now: float) -> None:
         """Takes the next step, if the replies are enough and the polls need it."""
-        if self._at_last_step:
-            self.answered, self._losses = 0, 0
-            for device in self._learning:
-                device.silence.held(now)
-                device.silence.take_step(self.step, now)
-            return
         online = sum(device.health.online for device in self._learning)
         self.look_at = self.proof * max(1, online)
         if self.answered < self.look_at:
             return
-        self.answered = 0
+        self.answered, self._held = 0, self._held + self.answered
+        if self._at_last_step:
+            self._hold(now)
+            return
         if self.suspects or now < self._next:
             return
         if sum(device.load for device in self._devices) < self.needed:
@@ -106,10 +106,16 @@ class ShorterSilences:
         for device in self._devices:
             device.silence.take_step(self.step, now)
             device.silence.keep_safe(at_rest=False)
-        if self._at_last_step:
-            self.look_at = HELD
         shortest = min(device.silence.shorter for device in self._learning)
         self._effects.info("silences shortened", line=self._line, shortest=shortest)
+
+    def _hold(self, now: float) -> None:
+        if self._held >= HELD:
+            self._losses = 0
+            for device in self._learning:
+                device.silence.held(now)
+        for device in self._learning:
+            device.silence.take_step(self.step, now)
 
     @property
     def _at_last_step(self) -> bool:
@@ -124,7 +130,7 @@ class ShorterSilences:
                 return  # the request arrived
         self.answered = 0
         if self.step and silence < device.silence.safe:
-            self.suspects = (device,) if self.spoke is None else (device, self.spoke)
+            self.suspects = (device,) if self.spoke in (None, device) else (device, self.spoke)
             self._silence = silence
             self._restore(str(result), now)
 
@@ -137,9 +143,9 @@ class ShorterSilences:
         if device.state is State.FAILING:
             return
         if device.state is State.ONLINE:
-            for each in self.suspects:
+            for times, each in enumerate(self.suspects, 1):  # not both are tried again together
                 if each.silence.learns:
-                    each.silence.was_too_short(self._silence, now)
+                    each.silence.was_too_short(self._silence, now, times)
             self._pause(now)
         self.suspects = ()
 
@@ -158,14 +164,14 @@ class ShorterSilences:
 
     def _pause(self, now: float) -> None:
         """Tries no shorter silence for a while, longer after each loss."""
-        self._next = now + PAUSE * 2**self._losses
+        self._next = now + self.pause * 2**self._losses
         self._losses += 1
 
     def _restore(self, why: str, now: float) -> None:
-        self.step = self.answered = 0
+        self.step = self.answered = self._held = 0
         self.spoke = self._shape = None
         self.look_at = self.proof
-        self._next = max(self._next, now + PAUSE)
+        self._next = max(self._next, now + self.pause)
         for device in self._devices:
             device.silence.take_step(0, now)
             device.silence.keep_safe(at_rest=True)

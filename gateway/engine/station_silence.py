@@ -40,16 +40,19 @@ class StationSilence:
 
     def take_step(self, step: int, now: float) -> None:
         """Halves the safe silence `step` times, as far as it was not too short recently."""
-        floor = self._floor if now < self._until else self.least
-        self.shorter = min(max(self.safe / 2**step, floor), self.safe)
+        floor = self._floor if now < self._until else 0.0
+        self.shorter = min(max(self.safe / 2**step, floor, self.least), self.safe)
 
-    def was_too_short(self, seconds: float, now: float) -> None:
-        """Remembers that a request after so many seconds was lost, twice as long each time."""
-        self._floor = max(2 * seconds, self.least)
-        self._until = now + FORGOTTEN_AFTER * 2**self._losses
+    def was_too_short(self, seconds: float, now: float, times: int = 1) -> None:
+        """Remembers that a request after so many seconds was lost, twice as long each time.
+
+        `times`: so many times as long.
+        """
+        self._floor = max(2 * seconds, self._floor)
+        self._until = now + times * FORGOTTEN_AFTER * 2**self._losses
         self._losses += 1
 
     def held(self, now: float) -> None:
-        """Forgets the count of losses, unless one is still remembered."""
+        """Forgets earlier losses, unless the last one is still remembered."""
         if now >= self._until:
-            self._losses = 0
+            self._losses, self._floor = 0, 0.0

@@ -109,8 +109,8 @@ class Bus:
         self.asked = named[0]
         health = self.asked.health
         self.foreign.sent(data, start, resync=health.needs_resync or not health.online)
-        if is_write(protocol, data) or is_command(protocol, data) or health.needs_resync:
-            self._check_silence(named[0], start)
+        poll = not (is_write(protocol, data) or is_command(protocol, data) or health.needs_resync)
+        self._check_silence(named[0], start, poll=poll)
         self.writes[number] += is_write(protocol, data)
         self.commands[number] += is_command(protocol, data)
         if is_registration(protocol, data):
@@ -124,13 +124,15 @@ class Bus:
         if heard and self.hurt["<"] < begin - 0.1:
             self.broke(f"{self.config.name}: spoke into a frame that was coming in")
 
-    def _check_silence(self, device: Device, start: float) -> None:
+    def _check_silence(self, device: Device, start: float, *, poll: bool) -> None:
         """Checks that the silence before a request other than a poll is not shortened."""
         if not isinstance(self.wire, SimWire):
             return
         silence, safe = self.wire.silence_at(start), device.wire.silence(device.timing)
         if 0.0 <= silence < safe - 1e-6 and self.wire.behind < start - 1.0:
-            self.broke(f"{device.name}: only {silence:.5f} s of silence before a write or resync")
+            self.story.counts["shorter silences"] += 1
+            if not (poll and device.timing.learn_silence):
+                self.broke(f"{device.name}: {silence:.5f} s of silence before what is no poll")
 
     def number_of(self, device: Device) -> int:
         """Returns the number of the device in a request, as `station_in` finds it."""

@@ -202,6 +202,7 @@ class World:
             shorter = line.engine._conclusions.shorter  # private: no setting of the file
             shorter.needed = chance.choice((0.0, 0.0, shorter.needed))
             shorter.proof = chance.choice((3, 10, shorter.proof))
+            shorter.pause = chance.choice((1.0, 10.0, shorter.pause))
             shorter.look_at = min(shorter.look_at, shorter.proof)
 
     def _twin(self, name: str) -> Troubled:
@@ -261,8 +262,6 @@ class World:
                 self.judge.broke(f"{task.get_name()} ended by itself: {task.exception()!r}")
         if suffering.done() and suffering.exception() is not None:
             self.judge.broke(f"faults ended by themselves: {suffering.exception()!r}")
-        for line in self.gateway.lines:
-            self.story.counts["steps of silence"] += line.engine._conclusions.shorter.step
         self.expect.at_the_end()
         for task in (everything := [*lines, *others, suffering]):
             task.cancel()
