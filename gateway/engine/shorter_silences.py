@@ -110,12 +110,15 @@ class ShorterSilences:
         self._effects.info("silences shortened", line=self._line, shortest=shortest)
 
     def _hold(self, now: float) -> None:
-        if self._held >= HELD:
+        before = [device.silence.shorter for device in self._learning]
+        for device in self._learning:
+            device.silence.take_step(self.step, now)
+        if before != [device.silence.shorter for device in self._learning]:
+            self._held = 0  # a silence that was too short is tried again
+        elif self._held >= HELD:
             self._losses = 0
             for device in self._learning:
                 device.silence.held(now)
-        for device in self._learning:
-            device.silence.take_step(self.step, now)
 
     @property
     def _at_last_step(self) -> bool:
@@ -171,7 +174,6 @@ class ShorterSilences:
         self.step = self.answered = self._held = 0
         self.spoke = self._shape = None
         self.look_at = self.proof
-        self._next = max(self._next, now + self.pause)
         for device in self._devices:
             device.silence.take_step(0, now)
             device.silence.keep_safe(at_rest=True)

@@ -239,6 +239,34 @@ def test_bytes_that_answer_no_request_bring_the_safe_silences_back() -> None:
     assert {kept for _, kept in bus.kept[-PROOF:]} == {SAFE}
 
 
+def test_the_pause_of_the_line_doubles() -> None:
+    bus = Bus(station())
+    for minutes in (1, 2, 4):
+        bus.learn()
+        assert bus.shortest == LEAST
+        bus.rig.note(bus.rig.engine.received(b"\x02", bus.rig.now, bus.rig.time))
+        bus.run(1)
+        bus.jump(0.8 * minutes * PAUSE)
+        bus.learn()
+        assert bus.shortest == SAFE
+        bus.jump(0.2 * minutes * PAUSE)
+
+
+def test_a_silence_is_forgotten_only_after_it_was_tried_again() -> None:
+    bus = Bus(station())
+    bus.listens_after[bus.rig.device] = 0.002
+    bus.learn()
+    bus.jump(PAUSE)
+    bus.run(HELD + 6 * PROOF)
+    assert len(bus.losses) == 1
+    bus.jump(FORGOTTEN_AFTER)
+    bus.run(6 * PROOF)
+    assert len(bus.losses) == 2
+    bus.jump(1.9 * FORGOTTEN_AFTER)
+    bus.run(6 * PROOF)
+    assert len(bus.losses) == 2
+
+
 def test_losses_are_forgotten_after_many_replies() -> None:
     bus = Bus(station())
     device = bus.rig.device

@@ -1521,10 +1521,11 @@ MUTANTS = (
         "tests/engine/test_shorter_silences.py",
     ),
     Mutant(
-        "silences are shortened again at once after a loss",
+        "silences that were too short are forgotten before they are tried again",
         "engine/shorter_silences.py",
-        "        self._next = max(self._next, now + self.pause)\n",
-        "",
+        "            self._held = 0  # a silence that was too short is tried again\n"
+        "        elif self._held",
+        "            pass\n        if self._held",
         "tests/engine/test_shorter_silences.py",
     ),
     Mutant(
