@@ -77,9 +77,12 @@ class Engine:
 
     def next(self, now: float) -> Job:
         """Returns the next job. All except `Idle` and `Reopen` are concluded before the next."""
+        shorter = self._conclusions.shorter
+        if shorter.suspects:
+            shorter.judge(now)
         job = self._next(now)
-        if self._conclusions.shorter.step:
-            self._conclusions.shorter.before(job)
+        if shorter.step:
+            shorter.before(job)
         return job
 
     def _next(self, now: float) -> Job:
@@ -134,6 +137,7 @@ class Engine:
     ) -> list[Effect]:
         """Applies the result of a job. Polls of one transaction report its traffic once."""
         device, in_flight = job.device, self._in_flight
+        self._count_silence(job, result, traffic, now)
         self._count(device, traffic, now)
         if isinstance(job, Poll):
             in_flight.open_polls -= 1
@@ -149,7 +153,6 @@ class Engine:
                 self._conclusions.polls_ended(job, traffic, now, time)
         else:
             self._conclusions.conclude(job, result, traffic, now, time)
-        self._judge_silence(job, result, traffic, now)
         if in_flight.continuation is None:
             in_flight.job = None
             in_flight.failed.clear()
@@ -163,7 +166,7 @@ class Engine:
         effects, self._effects.collected = self._effects.collected, []
         return effects
 
-    def _judge_silence(self, job: Transacted, result: Result, traffic: Traffic, now: float) -> None:
+    def _count_silence(self, job: Transacted, result: Result, traffic: Traffic, now: float) -> None:
         shorter, device = self._conclusions.shorter, job.device
         if isinstance(job, Poll) and not isinstance(result, Exception):
             shorter.spoke = device
@@ -175,8 +178,6 @@ class Engine:
             if isinstance(job, Poll):
                 shorter.failed(device, result, traffic.silence, now)
             shorter.spoke = None
-        if shorter.suspects:
-            shorter.judge(now)
 
     def _count(self, device: Device, traffic: Traffic, now: float) -> None:
         characters = (traffic.sent + traffic.heard) * self.wire.character

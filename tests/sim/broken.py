@@ -495,6 +495,13 @@ MUTANTS = (
         "tests/engine/test_results.py",
     ),
     Mutant(
+        "an address with damaged replies is tried as rarely as a missing one",
+        "planning/bad_addresses.py",
+        "        slowest = RETRIES[1] if self.code == DAMAGED else RETRIES[-1]\n",
+        "        slowest = RETRIES[-1]\n",
+        "tests/engine/test_results.py",
+    ),
+    Mutant(
         "silent addresses are tried as often as refused ones",
         "engine/device.py",
         "        if bad.silent and pause == RETRIES[-1]:\n",
@@ -1021,6 +1028,13 @@ MUTANTS = (
         "tests/northbound/test_turns.py",
     ),
     Mutant(
+        "history has every second slice",
+        "northbound/turns.py",
+        "                turn = self._take(rank, turn)\n",
+        "                self._give_back(turn)\n                turn = self._take(rank)\n",
+        "tests/northbound/test_turns.py",
+    ),
+    Mutant(
         "history goes before current values",
         "northbound/turns.py",
         "        if not current or self._in_a_row >= _SHARE_OF_HISTORY:\n",
@@ -1502,8 +1516,8 @@ MUTANTS = (
     Mutant(
         "a poll after a write gets a shorter silence",
         "engine/engine.py",
-        "            shorter.spoke = None\n        if shorter.suspects",
-        "        if shorter.suspects",
+        "            shorter.spoke = None\n",
+        "            pass\n",
         "tests/engine/test_shorter_silences.py",
     ),
     Mutant(
