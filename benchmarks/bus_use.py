@@ -12,6 +12,7 @@ four blocks of ten words.
 
 import argparse
 import asyncio
+import itertools
 import json
 import logging
 import random
@@ -74,9 +75,11 @@ class Counting:
 
     def __init__(self) -> None:
         self.count = 0
+        self.times: list[float] = []
 
     def samples(self, samples: Sequence[Sample]) -> None:
         self.count += len(samples)
+        self.times.append(asyncio.get_running_loop().time())
 
     def online(self, device: Device, online: bool) -> None:
         pass
@@ -141,7 +144,7 @@ async def rate(
     line = Line(
         Engine("bench", [device], wire),
         lambda receiver: open_port(SerialPath(path), serial, receiver),
-        Counting(),
+        sink := Counting(),
     )
     task, silence = asyncio.create_task(line.run()), device.silence
     await asyncio.sleep(1.0)
@@ -149,16 +152,16 @@ async def rate(
         async with asyncio.timeout(LEARNING):
             while silence.shorter > silence.least:
                 await asyncio.sleep(0.1)
-    loop = asyncio.get_running_loop()
-    began, before = loop.time(), device.record.exchanges
+    sink.times.clear()
     await asyncio.sleep(seconds)
-    found = (device.record.exchanges - before) / (loop.time() - began)
     task.cancel()
     await asyncio.gather(task, return_exceptions=True)
     assert child.stdin is not None
     child.stdin.close()
     child.wait()
-    return found, silence.shorter
+    gaps = sorted(after - before for before, after in itertools.pairwise(sink.times))
+    usual = gaps[len(gaps) // 4 : len(gaps) * 3 // 4]  # other programs disturb the rest
+    return len(usual) / sum(usual), silence.shorter
 
 
 async def measure(name: str, baud: int, seconds: float, *, writes: bool = False) -> Result:

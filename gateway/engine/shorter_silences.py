@@ -20,7 +20,7 @@ class ShorterSilences:
     """The silences of one line, between a reply and the next poll.
 
     A station may need a silence for two reasons. It still drives the pair after its own reply: this
-    damages the next request, whoever gets it. Or it does not listen yet after any frame: this
+    damages the next request on the line. Or it does not listen yet after any frame: this
     loses the requests to itself only. So the silence before a poll is the longer one of two: of the
     station that replied just before, and of the station that gets the poll. All others may miss a
     request that is not for them.
