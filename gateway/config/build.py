@@ -155,6 +155,7 @@ class Builder:
             silence=_either(settings.silence, default.silence),
             silence_chars=default.silence_chars,
             retries=default.retries if settings.retries is None else settings.retries,
+            learn_silence=default.learn_silence and settings.silence is None,
         )
         return DeviceSettings(
             name=name,

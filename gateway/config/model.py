@@ -253,7 +253,7 @@ class DeviceSection(Section):
     turnaround: Duration | None = None
     """Usual time from request to reply; left out: measured."""
     silence: Duration | None = None
-    """Pause on the line before each request."""
+    """Pause on the line before each request; left out: learned, where no standard asks for it."""
     retries: Annotated[int, Field(ge=0, le=10)] | None = None
     """Repetitions of a failed read; writes are not repeated."""
     verify_reads: Annotated[int, Field(ge=1, le=3)] = 1

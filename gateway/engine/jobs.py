@@ -268,6 +268,7 @@ class Traffic:
     exchanges: int = 0  # requests with a reply
     turnaround: float = 0.0  # seconds of the station for them, without the characters
     extra: int = 0  # frames of the station that answered no request
+    silence: float = math.inf  # seconds before its request, the shortest of several
 
 
 @dataclass(frozen=True, slots=True)

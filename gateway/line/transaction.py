@@ -105,7 +105,7 @@ class Transaction:
     async def tell(self, frame: Any) -> None:
         data = self._codec.encode(frame)
         channel = self._channel
-        await channel.quiet(self._device.silence)
+        await channel.quiet(self._device.silence.kept)
         channel.check_duty()
         self.has_sent = True
         channel.send(data)
@@ -123,9 +123,13 @@ class Transaction:
         """As in `Talk`. `within`: seconds in place of `reply_timeout`, for a short probe."""
         channel, device = self._channel, self._device
         if not self._open:
-            if channel.quiet_since + device.silence > channel.now():
-                await channel.quiet(device.silence)
+            kept = device.silence.kept
+            if channel.quiet_since + kept > channel.now():
+                await channel.quiet(kept)
             self._begin_hearing()
+            silence = channel.now() - channel.quiet_since
+            if silence < self.traffic.silence:
+                self.traffic.silence = silence
         if channel.guarded is not None:
             channel.check_duty()
         data = self._codec.encode(frame)

@@ -38,6 +38,7 @@ def device_document(device: Device, polls: Sequence[Poll], now: float) -> Docume
         "slowest_write": round(record.slowest_write, 4),
         "wire_time": round(record.wire_time, 3),
         "turnaround": None if record.turnaround is None else round(record.turnaround, 4),
+        "silence": round(device.silence.shorter, 5),
         "late_replies": record.late,
         "unasked_frames": record.unasked,
         "frames_heard": record.heard,

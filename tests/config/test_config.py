@@ -813,6 +813,7 @@ def test_device_settings_are_laid_over_the_protocols(file: Callable[[str], Confi
     assert device.timing.turnaround == 0.03
     assert device.turnaround == 0.03
     assert device.timing.silence == 0.0
+    assert not device.timing.learn_silence
     assert device.timing.retries == 0
     assert device.late_guard == 5.0
     assert (device.blocks, device.control, device.enabled) == (True, True, False)
