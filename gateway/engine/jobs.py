@@ -13,7 +13,7 @@ from gateway.engine.requests import Command, Request, Resyncs, Write
 from gateway.errors import BadValue, Busy, DeviceError, LineDown, Refused, Unclear
 from gateway.planning.planner import Block
 from gateway.protocols.driver import Span, UnnumberedReplies
-from gateway.tags import Sample
+from gateway.tags.scan import Scan
 
 NOT_QUEUED, EXPEDITED, ON_DEMAND = -1, -2, -3  # tickets of polls that are in no heap
 
@@ -24,8 +24,7 @@ class LastRead:
 
     at: float | None = None  # by the line's clock; None: the block's values are bad
     ever: bool = False  # the block was read at least once
-    units: Sequence[int] | None = None  # as read
-    samples: Sequence[Sample] | None = None  # made of the units
+    scan: Scan | None = None  # the next read is compared with it; None: with nothing
 
 
 @dataclass(slots=True, eq=False)
@@ -56,7 +55,7 @@ class Poll:
         age = 0.0 if self.last.at is None else now - self.last.at
         self.counts.worst_gap = max(self.counts.worst_gap, age)
         self.device.record.was_good(self.last.at)
-        self.last.at = None
+        self.last.at = self.last.scan = None
         return age
 
     @property

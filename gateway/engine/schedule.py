@@ -284,6 +284,11 @@ class Schedule:
         """Makes the device offline, after a failed probe or last retry of `took` seconds."""
         self._probes.went_offline(device, now, took)
 
+    def resynced(self, device: Device) -> None:
+        """Compares the next read of each block with nothing: it decodes all units."""
+        for poll in self._polls[device]:
+            poll.last.scan = None
+
     def came_online(self, device: Device, now: float) -> None:
         """Makes all blocks of a device due, because it came online."""
         for poll in self._polls[device]:
