@@ -128,7 +128,8 @@ def _what(job: Transacted) -> tuple[str, str]:
 
 
 def _values(block: Block, units: Sequence[Any]) -> str:
-    samples = block.decode(units, 0)
+    decoder = block.decoder
+    samples = decoder.fields(units, 0) if block.of_fields else decoder.first(units, 0)
     shown = [f"{one.tag.name} {one.value}" for one in samples[:_SHOWN] if one.value is not None]
     more = len(samples) - len(shown)
     return ", ".join(shown) + (f" and {more} more" if more else "")
