@@ -3,7 +3,7 @@
 import re
 import unicodedata
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 
 # Titles of each setting: English, German, Chinese (traditional and simplified), and the titles of
@@ -78,7 +78,7 @@ _KNOWN = {
 _RANK = {title: rank for rank, title in enumerate(_KNOWN)}
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class Column:
     """A column with a known title. `title` is as written, `index` counts from 0."""
 
@@ -125,13 +125,13 @@ def columns_of(cells: Sequence[str], others: Sequence[str]) -> Columns:
         elif first is not column:
             both = f"{first.place} has the same meaning: delete or rename one of them"
             found.mistakes.append((column.index, both))
-    device = found.by_setting.get("device")
-    if "address" not in found.by_setting and device and _plain(device.title) in _ADDRESS_TOO:
-        found.by_setting["address"] = found.by_setting.pop("device")
-        device.setting = "address"
+    named = found.by_setting.get("device")
+    if "address" not in found.by_setting and named and _plain(named.title) in _ADDRESS_TOO:
+        found.by_setting["address"] = replace(named, setting="address")
+        del found.by_setting["device"]
     every = found.by_setting.get("every")
-    if every is not None and any(_plain(cell) in _IN_MILLISECONDS for cell in cells):
-        every.unit = every.unit or "ms"
+    if every and not every.unit and any(_plain(cell) in _IN_MILLISECONDS for cell in cells):
+        found.by_setting["every"] = replace(every, unit="ms")
     return found
 
 
