@@ -14,7 +14,7 @@ _TITLES = {
     "variablenname, bezeichner, signalname, "
     "名稱, 名称, 標籤名稱, 标签名称, 標籤, 标签, "
     "變數名稱, 变量名称, 變量名稱, 变量名, 變數, 变量, 點名, 点名",
-    "address": "address, addr, register, plc address, register address, modbus address, operand, "
+    "address": "address, addr, adr, register, plc address, register address, modbus address, operand, "
     "device number, assign device label, "
     "adresse, sps adresse, registeradresse, "
     "位址, 地址, 元件, 元件編號, 元件编号, 軟元件, 软元件, 裝置位址, "
@@ -139,7 +139,9 @@ def _note_unknown(found: Columns, index: int, title: str, others: Sequence[str])
     """A title that is nearly known is a mistake: a misspelt `Scale` would change every value."""
     close = get_close_matches(_plain(title), [*_KNOWN, *others], n=1, cutoff=0.8)
     if close:
-        found.mistakes.append((index, f"no column of tags: did you mean {close[0].capitalize()}?"))
+        setting = _KNOWN.get(close[0], close[0])
+        known = next((title for title, one in _KNOWN.items() if one == setting), setting)
+        found.mistakes.append((index, f"no column of tags: did you mean {known.capitalize()}?"))
     else:
         found.unused.append(title)
 

@@ -140,12 +140,13 @@ class _Reader:
         name = self._name(row, settings)
         for problem in self._missing(row, name):
             self._mistake(row.number, problem)
-        if not name or "address" not in settings:
+        if "address" not in settings:
             return
         if name in self.sheet.tags:
             other = self.sheet.rows[name]
             self._mistake(row.number, f"{name} is in row {other} already", self._place("name"))
-            return
+        if not name or name in self.sheet.tags:
+            name = f"{name}_row_{row.number}"  # its other mistakes are reported too
         self.sheet.tags[name] = settings
         self.sheet.rows[name] = row.number
 
