@@ -14,7 +14,8 @@ _TITLES = {
     "variablenname, bezeichner, signalname, "
     "名稱, 名称, 標籤名稱, 标签名称, 標籤, 标签, "
     "變數名稱, 变量名称, 變量名稱, 变量名, 變數, 变量, 點名, 点名",
-    "address": "address, addr, adr, register, plc address, register address, modbus address, operand, "
+    "address": "address, addr, adr, register, plc address, register address, modbus address, "
+    "operand, "
     "device number, assign device label, "
     "adresse, sps adresse, registeradresse, "
     "位址, 地址, 元件, 元件編號, 元件编号, 軟元件, 软元件, 裝置位址, "
