@@ -89,6 +89,13 @@ def test_equal_comments_get_the_address_into_their_names() -> None:
     assert list(found.tags) == ["pump_runs", "pump_runs_M2", "M3"]
 
 
+def test_an_empty_label_takes_the_comment_but_an_empty_name_is_a_mistake() -> None:
+    text = "Device,{},Comment\nM1,,pump runs\nM2,run,\n"
+    assert list(sheet(text.format("Label")).tags) == ["pump_runs", "run"]
+    (mistake,) = sheet(text.format("Name")).mistakes
+    assert (mistake.row, mistake.what) == (2, "no name")
+
+
 def test_an_xlsx_file_has_its_tags_on_any_sheet() -> None:
     point = plant.Point("level", "40101", "int16", "", 0.1, "", writable=True)
     assert sheet(as_xlsx([point])).tags == {
@@ -311,6 +318,41 @@ def test_limits_count_for_tags_that_can_be_written() -> None:
         "a": {"address": "D1", "write": {"verify": True, "min": 1, "max": 40}},
         "b": {"address": "D2", "write": False},
     }
+
+
+@pytest.mark.parametrize(
+    ("title", "first", "second"),
+    [
+        ("Divisor", "1", "10"),
+        ("Decimal places", "0", "2"),
+        ("Negate Value", "", "x"),
+        ("Signed", "", "no"),
+        ("Decimal places", "0", "1"),
+        ("Inverted", "no", "1"),
+        ("Slave ID", "1", "2"),
+    ],
+)
+def test_a_column_that_would_change_values_is_not_left_out(
+    title: str, first: str, second: str
+) -> None:
+    text = f"Name,Address,{title}\na,D1,{first}\nb,D2,"
+    assert not sheet(f"{text}{first}\n").mistakes
+    (mistake,) = sheet(f"{text}{second}\n").mistakes
+    assert mistake.what.startswith("this column cannot be used: ")
+    assert mistake[:2] == (1, f"column C ({title})")
+
+
+def test_a_scaling_that_is_no_range_is_refused() -> None:
+    (mistake,) = sheet("Name,Address,Scaling\na,D1,0.1\n").mistakes
+    assert mistake.what == "0.1 is no scaling: write linear, or the factor into a column Scale"
+    (mistake,) = sheet("Name,Address,Scaling\na,D1,Linear\n").mistakes
+    assert mistake.what.startswith("a range needs its four ends")
+
+
+def test_a_column_of_bits_belongs_to_the_address() -> None:
+    found = sheet("Name,Address,Bit\na,D7,3\nb,D8,\nc,D9,x\n")
+    assert [raw["address"] for raw in found.tags.values()][:2] == ["D7.3", "D8"]
+    assert found.mistakes == [(4, "column C (Bit)", "x is no number of a bit")]
 
 
 def test_names_become_names_of_keys_and_the_text_stays_as_description() -> None:

@@ -1528,6 +1528,13 @@ MUTANTS = (
         "tests/sheets/test_sheets.py",
     ),
     Mutant(
+        "a column of divisors is left out",
+        "sheets/sheet.py",
+        "                self._mistake(self.header, why, self._place(setting))\n",
+        "                pass\n",
+        "tests/sheets/test_sheets.py",
+    ),
+    Mutant(
         "the error of a formula is a text",
         "sheets/cells.py",
         "    if _SPREADSHEET_ERROR.match(text):\n",
