@@ -60,7 +60,6 @@ def add_tags(sheet: Path, into: Path, devices: list[str], *, backup: bool = True
 
     Raises `ConfigErrors` with every mistake; then the file is as before.
     """
-    into = into.resolve()  # the file itself, not a link to it
     devices = devices or _only_device(into)
     before = read_file(into)
     try:
@@ -78,7 +77,8 @@ def add_tags(sheet: Path, into: Path, devices: list[str], *, backup: bool = True
     if missing:
         with_tags(str(into), text, missing.pop(), {}, "")  # raises: names the devices of the file
     after = (_BOM if before.startswith(_BOM) else b"") + text.encode()
-    _replace(into, before, after, wanted, _backup(into) if backup else None)
+    own = into.resolve()  # the file itself, not a link to it
+    _replace(own, before, after, wanted, _backup(own) if backup else None)
     for use in uses:
         print_notes(sheet, use.notes)
     said = [_said(sheet, into, use) for use in uses]

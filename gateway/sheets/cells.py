@@ -157,9 +157,14 @@ def order(text: str) -> str:
     return _ORDERS.get(_plain(text), text)
 
 
-def address(text: str) -> str:
-    """Returns an address; a number that the spreadsheet wrote as 40101,0 loses its end."""
-    return re.sub(r"\A([0-9]+),0+\Z", r"\1", text)
+def address(text: str, bit: str) -> str:
+    """Returns an address, with a bit of its word.
+
+    A number that the spreadsheet wrote as 40101,0 loses its end.
+    """
+    if bit and not bit.isdecimal():
+        raise ConfigError(f"{bit} is no number of a bit")
+    return re.sub(r"\A([0-9]+),0+\Z", r"\1", text) + (f".{bit}" if bit else "")
 
 
 def name(text: str) -> str:

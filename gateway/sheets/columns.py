@@ -2,8 +2,8 @@
 
 import re
 import unicodedata
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 
 # Titles of each setting: English, German, Chinese (traditional and simplified), and the titles of
@@ -14,12 +14,13 @@ _TITLES = {
     "variablenname, bezeichner, signalname, "
     "名稱, 名称, 標籤名稱, 标签名称, 標籤, 标签, "
     "變數名稱, 变量名称, 變量名稱, 变量名, 變數, 变量, 點名, 点名",
-    "address": "address, addr, register, plc address, register address, modbus address, operand, "
+    "address": "address, addr, adr, register, plc address, register address, modbus address, "
+    "operand, "
     "device number, assign device label, "
     "adresse, sps adresse, registeradresse, "
     "位址, 地址, 元件, 元件編號, 元件编号, 軟元件, 软元件, 裝置位址, "
     "寄存器, 寄存器地址, 暫存器, 暫存器位址",
-    "type": "type, data type, datatype, format, typ, datentyp, datenformat, "
+    "type": "type, data type, datatype, typ, datentyp, datenformat, "
     "類型, 类型, 資料類型, 数据类型, 資料型別, 資料型態, 數據類型",
     "unit": "unit, units, eng unit, eng units, engineering unit, engineering units, uom, "
     "einheit, 單位, 单位",
@@ -41,8 +42,7 @@ _TITLES = {
     "min": "min, minimum, lower limit, low limit, write min, untergrenze, 最小值, 下限",
     "max": "max, maximum, upper limit, high limit, write max, obergrenze, 最大值, 上限",
     "verify": "verify, read back, prüfen, rücklesen",
-    "history": "history, archive, log, logging, trend, historie, archiv, archivieren, "
-    "歷史, 历史, 記錄, 记录",
+    "history": "history, archive, historie, archiv, archivieren, 歷史, 历史, 記錄, 记录",
     "word_order": "word order, wordorder, word swap, wortreihenfolge, wortfolge",
     "byte_order": "byte order, byteorder, byte swap, bytereihenfolge, bytefolge",
     "length": "length, string length, chars, characters, länge, zeichen, 長度, 长度",
@@ -52,9 +52,29 @@ _TITLES = {
     "scaled_low": "scaled low, scaled min, eng low, eng min, eu min, eu low, messbereich von",
     "scaled_high": "scaled high, scaled max, eng high, eng max, eu max, eu high, messbereich bis",
     "scaling": "scaling",
+    "bit": "bit, bit no, bit number, bitnummer, bit nr, 位元, 位號, 位号",
+    # Columns that change a value or its source, in a way that no setting has: see `UNUSABLE`.
+    "divisor": "divisor, divide, divide by, divider, teiler, 除數, 除数",
+    "places": "decimal places, decimal point, decimal position, kommastellen, nachkommastellen, "
+    "dezimalstellen, 小數位數, 小数位数, 小數點, 小数点",
+    "negate": "negate value, negate, invert, inverted, invertiert, negiert",
+    "sign": "signed, unsigned, sign, vorzeichen",
+    "station": "station, station no, station number, slave, slave id, unit id, node, node id, "
+    "stationsnummer, 站號, 站号",
     # Columns of an export of the gateway that only inform.
     "": "key, write key, value type",
 }
+# Left out, these would give wrong values that look right.
+UNUSABLE = {
+    "divisor": "write the factor into a column Scale: 0.1 instead of 10",
+    "places": "write the factor into a column Scale: 0.1 instead of 1 place",
+    "negate": "write a negative Scale, or correct the PLC",
+    "sign": "write int16 or uint16 into a column Type",
+    "station": "the sheet has several stations: write their names into a column Device",
+}
+_NO = {"", "0", "no", "none", "false", "nein", "falsch", "-"}
+# Cells that change nothing; of stations, one is allowed.
+_NEUTRAL = {"divisor": {"", "1", "1,0", "1.0"}, "places": {"", "0"}, "negate": _NO, "sign": {""}}
 _TEXTS = ("name", "description")  # a second column for these is left out, not refused
 # Without another column of addresses this one has them: `Device` is the maker's word for D100.
 _ADDRESS_TOO = ("device", "device name", "裝置", "装置")
@@ -78,7 +98,7 @@ _KNOWN = {
 _RANK = {title: rank for rank, title in enumerate(_KNOWN)}
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class Column:
     """A column with a known title. `title` is as written, `index` counts from 0."""
 
@@ -125,13 +145,13 @@ def columns_of(cells: Sequence[str], others: Sequence[str]) -> Columns:
         elif first is not column:
             both = f"{first.place} has the same meaning: delete or rename one of them"
             found.mistakes.append((column.index, both))
-    device = found.by_setting.get("device")
-    if "address" not in found.by_setting and device and _plain(device.title) in _ADDRESS_TOO:
-        found.by_setting["address"] = found.by_setting.pop("device")
-        device.setting = "address"
+    named = found.by_setting.get("device")
+    if "address" not in found.by_setting and named and _plain(named.title) in _ADDRESS_TOO:
+        found.by_setting["address"] = replace(named, setting="address")
+        del found.by_setting["device"]
     every = found.by_setting.get("every")
-    if every is not None and any(_plain(cell) in _IN_MILLISECONDS for cell in cells):
-        every.unit = every.unit or "ms"
+    if every and not every.unit and any(_plain(cell) in _IN_MILLISECONDS for cell in cells):
+        found.by_setting["every"] = replace(every, unit="ms")
     return found
 
 
@@ -139,7 +159,9 @@ def _note_unknown(found: Columns, index: int, title: str, others: Sequence[str])
     """A title that is nearly known is a mistake: a misspelt `Scale` would change every value."""
     close = get_close_matches(_plain(title), [*_KNOWN, *others], n=1, cutoff=0.8)
     if close:
-        found.mistakes.append((index, f"no column of tags: did you mean {close[0].capitalize()}?"))
+        setting = _KNOWN.get(close[0], close[0])
+        known = next((title for title, one in _KNOWN.items() if one == setting), setting)
+        found.mistakes.append((index, f"no column of tags: did you mean {known.capitalize()}?"))
     else:
         found.unused.append(title)
 
@@ -160,6 +182,13 @@ def _setting(title: str, others: Sequence[str]) -> tuple[str | None, str]:
 def _plain(title: str) -> str:
     text = unicodedata.normalize("NFKC", title).casefold()
     return _SEPARATORS.sub(" ", text).strip(" *#")
+
+
+def unusable(setting: str, cells: Collection[str]) -> str:
+    """Returns why a column of `UNUSABLE` cannot be left out; empty if its cells change nothing."""
+    found = {cell.casefold() for cell in cells}
+    changes = len(found) > 1 if setting == "station" else bool(found - _NEUTRAL[setting])
+    return f"this column cannot be used: {UNUSABLE[setting]}" if changes else ""
 
 
 def letter(index: int) -> str:

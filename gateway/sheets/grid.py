@@ -4,8 +4,9 @@ import csv
 import io
 import itertools
 import re
+import zlib
 from collections.abc import Iterable, Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from zipfile import BadZipFile
 
 from gateway.errors import ConfigError
@@ -22,6 +23,13 @@ _BOMS = {b"\xef\xbb\xbf": "utf-8-sig", b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-
 _HIGH = re.compile(rb"[\x80-\xff]+")
 # Encodings of Chinese Excel; the narrowest first, so that a wrong one rarely fits.
 _CHINESE = ("gb2312", "big5", "gb18030")
+
+
+# What the reader of .xlsx files raises where bytes of the archive or of its XML are wrong.
+_DAMAGED = (
+    *(BadZipFile, zlib.error, EOFError, NotImplementedError, OSError, SyntaxError),
+    *(ValueError, KeyError, IndexError, TypeError, AttributeError),
+)
 
 
 class Row(NamedTuple):
@@ -105,10 +113,9 @@ def _delimited(text: str) -> Grid:
 def _score(text: str, delimiter: str) -> int:
     """Returns the number of known titles that the first rows have with this delimiter."""
     try:
-        rows = list(itertools.islice(_records(text, delimiter), HEADER_ROWS))
+        return _titles(_records(text, delimiter))
     except ConfigError:
         return 0
-    return max((titles_in(row.cells) for row in rows), default=0)
 
 
 def _records(text: str, delimiter: str) -> Iterator[Row]:
@@ -146,24 +153,25 @@ def _xlsx(data: bytes) -> list[Row]:
         ) from None
     try:
         book = load_workbook(io.BytesIO(data), read_only=True, data_only=True)
-    except (BadZipFile, ValueError, KeyError, OSError, SyntaxError) as error:
+        tabs = [list(_tab(book[name])) for name in book.sheetnames]
+    except _DAMAGED as error:
         raise ConfigError(f"the file is no .xlsx file, or damaged: {error}") from None
-    best: list[Row] = []
-    best_score = -1
-    for name in book.sheetnames:
-        sheet = book[name]
-        sheet.reset_dimensions()  # some programs write a wrong size
-        rows = [
-            Row(number, _trimmed(_cell_text(cell) for cell in cells))
-            for number, cells in enumerate(sheet.iter_rows(values_only=True), 1)
-        ]
-        score = max((titles_in(row.cells) for row in rows[:HEADER_ROWS]), default=0)
-        if score > best_score:
-            best, best_score = rows, score
-    return best
+    return max(tabs, key=_titles, default=[])
 
 
-def _cell_text(cell: object) -> str:
+def _tab(sheet: Any) -> Iterator[Row]:
+    sheet.reset_dimensions()  # some programs write a wrong size
+    for number, cells in enumerate(sheet.iter_rows(values_only=True), 1):
+        yield Row(number, _trimmed(cell_text(cell) for cell in cells))
+
+
+def _titles(rows: Iterable[Row]) -> int:
+    """Returns the number of known titles in the best of the first rows."""
+    return max((titles_in(row.cells) for row in itertools.islice(rows, HEADER_ROWS)), default=0)
+
+
+def cell_text(cell: object) -> str:
+    """Returns a cell of a spreadsheet as text."""
     match cell:
         case None:
             return ""

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from gateway.errors import ConfigError
 from gateway.sheets import cells
-from gateway.sheets.columns import Column, Columns, columns_of, titles_in
+from gateway.sheets.columns import UNUSABLE, Column, Columns, columns_of, titles_in, unusable
 from gateway.sheets.grid import HEADER_ROWS, Grid, Row
 
 _NUMBERS = ("scale", "offset", "min", "max", "raw_low", "raw_high", "scaled_low", "scaled_high")
@@ -18,6 +18,7 @@ _READERS: dict[str, Callable[[str], object]] = {
     "word_order": cells.order,
     "byte_order": cells.order,
 }
+_SCALINGS = ("", "none", "no", "keine", "linear")
 _KEPT = 3  # examples in a note
 
 
@@ -109,7 +110,7 @@ class _Reader:
         if "address" not in known:
             titles = ", ".join(column.title for column in known.values())
             self._mistake(self.header, f"no column Address; the titles are {titles}")
-        if not self._named and "description" not in known:
+        if "name" not in known and "description" not in known:
             self._mistake(self.header, "no column Name, and no Comment to make names of")
         self.sheet.columns = {setting: column.place for setting, column in known.items()}
         for part, whole in _PART_OF.items():
@@ -120,12 +121,17 @@ class _Reader:
 
     @property
     def _named(self) -> bool:
-        return "name" in self.columns.by_setting
+        """True where each row needs a name; labels may be empty."""
+        column = self.columns.by_setting.get("name")
+        return column is not None and "label" not in column.title.casefold()
 
     def learn(self, rows: Sequence[Row]) -> None:
         """Finds what only all rows together tell: the decimal mark, and the devices."""
         found = (self._cell(row, setting) for row in rows for setting in _NUMBERS)
         self.decimal = self.decimal or cells.decimal_mark(found)
+        for setting in UNUSABLE:
+            if why := unusable(setting, {self._cell(row, setting) for row in rows}):
+                self._mistake(self.header, why, self._place(setting))
         self.devices = {whose for row in rows if (whose := self._cell(row, "device"))}
 
     def add(self, row: Row, device: str) -> None:
@@ -140,12 +146,13 @@ class _Reader:
         name = self._name(row, settings)
         for problem in self._missing(row, name):
             self._mistake(row.number, problem)
-        if not name or "address" not in settings:
+        if "address" not in settings:
             return
         if name in self.sheet.tags:
             other = self.sheet.rows[name]
             self._mistake(row.number, f"{name} is in row {other} already", self._place("name"))
-            return
+        if not name or name in self.sheet.tags:
+            name = f"{name}_row_{row.number}"  # its other mistakes are reported too
         self.sheet.tags[name] = settings
         self.sheet.rows[name] = row.number
 
@@ -190,7 +197,7 @@ class _Reader:
                 settings.setdefault("description", written)
             return name
         address = self._cell(row, "address")
-        if self._named and "description" not in self.columns.by_setting:
+        if self._named:
             return ""
         comment = self._cell(row, "description")
         name = cells.name(comment or address)
@@ -199,7 +206,10 @@ class _Reader:
     def _settings(self, row: Row) -> Iterator[tuple[str, object]]:
         """Yields the settings of a tag that the row has."""
         if address := self._cell(row, "address"):
-            yield "address", cells.address(address)
+            bit = self._cell(row, "bit")
+            place = "bit" if bit else "address"
+            for _, spelt in self._one(row, place, partial(cells.address, address, bit)):
+                yield "address", spelt
         for setting in ("unit", "description"):
             if text := self._cell(row, setting):
                 yield setting, text
@@ -225,10 +235,13 @@ class _Reader:
         values = dict(self._numbers(row, ("scale", "offset", *_RANGE)))
         ends = [values.pop(setting) for setting in _RANGE if setting in values]
         linear = self._cell(row, "scaling").casefold()
-        if not ends or linear in ("none", "no", "keine"):
+        if linear not in _SCALINGS:
+            what = f"{linear} is no scaling: write linear, or the factor into a column Scale"
+            self._mistake(row.number, what, self._place("scaling"))
+        if (not ends and linear != "linear") or linear in ("none", "no", "keine"):
             yield from values.items()
             return
-        if linear not in ("", "linear") or len(ends) < 4 or values:
+        if len(ends) < 4 or values:
             self._mistake(
                 row.number,
                 "a range needs its four ends, linear, and no scale beside it: "

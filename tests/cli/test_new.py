@@ -69,8 +69,9 @@ def test_it_asks_on_a_terminal_and_names_the_mistakes_of_the_sheet(tmp_path: Pat
     path = tmp_path / "plant.yaml"
     answers = [f"tcp://127.0.0.1:{number}", "vigor", "", "hall-2", "all", "mixer", "tag.csv"]
     answers.append(str(tmp_path / "tags.csv"))
+    slow = ["--stations", "1", "--timeout", "10s"]  # for a slow machine
     with station("tcp", str(number)):
-        said, code = at_a_terminal([*answers], "new", path, "--stations", "0-2")
+        said, code = at_a_terminal([*answers], "new", path, *slow)
     assert code == 2
     assert "Stations found: 1. Use [all]: " in said
     assert "there is no file tag.csv" in said

@@ -28,7 +28,6 @@ def test_a_sheet_of_300_tags_is_on_zenoh_after_five_commands(tmp_path: Path) -> 
         done = plc_gateway(*map(here, step.command), cwd=tmp_path)
         printed = {normal(line) for line in (done.out + done.err).splitlines()}
         shown = {normal(here(line)) for line in step.shown} - {"…"}
-        assert shown <= printed or step.command[0] == "read", (shown - printed, printed)
         return shown <= printed
 
     simulate, new, *rest = steps(PAGE)
@@ -37,11 +36,14 @@ def test_a_sheet_of_300_tags_is_on_zenoh_after_five_commands(tmp_path: Path) -> 
     with ExitStack() as stack:
         plc = stack.enter_context(gateway(*map(here, simulate.command)))
         plc.says(here(simulate.shown[-2]))
-        assert prints(new)
+        # On a slow machine the simulated PLC may reply too late for a scan: it writes no file then.
+        until(partial(prints, new), "new finds the PLC and writes the file")
         path.write_text(path.read_text("utf-8").replace("tcp/127.0.0.1:7447", free_endpoint()))
         for step in rest:
             if step.command[0] == "run":
                 stack.enter_context(started(path)).says("device online")
+            elif step.command[0] == "import":
+                assert prints(step)  # a second one would be refused
             else:
                 until(partial(prints, step), f"{step.command} prints what the page shows")
         assert len(asyncio.run(_values(path))) == 300

@@ -1,13 +1,19 @@
 """Sheets of tags: files of several programs, and every mistake with its row and column."""
 
+import io
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from openpyxl import Workbook
 
 from gateway.config import ConfigErrors, load
 from gateway.config.sheet_tags import other_settings, parsed
 from gateway.errors import ConfigError
-from gateway.sheets import Sheet, cells, read_grid, read_sheet
+from gateway.sheets import Sheet, cells, grid, read_grid, read_sheet
 from gateway.sheets.columns import columns_of, letter
 from gateway.tags import WriteRule
 from tests.sheets import plant
@@ -29,6 +35,19 @@ lines:
 def sheet(text: str | bytes, device: str = "mixer") -> Sheet:
     data = text.encode() if isinstance(text, str) else text
     return read_sheet(read_grid(data), device, other_settings(), parsed)
+
+
+def as_xlsx(points: list[plant.Point]) -> bytes:
+    book = Workbook()
+    book.create_sheet("Cover").append(["Plant", "South"])
+    tags = book.create_sheet("Tags")
+    tags.append(["Name", "Address", "Scale", "R/W", "Every"])
+    for point in points:
+        tags.append([point.name, point.address, point.scale, point.writable, "500ms"])
+    tags.append([None, None])
+    stream = io.BytesIO()
+    book.save(stream)
+    return stream.getvalue()
 
 
 def mistakes(tmp_path: Path, text: str | bytes, config: str = PLANT) -> list[str]:
@@ -70,20 +89,23 @@ def test_equal_comments_get_the_address_into_their_names() -> None:
     assert list(found.tags) == ["pump_runs", "pump_runs_M2", "M3"]
 
 
-def test_an_xlsx_file_has_its_tags_on_any_sheet(tmp_path: Path) -> None:
-    from openpyxl import Workbook
+def test_an_empty_label_takes_the_comment_but_an_empty_name_is_a_mistake() -> None:
+    text = "Device,{},Comment\nM1,,pump runs\nM2,run,\n"
+    assert list(sheet(text.format("Label")).tags) == ["pump_runs", "run"]
+    (mistake,) = sheet(text.format("Name")).mistakes
+    assert (mistake.row, mistake.what) == (2, "no name")
 
-    book = Workbook()
-    book.create_sheet("Cover").append(["Plant", "South"])
-    tags = book.create_sheet("Tags")
-    tags.append(["Name", "Address", "Scale", "R/W", "Every"])
-    tags.append(["level", 40101.0, 0.1, True, "500ms"])
-    tags.append([None, None])
-    book.save(tmp_path / "tags.xlsx")
-    found = sheet((tmp_path / "tags.xlsx").read_bytes())
-    assert found.tags == {
+
+def test_an_xlsx_file_has_its_tags_on_any_sheet() -> None:
+    point = plant.Point("level", "40101", "int16", "", 0.1, "", writable=True)
+    assert sheet(as_xlsx([point])).tags == {
         "level": {"address": "40101", "scale": 0.1, "write": True, "every": "500ms"}
     }
+
+
+def test_numbers_of_an_xlsx_file_are_written_as_excel_shows_them() -> None:
+    texts = [grid.cell_text(cell) for cell in (40101.0, 0.1 + 0.2, 1e20, True, None, 7)]
+    assert texts == ["40101", "0.3", "1e+20", "true", "", "7"]
 
 
 # ---- encodings, delimiters, titles ---------------------------------------------------------------
@@ -132,6 +154,19 @@ def test_a_title_that_is_nearly_known_is_a_mistake_and_another_is_reported() -> 
     assert found.notes == ["columns not used: Cabinet"]
 
 
+def test_labels_of_a_plc_program_have_their_devices_and_types() -> None:
+    found = sheet(
+        "Class\tLabel Name\tData Type\tAssign (Device/Label)\tComment\tRemark\n"
+        "VAR_GLOBAL\tspeed\tWord [Signed]\tD100\tSpeed of the mixer\t\n"
+        "VAR_GLOBAL\tlevel\tFLOAT [Single Precision]\tD10\t\t\n"
+    )
+    assert found.tags == {
+        "speed": {"address": "D100", "description": "Speed of the mixer", "type": "int16"},
+        "level": {"address": "D10", "type": "float32"},
+    }
+    assert found.notes == ["columns not used: Class, Remark"]
+
+
 def test_two_columns_of_one_meaning_are_a_mistake() -> None:
     columns = columns_of(["Name", "Address", "Scale", "Faktor"], ())
     assert columns.mistakes == [
@@ -167,6 +202,22 @@ def test_a_sheet_of_several_devices_gives_each_its_rows() -> None:
 def test_a_file_that_is_no_sheet_is_named_so(data: bytes, problem: str) -> None:
     with pytest.raises(ConfigError, match=problem):
         sheet(data)
+
+
+@given(
+    st.sampled_from([plant.german, plant.kepware, plant.device_comments, as_xlsx]),
+    st.lists(st.tuples(st.floats(0, 1), st.integers(0, 9), st.binary(max_size=4)), max_size=4),
+)
+@settings(deadline=None, max_examples=60)
+def test_a_damaged_file_is_a_sheet_or_a_mistake(
+    program: Callable[[list[plant.Point]], bytes], damages: list[tuple[float, int, bytes]]
+) -> None:
+    data = bytearray(program(plant.points(5)))
+    for share, length, put in damages:
+        at = int(share * len(data))
+        data[at : at + length] = put
+    with suppress(ConfigError):
+        sheet(bytes(data))
 
 
 # ---- cells ---------------------------------------------------------------------------------------
@@ -267,6 +318,41 @@ def test_limits_count_for_tags_that_can_be_written() -> None:
         "a": {"address": "D1", "write": {"verify": True, "min": 1, "max": 40}},
         "b": {"address": "D2", "write": False},
     }
+
+
+@pytest.mark.parametrize(
+    ("title", "first", "second"),
+    [
+        ("Divisor", "1", "10"),
+        ("Decimal places", "0", "2"),
+        ("Negate Value", "", "x"),
+        ("Signed", "", "no"),
+        ("Decimal places", "0", "1"),
+        ("Inverted", "no", "1"),
+        ("Slave ID", "1", "2"),
+    ],
+)
+def test_a_column_that_would_change_values_is_not_left_out(
+    title: str, first: str, second: str
+) -> None:
+    text = f"Name,Address,{title}\na,D1,{first}\nb,D2,"
+    assert not sheet(f"{text}{first}\n").mistakes
+    (mistake,) = sheet(f"{text}{second}\n").mistakes
+    assert mistake.what.startswith("this column cannot be used: ")
+    assert mistake[:2] == (1, f"column C ({title})")
+
+
+def test_a_scaling_that_is_no_range_is_refused() -> None:
+    (mistake,) = sheet("Name,Address,Scaling\na,D1,0.1\n").mistakes
+    assert mistake.what == "0.1 is no scaling: write linear, or the factor into a column Scale"
+    (mistake,) = sheet("Name,Address,Scaling\na,D1,Linear\n").mistakes
+    assert mistake.what.startswith("a range needs its four ends")
+
+
+def test_a_column_of_bits_belongs_to_the_address() -> None:
+    found = sheet("Name,Address,Bit\na,D7,3\nb,D8,\nc,D9,x\n")
+    assert [raw["address"] for raw in found.tags.values()][:2] == ["D7.3", "D8"]
+    assert found.mistakes == [(4, "column C (Bit)", "x is no number of a bit")]
 
 
 def test_names_become_names_of_keys_and_the_text_stays_as_description() -> None:

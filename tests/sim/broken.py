@@ -1523,8 +1523,15 @@ MUTANTS = (
     Mutant(
         "a misspelt title of a sheet is only left out",
         "sheets/columns.py",
-        "    if close:\n        found.mistakes",
-        "    if False:\n        found.mistakes",
+        "    if close:\n        setting",
+        "    if False:\n        setting",
+        "tests/sheets/test_sheets.py",
+    ),
+    Mutant(
+        "a column of divisors is left out",
+        "sheets/sheet.py",
+        "                self._mistake(self.header, why, self._place(setting))\n",
+        "                pass\n",
         "tests/sheets/test_sheets.py",
     ),
     Mutant(
