@@ -16,7 +16,7 @@ import sqlite3
 import sys
 import tempfile
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AsyncExitStack
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -26,7 +26,7 @@ from typing import Any, NamedTuple, Self
 from tests.e2e.processes import ROOT, Program, gateway
 from tests.zenoh_peer import ZenohPeer, free_endpoint
 
-PATIENCE = 180.0  # seconds for anything
+PATIENCE = 300.0  # seconds for anything
 RESTART = 1.0  # seconds from the end of a gateway to its next start, as a service manager waits
 MB = 1e6
 
@@ -114,14 +114,16 @@ class Plant:
         """Returns the endpoints of a router and of the next one."""
         return [self.endpoints[(place + n) % self.sizes.routers] for n in range(2)]
 
-    def start_gateway(self, name: str, place: int, *, standby: bool = False) -> None:
+    def start_gateway(
+        self, name: str, place: int, *, standby: bool = False, mode: str = "client"
+    ) -> None:
         """Starts it, also again. `name` is `g<n>`, and `g<n>-spare` for the spare of a pair."""
         path = self.folder / f"{name}.yaml"
         if not path.exists():
-            path.write_text("\n".join(self._rows(name, place, standby=standby)) + "\n")
+            path.write_text("\n".join(self._rows(name, place, mode, standby=standby)) + "\n")
         self.gateways[name] = self._stack.enter_context(gateway("run", path))
 
-    def _rows(self, name: str, place: int, *, standby: bool) -> list[str]:
+    def _rows(self, name: str, place: int, mode: str, *, standby: bool) -> list[str]:
         sizes, plain = self.sizes, name.partition("-")[0]
         group = f", standby: {plain}" if standby else ""
         connect = ", ".join(self.near(place))
@@ -130,7 +132,7 @@ class Plant:
         vigor = "protocol: vigor, reply_timeout: 2s"
         rows = [
             f"gateway: {{name: {name}{group}}}",
-            f"zenoh: {{mode: client, listen: [], connect: [{connect}]}}",
+            f"zenoh: {{mode: {mode}, listen: [], connect: [{connect}]}}",
             f"history: {{path: {name}.db}}",
             f"defaults: {{{defaults}}}",
             "lines:",
@@ -231,7 +233,13 @@ class Seen(NamedTuple):
         return float(max(report["oldest"] for report in self.reports))
 
 
-async def watch(consumer: Consumer, sizes: Sizes, names: list[str], least: float = 0.0) -> Seen:
+async def watch(
+    consumer: Consumer,
+    sizes: Sizes,
+    names: Sequence[str],
+    least: float = 0.0,
+    until: Callable[[Seen], bool] = lambda _: True,
+) -> Seen:
     """Collects reports for `least` seconds, and until the values of all gateways are shown."""
     reports, begun = list[dict[str, Any]](), time.monotonic()
     while True:
@@ -239,7 +247,8 @@ async def watch(consumer: Consumer, sizes: Sizes, names: list[str], least: float
         reports.append(await consumer.report())
         seen, past = Seen(reports), time.monotonic() - begun
         shown = {name: (seen.numbers(name, "shown") or [(0.0, 0)])[-1][1] for name in names}
-        if past >= least and all(number == sizes.of_gateway for number in shown.values()):
+        whole = all(number == sizes.of_gateway for number in shown.values())
+        if past >= least and whole and until(seen):
             return seen
         if past > PATIENCE:
             raise SystemExit(f"values are missing after {past:.0f} s: {shown}")

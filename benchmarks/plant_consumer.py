@@ -27,8 +27,9 @@ from tests.zenoh_peer import configured
 
 # Of the simulated PLC (gateway/simulator/plant.py): a wave between 10 and 90, rounded.
 _MIDDLE, _HALF = 50.0, 40.0
-# Seconds from the moment of a value in the PLC to its time stamp: the rest of the transaction.
-_READ = 0.3
+# Seconds from the moment of a value in the PLC to its time stamp: the rest of the transaction, and
+# the delays of an overloaded machine.
+_READ = 1.0
 _LOOK = 0.02  # seconds between two looks at what arrived
 _AGES_EVERY = 1.0
 

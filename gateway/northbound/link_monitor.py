@@ -20,7 +20,10 @@ _NEVER = float("-inf")
 class LinkMonitor:
     """Sets `returned` when a router, or a session that may have been linked before, is linked."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, is_peer: bool = False) -> None:
+        """`is_peer`: the mode of the session. Zenoh sends the messages of a peer through one of its
+        routers; when this router ends, often none of the others takes over."""
+        self._is_peer = is_peer
         self.returned = asyncio.Event()
         self._up: dict[str, str] = {}  # kind of each linked session, by its id
         self._lost: dict[str, None] = {}  # ids of unlinked sessions, oldest first
@@ -56,6 +59,11 @@ class LinkMonitor:
 
     def _linked(self, session: str, kind: str) -> None:
         self._up[session] = kind
+        if kind == "router" and self._is_peer and list(self._up.values()).count("router") == 2:
+            log.warning(
+                "several routers",
+                why="in mode peer values may stop when one of them ends: set zenoh.mode to client",
+            )
         may_return = time.monotonic() - self._started < _RETURNING
         if kind == "router" or session in self._lost or may_return:
             self._lost.pop(session, None)

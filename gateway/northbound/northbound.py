@@ -84,7 +84,7 @@ class Northbound:
         for exposure in _exposures(self._config, writers, group):
             log.warning("Zenoh session exposed", why=exposure)
         self._plant = plant
-        self._links = LinkMonitor()
+        self._links = LinkMonitor(is_peer=settings.mode is ZenohMode.PEER)
         index = TagIndex(self.keys, plant.devices())
         devices = [device.name for device in index.devices]
         self._admission = Admission(group, self.keys, self._config, devices, plant.duty)

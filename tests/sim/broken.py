@@ -1746,4 +1746,18 @@ MUTANTS = (
         "silence_chars=3.5, learn_silence=True)",
         "tests/engine/test_shorter_silences.py",
     ),
+    Mutant(
+        "a peer of several routers is not warned of",
+        "northbound/link_monitor.py",
+        '.count("router") == 2:\n',
+        '.count("router") == 99:\n',
+        "tests/northbound/test_link_monitor.py",
+    ),
+    Mutant(
+        "a client tries only its first router",
+        "northbound/session.py",
+        "            _begin_with_next(config)\n",
+        "",
+        "tests/northbound/test_session.py",
+    ),
 )
