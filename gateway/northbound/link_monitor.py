@@ -3,6 +3,7 @@
 import asyncio
 import logging
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import structlog
@@ -31,7 +32,8 @@ class _Link:
 class LinkMonitor:
     """Sets `returned` when a router, or a session that may have been linked before, is linked."""
 
-    def __init__(self) -> None:
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
         self.returned = asyncio.Event()
         self._up: dict[str, _Link] = {}  # by the id of the linked session
         self._lost: dict[str, None] = {}  # ids of unlinked sessions, oldest first
@@ -48,7 +50,7 @@ class LinkMonitor:
     def declare(
         self, session: zenoh.Session, inbox: Inbox[zenoh.TransportEvent | zenoh.LinkEvent]
     ) -> list[object]:
-        self._started = time.monotonic()
+        self._started = self._clock()
         handler = zenoh.handlers.Callback(inbox, indirect=False)
         return [
             session.info.declare_transport_events_listener(handler, history=True),
@@ -74,18 +76,18 @@ class LinkMonitor:
             del self._lost[next(iter(self._lost))]
 
     def _log_up(self, session: str, link: _Link) -> None:
-        if self._log_limit.allows(time.monotonic()):
+        if self._log_limit.allows(self._clock()):
             level = logging.DEBUG if link.kind == "client" else logging.INFO
             log.log(level, "Zenoh link up", to=link.kind, address=link.address, id=session)
 
     def _log_down(self, session: str, link: _Link) -> None:
         """A warning for the last link: no other program sees the values any more."""
-        lasted = time.monotonic() - link.since
+        lasted = self._clock() - link.since
         if link.kind == "client" and lasted < _SHORT:
             level = logging.DEBUG
         else:
             level = logging.INFO if self._up else logging.WARNING
-        if level == logging.WARNING or self._log_limit.allows(time.monotonic()):
+        if level == logging.WARNING or self._log_limit.allows(self._clock()):
             log.log(
                 level,
                 "Zenoh link down",
@@ -97,8 +99,8 @@ class LinkMonitor:
             )
 
     def _linked(self, session: str, kind: str) -> None:
-        self._up[session] = _Link(kind, time.monotonic())
-        may_return = time.monotonic() - self._started < _RETURNING
+        self._up[session] = _Link(kind, self._clock())
+        may_return = self._clock() - self._started < _RETURNING
         if kind == "router" or session in self._lost or may_return:
             self._lost.pop(session, None)
             self.returned.set()

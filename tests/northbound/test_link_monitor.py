@@ -2,11 +2,9 @@
 
 from typing import Any, NamedTuple
 
-import pytest
 import structlog
 import zenoh
 
-from gateway.northbound import link_monitor
 from gateway.northbound.link_monitor import LinkMonitor
 
 
@@ -23,13 +21,6 @@ class TransportEvent(NamedTuple):
 UP, DOWN = zenoh.SampleKind.PUT, zenoh.SampleKind.DELETE
 
 
-@pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
-    now = [0.0]
-    monkeypatch.setattr(link_monitor.time, "monotonic", lambda: now[0])
-    return now
-
-
 def happens(monitor: LinkMonitor, kind: object, session: str, whatami: str) -> list[Any]:
     event: Any = TransportEvent(kind, Transport(session, whatami))
     with structlog.testing.capture_logs() as logged:
@@ -37,7 +28,7 @@ def happens(monitor: LinkMonitor, kind: object, session: str, whatami: str) -> l
     return [(entry["log_level"], entry["event"], entry["left"]) for entry in logged]
 
 
-def test_the_last_link_that_goes_is_a_warning(clock: list[float]) -> None:
+def test_the_last_link_that_goes_is_a_warning() -> None:
     monitor = LinkMonitor()
     happens(monitor, UP, "a", "router")
     happens(monitor, UP, "b", "peer")
@@ -46,8 +37,9 @@ def test_the_last_link_that_goes_is_a_warning(clock: list[float]) -> None:
     assert happens(monitor, DOWN, "b", "peer") == []  # it has gone already
 
 
-def test_a_health_check_is_no_event_and_a_client_that_stayed_is_one(clock: list[float]) -> None:
-    monitor = LinkMonitor()
+def test_a_health_check_is_no_event_and_a_client_that_stayed_is_one() -> None:
+    clock = [0.0]
+    monitor = LinkMonitor(lambda: clock[0])
     happens(monitor, UP, "check", "client")
     clock[0] = 0.5
     assert happens(monitor, DOWN, "check", "client") == [("debug", "Zenoh link down", 0)]
