@@ -1377,7 +1377,7 @@ MUTANTS = (
     Mutant(
         "clients of the process before keep their old values",
         "northbound/link_monitor.py",
-        "        may_return = time.monotonic() - self._started < _RETURNING\n",
+        "        may_return = self._clock() - self._started < _RETURNING\n",
         "        may_return = False\n",
         "tests/northbound/test_republish.py",
         (31,),
