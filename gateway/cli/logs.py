@@ -135,7 +135,7 @@ def set_up(form: LogFormat, level: LogLevel) -> Callable[[str], None]:
     """Logs to stderr: text for people, or one JSON document per line for programs.
 
     Also warnings of Python and of libraries; with JSON also crashes. Returns a function that writes
-    lines for people between the log entries, which JSON has not.
+    lines for people between the log entries.
     """
     render = (
         structlog.processors.JSONRenderer(default=str)
@@ -160,10 +160,9 @@ def set_up(form: LogFormat, level: LogLevel) -> Callable[[str], None]:
         wrapper_class=structlog.stdlib.BoundLogger,
         cache_logger_on_first_use=True,
     )
-    if form is LogFormat.TEXT:
-        return handler.write
-    _log_crashes()
-    return lambda _text: None
+    if form is LogFormat.JSON:
+        _log_crashes()
+    return handler.write
 
 
 def _log_crashes() -> None:

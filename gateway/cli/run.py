@@ -7,6 +7,7 @@ import shlex
 import shutil
 import sys
 import threading
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
@@ -35,27 +36,35 @@ def run(
     log_level: Annotated[LogLevel, typer.Option(help="debug shows every byte")] = LogLevel.INFO,
 ) -> None:
     """Run the service: poll, publish on Zenoh, accept writes. SIGTERM or Ctrl-C ends it."""
-    say = set_up(log_format, log_level)
-    try:
+    if log_format is LogFormat.TEXT:
         with progress(err) as report:
             loaded = load(config, report)
-        log.info("gateway starting", version=__version__, file=str(config), **_sizes(loaded))
-        hint = next_steps(loaded, config, program())
-        with asyncio.Runner(loop_factory=new_event_loop) as runner:
-            runner.run(service.run(loaded, lambda: say(hint)))
-    except GatewayError as error:
-        if log_format is LogFormat.TEXT:
-            raise
-        for sentence in str(error).splitlines():
-            log.error("gateway failed", why=sentence)  # noqa: TRY400  (a sentence, no trace)
-        sys.exit(USER_MISTAKE if isinstance(error, ConfigError) else FAILED)
-    log.info("gateway stopped")
+        _serve(loaded, config, set_up(log_format, log_level))
+    else:
+        set_up(log_format, log_level)  # first: a mistake in the file is a document too
+        try:
+            _serve(load(config), config, lambda _text: None)
+        except GatewayError as error:
+            for sentence in str(error).splitlines():
+                log.error("gateway failed", why=sentence)  # noqa: TRY400  (a sentence, no trace)
+            sys.exit(USER_MISTAKE if isinstance(error, ConfigError) else FAILED)
     end_beside_zenoh()
 
 
-def _sizes(config: Config) -> dict[str, object]:
+def _serve(config: Config, path: Path, say: Callable[[str], None]) -> None:
     tags = sum(len(device.tags) for device in config.devices)
-    return {"name": config.name, "lines": len(config.lines), "tags": tags}
+    log.info(
+        "gateway starting",
+        version=__version__,
+        file=str(path),
+        name=config.name,
+        lines=len(config.lines),
+        tags=tags,
+    )
+    hint = next_steps(config, path, program())
+    with asyncio.Runner(loop_factory=new_event_loop) as runner:
+        runner.run(service.run(config, lambda: say(hint)))
+    log.info("gateway stopped")
 
 
 def end_beside_zenoh() -> None:
