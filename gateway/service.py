@@ -50,6 +50,7 @@ async def run(config: Config, started: Callable[[], None] = lambda: None) -> Non
     loop = asyncio.get_running_loop()
 
     def end() -> None:
+        log.info("gateway stopping")
         supervisor.stopping()
         stop.set()
 

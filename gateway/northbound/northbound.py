@@ -229,11 +229,11 @@ class Northbound:
         self,
         session: zenoh.Session,
         declarations: Declarations,
-        links: Inbox[zenoh.TransportEvent],
+        links: Inbox[zenoh.TransportEvent | zenoh.LinkEvent],
     ) -> list[object]:
         """Declares everything that a standby gateway serves too."""
         token = declarations.token() if self._admission.standby.enabled else []
-        return [self._links.declare(session, links), *declarations.status(), *token]
+        return [*self._links.declare(session, links), *declarations.status(), *token]
 
     def _declare_plant(self, declarations: Declarations) -> list[object]:
         """The token comes last: a client that sees it may query at once."""

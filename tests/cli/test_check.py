@@ -97,7 +97,9 @@ def test_check_and_run_refuse_the_same_mistakes_with_2(
     checked = command("check", path)
     assert (checked.code, checked.out) == (2, "")
     assert says in checked.err
-    assert plc_gateway("run", path) == checked
+    ran = plc_gateway("run", path)
+    said = [line for line in ran.err.splitlines() if "gateway starting" not in line]
+    assert (ran.code, ran.out, said) == (2, "", checked.err.splitlines())
 
 
 @pytest.mark.parametrize(

@@ -1209,7 +1209,7 @@ MUTANTS = (
     Mutant(
         "control characters of clients reach the log",
         "cli/logs.py",
-        "            _without_control_characters,\n",
+        "        _without_control_characters,\n",
         "",
         "tests/attacks/test_terminal.py",
     ),
@@ -1236,9 +1236,9 @@ MUTANTS = (
     ),
     Mutant(
         "every failure of a bad line is logged",
-        "cli/logs.py",
-        "        if not limit.allows(self._clock()):\n",
-        "        if False:\n",
+        "cli/repeats.py",
+        "if self._passes(topic, event, entry, now, BURST if noun in _STATES else 1):",
+        "if True:",
         "tests/cli/test_logs.py",
     ),
     Mutant(
@@ -1377,7 +1377,7 @@ MUTANTS = (
     Mutant(
         "clients of the process before keep their old values",
         "northbound/link_monitor.py",
-        "        may_return = time.monotonic() - self._started < _RETURNING\n",
+        "        may_return = self._clock() - self._started < _RETURNING\n",
         "        may_return = False\n",
         "tests/northbound/test_republish.py",
         (31,),
@@ -1759,5 +1759,47 @@ MUTANTS = (
         "            _begin_with_next(config)\n",
         "",
         "tests/northbound/test_session.py",
+    ),
+    Mutant(
+        "the last state of a device that flaps is not the last in the log",
+        "cli/repeats.py",
+        "before = topic.waiting.pop(key, None)",
+        "before = topic.waiting.get(key)",
+        "tests/cli/test_logs.py",
+    ),
+    Mutant(
+        "warnings of other libraries are no documents",
+        "cli/logs.py",
+        "if isinstance(record.msg, _Rendered) or not self._processors:",
+        "if True:",
+        "tests/attacks/test_log_for_programs.py",
+    ),
+    Mutant(
+        "a jump of the clock is not logged",
+        "line/arrival.py",
+        "if abs(jump) >= JUMP:",
+        "if False:",
+        "tests/line/test_arrival.py",
+    ),
+    Mutant(
+        "the last link goes like any other",
+        "northbound/link_monitor.py",
+        "level = logging.INFO if self._up else logging.WARNING",
+        "level = logging.INFO",
+        "tests/northbound/test_link_monitor.py",
+    ),
+    Mutant(
+        "a health check is an event of the log",
+        "northbound/link_monitor.py",
+        "lasted < _SHORT:",
+        "lasted < 0.0:",
+        "tests/northbound/test_link_monitor.py",
+    ),
+    Mutant(
+        "a write to a real machine is proposed",
+        "cli/run.py",
+        "for line in config.lines if line.simulated for",
+        "for line in config.lines for",
+        "tests/cli/test_run.py",
     ),
 )
