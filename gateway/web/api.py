@@ -27,6 +27,7 @@ MOST_ITEMS = 1000  # of one page
 MOST_SAMPLES = 10_000
 _ITEMS = 200
 _SAMPLES = 1000
+BODY_WITHIN = 5.0  # seconds
 HISTORY_AT_ONCE = 4  # queries; they read the disk
 # 200 only for an acknowledged write. 502 and above: it was sent, or the device cannot be reached.
 _STATUS = {
@@ -150,7 +151,11 @@ class Api:
         arrived = asyncio.get_running_loop().time()
         if request.content_type != "application/json":
             return answer(415, "send the value as Content-Type: application/json")
-        key, data = request.query.get("tag", ""), await request.read()
+        try:
+            async with asyncio.timeout(BODY_WITHIN):
+                key, data = request.query.get("tag", ""), await request.read()
+        except TimeoutError:
+            return answer(408, f"the body did not arrive within {BODY_WITHIN:g} s")
         # A client that leaves cancels nothing: the write may be on the wire.
         task = asyncio.create_task(self._north.write(key, data, f"web {request[BY]}", arrived))
         self._writes.add(task)
