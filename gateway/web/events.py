@@ -124,7 +124,7 @@ async def _send(request: web.Request, response: web.StreamResponse, page: "Page"
 
 
 class Page:
-    """What one client has got, and what it gets next."""
+    """The events of one client: notes what it has, and makes what it gets next."""
 
     def __init__(
         self,

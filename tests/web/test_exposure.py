@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from gateway.config import load
+from gateway.config import ConfigErrors, load
 from gateway.errors import ConfigError
 from gateway.web import exposure
 from tests.e2e.processes import ROOT, vigor_line, write_config
@@ -39,6 +39,11 @@ def test_an_address_for_other_machines_is_warned_of(tmp_path: Path) -> None:
     assert warned(tmp_path, listen="[::1]:8080", tokens_file="tokens.txt") == []
     [warning] = warned(tmp_path, listen="0.0.0.0:8080", tokens_file="tokens.txt")
     assert "not encrypted" in warning
+
+
+def test_an_address_for_other_machines_without_tokens_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigErrors, match="name a tokens_file too"):
+        warned(tmp_path, listen="0.0.0.0:8080")
 
 
 def test_a_short_token_is_refused(tmp_path: Path) -> None:
