@@ -1550,9 +1550,9 @@ MUTANTS = (
     ),
     Mutant(
         "a write ends with the HTTP client that leaves",
-        "web/api.py",
-        "        result = await asyncio.shield(task)\n",
-        "        result = await task\n",
+        "web/server.py",
+        "            handle_signals=False,\n",
+        "            handle_signals=False,\n            handler_cancellation=True,\n",
         "tests/web/test_api.py",
     ),
     Mutant(
