@@ -1,60 +1,137 @@
 """The cost of an open status page: `python -m benchmarks.web`.
 
-It runs a gateway with 64 lines of simulated Vigor stations and 50,000 tags. In turn nothing is
-connected, and one page shows a line and a device, for the same time each. It prints the processor
-time of the gateway in both, the time of one scrape of /metrics, and with Chromium at hand the time
-to the first paint.
+A plant has 64 lines of simulated Vigor stations and 50,000 tags. First its lines run on virtual
+time, in turn without a page and with one that shows a line and a device: both do the same work on
+the wire, so that the processor times can be compared on a busy computer too. Zenoh is left out:
+with it the share of the page is smaller. Then a real gateway runs: one scrape of /metrics, and with
+Chromium at hand the time to the first paint.
 """
 
 import argparse
 import asyncio
+import gc
+import logging
 import shutil
 import statistics
 import subprocess
-import sys
 import tempfile
 import time
 import urllib.request
 from pathlib import Path
 
+import structlog
+
 from benchmarks.start import HERE, Sizes, rows, started
+from gateway.app import Gateway
+from gateway.config import Config, load
+from gateway.northbound import payload
+from gateway.northbound.audit import Counts
+from gateway.web.api import Api
+from gateway.web.events import WIRE_EVERY, Events, Loads, Page
+from gateway.web.sources import Documents, Sources
 from tests.e2e.processes import free_port
+from tests.sim.virtual import run_virtual
 from tests.web.browser import browser
+from tests.web.serving import PlainNorth
 from tests.zenoh_peer import free_endpoint
 
 SIZES = Sizes(lines=64, devices=8, tags=98)
+PUBLISHED_EVERY = 5.0  # seconds
 
 
-def processor(process: subprocess.Popen[bytes]) -> float:
-    """Seconds of the processor since its start."""
-    fields = Path(f"/proc/{process.pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / 100
+class North(PlainNorth):
+    """Collects the documents as the gateway does: also with their JSON."""
+
+    def __init__(self, gateway: Gateway) -> None:
+        super().__init__()
+        self._gateway = gateway
+        self._at = float("-inf")
+        self._found: Documents = {}
+
+    async def documents(self, max_age: float) -> Documents:
+        now = asyncio.get_running_loop().time()
+        if now - self._at > max_age:
+            found = dict(self._gateway.status())
+            found["status"] = {**found["status"], "refused_devices": {}}
+            found |= {"zenoh": {"to": []}, "outcomes": Counts().document()}
+            for document in found.values():
+                payload.document(document)
+            self._at, self._found = now, found
+        return self._found
+
+    async def publish(self) -> None:
+        while True:
+            await self.documents(0.0)
+            await asyncio.sleep(PUBLISHED_EVERY)
 
 
-def memory(process: subprocess.Popen[bytes]) -> float:
-    """MB."""
-    text = Path(f"/proc/{process.pid}/status").read_text()
-    return int(text.partition("VmRSS:")[2].split()[0]) / 1000
+async def play(gateway: Gateway, seconds: float, made: list[float] | None) -> None:
+    north = North(gateway)
+    tasks = [asyncio.create_task(line.run()) for line in gateway.lines]
+    tasks.append(asyncio.create_task(north.publish()))
+    if made is not None:
+        tasks.append(asyncio.create_task(show(Sources(gateway, north, None, lambda: True), made)))
+    await asyncio.sleep(seconds)
+    for task in tasks:
+        task.cancel()
+    await asyncio.gather(*tasks, return_exceptions=True)
 
 
-def spent(process: subprocess.Popen[bytes], port: int, seconds: float) -> tuple[float, float]:
-    """The share of one processor in the next seconds, and its microseconds for each exchange."""
-    exchanges, begun, before = exchanged(port), time.monotonic(), processor(process)
-    time.sleep(seconds)
-    used, passed = processor(process) - before, time.monotonic() - begun
-    return used / passed, used / (exchanged(port) - exchanges) * 1e6
+async def show(sources: Sources, made: list[float]) -> None:
+    """Makes the events of one page. Adds the processor time of each to `made`."""
+    api, loads = Api(sources), Loads(sources)
+    events, measuring = Events(sources, api, loads), asyncio.create_task(loads.run())
+    try:
+        with events.wires.watched("line0") as recorder:
+            page = Page(sources, events, api.select("d0-0", "", None, 200), recorder)
+            while True:
+                begun = time.process_time()  # nothing else runs meanwhile
+                await page.next()
+                made.append(time.process_time() - begun)
+                await asyncio.sleep(WIRE_EVERY)
+    finally:
+        measuring.cancel()
 
 
-def exchanged(port: int) -> float:
-    text = fetched(port, "/metrics").decode()
-    name = "plc_gateway_device_exchanges_total{"
-    return sum(float(row.split()[-1]) for row in text.splitlines() if row.startswith(name))
+def spent(config: Config, seconds: float, made: list[float] | None) -> tuple[float, int]:
+    """Seconds of the processor for so many seconds of the plant, and its exchanges."""
+    gateway = Gateway(config)
+    gc.collect()
+    begun = time.process_time()
+    run_virtual(play(gateway, seconds, made))
+    used = time.process_time() - begun
+    return used, sum(device.record.exchanges for device in gateway.enabled_devices)
+
+
+def compare(config: Config, seconds: float, rounds: int) -> None:
+    ratios, bases, counts = [], [], set()
+    made: list[float] = []
+    for _ in range(rounds):
+        before, exchanges = spent(config, seconds, None)
+        after, with_page = spent(config, seconds, made)
+        ratios.append(after / before - 1)
+        bases.append(before / seconds)
+        counts |= {exchanges, with_page}
+    base, events = statistics.median(bases), sum(made) / seconds / rounds
+    print(
+        f"the lines take {base:.1%} of a processor, the events of a page {events:.2%}: "
+        f"{events / base:+.1%}. As a whole: "
+        f"{', '.join(f'{ratio:+.1%}' for ratio in ratios)}. Exchanges: {sorted(counts)}. "
+        f"The longest event took {max(made) * 1000:.1f} ms",
+        flush=True,
+    )
 
 
 def fetched(port: int, path: str) -> bytes:
     with urllib.request.urlopen(f"http://127.0.0.1:{port}{path}", timeout=60) as reply:
         body: bytes = reply.read()
         return body
+
+
+def processor(process: subprocess.Popen[bytes]) -> float:
+    """Seconds of the processor since its start."""
+    fields = Path(f"/proc/{process.pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / 100
 
 
 def until_up(port: int, devices: int) -> None:
@@ -81,43 +158,8 @@ async def first_paint(port: int, chromium: str, profile: Path) -> tuple[float, f
         return paint / 1000, live
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seconds", type=float, default=15.0, help="of each measurement")
-    parser.add_argument("--rounds", type=int, default=3)
-    arguments = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
-        port, path = free_port(), Path(folder) / "plant.yaml"
-        text = "\n".join(rows(SIZES, free_endpoint(), alike=True))
-        path.write_text(f'web: {{listen: "127.0.0.1:{port}"}}\n{text}\n')
-        process = started(HERE, "run", path)
-        try:
-            measure(process, port, Path(folder), arguments.seconds, arguments.rounds)
-        finally:
-            process.kill()
-            process.wait()
-
-
-def measure(
-    process: subprocess.Popen[bytes], port: int, folder: Path, seconds: float, rounds: int
-) -> None:
+def measure(process: subprocess.Popen[bytes], port: int, folder: Path) -> None:
     until_up(port, SIZES.lines * SIZES.devices)
-    print(f"{SIZES.all_tags} tags on {SIZES.lines} lines, {memory(process):.0f} MB", flush=True)
-    alone, watched = [], []
-    for _ in range(rounds):
-        alone.append(spent(process, port, seconds))
-        page = f"http://127.0.0.1:{port}/api/events?line=line0&device=d0-0"
-        client = [sys.executable, "-c", _READER, page]
-        with subprocess.Popen(client, stdout=subprocess.DEVNULL) as reading:
-            time.sleep(2)  # the first event is the largest
-            watched.append(spent(process, port, seconds))
-            reading.kill()
-    before, after = (map(statistics.median, zip(*found, strict=True)) for found in (alone, watched))
-    shares, costs = zip(before, after, strict=True)
-    print("without a page {:.1%} of a processor, with one {:.1%}".format(*shares))
-    print(
-        "for each exchange {:.0f} and {:.0f} us".format(*costs), f"({costs[1] / costs[0] - 1:+.1%})"
-    )
     begun, used = time.monotonic(), processor(process)
     size = len(fetched(port, "/metrics"))
     taken = time.monotonic() - begun
@@ -129,7 +171,25 @@ def measure(
         print(f"first paint after {paint:.2f} s, all values live after {live:.2f} s")
 
 
-_READER = "import sys, urllib.request as u; r = u.urlopen(sys.argv[1])\nwhile r.read1(): pass"
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seconds", type=float, default=20.0, help="of the plant, in each round")
+    parser.add_argument("--rounds", type=int, default=5)
+    arguments = parser.parse_args()
+    structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.ERROR))
+    with tempfile.TemporaryDirectory() as folder:
+        port, path = free_port(), Path(folder) / "plant.yaml"
+        text = "\n".join(rows(SIZES, free_endpoint(), alike=True))
+        path.write_text(f'web: {{listen: "127.0.0.1:{port}"}}\n{text}\n')
+        print(f"{SIZES.all_tags} tags on {SIZES.lines} lines", flush=True)
+        compare(load(path), arguments.seconds, arguments.rounds)
+        process = started(HERE, "run", path)
+        try:
+            measure(process, port, Path(folder))
+        finally:
+            process.kill()
+            process.wait()
+
 
 if __name__ == "__main__":
     main()

@@ -18,7 +18,7 @@ from gateway.northbound import payload
 from gateway.northbound.faults import below, faults, warnings
 from gateway.northbound.payload import Failure, Problem
 from gateway.northbound.session import off_loop
-from gateway.tags import Tag, WriteResult
+from gateway.tags import Tag
 from gateway.web.guard import BY, answer
 from gateway.web.sources import Documents, Sources
 
@@ -27,6 +27,7 @@ MOST_ITEMS = 1000  # of one page
 MOST_SAMPLES = 10_000
 _ITEMS = 200
 _SAMPLES = 1000
+BODY_WITHIN = 5.0  # seconds
 HISTORY_AT_ONCE = 4  # queries; they read the disk
 # 200 only for an acknowledged write. 502 and above: it was sent, or the device cannot be reached.
 _STATUS = {
@@ -51,7 +52,6 @@ class Api:
         self._history = sources.history
         self._devices = {device.name: tuple(device.tags) for device in sources.plant.devices()}
         self._history_turns = asyncio.Semaphore(HISTORY_AT_ONCE)
-        self._writes: set[asyncio.Task[WriteResult | Failure]] = set()
 
     def routes(self) -> list[web.RouteDef]:
         return [
@@ -150,12 +150,13 @@ class Api:
         arrived = asyncio.get_running_loop().time()
         if request.content_type != "application/json":
             return answer(415, "send the value as Content-Type: application/json")
-        key, data = request.query.get("tag", ""), await request.read()
-        # A client that leaves cancels nothing: the write may be on the wire.
-        task = asyncio.create_task(self._north.write(key, data, f"web {request[BY]}", arrived))
-        self._writes.add(task)
-        task.add_done_callback(self._writes.discard)
-        result = await asyncio.shield(task)
+        try:
+            async with asyncio.timeout(BODY_WITHIN):
+                key, data = request.query.get("tag", ""), await request.read()
+        except TimeoutError:
+            return answer(408, f"the body did not arrive within {BODY_WITHIN:g} s")
+        # The server does not cancel this when the client leaves: the write may be on the wire.
+        result = await self._north.write(key, data, f"web {request[BY]}", arrived)
         status = _STATUS.get(result.problem, 500) if isinstance(result, Failure) else 200
         return _raw(payload.outcome(result), status)
 

@@ -78,7 +78,7 @@ class Events:
         self._sources = sources
         self._api = api
         self.loads = loads
-        self._wires = Wires(sources.plant)
+        self.wires = Wires(sources.plant)
         self._pages = 0
         self._state: tuple[Documents, dict[str, Any]] = ({}, {})
 
@@ -99,18 +99,18 @@ class Events:
             tags = self._api.select(device, "", query.get("after"), TAGS_SHOWN)
         self._pages += 1
         try:
-            with self._wires.watched(query.get("line", "")) as recorder:
+            with self.wires.watched(query.get("line", "")) as recorder:
                 response = web.StreamResponse(headers={"Content-Type": "text/event-stream"})
                 response.headers["X-Accel-Buffering"] = "no"  # a proxy passes events on at once
                 await response.prepare(request)
-                page = _Page(self._sources, self, tags, recorder)
+                page = Page(self._sources, self, tags, recorder)
                 await _send(request, response, page)
         finally:
             self._pages -= 1
         return response
 
 
-async def _send(request: web.Request, response: web.StreamResponse, page: "_Page") -> None:
+async def _send(request: web.Request, response: web.StreamResponse, page: "Page") -> None:
     while True:
         data = await page.next()
         try:
@@ -123,8 +123,8 @@ async def _send(request: web.Request, response: web.StreamResponse, page: "_Page
         await asyncio.sleep(WIRE_EVERY)
 
 
-class _Page:
-    """What one client has got, and what it gets next."""
+class Page:
+    """The events of one client: notes what it has, and makes what it gets next."""
 
     def __init__(
         self,

@@ -27,6 +27,7 @@ AGAIN = 10.0  # seconds until the address is tried again
 SCRAPE_AGE = 1.0  # seconds that the state in the metrics may be old
 _HEADER = 8190  # bytes of one line
 _ENDS_WITHIN = 0.2  # seconds for requests in progress when the gateway ends
+_LINGERS = 0.5  # seconds for the rest of a refused body
 _BUFFER = 64 * 1024  # bytes that the system keeps for a client: a slow one must not get old values
 
 
@@ -67,6 +68,7 @@ class Server:
             access_log=None,
             keepalive_timeout=IDLE,
             shutdown_timeout=_ENDS_WITHIN,
+            lingering_time=_LINGERS,
             max_line_size=_HEADER,
             max_field_size=_HEADER,
         )

@@ -288,6 +288,18 @@ SECTIONS = [
         "1: web.listen: 8080 is no address to listen on: write 127.0.0.1:8080",
     ),
     bad(
+        "web for other machines",
+        'web: {listen: "0.0.0.0:8080"}\n' + tags("speed: {address: D1}"),
+        "1: web.listen: other machines can reach 0.0.0.0: name a tokens_file too (see "
+        "docs/page.md), or listen on 127.0.0.1:8080",
+    ),
+    bad(
+        "web names",
+        "web: {names: [gateway.plant:8080]}\n" + tags("speed: {address: D1}"),
+        "1: web.names[0]: 'gateway.plant:8080' is no name of a machine: write gateway.plant, "
+        "without a port",
+    ),
+    bad(
         "defaults",
         "defaults:\n  evry: 1s\n  every: 0s\n  scale: 0\n" + tags("speed: {address: D1}"),
         "2: defaults.evry: no setting of defaults: did you mean every?",

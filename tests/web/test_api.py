@@ -160,6 +160,17 @@ async def test_a_write_goes_on_when_its_client_leaves(tokens: Path) -> None:
                 await asyncio.sleep(0.001)
 
 
+async def test_a_body_that_does_not_arrive_is_not_waited_for(
+    tokens: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gateway.web.api.BODY_WITHIN", 0.05)
+    async with serving(tokens_file=tokens) as client:
+        address = "/api/write?tag=mixer/recipe"
+        answer = await client.ask(address, "POST", b"", Content_Length="9", **AS_JSON)
+        assert answer.status == 408
+        assert client.north.written == []
+
+
 async def events(client: Client, query: str) -> "dict[str, Any]":
     """The first event of each kind."""
     reader, writer = await asyncio.open_connection("127.0.0.1", client.port)

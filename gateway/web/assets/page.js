@@ -188,7 +188,8 @@ function showLines() {
     load.textContent = last === undefined ? "" : `${Math.round(last * 100)} %`;
     planned.textContent = `${Math.round(expected * 100)} %`;
     rate.textContent = requests === null ? "" : requests.toFixed(1);
-    const points = loads.map((share, at) => `${360 - loads.length + at},${20 - share * 18}`).join(" ");
+    const step = 360 / Math.max(60, loads.length); // five minutes at least
+    const points = loads.map((share, at) => `${360 - (loads.length - 1 - at) * step},${20 - share * 18}`).join(" ");
     const chart = picture.firstChild;
     if (chart.dataset.count !== String(loads.length) || chart.dataset.last !== String(last)) {
       chart.dataset.count = loads.length;
