@@ -7,7 +7,7 @@ register three times a second; `write` is the longest time from the request to t
 acknowledgement, and the bound that `check` prints.
 
 `--silences` measures requests a second with the safe silence and with the learned one, in turn, in
-four blocks of ten words.
+four blocks of ten words. `--virtual`: on virtual time, so that no other program disturbs.
 """
 
 import argparse
@@ -21,6 +21,7 @@ import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import structlog
@@ -36,12 +37,14 @@ from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.driver import AnyDriver
 from gateway.protocols.modbus import ModbusRtu
 from gateway.protocols.vigor import Vigor
+from gateway.simulator.port import open_simulator
 from gateway.stations.computer_link import ComputerLinkStation
 from gateway.stations.modbus import ModbusStation
 from gateway.stations.station import Station
 from gateway.stations.vigor import VigorStation
 from gateway.tags import Sample, Tag
 from gateway.transport import SerialPath, SerialSettings, open_port
+from tests.sim.virtual import run_virtual
 
 TURNAROUND = 0.005
 BLOCKS, WORDS, FEW = 4, 64, 10
@@ -126,43 +129,44 @@ def paced(name: str, baud: int, turnaround: float) -> "tuple[subprocess.Popen[st
 
 
 async def rate(
-    name: str, baud: int, turnaround: float, seconds: float, *, learn: bool
+    name: str, baud: int, turnaround: float, seconds: float, *, learn: bool, virtual: bool
 ) -> tuple[float, float]:
     """Returns the requests a second, and the silence before a poll."""
     setting = SETTINGS[name]
-    child, path = paced(name, baud, turnaround)
     driver, wire = setting.driver(), WireTiming(baud, setting.bits)
-    timing = driver.timing if learn else replace(driver.timing, learn_silence=False)
     settings = DeviceSettings(
         name="plc",
         driver=driver,
-        timing=timing,
+        timing=driver.timing if learn else replace(driver.timing, learn_silence=False),
         turnaround=turnaround,
         tags=tags(setting.area, FEW),
     )
     device = Device(settings, wire)
-    serial = SerialSettings(baud, "8N1")
-    line = Line(
-        Engine("bench", [device], wire),
-        lambda receiver: open_port(SerialPath(path), serial, receiver),
-        sink := Counting(),
-    )
-    task, silence = asyncio.create_task(line.run()), device.silence
+    child: subprocess.Popen[str] | None = None
+    if virtual:
+        stations = [setting.station()]
+        opener = partial(open_simulator, stations, wire, turnaround=turnaround)
+    else:
+        child, path = paced(name, baud, turnaround)
+        opener = partial(open_port, SerialPath(path), SerialSettings(baud, "8N1"))
+    sink = Counting()
+    task = asyncio.create_task(Line(Engine("bench", [device], wire), opener, sink).run())
     await asyncio.sleep(1.0)
     with suppress(TimeoutError):
         async with asyncio.timeout(LEARNING):
-            while silence.shorter > silence.least:
+            while device.silence.shorter > device.silence.least:
                 await asyncio.sleep(0.1)
     sink.times.clear()
     await asyncio.sleep(seconds)
     task.cancel()
     await asyncio.gather(task, return_exceptions=True)
-    assert child.stdin is not None
-    child.stdin.close()
-    child.wait()
+    if child is not None:
+        assert child.stdin is not None
+        child.stdin.close()
+        child.wait()
     gaps = sorted(after - before for before, after in itertools.pairwise(sink.times))
-    usual = gaps[len(gaps) // 4 : len(gaps) * 3 // 4]  # other programs disturb the rest
-    return len(usual) / sum(usual), silence.shorter
+    usual = gaps if virtual else gaps[len(gaps) // 4 : len(gaps) * 3 // 4]
+    return len(usual) / sum(usual), device.silence.shorter
 
 
 async def measure(
@@ -222,7 +226,7 @@ async def measure(
     )
 
 
-def silences(bauds: Sequence[int], seconds: float) -> None:
+def silences(bauds: Sequence[int], seconds: float, *, virtual: bool) -> None:
     """Prints the requests a second with the safe and the learned silence, in turn."""
     print("protocol       baud turnaround    safe learned  ratio      silence")
     for name, setting in SETTINGS.items():
@@ -230,11 +234,14 @@ def silences(bauds: Sequence[int], seconds: float) -> None:
             continue
         for baud in bauds:
             for turnaround in (0.005, 0.001):
-                safe, kept = asyncio.run(rate(name, baud, turnaround, seconds, learn=False))
-                learned, short = asyncio.run(rate(name, baud, turnaround, seconds, learn=True))
+                run = partial(rate, name, baud, turnaround, seconds, virtual=virtual)
+                begin = run_virtual if virtual else asyncio.run
+                safe, kept = begin(run(learn=False))
+                learned, short = begin(run(learn=True))
                 print(
                     f"{name:13} {baud:6} {turnaround * 1000:7.0f} ms {safe:7.1f} {learned:7.1f} "
-                    f"{learned / safe:6.2f} {kept * 1000:4.1f} -> {short * 1000:.2f} ms",
+                    f"{learned / safe:6.2f} "
+                    f"{kept * 1000:4.1f} -> {short * 1000:.2f} ms",
                     flush=True,
                 )
 
@@ -245,10 +252,11 @@ def main() -> None:
     parser.add_argument("--protocols", nargs="*", default=list(SETTINGS))
     parser.add_argument("--bauds", nargs="*", type=int, default=[9600, 19200, 38400, 115200])
     parser.add_argument("--silences", action="store_true", help="safe and learned silences")
+    parser.add_argument("--virtual", action="store_true", help="the silences on virtual time")
     arguments = parser.parse_args()
     structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.WARNING))
     if arguments.silences:
-        silences(arguments.bauds, arguments.seconds)
+        silences(arguments.bauds, arguments.seconds, virtual=arguments.virtual)
         return
     columns = "exchanges    busy     cycle  predicted             write"
     print(f"{'protocol':14} {'baud':>7} {columns}")

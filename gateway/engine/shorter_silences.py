@@ -7,6 +7,7 @@ from gateway.engine.device import Device
 from gateway.engine.effects import Effects
 from gateway.engine.health import State
 from gateway.engine.jobs import Idle, Job, Poll, Reopen
+from gateway.engine.station_silence import MOST_DOUBLED
 from gateway.errors import Garbled, NoReply, Refusal, Refused
 from gateway.protocols.unsolicited import Unsolicited
 
@@ -168,7 +169,7 @@ class ShorterSilences:
     def _pause(self, now: float) -> None:
         """Tries no shorter silence for a while, longer after each loss."""
         self._next = now + self.pause * 2**self._losses
-        self._losses += 1
+        self._losses = min(self._losses + 1, MOST_DOUBLED)
 
     def _restore(self, why: str, now: float) -> None:
         self.step = self.answered = self._held = 0

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 
 FORGOTTEN_AFTER = 3600.0  # seconds until a silence that was too short may be tried again
+MOST_DOUBLED = 20  # a century
 ROUNDING = 0.002  # seconds by which a timer makes a silence longer
 
 
@@ -50,7 +51,7 @@ class StationSilence:
         """
         self._floor = max(2 * seconds, self._floor)
         self._until = now + times * FORGOTTEN_AFTER * 2**self._losses
-        self._losses += 1
+        self._losses = min(self._losses + 1, MOST_DOUBLED)
 
     def held(self, now: float) -> None:
         """Forgets earlier losses, unless the last one is still remembered."""

@@ -129,8 +129,10 @@ class HalfDuplex:
     def _reach_stations(self, request: _Sending) -> None:
         data, silence = request.heard(), request.start - self._replied_until
         for station in self._stations:
-            missing = getattr(station, "listens_after", 0.0) - silence
-            early = math.ceil(missing / self._character) if missing > 0.0 < self._character else 0
+            needed: float = getattr(station, "listens_after", 0.0)
+            early = 0
+            if 0.0 <= silence < needed and self._character:
+                early = math.ceil((needed - silence) / self._character)
             reply = b"".join(station.hear(data[early:], request.end))
             if reply:
                 delay: float = getattr(station, "delay", 0.0)

@@ -282,6 +282,14 @@ def test_losses_are_forgotten_after_many_replies() -> None:
     assert device.silence.shorter == LEAST
 
 
+def test_any_number_of_losses_can_be_counted() -> None:
+    device, now = station(), 0.0
+    for _ in range(2000):
+        device.silence.was_too_short(0.001, now)
+    device.silence.take_step(4, 1e9)
+    assert device.silence.shorter == pytest.approx(0.002)
+
+
 def test_a_line_with_time_to_spare_tries_nothing() -> None:
     bus = Bus(station(every=1.0))
     bus.run(5 * PROOF)

@@ -1641,6 +1641,16 @@ MUTANTS = (
         "tests/web/test_guard.py",
     ),
     Mutant(
+        "a write gets the shorter silence of the poll before",
+        "engine/shorter_silences.py",
+        "        silence.keep_safe(at_rest=False)\n        if not",
+        "        if not",
+        "tests/engine/test_shorter_silences.py",
+        (410024, 410013),
+        "storm",
+        0.1,
+    ),
+    Mutant(
         "a poll after a write gets a shorter silence",
         "engine/engine.py",
         "            shorter.spoke = None\n",
