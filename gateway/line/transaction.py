@@ -3,6 +3,7 @@
 import asyncio
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, TypeVar
 
 from gateway.engine.device import Device
@@ -24,9 +25,13 @@ class _Request:
     until: float  # by the line's clock
     reply: int  # characters of the longest reply
     future: "asyncio.Future[Any]"
+    sent: float  # by the line's clock
     heard: int = 0  # characters of its reply
-    number: int = 0  # 0: this protocol numbers no request
-    sent: float = 0.0  # by the line's clock
+
+    @property
+    def number(self) -> int:
+        """Returns its number; 0: this protocol numbers no request."""
+        return _number(self.frame)
 
 
 @dataclass(slots=True, eq=False)
@@ -108,7 +113,7 @@ class Transaction:
         await channel.quiet(self._device.silence)
         channel.check_duty()
         self.has_sent = True
-        channel.send(data)
+        channel.send(data, channel.now())
         self.traffic.sent += len(data)
         # No reply follows; the wire is busy until the last character is out.
         channel.pause(len(data) * channel.wire.character)
@@ -122,14 +127,16 @@ class Transaction:
     ) -> T:
         """As in `Talk`. `within`: seconds in place of `reply_timeout`, for a short probe."""
         channel, device = self._channel, self._device
+        started = channel.now()
         if not self._open:
-            if channel.quiet_since + device.silence > channel.now():
+            if channel.quiet_since + device.silence > started:
                 await channel.quiet(device.silence)
-            self._begin_hearing()
+                started = channel.now()
+            if self.has_sent:
+                self._begin_hearing()
         if channel.guarded is not None:
             channel.check_duty()
-        data = self._codec.encode(frame)
-        started, character = channel.now(), channel.wire.character
+        data, character = self._codec.encode(frame), channel.wire.character
         spoken = (len(data) * (2 if channel.echo.strip else 1) + reply) * character
         wait = device.settings.timing.reply_timeout if within is None else within
         until = started + spoken + wait
@@ -138,11 +145,10 @@ class Transaction:
             until += max(0.0, unanswered.held_up_until(device) - started)
         channel.alarm.by(until, self._expire)
         self.has_sent = True
-        channel.send(data)
+        channel.send(data, started)
         self.traffic.sent += len(data)
-        future: asyncio.Future[T] = asyncio.get_running_loop().create_future()
-        number = getattr(frame, "transaction", 0)
-        request = _Request(data, frame, answers, until, reply, future, number=number, sent=started)
+        future: asyncio.Future[T] = channel.loop.create_future()
+        request = _Request(data, frame, answers, until, reply, future, started)
         self._open.append(request)
         try:
             answer = await future
@@ -188,20 +194,32 @@ class Transaction:
         if self._gap is not None:
             self._gap.cancel()
         codec = self._codec
-        self._take(codec.feed, data)
-        gap = getattr(codec, "gap_timeout", None)  # before isinstance, which is slow
-        if gap and isinstance(codec, EndedByGap) and self._broken is None:
-            loop = asyncio.get_running_loop()
-            self._gap = loop.call_later(gap, self._take, codec.expire)
-
-    def _take(self, frames: Callable[..., list[Any]], *data: bytes) -> None:
         try:
-            for frame in frames(*data):
+            for frame in codec.feed(data):
                 self._offer(frame)
         except Garbled as error:
-            self._broken = error
-            for request in self._open:
-                _fail(request, error)
+            self._break(error)
+        if _may_end_by_gap(type(codec)):
+            self._await_gap(codec)
+
+    def _await_gap(self, codec: Codec[Any]) -> None:
+        """Ends the frame after a silence, if its codec asks for it."""
+        if isinstance(codec, EndedByGap) and codec.gap_timeout and self._broken is None:
+            loop = asyncio.get_running_loop()
+            self._gap = loop.call_later(codec.gap_timeout, self._end_by_gap, codec)
+
+    def _end_by_gap(self, codec: EndedByGap[Any]) -> None:
+        try:
+            for frame in codec.expire():
+                self._offer(frame)
+        except Garbled as error:
+            self._break(error)
+
+    def _break(self, error: Garbled) -> None:
+        """Ends the requests: the bytes are no frames."""
+        self._broken = error
+        for request in self._open:
+            _fail(request, error)
 
     def lost(self, error: LineDown) -> None:
         """Ends all outstanding requests, because the port was lost."""
@@ -264,7 +282,7 @@ class Transaction:
             return
         is_echo = self.may_echo and any(frame == request.frame for request in self._open)
         station = self._device.settings.driver.station
-        number = getattr(frame, "transaction", 0)
+        number = _number(frame)
         old = bool(number) and all(request.number != number for request in self._open)
         # A reply with an old number is repeated or late: it tells nothing of this station.
         foreign = not old and getattr(frame, "station", station) != station
@@ -302,9 +320,9 @@ class Transaction:
                 again = min(again, request.until)
             else:
                 self._late = _LateReply(request.answers)
-                if request.number:
+                if number := request.number:
                     device, answers = self._device, request.answers
-                    known = TimedOut(device, request.number, answers, request.sent)
+                    known = TimedOut(device, number, answers, request.sent)
                     self._channel.unanswered.requests.append(known)
                 request.future.set_exception(self._verdict(request.data))
         return again
@@ -324,6 +342,16 @@ class Transaction:
         if self._stray is Evidence.SHAPE:
             return Garbled(f"no answer to this: {shown}", heard, evidence=Evidence.SHAPE)
         return Garbled(f"no whole frame: {shown}", heard, evidence=Evidence.NOISE)
+
+
+@cache
+def _may_end_by_gap(codec: type[Codec[Any]]) -> bool:
+    return hasattr(codec, "gap_timeout")
+
+
+def _number(frame: Any) -> int:
+    number: int = getattr(frame, "transaction", 0)
+    return number
 
 
 def _fail(request: _Request, error: Exception) -> None:
