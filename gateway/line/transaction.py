@@ -132,8 +132,7 @@ class Transaction:
             if channel.quiet_since + device.silence > started:
                 await channel.quiet(device.silence)
                 started = channel.now()
-            if self.has_sent:
-                self._begin_hearing()
+            self._begin_hearing()
         if channel.guarded is not None:
             channel.check_duty()
         data, character = self._codec.encode(frame), channel.wire.character
