@@ -88,7 +88,12 @@ def read(endpoint: str) -> None:
 
 
 def _session(endpoint: str) -> zenoh.Session:
-    return zenoh.open(configure(ZenohConfig(mode=ZenohMode.CLIENT, connect=(endpoint,))))
+    """Opens a session that knows the gateway."""
+    session = zenoh.open(configure(ZenohConfig(mode=ZenohMode.CLIENT, connect=(endpoint,))))
+    with session.declare_querier("plant/**") as querier:
+        while not querier.matching_status.matching:  # type: ignore[attr-defined]
+            time.sleep(0.001)
+    return session
 
 
 @contextmanager

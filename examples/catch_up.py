@@ -19,7 +19,6 @@ import argparse
 import json
 import queue
 import sys
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import suppress
@@ -31,6 +30,7 @@ import zenoh
 CHECK_EVERY = 60.0  # seconds between two checks without a known gap
 FIRST_PAGE = 1000  # samples, so that the first ones arrive soon
 PAGE = 40_000  # samples; over a slow link take fewer, so that a page arrives in time
+MOST_REPLIES = 1_000_000  # that wait; Zenoh reads nothing more from the link when it is full
 ANSWER_WITHIN = 30.0  # seconds for a page
 RETRY_EVERY = 0.5  # seconds until an incomplete check is repeated
 # Samples of different lines may be recorded a moment after their time.
@@ -63,13 +63,27 @@ class Page(NamedTuple):
 
 
 class Answer:
-    """One query on its way: the replies arrive while the page before is delivered."""
+    """One query on its way. Its replies wait in Zenoh: a Python callback would hold them up while
+    the page before is delivered."""
 
     def __init__(self, session: zenoh.Session, selector: str) -> None:
-        self.ended = threading.Event()
-        self.replies: list[zenoh.Reply] = []
-        handler = zenoh.handlers.Callback(self.replies.append, self.ended.set, indirect=False)
-        session.get(selector, handler, timeout=ANSWER_WITHIN, accept_replies=zenoh.ReplyKeyExpr.ANY)
+        self._replies = session.get(
+            selector,
+            zenoh.handlers.FifoChannel(MOST_REPLIES),
+            timeout=ANSWER_WITHIN,
+            accept_replies=zenoh.ReplyKeyExpr.ANY,
+        )
+
+    def replies(self) -> Iterator[zenoh.Reply | None]:
+        """Yields each reply, and None when it waits for the next one."""
+        while True:
+            try:
+                reply = self._replies.try_recv()
+            except zenoh.ZError:  # the last one has been received
+                return
+            yield reply
+            if reply is None:
+                time.sleep(0.01)
 
 
 class CatchUp:
@@ -158,11 +172,12 @@ class CatchUp:
 
     def _page(self, answer: Answer, links: int) -> Page:
         """Waits for a page and notes its end. Raises `Gap` when a link changes, or replies lack."""
-        while not answer.ended.wait(0.1):
+        samples, ends = list[Sample](), dict[str, Any]()
+        for reply in answer.replies():
             if links != self._links:
                 raise Gap
-        samples, ends = list[Sample](), dict[str, Any]()
-        for reply in answer.replies:
+            if reply is None:
+                continue
             received = reply.ok
             if received is None:
                 raise Gap(reply.err)

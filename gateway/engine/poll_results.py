@@ -19,7 +19,7 @@ from gateway.errors import (
     Refused,
     Unsteady,
 )
-from gateway.planning.bad_addresses import RETRIES, SILENT
+from gateway.planning.bad_addresses import DAMAGED, RETRIES, SILENT
 from gateway.planning.planner import Block, describe
 from gateway.tags import Reason, Sample
 
@@ -239,7 +239,8 @@ class PollResults:
         others_answered = health.consecutive_failures <= 1
         lasting = others_answered and (known or half or poll.missed > 0)
         of_others = isinstance(error, Garbled) and error.evidence in OF_OTHERS
-        if lasting and not of_others and self._halved(poll, error, SILENT, now, time):
+        code = DAMAGED if isinstance(error, Garbled) else SILENT
+        if lasting and not of_others and self._halved(poll, error, code, now, time):
             return
         self._end_badly(poll, health.reason, error, now, time, answered=False)
         self._end_search(device, now)

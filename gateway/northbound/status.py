@@ -67,8 +67,7 @@ def refused_sentence(device: Device, bad: BadRange) -> str:
     """`D512..D519 of mixer: refused with 28 since 2026-11-20T12:00:00.000000Z`."""
     first, last = bad.tags[0].text, bad.tags[-1].text
     where = first if first == last else f"{first}..{last}"
-    how = bad.code if bad.silent else f"refused with {bad.code}"
-    return f"{where} of {device.name}: {how} since {rfc3339(bad.since)}"
+    return f"{where} of {device.name}: {bad.how} since {rfc3339(bad.since)}"
 
 
 def line_document(engine: Engine, expected: LineForecast, now: float) -> Document:

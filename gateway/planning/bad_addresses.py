@@ -21,6 +21,7 @@ from gateway.tags import Tag
 RETRIES = (2.0, 10.0, 60.0, 300.0)
 SPLIT_FIRST, SPLIT_LONGEST = 600.0, 86_400.0  # seconds until a split block is tried as a whole
 SILENT = "no reply"  # the code of addresses about which the device is silent
+DAMAGED = "no whole reply"  # the code of addresses whose replies arrive in part: of the wire
 Cut = tuple[str, int]  # (area, n): a boundary between n - 1 and n
 CostOf = Callable[[Span], Cost | None]
 
@@ -37,8 +38,15 @@ class BadRange:
 
     @property
     def retry(self) -> float:
-        """Seconds until it is tried again."""
-        return RETRIES[min(self.refusals, len(RETRIES) - 1)]
+        """Seconds until it is tried again; not long after a damaged reply, for the device has the
+        address."""
+        slowest = RETRIES[1] if self.code == DAMAGED else RETRIES[-1]
+        return min(RETRIES[min(self.refusals, len(RETRIES) - 1)], slowest)
+
+    @property
+    def how(self) -> str:
+        """The code, as part of a sentence."""
+        return self.code if self.code in (SILENT, DAMAGED) else f"refused with {self.code}"
 
     @property
     def silent(self) -> bool:

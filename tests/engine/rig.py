@@ -23,7 +23,7 @@ from gateway.engine.jobs import (
     Transacted,
 )
 from gateway.engine.requests import Command, Outcome, Request, Write
-from gateway.errors import LineDown, NoReply
+from gateway.errors import DeviceError, LineDown, NoReply
 from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.modbus import ModbusRtu, ModbusTcp
 from gateway.tags import Quality, Sample, WriteResult, WriteRule
@@ -128,9 +128,11 @@ class Rig:
         traffic = known if traffic is None else traffic
         return self.note(self.engine.conclude(job, result, traffic, self.now, self.time))
 
-    def fail(self, job: Transacted, late: float | None = None) -> None:
+    def fail(
+        self, job: Transacted, late: float | None = None, error: DeviceError = SILENCE
+    ) -> None:
         """No reply within the time-out; `late` seconds after it the reply, if at all."""
-        self.conclude(job, SILENCE, took=0.5)
+        self.conclude(job, error, took=0.5)
         settle = self.next()
         assert isinstance(settle, Settle)
         self.conclude(settle, Settled(late), took=0.1)

@@ -6,8 +6,17 @@ from dataclasses import replace
 import pytest
 
 from gateway.engine.device import SILENT_SHARE
-from gateway.engine.health import State
-from gateway.engine.jobs import Idle, Poll, Probe, Reopen, Resynced, Settle, Settled, Traffic
+from gateway.engine.health import PAUSE_LONGEST, State
+from gateway.engine.jobs import (
+    Idle,
+    Poll,
+    Probe,
+    Reopen,
+    Resynced,
+    Settle,
+    Settled,
+    Traffic,
+)
 from gateway.engine.poll_results import BUSY_PAUSE
 from gateway.engine.reply_shapes import QUIET
 from gateway.engine.turnaround import LEARN_EVERY
@@ -144,7 +153,12 @@ def test_a_busy_device_and_damaged_requests_start_no_search(refusal: Refused) ->
     assert rig.device.bad_addresses.clear
 
 
-def serve(rig: Rig, until: float, silent: Callable[[Span], bool] = lambda _: False) -> None:
+def serve(
+    rig: Rig,
+    until: float,
+    silent: Callable[[Span], bool] = lambda _: False,
+    error: DeviceError = SILENCE,
+) -> None:
     """Serves the device, which replies to all requests but those for silent spans."""
     while rig.now < until:
         job = rig.next()
@@ -154,7 +168,7 @@ def serve(rig: Rig, until: float, silent: Callable[[Span], bool] = lambda _: Fal
             case Probe():
                 rig.conclude(job, Resynced(9))
             case Poll(block=block) if silent(block.span):
-                rig.fail(job)
+                rig.fail(job, error=error)
             case Poll(block=block):
                 start, size = block.span.start, block.span.size
                 rig.conclude(job, (UNITS * 200)[start : start + size])
@@ -175,6 +189,16 @@ def test_an_address_about_which_the_device_is_silent_is_found_by_halves() -> Non
     serve(rig, 400.0)
     assert rig.device.bad_addresses.clear
     assert [block.span.size for block in rig.device.blocks] == [6]
+
+
+def test_an_address_whose_replies_were_damaged_for_long_is_back_soon() -> None:
+    rig = online(retries=2)
+    cut = Garbled("no whole frame", b"\x02", evidence=Evidence.TRUNCATED)
+    serve(rig, 600.0, lambda span: span.start <= 2 < span.start + span.size, cut)
+    [bad] = rig.device.bad_addresses.bad.values()
+    assert (bad.span.start, bad.span.size, bad.how) == (2, 1, "no whole reply")
+    serve(rig, 602.0 + PAUSE_LONGEST)
+    assert len(good_now(rig)) == 6
 
 
 @pytest.mark.parametrize("outage", [2.0, 8.0, 20.0])

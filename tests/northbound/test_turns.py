@@ -68,6 +68,20 @@ def test_current_values_go_before_history() -> None:
     assert sorted(order) == ["current"] * 2 + ["first"] * 2 + ["history"] * 2
 
 
+def test_history_does_not_get_every_second_slice() -> None:
+    clock, order = Clock(), list[str]()
+    turns = Turns(clock)
+    current = Answer(turns, Rank.CURRENT, lambda: order.append("current"))
+    assert current.has_turn.wait(PATIENCE)
+    history = Answer(turns, Rank.HISTORY, lambda: order.append("history"))
+    waiting(turns, 1)
+    clock.now = 0.01  # longer than a slice, shorter than a client that blocks
+    current.end()
+    assert history.has_turn.wait(PATIENCE)
+    history.end()
+    assert order == ["current", "current", "history", "history"]
+
+
 def test_an_answer_that_waits_for_its_client_keeps_nobody_else_waiting() -> None:
     clock, order = Clock(), list[str]()
     turns = Turns(clock)

@@ -495,6 +495,13 @@ MUTANTS = (
         "tests/engine/test_results.py",
     ),
     Mutant(
+        "an address with damaged replies is tried as rarely as a missing one",
+        "planning/bad_addresses.py",
+        "        slowest = RETRIES[1] if self.code == DAMAGED else RETRIES[-1]\n",
+        "        slowest = RETRIES[-1]\n",
+        "tests/engine/test_results.py",
+    ),
+    Mutant(
         "silent addresses are tried as often as refused ones",
         "engine/device.py",
         "        if bad.silent and pause == RETRIES[-1]:\n",
@@ -1018,6 +1025,13 @@ MUTANTS = (
         "northbound/turns.py",
         "if holder is not None and self._clock() - holder.since >= _BLOCKED:",
         "if False:",
+        "tests/northbound/test_turns.py",
+    ),
+    Mutant(
+        "history has every second slice",
+        "northbound/turns.py",
+        "                turn = self._take(rank, turn)\n",
+        "                self._give_back(turn)\n                turn = self._take(rank)\n",
         "tests/northbound/test_turns.py",
     ),
     Mutant(

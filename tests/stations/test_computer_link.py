@@ -148,8 +148,8 @@ def test_2_10_registered_words_are_answered_as_in_the_vector(
         ("05FFBR0TN00001", "06"),
         ("05FFBRzM001001", "06"),
         ("05FFWR0M001001", "06"),  # no multiple of 8
-        ("05FFWR0M000820", ""),
-        ("05FFWR0M000821", "06"),  # 33 words
+        ("05FFWR0M000840", ""),
+        ("05FFWR0M000841", "06"),  # 65 words
         ("05FFWR0TS00001", "06"),
         ("05FFWR0CN20010", ""),
         ("05FFWR0CN20011", "06"),

@@ -57,7 +57,7 @@ class Limits:
 
 
 _LIYAN = Limits(
-    read={Kind.BITS: 64, Kind.SIXTEENS: 32, Kind.WORDS: 64, Kind.DWORDS: 16},
+    read={Kind.BITS: 64, Kind.SIXTEENS: 64, Kind.WORDS: 64, Kind.DWORDS: 16},
     write={Kind.BITS: 64, Kind.SIXTEENS: 8, Kind.WORDS: 64, Kind.DWORDS: 16},
     loopback=128,
     monitored=10,
