@@ -28,11 +28,6 @@ class _Request:
     sent: float  # by the line's clock
     heard: int = 0  # characters of its reply
 
-    @property
-    def number(self) -> int:
-        """Returns its number; 0: this protocol numbers no request."""
-        return _number(self.frame)
-
 
 @dataclass(slots=True, eq=False)
 class _LateReply:
@@ -193,32 +188,20 @@ class Transaction:
         if self._gap is not None:
             self._gap.cancel()
         codec = self._codec
+        self._take(codec.feed, data)
+        if not _may_end_by_gap(type(codec)) or self._broken is not None:
+            return
+        if isinstance(codec, EndedByGap) and (gap := codec.gap_timeout):
+            self._gap = channel.loop.call_later(gap, self._take, codec.expire)
+
+    def _take(self, frames: Callable[..., list[Any]], *data: bytes) -> None:
         try:
-            for frame in codec.feed(data):
+            for frame in frames(*data):
                 self._offer(frame)
         except Garbled as error:
-            self._break(error)
-        if _may_end_by_gap(type(codec)):
-            self._await_gap(codec)
-
-    def _await_gap(self, codec: Codec[Any]) -> None:
-        """Ends the frame after a silence, if its codec asks for it."""
-        if isinstance(codec, EndedByGap) and codec.gap_timeout and self._broken is None:
-            loop = asyncio.get_running_loop()
-            self._gap = loop.call_later(codec.gap_timeout, self._end_by_gap, codec)
-
-    def _end_by_gap(self, codec: EndedByGap[Any]) -> None:
-        try:
-            for frame in codec.expire():
-                self._offer(frame)
-        except Garbled as error:
-            self._break(error)
-
-    def _break(self, error: Garbled) -> None:
-        """Ends the requests: the bytes are no frames."""
-        self._broken = error
-        for request in self._open:
-            _fail(request, error)
+            self._broken = error
+            for request in self._open:
+                _fail(request, error)
 
     def lost(self, error: LineDown) -> None:
         """Ends all outstanding requests, because the port was lost."""
@@ -282,7 +265,7 @@ class Transaction:
         is_echo = self.may_echo and any(frame == request.frame for request in self._open)
         station = self._device.settings.driver.station
         number = _number(frame)
-        old = bool(number) and all(request.number != number for request in self._open)
+        old = bool(number) and all(_number(request.frame) != number for request in self._open)
         # A reply with an old number is repeated or late: it tells nothing of this station.
         foreign = not old and getattr(frame, "station", station) != station
         if self._stray is not Evidence.STATION:
@@ -319,7 +302,7 @@ class Transaction:
                 again = min(again, request.until)
             else:
                 self._late = _LateReply(request.answers)
-                if number := request.number:
+                if number := _number(request.frame):
                     device, answers = self._device, request.answers
                     known = TimedOut(device, number, answers, request.sent)
                     self._channel.unanswered.requests.append(known)
@@ -349,6 +332,7 @@ def _may_end_by_gap(codec: type[Codec[Any]]) -> bool:
 
 
 def _number(frame: Any) -> int:
+    """Returns the number of a request or reply; 0: this protocol has none."""
     number: int = getattr(frame, "transaction", 0)
     return number
 
