@@ -99,18 +99,18 @@ class Engine:
             job = self._unsolicited.next(now)
         if job is None:
             job = self.schedule.next(now)
-            if type(job) is Write and (others := self.schedule.requests.companions(job)):
-                job = WriteTogether(job.device, [job, *others])
         if isinstance(job, Idle):
             return Idle(silence.due) if now < silence.due < job.until else job
-        in_flight.job, in_flight.begun = job, now
-        if job.device.shapes is not None and not isinstance(job, Poll):
-            resync_around(job, job.device.shapes, now)
         if isinstance(job, Poll):
             in_flight.open_polls = in_flight.together = 1
             in_flight.charged = None if job.expedited else job.device
         else:
+            if type(job) is Write and (others := self.schedule.requests.companions(job)):
+                job = WriteTogether(job.device, [job, *others])
+            if job.device.shapes is not None:
+                resync_around(job, job.device.shapes, now)
             in_flight.charged = job.device if isinstance(job, Probe) else None
+        in_flight.job, in_flight.begun = job, now
         return job
 
     def _every_station_failed(self) -> bool:

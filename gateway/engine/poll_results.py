@@ -51,7 +51,7 @@ class PollResults:
             gap = now - last.at
             if gap > counts.worst_gap:
                 counts.worst_gap = gap
-            counts.mean_gap += (gap - counts.mean_gap) / max(1, min(10, counts.reads))
+            counts.mean_gap += (gap - counts.mean_gap) / (min(10, counts.reads) or 1)
         counts.reads += 1
         last.at, last.ever = now, True
         if not block.listed:

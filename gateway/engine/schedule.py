@@ -154,7 +154,8 @@ class Schedule:
     # The next job
 
     def next(self, now: float) -> Request | Probe | Poll | Idle:
-        self._share_on_demand(now)
+        if now >= self._on_demand_at or self._queue.expedited:
+            self._share_on_demand(now)
         due = self._queue.ripen(now)
         waiting = self._queue.waiting
         until = waiting[0][0] if waiting else NEVER
@@ -165,7 +166,9 @@ class Schedule:
             if job is not None:
                 return job
         self._wrote = False
-        others = [device for device in self.devices if not device.health.online]
+        # `online` alone is slower: almost always all devices are in the first state.
+        online = State.ONLINE
+        others = [d for d in self.devices if d.health.state is not online and not d.health.online]
         if others:
             probe = self._probes.next(others, now, now if due else until)
             if isinstance(probe, Probe):

@@ -200,15 +200,18 @@ class Line:
                 continue
             if isinstance(job, Reopen):
                 raise LineDown(job.why)
-            if self._transaction is None or not isinstance(job, Settle):
-                self._transaction = Transaction(channel, job.device, self._unmatched)
-            if isinstance(job, Poll) and job.device.window > 1:
-                await self._perform_together((job, *engine.alongside(job, begun)), channel)
-                continue
-            result = await perform(job, self._transaction)
+            transaction = self._transaction
+            if transaction is not None and isinstance(job, Settle):
+                transaction.traffic = Traffic()
+            else:
+                transaction = self._transaction = Transaction(channel, job.device, self._unmatched)
+                if isinstance(job, Poll) and job.device.window > 1:
+                    await self._perform_together((job, *engine.alongside(job, begun)), channel)
+                    continue
+            result = await perform(job, transaction)
             if self.watcher is not None:
                 self.watcher(job, result, begun, now())
-            traffic, self._transaction.traffic = self._transaction.traffic, Traffic()
+            traffic = transaction.traffic
             self._deliver(engine.conclude(job, result, traffic, now(), self._wall()))
         raise self._lost
 
@@ -243,9 +246,10 @@ class Line:
 
     def _deliver(self, effects: Sequence[Effect]) -> None:
         for effect in effects:
+            if type(effect) is Samples:  # before `match`, which is slower
+                self._sink.samples(effect.samples)
+                continue
             match effect:
-                case Samples(samples):
-                    self._sink.samples(samples)
                 case OnlineChange(device, online):
                     self._sink.online(device, online)
                 case RequestEnded(request, outcome):
