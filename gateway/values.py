@@ -11,12 +11,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from enum import StrEnum
+from operator import index
 
 from gateway.errors import BadValue, ConfigError
 
 Value = bool | int | float | str
 Words = Sequence[int]
 FromWords = Callable[[Words], Value | None]
+FromWord = Callable[[int], Value | None]
 ToWords = Callable[[Value], list[int]]
 
 
@@ -140,17 +142,23 @@ def from_words(layout: Layout) -> FromWords:
         return lambda words: shortest(unpack(_octets(_ordered(words, layout)))[0])
     if kind is Kind.FLOAT64:
         return lambda words: _finite(unpack(_octets(_ordered(words, layout)))[0])
-    plain = layout.byte_order is Order.HIGH_FIRST
-    if plain and kind is Kind.UINT16:
-        return lambda words: words[0]
-    if plain and kind is Kind.INT16:
-        return lambda words: words[0] - 0x10000 if words[0] & 0x8000 else words[0]
 
     def number(words: Words) -> Value | None:
         value: int = unpack(_octets(_ordered(words, layout)))[0]
         return value
 
     return number
+
+
+def from_word(layout: Layout) -> FromWord:
+    """Returns `from_words` for a value of one word, which the function takes without a sequence."""
+    kind = layout.type.kind
+    if kind is Kind.UINT16 and layout.byte_order is Order.HIGH_FIRST:
+        return index  # the word itself
+    if kind is Kind.INT16 and layout.byte_order is Order.HIGH_FIRST:
+        return lambda word: word - 0x10000 if word & 0x8000 else word
+    of_words = from_words(layout)
+    return bool if kind is Kind.BOOL else lambda word: of_words((word,))
 
 
 def to_words(layout: Layout) -> ToWords:

@@ -159,7 +159,7 @@ async def test_a_fresh_value_is_read_on_demand(tmp_path: Path) -> None:
     async with running(made(tmp_path, every="1h")) as watched:
         await watched.until_good("mixer/speed")
         known = watched.gateway.sample(tag(watched, "speed"))
-        assert await watched.gateway.fresh(tag(watched, "speed"), 3600.0) is known
+        assert await watched.gateway.fresh(tag(watched, "speed"), 3600.0) == known
         before = time.time_ns()
         fresh = await watched.gateway.fresh(tag(watched, "speed"), 0.0)
         assert (fresh.quality, fresh.time > known.time) == (Quality.GOOD, True)

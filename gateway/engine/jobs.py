@@ -13,7 +13,7 @@ from gateway.engine.requests import Command, Request, Resyncs, Write
 from gateway.errors import BadValue, Busy, DeviceError, LineDown, Refused, Unclear
 from gateway.planning.planner import Block
 from gateway.protocols.driver import Span, UnnumberedReplies
-from gateway.tags import Sample
+from gateway.tags.scan import Scan
 
 NOT_QUEUED, EXPEDITED, ON_DEMAND = -1, -2, -3  # tickets of polls that are in no heap
 
@@ -24,8 +24,7 @@ class LastRead:
 
     at: float | None = None  # by the line's clock; None: the block's values are bad
     ever: bool = False  # the block was read at least once
-    units: Sequence[int] | None = None  # as read
-    samples: Sequence[Sample] | None = None  # made of the units
+    scan: Scan | None = None  # the next read is compared with it; None: with nothing
 
 
 @dataclass(slots=True, eq=False)
@@ -55,7 +54,8 @@ class Poll:
         """Forgets the last read, because its values turn bad. Returns their age."""
         age = 0.0 if self.last.at is None else now - self.last.at
         self.counts.worst_gap = max(self.counts.worst_gap, age)
-        self.last.at = None
+        self.device.record.was_good(self.last.at)
+        self.last.at = self.last.scan = None
         return age
 
     @property
@@ -267,6 +267,7 @@ class Traffic:
     exchanges: int = 0  # requests with a reply
     turnaround: float = 0.0  # seconds of the station for them, without the characters
     extra: int = 0  # frames of the station that answered no request
+    silence: float = math.inf  # seconds before its request, the shortest of several
 
 
 @dataclass(frozen=True, slots=True)

@@ -49,6 +49,7 @@ class PollQueue:
         "_late",
         "_most_in_time",
         "_most_waiting",
+        "_own",
         "_shared",
         "_tickets",
         "by_device",
@@ -63,6 +64,7 @@ class PollQueue:
         self.waiting: Heap = []  # by due time
         self.by_device: dict[Device, DuePolls] = {}
         self._shared = shared
+        self._own: DuePolls | None = None  # of the single device
         self.in_time: list[tuple[float, int, DuePolls]] = []  # by the deadline of the first poll
         self._late: list[tuple[float, int, DuePolls]] = []  # by use of the wire
         self.due: Poll | None = None  # after `ripen`: the due poll that goes first
@@ -113,7 +115,10 @@ class PollQueue:
                 self._add(poll)
         while expedited and not (expedited[0].live and expedited[0].device.health.online):
             expedited.popleft()
-        self.due = due = self._first(now)
+        if self._shared:
+            self.due = due = self._first(now)
+        else:
+            self.due = due = self._own.first() if self._own is not None else None
         return due is not None or bool(expedited)
 
     def more(self, device: Device, most: int) -> list[Poll]:
@@ -143,7 +148,7 @@ class PollQueue:
     def _add(self, poll: Poll) -> None:
         own = self.by_device.get(poll.device)
         if own is None:
-            own = self.by_device[poll.device] = DuePolls(poll.device)
+            own = self._own = self.by_device[poll.device] = DuePolls(poll.device)
         heap = own.heap
         deadline = min(
             poll.due + poll.block.every, poll.soon
@@ -170,9 +175,6 @@ class PollQueue:
 
         If deadlines have passed: the first poll of the late device that used the wire least.
         """
-        if not self._shared:
-            for own in self.by_device.values():
-                return own.first()
         first = self._first_in_time(now)
         if self._late:  # a device there may have become punctual again
             first = self._first_late(now) or self._first_in_time(now)

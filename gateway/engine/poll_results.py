@@ -22,7 +22,6 @@ from gateway.errors import (
 from gateway.planning.bad_addresses import DAMAGED, RETRIES, SILENT
 from gateway.planning.planner import Block, describe
 from gateway.tags import Reason, Sample
-from gateway.tags.unchanged import Unchanged
 
 TOGETHER = RETRIES[0] + 1.0  # seconds in which all addresses that return are tried
 OF_OTHERS = (Evidence.STATION, Evidence.SHAPE, Evidence.ECHO)  # they say nothing of addresses
@@ -52,7 +51,7 @@ class PollResults:
             gap = now - last.at
             if gap > counts.worst_gap:
                 counts.worst_gap = gap
-            counts.mean_gap += (gap - counts.mean_gap) / max(1, min(10, counts.reads))
+            counts.mean_gap += (gap - counts.mean_gap) / (min(10, counts.reads) or 1)
         counts.reads += 1
         last.at, last.ever = now, True
         if not block.listed:
@@ -93,19 +92,18 @@ class PollResults:
         self._end_search(device, now)
 
     def _samples(self, poll: Poll, units: Sequence[int], time: int) -> Sequence[Sample]:
-        """Returns the samples of the units. Equal units are not decoded again."""
-        last = poll.last
-        samples = last.samples
-        if samples is None or units != last.units or poll.block.eager:
-            last.units = units
-            last.samples = samples = poll.block.decode(units, time)
-        elif not isinstance(samples, Unchanged):
-            last.samples = samples = Unchanged(samples, time)
-        elif samples.superseded:
-            last.samples = samples = poll.block.decode(units, time)
+        """Returns the samples of the units. Only units that changed are decoded."""
+        block, last = poll.block, poll.last
+        scan = last.scan
+        if block.of_fields:
+            return block.decoder.fields(units, time)
+        if scan is None or scan.latest.superseded:
+            scan = last.scan = block.decoder.first(units, time)
+        elif units == scan.units:
+            scan.time = time
         else:
-            samples.time = time
-        return samples
+            scan = last.scan = block.decoder.after(scan, units, time)
+        return scan
 
     def _count_garbled(self, device: Device, fields: Sequence[Any]) -> None:
         """Counts the garbled fields of a good frame."""

@@ -26,8 +26,10 @@ class Results:
     def answered(self, device: Device, now: float, time: int, *, resynced: bool = False) -> None:
         """Notes a reply of the device, also an error reply. `resynced`: to a resync."""
         health = device.health
-        if resynced and device.shapes is not None:
-            device.shapes.marked(now)
+        if resynced:
+            self._schedule.resynced(device)
+            if device.shapes is not None:
+                device.shapes.marked(now)
         if health.state is State.ONLINE and not health.needs_resync:
             return
         if health.answered(resynced=resynced):

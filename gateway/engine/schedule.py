@@ -154,7 +154,8 @@ class Schedule:
     # The next job
 
     def next(self, now: float) -> Request | Probe | Poll | Idle:
-        self._share_on_demand(now)
+        if now >= self._on_demand_at or self._queue.expedited:
+            self._share_on_demand(now)
         due = self._queue.ripen(now)
         waiting = self._queue.waiting
         until = waiting[0][0] if waiting else NEVER
@@ -165,7 +166,9 @@ class Schedule:
             if job is not None:
                 return job
         self._wrote = False
-        others = [device for device in self.devices if not device.health.online]
+        # `online` alone is slower: almost always all devices are in the first state.
+        online = State.ONLINE
+        others = [d for d in self.devices if d.health.state is not online and not d.health.online]
         if others:
             probe = self._probes.next(others, now, now if due else until)
             if isinstance(probe, Probe):
@@ -271,6 +274,7 @@ class Schedule:
     def again(self, poll: Poll, when: float | None = None, *, counted: bool = True) -> None:
         """Polls again when the deadline is the earliest, or from `when` on."""
         poll.tries += counted
+        poll.device.record.count_retry()
         if when is not None:
             poll.due = when
         self._queue.push(poll)
@@ -283,11 +287,17 @@ class Schedule:
         """Makes the device offline, after a failed probe or last retry of `took` seconds."""
         self._probes.went_offline(device, now, took)
 
+    def resynced(self, device: Device) -> None:
+        """Compares the next read of each block with nothing: it decodes all units."""
+        for poll in self._polls[device]:
+            poll.last.scan = None
+
     def came_online(self, device: Device, now: float) -> None:
         """Makes all blocks of a device due, because it came online."""
         for poll in self._polls[device]:
             poll.due = now
             poll.missed = 0
+            device.record.was_good(poll.last.at)
             poll.last.at = None
         self.plan(device, now)
         for poll in self._polls[device]:

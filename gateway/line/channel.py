@@ -137,6 +137,7 @@ class Channel:
         "alarm",
         "echo",
         "guarded",
+        "loop",
         "lost_by",
         "now",
         "quiet_since",
@@ -159,7 +160,8 @@ class Channel:
         self.wire_log = wire_log
         self.echo = echo
         echo.opened()
-        self.now = asyncio.get_running_loop().time
+        self.loop = asyncio.get_running_loop()
+        self.now = self.loop.time
         self.quiet_since = 0.0  # the last time when the wire was busy
         self.alarm = Alarm()  # for the time-outs of its transactions
         self.lost_by: LineDown | None = None
@@ -174,7 +176,7 @@ class Channel:
         if since is not None and (why := self._may_not_send(since, self.now())):
             raise Busy(why)
 
-    def send(self, data: bytes) -> None:
+    def send(self, data: bytes, now: float) -> None:
         """Sends the bytes. Raises `LineDown`."""
         if self.lost_by is not None:
             raise self.lost_by
@@ -182,7 +184,7 @@ class Channel:
             self.echo.sent(data)
         if self.wire_log.active:
             self.wire_log.sent(data)
-        self.quiet_since = self.now()
+        self.quiet_since = now
         self._port.write(data)
 
     def pause(self, seconds: float) -> None:

@@ -3,6 +3,7 @@
 import asyncio
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, TypeVar
 
 from gateway.engine.device import Device
@@ -24,9 +25,8 @@ class _Request:
     until: float  # by the line's clock
     reply: int  # characters of the longest reply
     future: "asyncio.Future[Any]"
+    sent: float  # by the line's clock
     heard: int = 0  # characters of its reply
-    number: int = 0  # 0: this protocol numbers no request
-    sent: float = 0.0  # by the line's clock
 
 
 @dataclass(slots=True, eq=False)
@@ -105,10 +105,10 @@ class Transaction:
     async def tell(self, frame: Any) -> None:
         data = self._codec.encode(frame)
         channel = self._channel
-        await channel.quiet(self._device.silence)
+        await channel.quiet(self._device.silence.kept)
         channel.check_duty()
         self.has_sent = True
-        channel.send(data)
+        channel.send(data, channel.now())
         self.traffic.sent += len(data)
         # No reply follows; the wire is busy until the last character is out.
         channel.pause(len(data) * channel.wire.character)
@@ -122,14 +122,19 @@ class Transaction:
     ) -> T:
         """As in `Talk`. `within`: seconds in place of `reply_timeout`, for a short probe."""
         channel, device = self._channel, self._device
+        started = channel.now()
         if not self._open:
-            if channel.quiet_since + device.silence > channel.now():
-                await channel.quiet(device.silence)
+            kept = device.silence.kept
+            if channel.quiet_since + kept > started:
+                await channel.quiet(kept)
+                started = channel.now()
             self._begin_hearing()
+            silence = started - channel.quiet_since
+            if silence < self.traffic.silence:
+                self.traffic.silence = silence
         if channel.guarded is not None:
             channel.check_duty()
-        data = self._codec.encode(frame)
-        started, character = channel.now(), channel.wire.character
+        data, character = self._codec.encode(frame), channel.wire.character
         spoken = (len(data) * (2 if channel.echo.strip else 1) + reply) * character
         wait = device.settings.timing.reply_timeout if within is None else within
         until = started + spoken + wait
@@ -138,11 +143,10 @@ class Transaction:
             until += max(0.0, unanswered.held_up_until(device) - started)
         channel.alarm.by(until, self._expire)
         self.has_sent = True
-        channel.send(data)
+        channel.send(data, started)
         self.traffic.sent += len(data)
-        future: asyncio.Future[T] = asyncio.get_running_loop().create_future()
-        number = getattr(frame, "transaction", 0)
-        request = _Request(data, frame, answers, until, reply, future, number=number, sent=started)
+        future: asyncio.Future[T] = channel.loop.create_future()
+        request = _Request(data, frame, answers, until, reply, future, started)
         self._open.append(request)
         try:
             answer = await future
@@ -189,10 +193,10 @@ class Transaction:
             self._gap.cancel()
         codec = self._codec
         self._take(codec.feed, data)
-        gap = getattr(codec, "gap_timeout", None)  # before isinstance, which is slow
-        if gap and isinstance(codec, EndedByGap) and self._broken is None:
-            loop = asyncio.get_running_loop()
-            self._gap = loop.call_later(gap, self._take, codec.expire)
+        if not _may_end_by_gap(type(codec)) or self._broken is not None:
+            return
+        if isinstance(codec, EndedByGap) and (gap := codec.gap_timeout):
+            self._gap = channel.loop.call_later(gap, self._take, codec.expire)
 
     def _take(self, frames: Callable[..., list[Any]], *data: bytes) -> None:
         try:
@@ -264,8 +268,8 @@ class Transaction:
             return
         is_echo = self.may_echo and any(frame == request.frame for request in self._open)
         station = self._device.settings.driver.station
-        number = getattr(frame, "transaction", 0)
-        old = bool(number) and all(request.number != number for request in self._open)
+        number = _number(frame)
+        old = bool(number) and all(_number(request.frame) != number for request in self._open)
         # A reply with an old number is repeated or late: it tells nothing of this station.
         foreign = not old and getattr(frame, "station", station) != station
         if self._stray is not Evidence.STATION:
@@ -302,9 +306,9 @@ class Transaction:
                 again = min(again, request.until)
             else:
                 self._late = _LateReply(request.answers)
-                if request.number:
+                if number := _number(request.frame):
                     device, answers = self._device, request.answers
-                    known = TimedOut(device, request.number, answers, request.sent)
+                    known = TimedOut(device, number, answers, request.sent)
                     self._channel.unanswered.requests.append(known)
                 request.future.set_exception(self._verdict(request.data))
         return again
@@ -324,6 +328,17 @@ class Transaction:
         if self._stray is Evidence.SHAPE:
             return Garbled(f"no answer to this: {shown}", heard, evidence=Evidence.SHAPE)
         return Garbled(f"no whole frame: {shown}", heard, evidence=Evidence.NOISE)
+
+
+@cache
+def _may_end_by_gap(codec: type[Codec[Any]]) -> bool:
+    return hasattr(codec, "gap_timeout")
+
+
+def _number(frame: Any) -> int:
+    """Returns the number of a request or reply; 0: this protocol has none."""
+    number: int = getattr(frame, "transaction", 0)
+    return number
 
 
 def _fail(request: _Request, error: Exception) -> None:

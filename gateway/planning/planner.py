@@ -8,7 +8,7 @@ costs less than a request of its own.
 
 from bisect import bisect_left, bisect_right
 from collections import defaultdict, deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 
@@ -17,10 +17,9 @@ from gateway.planning.coalesce import Request
 from gateway.planning.rows import Row, Seconds, requests_of
 from gateway.protocols.driver import AnyDriver, Cost, Span
 from gateway.protocols.models import Model, model_of
-from gateway.tags import Publish, Quality, Reason, Sample, Tag, bad, of_field
-from gateway.values import Value
+from gateway.tags import Tag
+from gateway.tags.scan import Decoder
 
-Decode = Callable[[Sequence[int]], Value | None]
 Cuts = frozenset[tuple[str, int]]  # (area, n): no block may hold both n - 1 and n
 
 
@@ -36,39 +35,21 @@ class Block:
     tags: tuple[Tag, ...]
     cost: Cost
     listed: tuple[Span, ...] = ()
-    parts: tuple[tuple[Tag, Decode, slice], ...] = field(init=False, repr=False)
+    decoder: Decoder = field(init=False, repr=False)
     of_fields: bool = field(
         init=False, repr=False
     )  # frames protocol: the units are values, not words
-    eager: bool = field(init=False, repr=False)  # decode every read, although nothing changed
+    text: str = field(init=False, repr=False, default="")  # once `describe` has made it
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "parts", tuple(self._parts()))
-        object.__setattr__(self, "of_fields", self.tags[0].shape is not None)
-        eager = any(tag.heartbeat or tag.publish is Publish.ALWAYS for tag in self.tags)
-        object.__setattr__(self, "eager", eager or self.of_fields)
-
-    def _parts(self) -> Iterator[tuple[Tag, Decode, slice]]:
-        """Yields each tag with its decoder and the position of its units in the reply."""
         begins, place = {}, 0
         for span in self.listed:
             begins[span] = place
             place += span.size
-        for tag in self.tags:
-            begin = begins.get(tag.span, tag.span.start - self.span.start)
-            yield tag, tag.decode, slice(begin, begin + tag.span.size)
-
-    def decode(self, units: Sequence[int], time: int) -> list[Sample]:
-        """Returns a sample for each tag; `time` is the arrival of the reply (ns since 1970)."""
-        if self.of_fields:
-            return [of_field(tag, units[part.start], time) for tag, _, part in self.parts]
-        good, new = Quality.GOOD, tuple.__new__  # twice as fast as the constructor
-        return [
-            bad(tag, Reason.NOT_A_NUMBER, time)
-            if (value := decode(units[part])) is None
-            else new(Sample, (tag, value, good, time, None, ""))
-            for tag, decode, part in self.parts
-        ]
+        start = self.span.start
+        begin = [begins.get(tag.span, tag.span.start - start) for tag in self.tags]
+        object.__setattr__(self, "decoder", Decoder(self.tags, begin))
+        object.__setattr__(self, "of_fields", self.tags[0].shape is not None)
 
 
 @dataclass(slots=True)
@@ -205,6 +186,9 @@ def runs_of(tags: Iterable[Tag]) -> list[Span]:
 
 def describe(block: Block) -> str:
     """Returns the first and last address of a block as the file writes them: `D7.3..D10`."""
-    first = min(block.tags, key=lambda tag: tag.span)
-    last = max(block.tags, key=lambda tag: (tag.span.area, tag.span.start + tag.span.size))
-    return first.text if first is last else f"{first.text}..{last.text}"
+    if not block.text:  # kept: the status names every block every few seconds
+        first = min(block.tags, key=lambda tag: tag.span)
+        last = max(block.tags, key=lambda tag: (tag.span.area, tag.span.start + tag.span.size))
+        text = first.text if first is last else f"{first.text}..{last.text}"
+        object.__setattr__(block, "text", text)
+    return block.text

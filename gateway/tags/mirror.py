@@ -1,9 +1,11 @@
 """The latest sample of every tag, and the choice of samples to publish."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from itertools import compress, count
+from operator import ne
 
 from gateway.tags import Publish, Quality, Reason, Sample, Tag, bad
-from gateway.tags.unchanged import Unchanged
+from gateway.tags.scan import Latest, Samples, Scan
 
 
 class Mirror:
@@ -19,9 +21,8 @@ class Mirror:
         self._current = {tag: bad(tag, Reason.STARTING, now) for tag in tags}
         self._published: dict[Tag, Sample] = {}
         self._begun = False
-        # Tags of repeated equal reads. Sample and `Unchanged` are in one entry: another thread gets
-        # both by one look-up and never combines a value with the time of another.
-        self._unchanged: dict[Tag, tuple[Sample, Unchanged]] = {}
+        # Tags whose latest sample is in a scan, with their place there.
+        self._places: dict[Tag, tuple[Latest, int]] = {}
 
     def begin(self, now: int) -> None:
         """Gives the first samples another time, once. Call it before the lines begin.
@@ -34,42 +35,22 @@ class Mirror:
             self._current = {tag: s._replace(time=now) for tag, s in self._current.items()}
 
     def __getitem__(self, tag: Tag) -> Sample:
-        entry = self._unchanged.get(tag)
+        entry = self._places.get(tag)
         if entry is None:
             return self._current[tag]
-        sample, unchanged = entry
-        return unchanged.restamped(sample)
+        latest, place = entry
+        return latest.scan[place]
 
     def samples(self) -> Iterable[Sample]:
         return map(self.__getitem__, self._current)
 
-    def update(self, samples: Iterable[Sample]) -> list[Sample]:
+    def update(self, samples: Iterable[Sample]) -> Sequence[Sample]:
         """Stores the samples. Returns those to publish, in their order."""
-        if type(samples) is Unchanged and self._adopt(samples):
-            return []
-        current, published, good = self._current, self._published, Quality.GOOD
-        unchanged = self._unchanged
-        to_publish = []
-        for sample in samples:
-            tag, value, quality, _, _, _ = sample
-            if quality is not good and _same_failure(current[tag], sample):
-                continue  # keeps the time when it became bad
-            # Before the entry of `unchanged` goes: other threads must find one or the other.
-            current[tag] = sample
-            if tag in unchanged:
-                unchanged.pop(tag)[1].superseded = True
-            last = published.get(tag)
-            if last is not None and quality is last.quality is good:
-                if last.value == value:
-                    if tag.heartbeat is None and tag.publish is not Publish.ALWAYS:
-                        continue  # most samples end here
-                elif tag.deadband is None:
-                    published[tag] = sample
-                    to_publish.append(sample)
-                    continue
-            if _is_due(last, sample):
-                published[tag] = sample
-                to_publish.append(sample)
+        if type(samples) is Scan and samples.latest.in_use:
+            return self._renew(samples.latest, samples)
+        to_publish = self._store(samples)
+        if type(samples) is Scan and not samples.latest.superseded:
+            self._adopt(samples.latest, samples)
         return to_publish
 
     def mark_published(self, samples: Iterable[Sample]) -> list[Sample]:
@@ -77,33 +58,75 @@ class Mirror:
 
         Returns those whose value differs from the last published one by less than the deadband.
         """
-        published = self._published
         changed = []
         for sample in samples:
-            last = published.get(sample.tag)
-            published[sample.tag] = sample
+            last = self._last_published(sample.tag)
+            self._published[sample.tag] = sample
             if last is not None and last.value != sample.value:
                 changed.append(sample)
         return changed
 
-    def _adopt(self, unchanged: Unchanged) -> bool:
-        """Returns True when the values are the current ones, so that only the time is new."""
-        if unchanged.superseded:
-            return False
-        entry = self._unchanged.get(unchanged.samples[0].tag)
-        if entry is None or entry[1] is not unchanged:
-            if not all(self._is_current(sample) for sample in unchanged.samples):
-                unchanged.superseded = True
-                return False
-            tags = [sample.tag for sample in unchanged.samples]
-            self._unchanged |= {tag: (self._current[tag], unchanged) for tag in tags}
-        return True
+    def _last_published(self, tag: Tag) -> Sample | None:
+        entry = self._places.get(tag)
+        if entry is None or entry[1] in entry[0].by_rule:
+            return self._published.get(tag)
+        return self[tag]  # each change of it is published
 
-    def _is_current(self, sample: Sample) -> bool:
-        current = self._current[sample.tag]
-        return current is sample or (
-            current.quality is Quality.BAD and _same_failure(current, sample)
-        )
+    def _store(self, samples: Iterable[Sample]) -> list[Sample]:
+        current, published, places = self._current, self._published, self._places
+        to_publish = []
+        for sample in samples:
+            tag = sample.tag
+            if tag in places:
+                self._supersede(places[tag][0])
+            if sample.quality is Quality.BAD and _same_failure(current[tag], sample):
+                continue  # keeps the time when it became bad
+            current[tag] = sample
+            if _is_due(published.get(tag), sample):
+                published[tag] = sample
+                to_publish.append(sample)
+        return to_publish
+
+    def _adopt(self, latest: Latest, scan: Scan) -> None:
+        """Finds the samples of these tags in the scan from now on. They were stored already."""
+        tags = scan.tags
+        scan.failures = {place: self._current[tags[place]] for place in scan.failures}
+        latest.adopt(scan)
+        self._places |= {tag: (latest, place) for place, tag in enumerate(tags)}
+
+    def _renew(self, latest: Latest, scan: Scan) -> Sequence[Sample]:
+        """Replaces the scan of a block by the next one. Returns the samples to publish."""
+        before, latest.scan = latest.scan, scan
+        changed: Sequence[int] = ()
+        if scan.values is not before.values:
+            changed = list(compress(count(), map(ne, scan.values, before.values)))
+        if latest.by_rule:
+            changed = self._due(latest, before, changed)
+        return Samples(scan, changed) if changed else ()
+
+    def _due(self, latest: Latest, before: Scan, changed: Sequence[int]) -> list[int]:
+        """Returns the places to publish, after the rules of their tags."""
+        scan, published, due = latest.scan, self._published, []
+        for place in sorted({*changed, *latest.unasked}):
+            if place in latest.by_rule:
+                if scan.values[place] is before.values[place] is None:
+                    continue  # still bad
+                sample = scan[place]
+                if not _is_due(published.get(sample.tag), sample):
+                    continue
+                published[sample.tag] = sample
+            due.append(place)
+        return due
+
+    def _supersede(self, latest: Latest) -> None:
+        """Takes the samples out of a scan: one of its tags got another sample."""
+        latest.superseded = True
+        for place, sample in enumerate(latest.scan):
+            # Before its entry goes: other threads must find one or the other.
+            self._current[sample.tag] = sample
+            if place not in latest.by_rule:
+                self._published[sample.tag] = sample
+            del self._places[sample.tag]
 
 
 def _same_failure(current: Sample, sample: Sample) -> bool:

@@ -11,7 +11,7 @@ from gateway.errors import BadValue, Garbled
 from gateway.protocols.driver import Address, Span, Unit
 from gateway.protocols.typed_fields import Shape
 from gateway.tags.scaling import exact_below, scaled, unscaled
-from gateway.values import Kind, Layout, Value, from_words, to_words
+from gateway.values import Kind, Layout, Value, from_word, from_words, to_words
 
 # Larger whole numbers are refused at once: as many bits as the largest float has.
 _MOST_BITS = 1024
@@ -71,16 +71,18 @@ class Tag:
     write: WriteRule | None = None
     shape: Shape | None = None  # for a field of a frame: a read gives the value itself
     event: bool = False  # every value is published, also an equal one
-    decode: Callable[[Sequence[Any]], Value | None] = field(init=False, repr=False)
+    # From the unit of the span to the value, or from its units if it has several.
+    convert: Callable[[Any], Value | None] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         scale, offset = self.scale, self.offset
-        decode: Callable[[Sequence[Any]], Value | None]
+        convert: Callable[[Any], Value | None]
         if self.shape is None:
-            decode = _decoder(self.layout, self.unit_kind, self.address.bit, scale, offset)
+            unit = self.unit_kind
+            convert = _decoder(self.layout, unit, self.single, self.address.bit, scale, offset)
         else:
-            decode = _field_decoder(self.layout, scale, offset)
-        object.__setattr__(self, "decode", decode)
+            convert = _field_decoder(self.layout, scale, offset)
+        object.__setattr__(self, "convert", convert)
 
     def copy(self, device: str, name: str) -> "Tag":
         """Returns the same tag under another name. Ten times faster than `replace`."""
@@ -90,6 +92,15 @@ class Tag:
         object.__setattr__(twin, "device", device)
         object.__setattr__(twin, "name", name)
         return twin
+
+    @property
+    def single(self) -> bool:
+        """True if `convert` takes one unit."""
+        return self.shape is not None or self.span.size == 1
+
+    def decode(self, units: Sequence[Any]) -> Value | None:
+        """Returns the value of the units of the span; None: they hold none."""
+        return self.convert(units[0] if self.single else units)
 
     @property
     def key(self) -> str:
@@ -179,17 +190,23 @@ def _is_float(layout: Layout) -> bool:
 
 @lru_cache(maxsize=4096)
 def _decoder(
-    layout: Layout, unit: Unit, bit: int | None, scale: float, offset: float
-) -> Callable[[Sequence[int]], Value | None]:
-    """Returns the function from units to value, shared by all tags of the same kind."""
-    if bit is not None:
-        return lambda units: bool(units[0] >> bit & 1)
-    plain = from_words(layout)
-    if unit is Unit.DWORD:
-        narrow = plain
+    layout: Layout, unit: Unit, single: bool, bit: int | None, scale: float, offset: float
+) -> Callable[[Any], Value | None]:
+    """Returns the function from units to value, shared by all tags of the same kind.
 
-        def plain(units: Sequence[int]) -> Value | None:
-            return narrow([half for word in units for half in (word & 0xFFFF, word >> 16)])
+    `single`: it takes one unit, otherwise a sequence.
+    """
+    if bit is not None:
+        if single:
+            return lambda unit: bool(unit >> bit & 1)
+        return lambda units: bool(units[0] >> bit & 1)
+    plain = from_word(layout) if single else from_words(layout)
+    if unit is Unit.DWORD:
+        narrow = from_words(layout)
+
+        def plain(units: Any) -> Value | None:
+            dwords = (units,) if single else units
+            return narrow([half for word in dwords for half in (word & 0xFFFF, word >> 16)])
 
     if (scale == 1 and offset == 0) or not layout.type.is_number:
         return plain
@@ -197,7 +214,7 @@ def _decoder(
         return _scaled_float(plain, scale, offset)
     value_of = scaled(scale, offset)
 
-    def integer(units: Sequence[int]) -> Value | None:
+    def integer(units: Any) -> Value | None:
         raw = plain(units)
         return value_of(raw) if isinstance(raw, int) else None
 
@@ -205,9 +222,9 @@ def _decoder(
 
 
 def _scaled_float(
-    plain: Callable[[Sequence[int]], Value | None], scale: float, offset: float
-) -> Callable[[Sequence[int]], Value | None]:
-    def value(units: Sequence[int]) -> Value | None:
+    plain: Callable[[Any], Value | None], scale: float, offset: float
+) -> Callable[[Any], Value | None]:
+    def value(units: Any) -> Value | None:
         raw = plain(units)
         if raw is None or isinstance(raw, str):
             return raw
@@ -218,15 +235,12 @@ def _scaled_float(
 
 
 @lru_cache(maxsize=4096)
-def _field_decoder(
-    layout: Layout, scale: float, offset: float
-) -> Callable[[Sequence[Any]], Value | None]:
-    """Returns the decoder for a field of a frame: units[0] is its value or a `Garbled`."""
+def _field_decoder(layout: Layout, scale: float, offset: float) -> Callable[[Any], Value | None]:
+    """Returns the decoder for a field of a frame: its value or a `Garbled`."""
     scales = layout.type.is_number and not (scale == 1 and offset == 0)
     value_of = None if _is_float(layout) or not scales else scaled(scale, offset)
 
-    def value(units: Sequence[Any]) -> Value | None:
-        raw: Value | Garbled = units[0]
+    def value(raw: Value | Garbled) -> Value | None:
         if isinstance(raw, Garbled):
             return None
         if not scales or isinstance(raw, str):

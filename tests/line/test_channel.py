@@ -239,7 +239,7 @@ async def test_a_line_that_is_never_quiet_is_garbled_after_a_second(baudrate: in
 @on_virtual_time
 async def test_a_pause_delays_the_next_request() -> None:
     port = channel()
-    port.send(b"1")
+    port.send(b"1", now())
     sent = now()
     port.pause(0.1)
     await port.quiet(0.005)
@@ -252,5 +252,5 @@ async def test_a_lost_port_sends_nothing() -> None:
     port = Channel(far, WireTiming(9600, 10), WireLog("hall"), Echo("hall", None))
     port.lost_by = LineDown("unplugged")
     with pytest.raises(LineDown, match="unplugged"):
-        port.send(b"1")
+        port.send(b"1", 0.0)
     assert far.sent == []

@@ -177,7 +177,7 @@ def test_bits_and_words_of_one_address_share_a_block() -> None:
     ]
     (block,) = plan(tags, DRIVER, at(9600))
     assert block.span == Span("D", 7, 2)
-    samples = block.decode([0b1000, 0], 5)
+    samples = block.decoder.first([0b1000, 0], 5)
     assert [s.value for s in samples if s.tag.address.bit is not None] == [True, False]
     assert all(s.time == 5 for s in samples)
 
@@ -186,7 +186,7 @@ def test_words_without_a_value_give_a_bad_sample() -> None:
     (block,) = plan(
         [make_tag("D0", type="float32"), make_tag("D2", type="bcd16")], DRIVER, at(9600)
     )
-    samples = block.decode([0xFFFF, 0xFFFF, 0x00AB], 1)
+    samples = block.decoder.first([0xFFFF, 0xFFFF, 0x00AB], 1)
     assert [(s.value, s.quality, s.reason) for s in samples] == [
         (None, Quality.BAD, Reason.NOT_A_NUMBER)
     ] * 2

@@ -245,7 +245,7 @@ def test_limits_do_not_let_other_types_through(value: Value) -> None:
 
 
 def test_tags_of_one_kind_share_their_decoder() -> None:
-    assert tag(scale=0.1).decode is tag(scale=0.1).decode
+    assert tag(scale=0.1).convert is tag(scale=0.1).convert
     assert tag(scale=0.1).decode is not tag(scale=0.2).decode
     swapped = Layout(ValueType(Kind.INT16), Order.LOW_FIRST, Order.LOW_FIRST)
     assert tag().decode([0x0100]) == 256

@@ -3,6 +3,7 @@
 import re
 from binascii import unhexlify
 from dataclasses import dataclass
+from functools import lru_cache
 
 from gateway.errors import Evidence, Garbled
 
@@ -54,6 +55,9 @@ def encode(frame: Frame) -> bytes:
     return start + summed + b"%02X" % (sum(summed) & 0xFF)
 
 
+_encoded = lru_cache(maxsize=1024)(encode)  # polls send the same requests again and again
+
+
 # ACK; station, command, status; data; then ETX and the sum, or a wrong character. An ACK without
 # six digits behind it is noise; an ACK inside a frame begins another frame.
 _REPLY = re.compile(
@@ -73,7 +77,7 @@ class VigorCodec:
         self._damage: Garbled | None = None
 
     def encode(self, frame: Frame) -> bytes:
-        return encode(frame)
+        return _encoded(frame)
 
     def feed(self, data: bytes) -> list[Frame]:
         """Returns the replies completed by `data`.

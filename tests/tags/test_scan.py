@@ -1,10 +1,12 @@
-"""Repeated equal reads: only the time moves, and no change is missed."""
+"""Reads of a block: no change is missed, and every value gets the time of its read."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import fields
 from typing import Any
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from gateway.engine.effects import Effect, Samples
 from gateway.engine.engine import Engine
@@ -19,9 +21,9 @@ from gateway.engine.jobs import (
     Transacted,
 )
 from gateway.errors import NoReply
-from gateway.tags import Publish, Quality, Reason, Sample, Tag, bad, good
+from gateway.tags import Deadband, Publish, Quality, Reason, Sample, Tag, bad, good
 from gateway.tags.mirror import Mirror
-from gateway.tags.unchanged import Unchanged
+from gateway.tags.scan import Decoder, Scan
 from tests.sim.bench import WIRE
 from tests.sim.plant import device, make_tag
 
@@ -42,7 +44,7 @@ class Reader:
         for effect in effects:
             if isinstance(effect, Samples):
                 self.samples = effect.samples
-                self.published = self.mirror.update(effect.samples)
+                self.published = list(self.mirror.update(effect.samples))
 
     def next(self) -> Poll:
         """Returns the poll of the block. Answers the probes before it."""
@@ -80,7 +82,7 @@ def test_the_third_equal_read_only_moves_the_time() -> None:
     reader = Reader(*tags)
     for _ in range(3):
         reader.read(7, 8)
-    assert isinstance(reader.samples, Unchanged)
+    assert isinstance(reader.samples, Scan)
     assert reader.published == []
     assert [reader.mirror[a], reader.mirror[b]] == [good(a, 7, 3), good(b, 8, 3)]
     assert list(reader.mirror.samples()) == [good(a, 7, 3), good(b, 8, 3)]
@@ -184,16 +186,17 @@ class Interrupted(Tag):
         return id(self)
 
 
-def interrupted(again: int) -> tuple[Tag, Mirror]:
+def interrupted(again: int) -> tuple[Tag, Mirror, Scan]:
     """A tag that was 1 at 1000, and still 1 at the read `again`."""
     plain = make_tag("D0")
     tag = Interrupted(**{f.name: getattr(plain, f.name) for f in fields(plain) if f.init})
     mirror = Mirror([tag], 0)
-    samples = [good(tag, 1, 1000)]
-    mirror.update(samples)
+    scan = Decoder([tag], [0]).first([1], 1000)
+    mirror.update(scan)
     if again > 1000:
-        mirror.update(Unchanged(samples, again))
-    return tag, mirror
+        scan.time = again
+        mirror.update(scan)
+    return tag, mirror, scan
 
 
 def at_look_up(number: int, do: Callable[[], None]) -> None:
@@ -208,12 +211,13 @@ def at_look_up(number: int, do: Callable[[], None]) -> None:
 @pytest.mark.parametrize("number", [1, 2, 3])
 def test_a_change_during_a_look_up_never_mixes_value_and_time(number: int, again: int) -> None:
     """The event loop may change the sample during a look-up by an answering thread."""
-    tag, mirror = interrupted(again)
+    tag, mirror, scan = interrupted(again)
 
     def change() -> None:
-        samples = [good(tag, 2, 2000)]
-        mirror.update(samples)
-        mirror.update(Unchanged(samples, 3000))
+        changed = Decoder([tag], [0]).after(scan, [2], 2000)
+        mirror.update(changed)
+        changed.time = 3000
+        mirror.update(changed)
 
     at_look_up(number, change)
     seen = mirror[tag]
@@ -224,7 +228,7 @@ def test_a_change_during_a_look_up_never_mixes_value_and_time(number: int, again
 @pytest.mark.parametrize("again", [1000, 1500])
 @pytest.mark.parametrize("number", range(1, 7))
 def test_a_look_up_during_a_change_finds_the_old_or_the_new_sample(number: int, again: int) -> None:
-    tag, mirror = interrupted(again)
+    tag, mirror, _ = interrupted(again)
     seen: list[Sample] = []
     at_look_up(number, lambda: seen.append(mirror[tag]))
     mirror.update([good(tag, 2, 2000)])
@@ -244,3 +248,144 @@ def test_a_failure_between_two_equal_reads_makes_the_value_bad() -> None:
     assert reader.mirror[tag].quality is Quality.BAD
     reader.read(7)
     assert reader.published == [good(tag, 7, reader.time)]
+
+
+def test_only_changed_units_are_decoded() -> None:
+    decoded: list[int] = []
+
+    def convert(unit: int) -> int:
+        decoded.append(unit)
+        return unit
+
+    tags = [make_tag(f"D{n}") for n in range(4)]
+    for tag in tags:
+        object.__setattr__(tag, "convert", convert)
+    decoder = Decoder(tags, range(4))
+    scan = decoder.first([1, 2, 3, 4], 1)
+    decoded.clear()
+    later = decoder.after(scan, [1, 2, 9, 4], 2)
+    assert decoded == [9]
+    assert list(later) == [good(tag, n, 2) for tag, n in zip(tags, (1, 2, 9, 4), strict=True)]
+    assert list(scan) == [good(tag, n, 1) for tag, n in zip(tags, (1, 2, 3, 4), strict=True)]
+
+
+def test_a_change_of_one_unit_reaches_every_tag_over_it() -> None:
+    names = ("D0.3", "D0.4", "D1")
+    tags = [make_tag("D0", name="word"), make_tag("D0", name="both", type="int32")]
+    tags += [make_tag(name) for name in names]
+    decoder = Decoder(tags, (0, 0, 0, 0, 1))
+    scan = decoder.first([0, 5], 1)
+    assert [sample.value for sample in scan] == [0, 5 << 16, False, False, 5]
+    scan = decoder.after(scan, [8, 5], 2)
+    assert [sample.value for sample in scan] == [8, (5 << 16) + 8, True, False, 5]
+
+
+def test_samples_to_publish_keep_their_time() -> None:
+    tags = [make_tag(text) for text in TWO]
+    decoder, mirror = Decoder(tags, (0, 1)), Mirror(tags, 0)
+    mirror.update(first := decoder.first([1, 2], 1))
+    second = decoder.after(first, [1, 3], 2)
+    to_publish = mirror.update(second)
+    second.time = 3  # the next read is equal
+    assert list(to_publish) == [good(tags[1], 3, 2)]
+    assert mirror[tags[1]] == good(tags[1], 3, 3)
+
+
+def test_a_deadband_counts_from_the_last_published_value_of_a_scan() -> None:
+    tags = [make_tag("D0", deadband=Deadband(5)), make_tag("D1")]
+    reader = Reader(*tags)
+    published = []
+    for value in (0, 3, 4, 5, 9, 10, 6, 5):
+        reader.read(value, 7)
+        published += [sample.value for sample in reader.published if sample.tag is tags[0]]
+        assert reader.mirror[tags[0]] == good(tags[0], value, reader.time)
+    assert published == [0, 5, 10, 5]
+
+
+NAN = (0, 0x7FC0)
+
+
+@pytest.mark.parametrize("between", ["bad", "resync", "plan"])
+def test_the_first_read_after_a_break_is_compared_with_nothing(between: str) -> None:
+    tag = make_tag("D0", type="float32")
+    reader = Reader(tag)
+    for _ in range(3):
+        reader.read(*NAN)
+    before, schedule = reader.samples, reader.engine.schedule
+    assert list(before) == [bad(tag, Reason.NOT_A_NUMBER, 1)]
+    match between:
+        case "bad":
+            schedule.polls(reader.device)[0].forget(float(reader.time))
+        case "resync":
+            reader.device.health.left_outstanding(tag.span, float(reader.time))
+        case _:
+            reader.device.plan()
+            schedule.plan(reader.device, float(reader.time))
+    reader.read(*NAN)
+    assert isinstance(before, Scan)
+    assert isinstance(reader.samples, Scan)
+    assert reader.samples.latest is not before.latest
+    assert reader.mirror[tag] == bad(tag, Reason.NOT_A_NUMBER, 1)
+
+
+WORDS = st.sampled_from([0, 1, 2, 0x7FC0, 0x3F80, 0xFFFF])
+STEPS = st.lists(
+    st.one_of(
+        st.tuples(st.just("read"), st.lists(WORDS, min_size=6, max_size=6)),
+        st.tuples(st.just("one"), st.tuples(st.integers(0, 5), WORDS)),
+        st.tuples(st.just("equal"), st.none()),
+        st.tuples(st.just("bad"), st.integers(0, 9)),
+        st.tuples(st.just("other"), st.integers(0, 9)),
+        st.tuples(st.just("again"), st.integers(0, 9)),
+        st.tuples(st.just("resync"), st.none()),
+    ),
+    max_size=25,
+)
+
+
+@settings(deadline=None, max_examples=80)
+@given(STEPS)
+def test_scans_and_single_samples_give_the_same_mirror(steps: list[tuple[str, Any]]) -> None:
+    """The other mirror gets a new sample of each tag at each read."""
+    rules: list[dict[str, Any]] = [
+        {"type": "float32"},
+        {"type": "uint16", "deadband": Deadband(2)},
+        {"type": "bcd16", "publish": Publish.ALWAYS},
+        {"type": "int16", "heartbeat": 2e-9},
+        {"type": "int16", "scale": 0.1, "deadband": Deadband(10, percent=True)},
+        {"type": "float32", "heartbeat": 3e-9, "deadband": Deadband(1)},
+        {"type": "string[4]"},
+    ]
+    tags = [make_tag(f"D{n % 5}", name=f"t{n}", **rule) for n, rule in enumerate(rules)]
+    tags += [make_tag(f"D0.{bit}") for bit in (0, 1)] + [make_tag("D5")]
+    reader, other = Reader(*tags), Mirror(tags, 0)
+    words = [0] * 6
+    for step, what in steps:
+        if step in ("bad", "other", "again"):
+            tag = tags[what]
+            if step == "again":
+                assert reader.mirror.mark_published([reader.mirror[tag]]) == other.mark_published(
+                    [other[tag]]
+                )
+                continue
+            sample = bad(tag, Reason.NO_REPLY, reader.time)
+            if step == "other":
+                sample = good(tag, "x" if tag is tags[6] else 3, reader.time)
+            assert list(reader.mirror.update([sample])) == other.update([sample])
+            continue
+        if step == "resync":
+            reader.device.health.left_outstanding(tags[0].span, float(reader.time))
+        elif step == "read":
+            words = what
+        elif step == "one":
+            words = [*words]
+            words[what[0]] = what[1]
+        reader.read(*words)
+        fresh = [
+            bad(tag, Reason.NOT_A_NUMBER, reader.time)
+            if (value := tag.decode(words[tag.span.start : tag.span.start + tag.span.size])) is None
+            else good(tag, value, reader.time)
+            for tag in reader.engine.schedule.polls(reader.device)[0].block.tags
+        ]
+        assert reader.published == other.update(fresh)
+        assert list(reader.mirror.samples()) == list(other.samples())

@@ -1,0 +1,185 @@
+"""Decodes the reads of a block: only what changed, and makes samples only where they are needed."""
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from itertools import compress
+from operator import call, itemgetter, ne
+from typing import Any, overload
+
+from gateway.tags.sample import Quality, Reason, Sample, bad, of_field
+from gateway.tags.tag import Publish, Tag
+from gateway.values import Value
+
+Failures = Mapping[int, Sample]  # bad samples by place: the units there hold no value
+NO_FAILURES: Failures = {}
+
+
+class Latest:
+    """The latest scan of one block in the mirror.
+
+    The mirror replaces `scan` in one step, so another thread never combines a value with the time
+    of another read. `superseded` becomes True when another sample of one of the tags arrives; the
+    next read of the block is then compared with nothing.
+    """
+
+    __slots__ = ("by_rule", "scan", "superseded", "unasked", "used")
+
+    def __init__(self) -> None:
+        self.scan: Scan
+        self.used = False  # the mirror finds the samples of the tags here
+        self.superseded = False
+        self.by_rule: Collection[int] = ()  # places of tags with a deadband, a heartbeat ...
+        self.unasked: Collection[int] = ()  # of these, tags that are published without a change
+
+    @property
+    def in_use(self) -> bool:
+        return self.used and not self.superseded
+
+    def adopt(self, scan: "Scan") -> None:
+        """Begins with a scan."""
+        places = tuple(enumerate(scan.tags))
+        eager = [p for p, tag in places if tag.heartbeat or tag.publish is Publish.ALWAYS]
+        self.by_rule = frozenset(eager).union(p for p, tag in places if tag.deadband is not None)
+        self.unasked = tuple(eager)
+        self.scan, self.used = scan, True
+
+
+class Samples(Sequence[Sample]):
+    """The samples of some places of a read. They are made when the first one is taken."""
+
+    __slots__ = ("_failures", "_made", "_places", "_tags", "_time", "_values")
+
+    def __init__(self, scan: "Scan", places: Sequence[int]) -> None:
+        self._tags, self._values, self._failures = scan.tags, scan.values, scan.failures
+        self._time = scan.time  # an equal read moves that of the scan
+        self._places = places
+        self._made: list[Sample] | None = None
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    def __iter__(self) -> Iterator[Sample]:
+        return iter(self._all())
+
+    @overload
+    def __getitem__(self, index: int) -> Sample: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[Sample]: ...
+    def __getitem__(self, index: int | slice) -> Sample | list[Sample]:
+        return self._all()[index]
+
+    def _all(self) -> list[Sample]:
+        if self._made is None:
+            tags, values, time = self._tags, self._values, self._time
+            good, new = Quality.GOOD, tuple.__new__  # twice as fast as the constructor
+            self._made = [
+                self._failures[place]
+                if (value := values[place]) is None
+                else new(Sample, (tags[place], value, good, time, None, ""))
+                for place in self._places
+            ]
+        return self._made
+
+
+class Scan(Sequence[Sample]):
+    """One read of a block: a value for each tag, and one time.
+
+    `time` (nanoseconds since 1970) is the latest read; a read of equal units only moves it. A bad
+    sample keeps the time when it became bad.
+    """
+
+    __slots__ = ("failures", "keys", "latest", "tags", "time", "units", "values")
+
+    def __init__(
+        self,
+        tags: Sequence[Tag],
+        units: Sequence[Any],
+        keys: Sequence[Any],
+        values: Sequence[Value | None],
+        failures: Failures,
+        time: int,
+        latest: Latest,
+    ) -> None:
+        """`keys`: the unit or units of each tag."""
+        self.tags = tags
+        self.units = units
+        self.keys = keys
+        self.values = values
+        self.failures = failures
+        self.time = time
+        self.latest = latest
+
+    def __len__(self) -> int:
+        return len(self.tags)
+
+    def __iter__(self) -> Iterator[Sample]:
+        return iter(Samples(self, range(len(self.tags))))
+
+    @overload
+    def __getitem__(self, index: int) -> Sample: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[Sample]: ...
+    def __getitem__(self, index: int | slice) -> Sample | list[Sample]:
+        if isinstance(index, slice):
+            return list(self)[index]
+        value = self.values[index]
+        if value is None:
+            return self.failures[index]
+        return Sample(self.tags[index], value, Quality.GOOD, self.time)
+
+
+class Decoder:
+    """Makes the scans of one block."""
+
+    __slots__ = ("_begins", "_convert", "_keys", "_places", "_tags")
+
+    def __init__(self, tags: Sequence[Tag], begins: Sequence[int]) -> None:
+        """`begins`: for each tag the place of its first unit in the reply."""
+        self._tags = tags
+        self._begins = begins
+        self._places = range(len(tags))
+        self._convert = tuple(tag.convert for tag in tags)
+        self._keys = itemgetter(
+            *(
+                begin if tag.single else slice(begin, begin + tag.span.size)
+                for tag, begin in zip(tags, begins, strict=True)
+            ),
+            *((slice(0),) if len(tags) == 1 else ()),  # else it would return no tuple
+        )
+
+    def first(self, units: Sequence[Any], time: int) -> Scan:
+        """Decodes all units; `time` is the arrival of the reply (ns since 1970)."""
+        keys = self._keys(units)
+        values = list(map(call, self._convert, keys))
+        failures = self._failures(values, NO_FAILURES, time)
+        return Scan(self._tags, units, keys, values, failures, time, Latest())
+
+    def after(self, before: Scan, units: Sequence[Any], time: int) -> Scan:
+        """Decodes the units that are not those of the read before."""
+        keys, convert = self._keys(units), self._convert
+        changed = list(map(ne, keys, before.keys))
+        new = list(map(call, compress(convert, changed), compress(keys, changed)))
+        failures = before.failures
+        if len(new) == len(convert):
+            values = new
+        else:
+            values = list(before.values)
+            for place, value in zip(compress(self._places, changed), new, strict=True):
+                values[place] = value
+        if failures or None in new:
+            failures = self._failures(values, failures, time)
+        return Scan(self._tags, units, keys, values, failures, time, before.latest)
+
+    def fields(self, units: Sequence[Any], time: int) -> list[Sample]:
+        """Returns the samples of a frame: its fields are values, not words."""
+        parts = zip(self._tags, self._begins, strict=True)
+        return [of_field(tag, units[begin], time) for tag, begin in parts]
+
+    def _failures(self, values: Sequence[Value | None], before: Failures, time: int) -> Failures:
+        """Returns a bad sample for each place without a value. One that is bad already stays."""
+        if None not in values:
+            return NO_FAILURES
+        places = (place for place, value in enumerate(values) if value is None)
+        return {
+            place: before.get(place) or bad(self._tags[place], Reason.NOT_A_NUMBER, time)
+            for place in places
+        }
