@@ -135,7 +135,7 @@ def libmodbus(master: Path, mode: str, where: str, count: int) -> float:
 
 
 def modbus_serial(mode: str, where: str, count: int) -> float:
-    """Returns seconds of processor time; V8 compiles within them, so take 2,000 reads or more."""
+    """Returns seconds of processor time, after 5,000 reads in which Node compiles."""
     script = Path(__file__).with_name("modbus_serial_reads.js")
     command = ["node", str(script), mode, where, str(count)]
     output = subprocess.run(command, check=True, capture_output=True, text=True).stdout
