@@ -8,15 +8,16 @@ RUN python -m venv /opt/gateway \
 
 FROM python:3.12-slim
 # Serial ports belong to the group dialout: docker run --device /dev/ttyUSB0 --group-add dialout ...
-RUN useradd --system --uid 10001 --groups dialout --home-dir /data --create-home gateway
+RUN useradd --system --uid 10001 --user-group --groups dialout --home-dir /data --create-home gateway
 COPY --from=build /opt/gateway /opt/gateway
 COPY config.example.yaml /etc/plc-gateway/config.yaml
-ENV PATH=/opt/gateway/bin:$PATH PYTHONUNBUFFERED=1 PYTHONDONTWRITEBYTECODE=1
-USER gateway
+# Relative paths of files that the gateway writes are below STATE_DIRECTORY.
+ENV PATH=/opt/gateway/bin:$PATH PYTHONUNBUFFERED=1 PYTHONDONTWRITEBYTECODE=1 STATE_DIRECTORY=/data
+USER 10001:10001
 WORKDIR /data
 VOLUME /data
 EXPOSE 7447
-# The gateway writes only below /data: run it with --read-only --tmpfs /tmp.
+# The gateway writes only below /data: run it with --read-only.
 # With `users_file` the health check needs -e PLC_GATEWAY_CLI_USER -e PLC_GATEWAY_CLI_PASSWORD
 # (docs/security.md).
 HEALTHCHECK --interval=30s --timeout=10s --start-period=15s \

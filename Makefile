@@ -4,7 +4,7 @@ BIN := .venv/bin
 # A program of the tests starts twice as fast if its modules need not be compiled again.
 export PYTHONDONTWRITEBYTECODE =
 
-.PHONY: run test coverage check format schema sim fuzz soak mutants faults bench clean
+.PHONY: run test coverage check format schema sim fuzz soak mutants faults bench peers plant clean
 
 run: .venv/installed
 	$(BIN)/plc-gateway run config.example.yaml
@@ -36,6 +36,15 @@ bench: .venv/ready
 	$(BIN)/python -m benchmarks.planning
 	$(BIN)/python -m benchmarks.start
 	$(BIN)/python -m benchmarks.northbound
+
+# This gateway beside its peers (docs/peers.md); .ci/install-peers installs them.
+peers: .venv/ready
+	$(BIN)/python -m benchmarks.peers
+
+# Ten gateways and three routers, some of them killed (docs/scale.md); takes about seven minutes.
+plant: .venv/ready
+	$(BIN)/python -m benchmarks.routers
+	$(BIN)/python -m benchmarks.plant
 
 clean:
 	rm -rf .venv build dist *.egg-info .coverage

@@ -5,10 +5,14 @@ the time of characters on the wire, as a share of the time without turnarounds a
 `cycle` compares one round of all blocks with the forecast of `check`. A second run writes a
 register three times a second; `write` is the longest time from the request to the
 acknowledgement, and the bound that `check` prints.
+
+`--silences` measures requests a second with the safe silence and with the learned one, in turn, in
+four blocks of ten words. `--virtual`: on virtual time, so that no other program disturbs.
 """
 
 import argparse
 import asyncio
+import itertools
 import json
 import logging
 import random
@@ -16,7 +20,8 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import structlog
@@ -32,15 +37,18 @@ from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.driver import AnyDriver
 from gateway.protocols.modbus import ModbusRtu
 from gateway.protocols.vigor import Vigor
+from gateway.simulator.port import open_simulator
 from gateway.stations.computer_link import ComputerLinkStation
 from gateway.stations.modbus import ModbusStation
 from gateway.stations.station import Station
 from gateway.stations.vigor import VigorStation
 from gateway.tags import Sample, Tag
 from gateway.transport import SerialPath, SerialSettings, open_port
+from tests.sim.virtual import run_virtual
 
 TURNAROUND = 0.005
-BLOCKS, WORDS = 4, 64
+BLOCKS, WORDS, FEW = 4, 64, 10
+LEARNING = 60.0  # seconds at most
 
 
 class Setting(NamedTuple):
@@ -70,9 +78,11 @@ class Counting:
 
     def __init__(self) -> None:
         self.count = 0
+        self.times: list[float] = []
 
     def samples(self, samples: Sequence[Sample]) -> None:
         self.count += len(samples)
+        self.times.append(asyncio.get_running_loop().time())
 
     def online(self, device: Device, online: bool) -> None:
         pass
@@ -84,14 +94,15 @@ class Result:
     cycle: float
     predicted: float
     exchanges: int
+    blocks: int = BLOCKS
     write: float = 0.0
     bound: float = 0.0
 
 
-def tags(area: str) -> tuple[Tag, ...]:
-    """Four full blocks of 64 words, with intervals ten times too short for any line."""
+def tags(area: str, size: int = WORDS) -> tuple[Tag, ...]:
+    """Four blocks of so many words, with intervals ten times too short for any line."""
     # Too far apart to share a request.
-    numbers = [number + (number // WORDS) * 200 for number in range(BLOCKS * WORDS)]
+    numbers = [number + (number // size) * 200 for number in range(BLOCKS * size)]
     return words(area, numbers, 0.01, writable=numbers[:1])
 
 
@@ -105,24 +116,80 @@ async def writing(line: Line, device: Device, tag: Tag, took: list[float]) -> No
             took.append((await line.write(device, tag, tag.encode(number))).took)
 
 
-async def measure(name: str, baud: int, seconds: float, *, writes: bool = False) -> Result:
-    setting = SETTINGS[name]
+def paced(name: str, baud: int, turnaround: float) -> "tuple[subprocess.Popen[str], str]":
+    """Starts the wire. Returns its process, and the path of its pty."""
     child = subprocess.Popen(
-        [sys.executable, "-m", "benchmarks.paced_wire", name, str(baud), str(TURNAROUND)],
+        [sys.executable, "-m", "benchmarks.paced_wire", name, str(baud), str(turnaround)],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
     )
+    assert child.stdout is not None
+    return child, child.stdout.readline().strip()
+
+
+async def rate(
+    name: str, baud: int, turnaround: float, seconds: float, *, learn: bool, virtual: bool
+) -> tuple[float, float]:
+    """Returns the requests a second, and the silence before a poll."""
+    setting = SETTINGS[name]
+    driver, wire = setting.driver(), WireTiming(baud, setting.bits)
+    settings = DeviceSettings(
+        name="plc",
+        driver=driver,
+        timing=driver.timing if learn else replace(driver.timing, learn_silence=False),
+        turnaround=turnaround,
+        tags=tags(setting.area, FEW),
+    )
+    device = Device(settings, wire)
+    child: subprocess.Popen[str] | None = None
+    if virtual:
+        stations = [setting.station()]
+        opener = partial(open_simulator, stations, wire, turnaround=turnaround)
+    else:
+        child, path = paced(name, baud, turnaround)
+        opener = partial(open_port, SerialPath(path), SerialSettings(baud, "8N1"))
+    sink = Counting()
+    task = asyncio.create_task(Line(Engine("bench", [device], wire), opener, sink).run())
+    await asyncio.sleep(1.0)
+    with suppress(TimeoutError):
+        async with asyncio.timeout(LEARNING):
+            while device.silence.shorter > device.silence.least:
+                await asyncio.sleep(0.1)
+    sink.times.clear()
+    await asyncio.sleep(seconds)
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)
+    if child is not None:
+        assert child.stdin is not None
+        child.stdin.close()
+        child.wait()
+    gaps = sorted(after - before for before, after in itertools.pairwise(sink.times))
+    usual = gaps if virtual else gaps[len(gaps) // 4 : len(gaps) * 3 // 4]
+    return len(usual) / sum(usual), device.silence.shorter
+
+
+async def measure(
+    name: str,
+    baud: int,
+    seconds: float,
+    *,
+    writes: bool = False,
+    turnaround: float = TURNAROUND,
+    chosen: tuple[Tag, ...] | None = None,
+) -> Result:
+    """`chosen`: other tags than the four full blocks."""
+    setting = SETTINGS[name]
+    child, path = paced(name, baud, turnaround)
     assert child.stdin is not None
     assert child.stdout is not None
-    path = child.stdout.readline().strip()
     driver, wire = setting.driver(), WireTiming(baud, setting.bits)
     settings = DeviceSettings(
         name="plc",
         driver=driver,
         timing=driver.timing,
-        turnaround=TURNAROUND,
-        tags=tags(setting.area),
+        turnaround=turnaround,
+        tags=chosen or tags(setting.area),
     )
     device = Device(settings, wire)
     # 8N1 on the pty whatever the format: a pty cannot do parity.
@@ -155,7 +222,28 @@ async def measure(name: str, baud: int, seconds: float, *, writes: bool = False)
         cycle=passed["elapsed"] / exchanges * len(device.blocks),
         predicted=promised.cycle,
         exchanges=exchanges,
+        blocks=len(device.blocks),
     )
+
+
+def silences(bauds: Sequence[int], seconds: float, *, virtual: bool) -> None:
+    """Prints the requests a second with the safe and the learned silence, in turn."""
+    print("protocol       baud turnaround    safe learned  ratio      silence")
+    for name, setting in SETTINGS.items():
+        if not setting.driver().timing.learn_silence:
+            continue
+        for baud in bauds:
+            for turnaround in (0.005, 0.001):
+                run = partial(rate, name, baud, turnaround, seconds, virtual=virtual)
+                begin = run_virtual if virtual else asyncio.run
+                safe, kept = begin(run(learn=False))
+                learned, short = begin(run(learn=True))
+                print(
+                    f"{name:13} {baud:6} {turnaround * 1000:7.0f} ms {safe:7.1f} {learned:7.1f} "
+                    f"{learned / safe:6.2f} "
+                    f"{kept * 1000:4.1f} -> {short * 1000:.2f} ms",
+                    flush=True,
+                )
 
 
 def main() -> None:
@@ -163,8 +251,13 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=6.0)
     parser.add_argument("--protocols", nargs="*", default=list(SETTINGS))
     parser.add_argument("--bauds", nargs="*", type=int, default=[9600, 19200, 38400, 115200])
+    parser.add_argument("--silences", action="store_true", help="safe and learned silences")
+    parser.add_argument("--virtual", action="store_true", help="the silences on virtual time")
     arguments = parser.parse_args()
     structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.WARNING))
+    if arguments.silences:
+        silences(arguments.bauds, arguments.seconds, virtual=arguments.virtual)
+        return
     columns = "exchanges    busy     cycle  predicted             write"
     print(f"{'protocol':14} {'baud':>7} {columns}")
     for name in arguments.protocols:

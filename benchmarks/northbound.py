@@ -71,6 +71,9 @@ class Plant:
     def devices(self) -> list[Device]:
         return self.made
 
+    def begin(self) -> None:
+        pass
+
     def tag(self, key: str) -> Tag | None:
         return next((tag for tag in self.tags if tag.key == key), None)
 

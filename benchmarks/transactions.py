@@ -1,10 +1,11 @@
 """CPU per read of 64 words: `python -m benchmarks.transactions`.
 
 Compares our whole line (engine, transaction, driver, decoding, mirror) with pymodbus's asyncio
-client and a libmodbus loop in C, against the same slave (libmodbus, in another process) in one run.
+client, npm's modbus-serial (where it is installed) and a libmodbus loop in C, against the same
+slave (libmodbus, in another process) in one run.
 Its registers keep their values; for the rows `changing` all of them change between two reads. No
 foreign Vigor slave exists, so a simulated station in another process replies. Figures are
-processor time of this process, or of the C loop, per exchange. Compare ratios within one run.
+processor time of this process, or of that of the peer, per exchange. Compare ratios within one run.
 """
 
 import argparse
@@ -141,6 +142,18 @@ def libmodbus(master: Path, mode: str, where: str, count: int) -> float:
     return float(output.split()[1]) / 1e6
 
 
+def modbus_serial(mode: str, where: str, count: int) -> float:
+    """Returns seconds of processor time; V8 compiles within them, so take 2,000 reads or more."""
+    script = Path(__file__).with_name("modbus_serial_reads.js")
+    command = ["node", str(script), mode, where, str(count)]
+    output = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    return float(output.split()[1]) / 1e6
+
+
+def has_modbus_serial() -> bool:
+    return shutil.which("node") is not None and (INTEROP / "node_modules/modbus-serial").is_dir()
+
+
 @contextlib.contextmanager
 def process(*command: str | Path) -> Iterator[str]:
     """A peer in another process; yields the first line that it prints."""
@@ -220,6 +233,7 @@ def beside(
     opener: Callable[[Receiver], Awaitable[Port]],
     client: Callable[[], AsyncModbusTcpClient | AsyncModbusSerialClient] | None = None,
     in_c: Callable[[int], float] | None = None,
+    in_node: Callable[[int], float] | None = None,
     changing: Callable[[Receiver], Awaitable[Port]] | None = None,
 ) -> Runs:
     """Ours and the other masters of that slave; once more on uvloop where it is installed.
@@ -251,6 +265,8 @@ def beside(
             runs["pymodbus client" + suffix] = partial(_of_pymodbus, on, client)
     if in_c is not None:
         runs["libmodbus in C"] = in_c
+    if in_node is not None and has_modbus_serial():
+        runs["npm's modbus-serial"] = in_node
     return runs
 
 
@@ -274,6 +290,7 @@ def modbus_tcp(folder: Path, count: int, rounds: int) -> dict[str, float] | None
             tcp_opener(port),
             lambda: AsyncModbusTcpClient("127.0.0.1", port=port),
             lambda n: libmodbus(master, "tcp", str(port), n),
+            lambda n: modbus_serial("tcp", str(port), n),
             tcp_opener(other),
         )
         return repeated(runs, count, rounds)
@@ -295,6 +312,7 @@ def modbus_rtu(folder: Path, count: int, rounds: int) -> dict[str, float] | None
             serial_opener(near),
             lambda: AsyncModbusSerialClient(near, baudrate=115200),
             lambda n: libmodbus(master, "rtu", near, n),
+            lambda n: modbus_serial("rtu", near, n),
             serial_opener(other),
         )
         return repeated(runs, count, rounds)

@@ -29,7 +29,7 @@ import zenoh
 
 CHECK_EVERY = 60.0  # seconds between two checks without a known gap
 FIRST_PAGE = 1000  # samples, so that the first ones arrive soon
-PAGE = 40_000  # samples; over a slow link take fewer, so that a page arrives in time
+PAGE = 40_000  # samples of all gateways; over a slow link take fewer, so that it arrives in time
 MOST_REPLIES = 1_000_000  # that wait; Zenoh reads nothing more from the link when it is full
 ANSWER_WITHIN = 30.0  # seconds for a page
 RETRY_EVERY = 0.5  # seconds until an incomplete check is repeated
@@ -102,7 +102,7 @@ class CatchUp:
         self._known: tuple[set[Sample], set[Sample]] = set(), set()
         self._last: dict[str, Sample] = {}  # the last delivered sample of each key
         self._declared = [
-            session.declare_subscriber(f"{prefix}/**", self._arrived.put),
+            session.declare_subscriber(f"{prefix}/**", self._value),
             session.liveliness().declare_subscriber(
                 f"{prefix}/@gateway/*", self._gateway, history=True
             ),
@@ -110,6 +110,10 @@ class CatchUp:
         ]
 
     # Zenoh's threads call these: they only record the change.
+
+    def _value(self, received: zenoh.Sample) -> None:
+        # A copy: a sample of Zenoh keeps the whole batch, up to 64 kB, in which it arrived.
+        self._arrived.put(_sample(str(received.key_expr), received))
 
     def _gateway(self, token: zenoh.Sample) -> None:
         key = str(token.key_expr)
@@ -143,13 +147,20 @@ class CatchUp:
                 arrived = self._arrived.get(timeout=max(0.0, due - time.monotonic()))
             except queue.Empty:
                 continue
-            if arrived is MISSED:
-                due = min(due, time.monotonic() + RETRY_EVERY)  # links change together
-            elif isinstance(arrived, zenoh.Sample):
-                if due - time.monotonic() <= RETRY_EVERY:
-                    # A check is due: this sample is in history too, and arrives in its place.
-                    continue
-                yield from self._new([_sample(str(arrived.key_expr), arrived)], may_return=True)
+            if due - time.monotonic() <= RETRY_EVERY:
+                # A check is due: this sample is in history too, and arrives in its place.
+                continue
+            if isinstance(arrived, Sample) and not self._may_be_known(arrived):
+                yield from self._new([arrived], may_return=True)
+                continue
+            due = time.monotonic() + RETRY_EVERY  # links change together
+
+    def _may_be_known(self, sample: Sample) -> bool:
+        """Returns True if only history can tell: a page before the last one may have had it."""
+        last = self._last.get(sample.key)
+        if last is None or sample.time > last.time or sample == last:
+            return False
+        return not any(sample in known for known in self._known)
 
     def _missed(self) -> Iterator[Page]:
         """Yields every sample since the last complete page, in pages. Raises `Gap` if some may
@@ -165,7 +176,8 @@ class CatchUp:
                 return
 
     def _query(self, size: int) -> Answer:
-        selector = f"{self._prefix}/**?_time=[{self._begin}..];page={size}"
+        of_each = max(1, size // max(1, len(self._gateways)))  # every gateway sends as many
+        selector = f"{self._prefix}/**?_time=[{self._begin}..];page={of_each}"
         if self._places:
             selector += f";after={','.join(self._places.values())}"
         return Answer(self._session, selector)
@@ -236,29 +248,31 @@ def _sample(key: str, received: zenoh.Sample) -> Sample:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--connect", required=True, help="e.g. tcp/127.0.0.1:7447")
+    parser.add_argument(
+        "--connect", required=True, nargs="+", help="e.g. tcp/127.0.0.1:7447; others are spare"
+    )
     parser.add_argument("--prefix", default="plant")
     parser.add_argument("--since", help="e.g. 2026-11-20T12:00:00Z (now, when left out)")
     given = parser.parse_args()
     since = given.since or datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
-    with opened(given.connect) as session:
+    with opened(*given.connect) as session:
         for sample in CatchUp(session, given.prefix, since).samples():
             late = " late" if sample.late else ""
             print(f"{sample.time} {sample.key} {sample.value}{late}", flush=True)
 
 
-def opened(endpoint: str) -> zenoh.Session:
-    """Opens a session, and waits for the router. Zenoh reconnects an open session by itself."""
+def opened(*endpoints: str) -> zenoh.Session:
+    """Opens a session, and waits for a router. Zenoh reconnects an open session by itself."""
     config = zenoh.Config()
     config.insert_json5("mode", '"client"')
-    config.insert_json5("connect/endpoints", json.dumps([endpoint]))
+    config.insert_json5("connect/endpoints", json.dumps(endpoints))
     config.insert_json5("connect/retry", '{"period_init_ms": 500, "period_max_ms": 2000}')
     config.insert_json5("scouting/multicast/enabled", "false")
     while True:
         try:
             return zenoh.open(config)
         except zenoh.ZError as error:
-            print(f"waiting for {endpoint}: {error}", file=sys.stderr)
+            print(f"waiting for {endpoints}: {error}", file=sys.stderr)
             time.sleep(RETRY_EVERY)
 
 

@@ -15,7 +15,7 @@ from gateway.engine.requests import WRITE_EXPIRY, CommandResult
 from gateway.errors import Busy, Offline
 from gateway.line.build import OpenPort, line_of, opener
 from gateway.line.duty import Duty
-from gateway.line.line import Line
+from gateway.line.line import Line, Watcher
 from gateway.northbound.status import Document, device_document, line_document, standing
 from gateway.tags import Quality, Reason, Sample, Tag, WriteResult, bad
 from gateway.tags.mirror import Mirror
@@ -93,6 +93,11 @@ class Gateway:
             if not device.enabled:
                 self.mirror.update(bad(tag, Reason.DISABLED, wall()) for tag in device.tags)
 
+    def begin(self) -> None:
+        """Stamps the first samples again: this gateway may have been in standby for months."""
+        if self.config.standby is not None:
+            self.mirror.begin(self._wall())
+
     def _add_line(self, config: LineConfig, open_port: OpenPort, seed: int) -> None:
         devices = [device for device in config.devices if device.enabled]
         line = line_of(
@@ -130,6 +135,13 @@ class Gateway:
     def add_document(self, path: str, document: Callable[[], Document]) -> None:
         """Adds a document of another part to the status."""
         self._documents[path] = document
+
+    def watch(self, line: str, watcher: Watcher | None) -> bool:
+        """Sets or removes the watcher of a line. False: there is no such line."""
+        found = [one for one in self.lines if one.engine.name == line]
+        for one in found:
+            one.watcher = watcher
+        return bool(found)
 
     @property
     def enabled_devices(self) -> Sequence[Device]:
@@ -280,5 +292,5 @@ class Gateway:
             documents[f"lines/{engine.name}"] = line_document(engine, expected, now)
         for name, (line, device) in self._places.items():
             polls = line.engine.schedule.polls(device)
-            documents[f"devices/{name}"] = device_document(device, polls)
+            documents[f"devices/{name}"] = device_document(device, polls, now)
         return documents | {path: document() for path, document in self._documents.items()}

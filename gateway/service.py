@@ -5,7 +5,7 @@ import gc
 import signal
 import sys
 import time
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Coroutine, Mapping, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager
 from typing import Any
 
@@ -21,6 +21,7 @@ from gateway.line.duty import Duty
 from gateway.line.line import Line
 from gateway.northbound import Northbound, group_settings
 from gateway.northbound.session import off_loop
+from gateway.supervisor import Supervisor
 from gateway.tags import Sample
 
 log = structlog.get_logger("gateway")
@@ -45,25 +46,42 @@ async def run(config: Config, started: Callable[[], None] = lambda: None) -> Non
     sys.setswitchinterval(THREAD_SWITCH)
     gc.set_threshold(*GC_THRESHOLDS)
     stop = asyncio.Event()
+    supervisor = Supervisor()
     loop = asyncio.get_running_loop()
+
+    def end() -> None:
+        log.info("gateway stopping")
+        supervisor.stopping()
+        stop.set()
+
     for number in (signal.SIGTERM, signal.SIGINT):
-        loop.add_signal_handler(number, stop.set)
+        loop.add_signal_handler(number, end)
+    loop.add_signal_handler(signal.SIGHUP, end if sys.stderr.isatty() else _ignore_hangup)
     withheld: Mapping[str, str] = {}
-    while (now_withheld := await _serve(config, withheld, stop, started)) is not None:
-        withheld = now_withheld
-        gc.unfreeze()  # the tags of the ended gateway
-        gc.collect()
-        if withheld and len(withheld) == len(config.devices):
-            others = " and ".join(sorted(set(withheld.values())))
-            raise GatewayError(
-                f"gateway {others} serves every device of this file already: a device belongs to "
-                "one gateway, or to the gateways of one standby group"
-            )
-        log.warning("gateway starts over")  # the entry before says why
+    with supervisor.informed():
+        while (left := await _serve(config, withheld, stop, started, supervisor)) is not None:
+            withheld = left
+            gc.unfreeze()  # the tags of the ended gateway
+            gc.collect()
+            if withheld and len(withheld) == len(config.devices):
+                others = " and ".join(sorted(set(withheld.values())))
+                raise GatewayError(
+                    f"gateway {others} serves every device of this file already: a device belongs "
+                    "to one gateway, or to the gateways of one standby group"
+                )
+            log.warning("gateway starts over")  # the entry before says why
+
+
+def _ignore_hangup() -> None:
+    log.warning("signal ignored", signal="SIGHUP", so="a changed file counts after a restart")
 
 
 async def _serve(
-    file: Config, withheld: Mapping[str, str], stop: asyncio.Event, started: Callable[[], None]
+    file: Config,
+    withheld: Mapping[str, str],
+    stop: asyncio.Event,
+    started: Callable[[], None],
+    supervisor: Supervisor,
 ) -> Mapping[str, str] | None:
     """Runs one gateway until `stop`, or until another gateway serves devices of the file.
 
@@ -80,6 +98,7 @@ async def _serve(
     history = _history(config)
     northbound = _northbound(config, gateway, history)
     northbound.withhold(withheld)
+    web = _web(config, gateway, northbound, history)
     state_file = None if config.state_file is None else StateFile(config.state_file)
     if state_file is not None:
         state_file.restore(gateway.enabled_devices)
@@ -110,8 +129,13 @@ async def _serve(
         if exclusive.done():  # otherwise another process may have this file and these lines
             if history is not None:
                 history.start()
+            supervisor.ready()  # also a standby, and a client that waits for its router
+            supervisor.says("waiting for the network, or as standby")
+            if web is not None:
+                _start_web(web, cleanup)
             await _first(active, zenoh, stopping, replaced)
             if active.done():
+                supervisor.says(f"serving {len(config.devices)} devices")
                 lines = await _start_lines(gateway, plans, history, state_file, cleanup)
         await _first(opened, zenoh, stopping, replaced)
         if opened.done():
@@ -140,6 +164,24 @@ def _northbound(config: Config, gateway: Gateway, history: Historian | None) -> 
     )
 
 
+def _web(
+    config: Config, gateway: Gateway, northbound: Northbound, history: Historian | None
+) -> Callable[[], Coroutine[Any, Any, None]] | None:
+    """Returns the program of the HTTP side; None without `web` in the file."""
+    if config.web is None:
+        return None
+    from gateway.web.server import Server  # imported only here: it costs time and memory
+    from gateway.web.sources import Sources
+
+    sources = Sources(gateway, northbound, history, northbound.opened.is_set)
+    return Server(config.web, sources).run
+
+
+def _start_web(web: Callable[[], Coroutine[Any, Any, None]], cleanup: AsyncExitStack) -> None:
+    serving = asyncio.create_task(web(), name="web")
+    cleanup.push_async_callback(_end, [serving])
+
+
 def _plan_lines(gateway: Gateway, cleanup: AsyncExitStack) -> list[asyncio.Task[None]]:
     """Plans the lines one after another, beside the event loop: each may run once it is planned."""
     turn = asyncio.Lock()
@@ -165,6 +207,7 @@ async def _start_lines(
     state_file: StateFile | None,
     cleanup: AsyncExitStack,
 ) -> list[asyncio.Task[None]]:
+    gateway.begin()
     if history is not None:
         history.record(gateway.mirror.samples())  # "starting" marks the restart
     if state_file is not None:

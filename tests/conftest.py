@@ -2,7 +2,9 @@
 
 import os
 import shutil
+import sys
 from collections.abc import Callable, Coroutine
+from pathlib import Path
 from typing import Any, NoReturn
 
 import pytest
@@ -18,7 +20,8 @@ def run_virtual() -> Callable[[Coroutine[Any, Any, Any]], Any]:
 
 def needs(program: str) -> str:
     """Returns the path of a program that a test needs (see `lacking`)."""
-    places = f"{os.environ.get('PATH', '')}:/usr/sbin:/usr/local/sbin"
+    own = Path(sys.executable).parent  # programs that pip installs
+    places = f"{own}:{os.environ.get('PATH', '')}:/usr/sbin:/usr/local/sbin"
     return shutil.which(program, path=places) or lacking(f"{program} is not installed")
 
 

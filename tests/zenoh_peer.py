@@ -423,7 +423,7 @@ def _execute(session: zenoh.Session, kept: list[object], request: dict[str, Any]
     return None
 
 
-def _configured(setup: dict[str, Any]) -> zenoh.Config:
+def configured(setup: dict[str, Any]) -> zenoh.Config:
     config = zenoh.Config()
     settings = {
         "mode": setup["mode"],
@@ -449,7 +449,7 @@ def _configured(setup: dict[str, Any]) -> zenoh.Config:
 
 def main() -> None:
     kept: list[object] = []
-    with zenoh.open(_configured(json.loads(sys.argv[1]))) as session:
+    with zenoh.open(configured(json.loads(sys.argv[1]))) as session:
         for line in sys.stdin:
             request = json.loads(line)
             try:

@@ -1,7 +1,7 @@
 """The `check` command: validates the file and prints the plan of each line."""
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Annotated
 
 import typer
@@ -12,10 +12,12 @@ from rich.text import Text
 from gateway import app, northbound
 from gateway.cli.progress import progress
 from gateway.cli.terminal import FAILED, ConfigPath, err, out
-from gateway.config import Config, load
+from gateway.config import Config, load, state_folder
 from gateway.engine.forecast import LineForecast
+from gateway.history.place import trouble
 from gateway.planning.planner import describe
 from gateway.planning.wire_timing import NETWORK_BAUD, WireTiming
+from gateway.web import exposure
 
 
 def check(
@@ -31,31 +33,58 @@ def check(
     """Validate the file and print the plan of each line. Sends nothing."""
     with progress(err) as report:
         loaded = load(config, report)
-        warnings = northbound.check(loaded)
+        warnings = northbound.check(loaded) + exposure.check(loaded)
         lines = app.forecasts(loaded, report)
     few = sum(len(line.blocks) for line in lines) <= 100
     out.print(plan(lines, every_block=few if blocks is None else blocks))
-    for tag in (tag for device in loaded.devices for tag in device.tags):
-        if tag.write is not None and tag.address.bit is not None:
-            err.print(
-                f"note: writing {tag.key} ({tag.text}) reads the word, changes one bit and writes "
-                "the word back; changes by the PLC in between are lost"
-            )
-    for tag in (tag for device in loaded.devices for tag in device.tags):
-        if (limit := tag.exact_below) is not None:
-            err.print(
-                f"note: {tag.key} ({tag.text}): a JSON number has 53 bits. Beyond {limit:.4g}"
-                " either way two values of the device can look equal, and a write can be one"
-                " step off"
-            )
+    for note in _notes(loaded):
+        err.print(f"note: {note}")
     for line in lines:
         if line.overloaded:
             err.print(f"warning: {line.advice()}")
     for warning in warnings:
         err.print(f"warning: {warning}")
+    if unwritable := list(_unwritable(loaded)):
+        for sentence in unwritable:
+            err.print(f"error: {sentence}")
+        sys.exit(FAILED)
     print(f"{config}: good, {size(loaded)}")
     if strict and any(line.overloaded for line in lines):
         sys.exit(FAILED)
+
+
+def _notes(config: Config) -> Iterator[str]:
+    tags = [tag for device in config.devices for tag in device.tags]
+    for tag in tags:
+        if tag.write is not None and tag.address.bit is not None:
+            yield (
+                f"writing {tag.key} ({tag.text}) reads the word, changes one bit and writes "
+                "the word back; changes by the PLC in between are lost"
+            )
+    for tag in tags:
+        if (limit := tag.exact_below) is not None:
+            yield (
+                f"{tag.key} ({tag.text}): a JSON number has 53 bits. Beyond {limit:.4g}"
+                " either way two values of the device can look equal, and a write can be one"
+                " step off"
+            )
+    for sheet in config.sheets:
+        yield from (f"{sheet.file.name}: {note}" for note in sheet.notes)
+
+
+def _unwritable(config: Config) -> Iterator[str]:
+    """Yields a sentence for each file that the gateway could not write."""
+    kept = config.history
+    below = "set" if state_folder() else "not set"
+    for setting, file in (
+        ("history.path", None if kept is None else kept.path),
+        ("gateway.state", config.state_file),
+    ):
+        if file is not None and (why := trouble(file)) is not None:
+            yield (
+                f"{setting}: {file} cannot be written: {why}. Check as the user of the service, "
+                f"with its $STATE_DIRECTORY ({below} here)"
+            )
 
 
 def size(config: Config) -> str:

@@ -14,7 +14,7 @@ from gateway.engine.requests import CommandResult
 from gateway.engine.unsolicited import unsolicited_tags
 from gateway.errors import BadValue, LineDown
 from gateway.line import build
-from gateway.line.line import Line
+from gateway.line.line import Line, SampleSink
 from gateway.tags import Reason, Sample, Tag, WriteResult, bad
 from gateway.values import Value
 
@@ -77,6 +77,12 @@ async def _listen(once: _Once, unsolicited: AbstractSet[Tag]) -> None:
     with suppress(TimeoutError):
         async with asyncio.timeout(LISTEN_FOR):
             await once.all_heard.wait()
+
+
+async def follow(config: Config, sink: SampleSink) -> None:
+    """Reads all tags at their intervals until it is cancelled."""
+    lines = [build.line_of(line, line.devices, sink) for line in config.lines]
+    await asyncio.gather(*(line.run() for line in lines))
 
 
 async def write(config: Config, tag: Tag, value: Value) -> WriteResult:

@@ -7,20 +7,21 @@ import select
 import sys
 import threading
 import time
-from collections.abc import Callable, MutableMapping
+from collections.abc import Callable, MutableMapping, Sequence
+from contextlib import suppress
 from enum import StrEnum
 from typing import Any
 
 import structlog
+from structlog.typing import Processor
 
+from gateway.cli.repeats import Repeats
 from gateway.cli.terminal import printable
-from gateway.northbound.rate_limit import RateLimit
 
 log = structlog.get_logger("gateway.log")
 
 LIMIT = 10_000  # entries that wait while the reader of stderr stalls: 2 to 4 MB
-BURST = 20  # entries of one event and device at once
-EVERY = 60.0  # seconds between further ones
+FLUSH_EVERY = 1.0  # seconds: repeated entries may be due
 _END_WITHIN = 0.2  # seconds for the last entries
 
 
@@ -43,9 +44,14 @@ class QueuedHandler(logging.Handler):
     itself: the lock of `sys.stderr` would hold up the end of the process.
     """
 
-    def __init__(self, file: int) -> None:
+    def __init__(
+        self, file: int, processors: Sequence[Processor] = (), repeats: Repeats | None = None
+    ) -> None:
+        """`processors` render the entries of other libraries. `repeats` is flushed regularly."""
         super().__init__()
         self.dropped = 0
+        self._processors = processors
+        self._repeats = repeats
         self._file = file
         self._reported = 0
         self._queue: queue.Queue[str | None] = queue.Queue(LIMIT)
@@ -53,7 +59,16 @@ class QueuedHandler(logging.Handler):
         self._thread.start()
 
     def emit(self, record: logging.LogRecord) -> None:
-        self.write(self.format(record))
+        if isinstance(record.msg, _Rendered) or not self._processors:
+            self.write(record.getMessage())
+            return
+        entry: Any = {"event": record.getMessage(), "logger": record.name}
+        if record.exc_info:
+            entry["exc_info"] = record.exc_info
+        with suppress(structlog.DropEvent):
+            for processor in self._processors:
+                entry = processor(None, record.levelname.lower(), entry)
+            self.write(str(entry))
 
     def write(self, text: str) -> None:
         """Queues lines. Never blocks."""
@@ -72,7 +87,17 @@ class QueuedHandler(logging.Handler):
         super().close()
 
     def _run(self) -> None:
-        while (text := self._queue.get()) is not None:
+        flushed = time.monotonic()
+        while True:
+            if self._repeats is not None and time.monotonic() - flushed >= FLUSH_EVERY:
+                self._repeats.flush()
+                flushed = time.monotonic()
+            try:
+                text = self._queue.get(timeout=FLUSH_EVERY)
+            except queue.Empty:
+                continue
+            if text is None:
+                return
             try:
                 self._write_all(f"{text}\n".encode(errors="backslashreplace"))
             except OSError:  # the reader has gone, or the disk is full
@@ -90,30 +115,6 @@ class QueuedHandler(logging.Handler):
                 select.select((), (self._file,), ())
 
 
-class Repeats:
-    """Drops entries of one event and device that come too fast, and counts them in the next one.
-
-    A bad line makes several entries a second: hundreds of megabytes a day for some devices.
-    """
-
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        self._clock = clock
-        self._limits: dict[tuple[object, ...], RateLimit] = {}
-
-    def __call__(
-        self, _logger: object, _method: str, event: MutableMapping[str, Any]
-    ) -> MutableMapping[str, Any]:
-        source = event.get("line"), event.get("device")
-        if source == (None, None):
-            return event
-        limit = self._limits.setdefault((event["event"], *source), RateLimit(BURST, EVERY))
-        if not limit.allows(self._clock()):
-            raise structlog.DropEvent
-        if unlogged := limit.newly_suppressed():
-            event["unlogged"] = unlogged
-        return event
-
-
 def _without_control_characters(
     _logger: object, _method: str, event: MutableMapping[str, Any]
 ) -> MutableMapping[str, Any]:
@@ -124,32 +125,56 @@ def _without_control_characters(
     return event
 
 
+class _Rendered(str):
+    """A line of the log: what other libraries log is none yet."""
+
+    __slots__ = ()
+
+
 def set_up(form: LogFormat, level: LogLevel) -> Callable[[str], None]:
     """Logs to stderr: text for people, or one JSON document per line for programs.
 
-    Returns a function that writes lines for people between the log entries.
+    Also warnings of Python and of libraries; with JSON also crashes. Returns a function that writes
+    lines for people between the log entries.
     """
-    handler = QueuedHandler(sys.stderr.fileno())
-    logging.basicConfig(
-        format="%(message)s", handlers=[handler], level=getattr(logging, level.upper())
-    )
     render = (
-        structlog.processors.JSONRenderer()
+        structlog.processors.JSONRenderer(default=str)
         if form is LogFormat.JSON
         else structlog.dev.ConsoleRenderer(colors=sys.stderr.isatty())
     )
+    repeats = None if level is LogLevel.DEBUG else Repeats()
+    processors: list[Processor] = [
+        *([] if repeats is None else [repeats]),
+        structlog.stdlib.add_log_level,
+        structlog.processors.TimeStamper(fmt="iso", utc=True),
+        _without_control_characters,
+        structlog.processors.format_exc_info,
+        lambda logger, method, event: _Rendered(render(logger, method, event)),
+    ]
+    handler = QueuedHandler(sys.stderr.fileno(), processors, repeats)
+    logging.basicConfig(handlers=[handler], level=getattr(logging, level.upper()))
+    logging.captureWarnings(True)
     structlog.configure(
-        processors=[
-            structlog.stdlib.filter_by_level,
-            *([] if level is LogLevel.DEBUG else [Repeats()]),
-            structlog.stdlib.add_log_level,
-            structlog.processors.TimeStamper(fmt="iso", utc=True),
-            _without_control_characters,
-            structlog.processors.format_exc_info,
-            render,
-        ],
+        processors=[structlog.stdlib.filter_by_level, *processors],
         logger_factory=structlog.stdlib.LoggerFactory(),
         wrapper_class=structlog.stdlib.BoundLogger,
         cache_logger_on_first_use=True,
     )
+    if form is LogFormat.JSON:
+        _log_crashes()
     return handler.write
+
+
+def _log_crashes() -> None:
+    """Python itself would print a trace of many lines."""
+
+    def of_thread(crash: threading.ExceptHookArgs) -> None:
+        if crash.exc_type is not SystemExit:
+            log.critical("thread crashed", exc_info=crash.exc_value)
+
+    def of_cleanup(crash: "sys.UnraisableHookArgs") -> None:
+        log.error("cleanup failed", exc_info=crash.exc_value, of=repr(crash.object))
+
+    sys.excepthook = lambda _kind, crash, _trace: log.critical("gateway crashed", exc_info=crash)
+    threading.excepthook = of_thread
+    sys.unraisablehook = of_cleanup

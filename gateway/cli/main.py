@@ -11,7 +11,22 @@ from typing import Annotated, NoReturn
 import typer
 
 from gateway import __version__
-from gateway.cli import check, control, read, run, scan_command, simulate, status, watch, write
+from gateway.cli import (
+    backup,
+    check,
+    control,
+    export,
+    import_command,
+    new,
+    peek,
+    read,
+    run,
+    scan_command,
+    simulate,
+    status,
+    watch,
+    write,
+)
 from gateway.cli.terminal import FAILED, USER_MISTAKE, end
 from gateway.config import schema as config_schema
 from gateway.errors import BadValue, ConfigError, GatewayError
@@ -86,9 +101,14 @@ cli.command(context_settings={"ignore_unknown_options": True})(write.write)
 cli.command(context_settings={"ignore_unknown_options": True})(control.control)
 cli.command()(watch.watch)
 cli.command()(scan_command.scan)
+cli.command()(peek.peek)
+cli.command()(new.new)
+cli.command("import")(import_command.import_)
+cli.command()(export.export)
 cli.command()(simulate.simulate)
 cli.command()(status.status)
 cli.command()(status.health)
+cli.command()(backup.backup)
 
 
 @cli.command()

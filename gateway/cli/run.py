@@ -7,20 +7,25 @@ import shlex
 import shutil
 import sys
 import threading
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
+import structlog
 import typer
 
-from gateway import service
+from gateway import __version__, service
 from gateway.cli.check import size
 from gateway.cli.logs import LogFormat, LogLevel, set_up
 from gateway.cli.progress import progress
-from gateway.cli.terminal import ConfigPath, err
+from gateway.cli.terminal import FAILED, USER_MISTAKE, ConfigPath, err
 from gateway.config import Config, load
+from gateway.errors import ConfigError, GatewayError
 from gateway.tags import Tag, WriteRule
 from gateway.transport.loop import new_event_loop
 from gateway.values import Kind
+
+log = structlog.get_logger("gateway")
 
 
 def run(
@@ -31,13 +36,35 @@ def run(
     log_level: Annotated[LogLevel, typer.Option(help="debug shows every byte")] = LogLevel.INFO,
 ) -> None:
     """Run the service: poll, publish on Zenoh, accept writes. SIGTERM or Ctrl-C ends it."""
-    with progress(err) as report:
-        loaded = load(config, report)
-    say = set_up(log_format, log_level)
-    hint = next_steps(loaded, config, program())
-    with asyncio.Runner(loop_factory=new_event_loop) as runner:
-        runner.run(service.run(loaded, lambda: say(hint)))
+    if log_format is LogFormat.TEXT:
+        with progress(err) as report:
+            loaded = load(config, report)
+        _serve(loaded, config, set_up(log_format, log_level))
+    else:
+        set_up(log_format, log_level)  # first: a mistake in the file is a document too
+        try:
+            _serve(load(config), config, lambda _text: None)
+        except GatewayError as error:
+            for sentence in str(error).splitlines():
+                log.error("gateway failed", why=sentence)  # noqa: TRY400  (a sentence, no trace)
+            sys.exit(USER_MISTAKE if isinstance(error, ConfigError) else FAILED)
     end_beside_zenoh()
+
+
+def _serve(config: Config, path: Path, say: Callable[[str], None]) -> None:
+    tags = sum(len(device.tags) for device in config.devices)
+    log.info(
+        "gateway starting",
+        version=__version__,
+        file=str(path),
+        name=config.name,
+        lines=len(config.lines),
+        tags=tags,
+    )
+    hint = next_steps(config, path, program())
+    with asyncio.Runner(loop_factory=new_event_loop) as runner:
+        runner.run(service.run(config, lambda: say(hint)))
+    log.info("gateway stopped")
 
 
 def end_beside_zenoh() -> None:
@@ -69,7 +96,8 @@ def next_steps(config: Config, path: Path, command: str) -> str:
     ]
     if tags:
         lines.append(f"  {command} read {file} {tags[0].key}")
-    for tag in tags:
+    simulated = (tag for line in config.lines if line.simulated for tag in line.tags)
+    for tag in simulated:  # a proposed write must move no machine
         if tag.write is not None:
             lines.append(f"  {command} write {file} {tag.key} {_example(tag)}")
             break

@@ -91,8 +91,8 @@ def planned(
 ) -> Plan:
     """Parses the options of the command. Raises `ConfigError`."""
     where, hints = parse_port(port), _hints(protocol)
-    numbers = list(hints.stations if stations is None else dict.fromkeys(_numbers(stations)))
-    drivers = [driver for number in numbers for driver, _ in variants(protocol, number)]
+    asked = list(hints.stations if stations is None else dict.fromkeys(numbers(stations)))
+    drivers = [driver for number in asked for driver, _ in variants(protocol, number)]
     if isinstance(where, SimulatorAddress):
         raise ConfigError("simulated PLCs need no scan: the file lists them")
     if drivers[0].traits.over_network and not isinstance(where, TcpAddress):
@@ -110,10 +110,10 @@ def planned(
     async def open_it(settings: SerialSettings | None, receiver: Receiver) -> Port:
         return await open_port(where, settings or SerialSettings(), receiver)
 
-    return Plan(open_it, protocol, numbers, serial, parsers.duration(timeout))
+    return Plan(open_it, protocol, asked, serial, parsers.duration(timeout))
 
 
-def _numbers(text: str) -> Iterator[int]:
+def numbers(text: str) -> Iterator[int]:
     """Parses `1-31,40`."""
     for part in text.split(","):
         begin, dash, end = part.partition("-")

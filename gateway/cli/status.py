@@ -15,10 +15,10 @@ from rich.table import Table
 from rich.text import Text
 
 from gateway.cli.client import Client, connected
-from gateway.cli.faults import Documents, below, faults, warnings
 from gateway.cli.terminal import FAILED, AsJson, ConfigPath, err, out, printable
 from gateway.config import load
 from gateway.errors import GatewayError
+from gateway.northbound.faults import Documents, below, faults, warnings
 
 EVERY = 1.0  # seconds between two views of --watch
 HOUR = "now(-1h)"

@@ -1,14 +1,15 @@
 """The configuration: one YAML file, checked as a whole, every mistake named with its line."""
 
 import gc
-from collections.abc import Callable, Iterator
+import os
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
 from gateway.config.build import Builder
 from gateway.config.file_rules import check_files
-from gateway.config.messages import ConfigErrors
+from gateway.config.messages import ConfigErrors, Mistakes, OptionPlaces
 from gateway.config.records import (
     Config,
     HistoryConfig,
@@ -19,6 +20,7 @@ from gateway.config.records import (
     ZenohMode,
 )
 from gateway.config.schema import schema
+from gateway.config.sheet_tags import SheetUse
 from gateway.config.yaml_file import read_yaml
 
 __all__ = [
@@ -28,33 +30,60 @@ __all__ = [
     "LineConfig",
     "TlsConfig",
     "WebConfig",
+    "SheetUse",
     "ZenohConfig",
     "ZenohMode",
+    "built",
     "load",
+    "state_folder",
     "schema",
 ]
 
+STATE_VARIABLE = "STATE_DIRECTORY"  # systemd sets it, with one or more folders
 # Settings that are texts even where YAML sees a number: `7E1`, `40101`, `unit: 1`.
 _TEXTS = frozenset({"address", "description", "format", "name", "port", "prefix", "unit"})
 
 
-def load(path: str | Path, report: Callable[[str, float], None] | None = None) -> Config:
-    """Reads and checks the file. Paths in it are relative to its folder.
+def load(
+    path: str | Path,
+    report: Callable[[str, float], None] | None = None,
+    imports: Mapping[str, Path] | None = None,
+) -> Config:
+    """Reads and checks the file. Paths in it are relative to its folder; those of files that the
+    gateway writes are relative to `state_folder()`, if there is one.
 
-    `report` receives the name of each step and the share of it that is done. Raises `ConfigErrors`
-    with every mistake.
+    `report` receives the name of each step and the share of it that is done. `imports`: a sheet
+    with more tags, by device. Raises `ConfigErrors` with every mistake.
     """
     read = None if report is None else partial(report, f"reading {Path(path).name}")
     checked = None if report is None else partial(report, "checking the tags")
     with _without_gc():
         file, mistakes = read_yaml(Path(path), _TEXTS, read)
-        config = Builder(mistakes, Path(path).parent, checked).config(file.data)
+        builder = Builder(mistakes, Path(path).parent, state_folder(), checked, imports or {})
+        config = builder.config(file.data)
         if config is not None:
             check_files(config, Path(path), mistakes)
     mistakes.raise_all()
     if config is None:
         raise AssertionError(f"{path}: no configuration, and no mistake either")
     return config
+
+
+def built(data: Mapping[str, object], folder: Path | None = None) -> Config:
+    """Returns the configuration of data that is in no file. Raises `ConfigErrors`."""
+    mistakes = Mistakes(OptionPlaces())
+    config = Builder(mistakes, folder or Path()).config(data)
+    mistakes.raise_all()
+    if config is None:
+        raise AssertionError(f"{data}: no configuration, and no mistake either")
+    return config
+
+
+def state_folder() -> Path | None:
+    """Returns the folder for the files that the gateway writes: systemd's StateDirectory, or that
+    of a container. None: beside the configuration file."""
+    first = os.environ.get(STATE_VARIABLE, "").partition(":")[0]
+    return Path(first) if first else None
 
 
 @contextmanager

@@ -25,6 +25,7 @@ from gateway.config.records import (
     ZenohConfig,
     ZenohMode,
 )
+from gateway.config.sheet_tags import SheetTags
 from gateway.config.tag_rules import inherit
 from gateway.config.validate import (
     driver_of,
@@ -39,20 +40,27 @@ from gateway.protocols.driver import AnyDriver, Timing
 from gateway.protocols.registry import PROTOCOLS
 from gateway.transport.port import SerialPath
 
+STATE_FILE = FilePath("state.json")  # where there is a folder for it
+
 
 @dataclass(slots=True)
 class Builder:
-    """Builds one `Config`. Paths in the file are relative to `folder`."""
+    """Builds one `Config`. Paths in the file are relative to `folder`; those of the files that the
+    gateway writes to `state_folder`, if there is one."""
 
     mistakes: Mistakes
     folder: FilePath
+    state_folder: FilePath | None = None
     report: Callable[[float], None] | None = None  # receives the share of the devices that is built
+    imports: Mapping[str, FilePath] = field(default_factory=dict)  # one more sheet of a device
     _devices: dict[str, str] = field(default_factory=dict)  # name -> its line
     _count: int = 0  # devices in the file
     _tags: DeviceTags = field(init=False)
+    _sheets: SheetTags = field(init=False)
 
     def __post_init__(self) -> None:
         self._tags = DeviceTags(self.mistakes)
+        self._sheets = SheetTags(self.mistakes, self.folder)
 
     def config(self, data: Mapping[str, Any]) -> Config | None:
         """Returns the whole file; None, after mistakes, where no part could be made."""
@@ -74,15 +82,16 @@ class Builder:
         self._check_history(top)
         return Config(
             name=top.gateway.name,
-            state_file=None if top.gateway.state is None else self.folder / top.gateway.state,
+            state_file=self._state_file(top),
             standby=top.gateway.standby,
             standby_alone=top.gateway.standby_alone,
             secret_file=self._file(top.gateway.secret_file, ("gateway", "secret_file")),
             writers_file=self._file(top.writers.file, ("writers", "file")) if top.writers else None,
             zenoh=self._zenoh(top),
             history=self._history(top),
-            web=WebConfig(host=top.web.listen[0], port=top.web.listen[1]) if top.web else None,
+            web=self._web(top),
             lines=tuple(lines),
+            sheets=tuple(self._sheets.used),
         )
 
     def _line(self, name: str, raw: object, path: Path, outer: TagDefaults) -> LineConfig | None:
@@ -133,6 +142,10 @@ class Builder:
         driver = self._driver(raw.get("protocol"), own, path)
         defaults = self._defaults(raw, path, outer)
         tags = self._tags.build(name, raw.get("tags"), (*path, "tags"), defaults, driver)
+        own_sheet = None if settings is None else settings.tags_from
+        for sheet in filter(None, (own_sheet, self.imports.get(name))):
+            place, taken = (*path, "tags_from"), {tag.name for tag in tags}
+            tags += self._sheets.build(name, sheet, place, defaults, driver, taken)
         if settings is None or driver is None:
             return None
         default = driver.timing
@@ -142,6 +155,7 @@ class Builder:
             silence=_either(settings.silence, default.silence),
             silence_chars=default.silence_chars,
             retries=default.retries if settings.retries is None else settings.retries,
+            learn_silence=default.learn_silence and settings.silence is None,
         )
         return DeviceSettings(
             name=name,
@@ -202,16 +216,17 @@ class Builder:
                 )
 
     def _check_history(self, top: FileSection) -> None:
-        if self._tags.recorded is not None and top.history is None:
+        recorded = self._tags.recorded or self._sheets.recorded
+        if recorded is not None and top.history is None:
             self.mistakes.add(
-                (*self._tags.recorded, "history"),
+                (*recorded, "history"),
                 "the file has no `history:` section: write `history: {path: history.db}` beside "
                 "`lines:`",
             )
-        if top.history is None or top.gateway.state is None:
+        state = self._state_file(top)
+        if top.history is None or state is None:
             return
-        history, state = self.folder / top.history.path, self.folder / top.gateway.state
-        if realpath(history) == realpath(state):
+        if realpath(self._written(top.history.path)) == realpath(state):
             self.mistakes.add(
                 ("gateway", "state"),
                 f"history is kept in {top.history.path}: two files are needed, such as "
@@ -250,11 +265,39 @@ class Builder:
             self.mistakes.add(path, f"there is no file {file}")
         return file
 
+    def _written(self, name: FilePath) -> FilePath:
+        """Returns the path of a file that the gateway writes."""
+        return (self.state_folder or self.folder) / name
+
+    def _state_file(self, top: FileSection) -> FilePath | None:
+        name = top.gateway.state
+        if name is None and self.state_folder is not None:
+            name = STATE_FILE
+        return None if name is None else self._written(name)
+
+    def _web(self, top: FileSection) -> WebConfig | None:
+        if top.web is None:
+            return None
+        (host, port), place = top.web.listen, ("web", "tokens_file")
+        web = WebConfig(
+            host=host,
+            port=port,
+            tokens_file=self._file(top.web.tokens_file, place),
+            names=tuple(top.web.names),
+        )
+        if web.tokens_file is None and not web.is_local:
+            self.mistakes.add(
+                ("web", "listen"),
+                f"other machines can reach {host}: name a tokens_file too (see docs/page.md), or "
+                f"listen on 127.0.0.1:{port}",
+            )
+        return web
+
     def _history(self, top: FileSection) -> HistoryConfig | None:
         if top.history is None:
             return None
         return HistoryConfig(
-            path=self.folder / top.history.path,
+            path=self._written(top.history.path),
             keep=top.history.keep,
             max_size=top.history.max_size,
         )

@@ -46,11 +46,13 @@ def _read(config: Config, own: FilePath) -> Iterator[tuple[str, FilePath]]:
         "zenoh.users_file": zenoh.users_file,
         "writers.file": config.writers_file,
         "gateway.secret_file": config.secret_file,
+        "web.tokens_file": None if config.web is None else config.web.tokens_file,
     }
     if tls is not None:
         files |= {"zenoh.tls.ca": tls.ca, "zenoh.tls.key": tls.key}
         files |= {"zenoh.tls.certificate": tls.certificate}
     yield from ((what, file) for what, file in files.items() if file is not None)
+    yield from (("a sheet of tags", sheet.file) for sheet in config.sheets)
 
 
 def _same(file: FilePath, other: FilePath) -> bool:

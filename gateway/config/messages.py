@@ -16,11 +16,15 @@ _MEANT = re.compile(r"did you mean (\w+)\?")
 
 
 class ConfigErrors(ConfigError):
-    """Every mistake of one file. `messages` are `file:line: path: mistake`, by line."""
+    """Every mistake of one file. `messages` are `file:line: path: mistake`, by line.
 
-    def __init__(self, messages: Sequence[str]) -> None:
+    `count`: of the mistakes; many alike have one message.
+    """
+
+    def __init__(self, messages: Sequence[str], count: int | None = None) -> None:
         super().__init__("\n".join(messages))
         self.messages = tuple(messages)
+        self.count = len(messages) if count is None else count
 
 
 class Places(Protocol):
@@ -32,11 +36,27 @@ class Places(Protocol):
     def line(self, path: Path) -> int:
         """Returns the line, from 1, of the deepest part of `path` in the file."""
 
+    def at(self, line: int, path: Path) -> str:
+        """Returns the beginning of a message: file, line and path, with a colon behind them."""
+
+
+class OptionPlaces:
+    """The places of settings that are options of a command."""
+
+    name = "options"
+
+    def line(self, path: Path) -> int:
+        return len(path)
+
+    def at(self, line: int, path: Path) -> str:
+        return f"{path[-1]}: " if path else ""
+
 
 class Mistake(NamedTuple):
     line: int
     path: Path
     what: str
+    begin: str = ""  # of the message; left out: from line and path
 
     @property
     def kind(self) -> tuple[object, str]:
@@ -50,35 +70,47 @@ class Mistakes:
 
     places: Places
     _found: list[Mistake] = field(default_factory=list)
+    _others: list["Mistakes"] = field(default_factory=list)
 
     def add(self, path: Path, what: str) -> None:
         mistake = Mistake(self.places.line(path), path, what)
         if mistake not in self._found[-20:]:
             self._found.append(mistake)
 
+    def add_at(self, line: int, begin: str, what: str) -> None:
+        """Adds a mistake that has no path. `begin`: of its message."""
+        self._found.append(Mistake(line, (), what, begin))
+
+    def include(self, other: "Mistakes") -> None:
+        """Adds the mistakes of another file, after those of this one."""
+        self._others.append(other)
+
     def __len__(self) -> int:
-        return len(self._found)
+        return len(self._found) + sum(map(len, self._others))
 
     def raise_all(self) -> None:
         """Raises `ConfigErrors` if there was any mistake."""
-        if self._found:
-            raise ConfigErrors(list(self._messages()))
+        if len(self):
+            raise ConfigErrors(list(self._messages()), len(self))
 
     def _messages(self) -> Iterator[str]:
         """Yields the mistakes by line; of many alike the first ten, and the number of others."""
         misspelt = {
-            (*path[:-1], m[1]) for _, path, what in self._found if (m := _MEANT.search(what))
+            (*path[:-1], m[1]) for _, path, what, _ in self._found if (m := _MEANT.search(what))
         }
         kinds = defaultdict[object, list[Mistake]](list)
         for mistake in sorted(self._found, key=lambda mistake: mistake.line):
             if not (mistake.path in misspelt and mistake.what.startswith("missing")):
                 kinds[mistake.kind].append(mistake)
         shown = [m for alike in kinds.values() for m in alike[:MOST_ALIKE]]
-        for line, path, what in sorted(shown, key=lambda mistake: mistake.line):
-            yield f"{self.places.name}:{line}: {dotted(path) + ': ' if path else ''}{what}"
+        for line, path, what, begin in sorted(shown, key=lambda mistake: mistake.line):
+            yield f"{begin or self.places.at(line, path)}{what}"
         for alike in kinds.values():
             if more := alike[MOST_ALIKE:]:
-                yield f"{self.places.name}:{more[0].line}: {len(more)} more like: {alike[0].what}"
+                begin = self.places.at(more[0].line, ())
+                yield f"{begin}{len(more)} more like: {alike[0].what}"
+        for other in self._others:
+            yield from other._messages()
 
 
 def dotted(path: Path) -> str:

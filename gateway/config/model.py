@@ -32,6 +32,7 @@ from gateway.config.setting_types import (
     FilePath,
     Finite,
     Group,
+    HostName,
     Interval,
     Name,
     OrderName,
@@ -62,7 +63,7 @@ class GatewaySection(Section):
     name: Name = "gateway"
     """The chunk of this gateway in the keys."""
     state: FilePath | None = None
-    """The file that keeps learned properties of the devices (refused addresses) across restarts."""
+    """Keeps refused addresses across restarts; with $STATE_DIRECTORY left out: state.json there."""
     standby: Group | None = None
     """A name shared by two gateways of one plant: one is active, the other is the standby."""
     standby_alone: Interval | None = None
@@ -140,7 +141,7 @@ class HistorySection(Section):
     """Samples kept on disk, for tags with `history: true`."""
 
     path: FilePath = Path("history.db")
-    """The SQLite file, relative to this file's folder."""
+    """The SQLite file, relative to $STATE_DIRECTORY, else to this file's folder."""
     keep: Interval = 7 * 86400.0
     """Older samples are deleted."""
     max_size: Annotated[
@@ -156,6 +157,10 @@ class WebSection(Section):
 
     listen: WebAddress = ("127.0.0.1", 8080)
     """The address of the page."""
+    tokens_file: FilePath | None = None
+    """One line `name:token` for each client; without it nothing can be written."""
+    names: list[HostName] = []
+    """Names of this machine in a browser's address, besides `localhost` and its host name."""
 
 
 class WriteSection(Section):
@@ -248,7 +253,7 @@ class DeviceSection(Section):
     turnaround: Duration | None = None
     """Usual time from request to reply; left out: measured."""
     silence: Duration | None = None
-    """Pause on the line before each request."""
+    """Pause on the line before each request; left out: learned, where no standard asks for it."""
     retries: Annotated[int, Field(ge=0, le=10)] | None = None
     """Repetitions of a failed read; writes are not repeated."""
     verify_reads: Annotated[int, Field(ge=1, le=3)] = 1
@@ -268,6 +273,8 @@ class DeviceSection(Section):
     defaults: dict[str, Any] = {}
     tags: dict[str, Any] = {}
     """The values of the device, by name."""
+    tags_from: FilePath | None = None
+    """A sheet with more tags of the device, CSV or .xlsx: docs/import.md."""
 
 
 class LineSection(Section):

@@ -23,6 +23,7 @@ SECONDS = {"ms": 0.001, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
 _SIZE = re.compile(r"([0-9]+(?:\.[0-9]+)?) ?([kKMGT]B)\Z")
 BYTES = {"kB": 10**3, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
 _PERCENT = re.compile(r"([0-9]+(?:\.[0-9]+)?) ?%\Z")
+_HOST_NAME = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]*[A-Za-z0-9])?\Z")
 _WEB = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[^\[\]/:\s]+):([0-9]{1,5})\Z")
 _ENDPOINT = re.compile(r"[a-z][a-z0-9_-]*/[^\s/]\S*\Z")
 _WITH_PORT = ("tcp", "udp", "tls", "quic", "ws")
@@ -172,6 +173,15 @@ def web_address(text: object) -> tuple[str, int]:
     if match is None or not 1 <= int(match[2]) <= 65535:
         raise ConfigError(f"{shown(text)} is no address to listen on: write 127.0.0.1:8080")
     return match[1].strip("[]"), int(match[2])
+
+
+def host_name(text: object) -> str:
+    """Parses `gateway.plant`, the name of a machine, in lower case."""
+    if not isinstance(text, str) or not _HOST_NAME.match(text):
+        raise ConfigError(
+            f"{shown(text)} is no name of a machine: write gateway.plant, without a port"
+        )
+    return text.lower()
 
 
 def every_digit(written: object, as_float: Callable[[object], float]) -> float:

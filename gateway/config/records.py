@@ -3,8 +3,10 @@
 from collections.abc import Container
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from ipaddress import ip_address
 from pathlib import Path
 
+from gateway.config.sheet_tags import SheetUse
 from gateway.engine.device import DeviceSettings
 from gateway.planning.wire_timing import WireTiming
 from gateway.tags import Tag
@@ -58,10 +60,20 @@ class HistoryConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WebConfig:
-    """The address of the status page."""
+    """The address of the status page, and who may use it."""
 
     host: str
     port: int
+    tokens_file: Path | None = None  # None: nothing can be written
+    names: tuple[str, ...] = ()  # of this machine, in the address of a browser
+
+    @property
+    def is_local(self) -> bool:
+        """True if other machines cannot reach the address."""
+        try:
+            return ip_address(self.host).is_loopback
+        except ValueError:
+            return self.host == "localhost"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -98,6 +110,7 @@ class Config:
     history: HistoryConfig | None
     web: WebConfig | None
     lines: tuple[LineConfig, ...]
+    sheets: tuple[SheetUse, ...] = ()  # files that the tags of some devices come from
 
     @property
     def devices(self) -> tuple[DeviceSettings, ...]:

@@ -83,6 +83,11 @@ WebAddress = Annotated[
     PlainValidator(parsers.web_address),
     WithJsonSchema({"type": "string", "pattern": f"^{_HOST}:[0-9]{{1,5}}$"}),
 ]
+HostName = Annotated[
+    str,
+    PlainValidator(parsers.host_name),
+    WithJsonSchema({"type": "string", "pattern": r"^[A-Za-z0-9]([A-Za-z0-9.-]*[A-Za-z0-9])?$"}),
+]
 FilePath = Annotated[Path, PlainValidator(parsers.path), WithJsonSchema({"type": "string"})]
 OrderName = Annotated[Order, PlainValidator(parsers.order), WithJsonSchema(_ORDER_SCHEMA)]
 Endpoint = Annotated[str, PlainValidator(parsers.endpoint), WithJsonSchema(_ENDPOINT_SCHEMA)]

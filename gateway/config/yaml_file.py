@@ -12,7 +12,7 @@ from typing import Any
 
 import yaml
 
-from gateway.config.messages import ConfigErrors, Mistakes, Path
+from gateway.config.messages import ConfigErrors, Mistakes, Path, dotted
 from gateway.config.yaml_events import plain_data
 from gateway.config.yaml_scalars import scalar
 
@@ -93,6 +93,9 @@ class YamlFile:
                 break
         return _line(mark)
 
+    def at(self, line: int, path: Path) -> str:
+        return f"{self.name}:{line}: {dotted(path) + ': ' if path else ''}"
+
     def read(self, mistakes: Mistakes, report: Callable[[float], None] | None = None) -> None:
         """Fills `data`, and notes YAML that a configuration must not use.
 
@@ -105,7 +108,7 @@ class YamlFile:
 
     def _tree(self) -> yaml.MappingNode:
         if self._root is None:
-            self._root = _compose(self.name, self.text)
+            self._root = compose(self.name, self.text)
         return self._root
 
     def _plain(self, node: yaml.Node, path: Path, mistakes: Mistakes) -> Any:
@@ -196,7 +199,8 @@ def read_yaml(
     return file, mistakes
 
 
-def _compose(name: str, text: str) -> yaml.MappingNode:
+def compose(name: str, text: str) -> yaml.MappingNode:
+    """Returns the tree of a file. Raises `ConfigErrors` with the place of a mistake."""
     try:
         root = yaml.compose(text.encode(), Loader=_LOADER)
     except yaml.MarkedYAMLError as error:

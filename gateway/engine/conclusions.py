@@ -26,6 +26,7 @@ from gateway.engine.poll_results import PollResults
 from gateway.engine.request_results import RequestResults
 from gateway.engine.requests import Command, Write
 from gateway.engine.results import Results
+from gateway.engine.shorter_silences import ShorterSilences
 from gateway.engine.together import Together
 from gateway.errors import BadValue, DeviceError, Garbled, LineDown, Refused, Unclear, Unsteady
 
@@ -45,11 +46,13 @@ class Conclusions:
         results: Results,
         polls: PollResults,
         requests: RequestResults,
+        shorter: ShorterSilences,
         effects: Effects,
         gap: float,
     ) -> None:
         """`gap`: seconds without a byte that end a run of noise."""
         self.silence = LineSilence()
+        self.shorter = shorter
         self.together = Together(effects)
         self._in_flight = in_flight
         self._results = results

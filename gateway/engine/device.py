@@ -9,6 +9,7 @@ from gateway.engine.health import Health, State, diagnosis
 from gateway.engine.monitor_list import MonitorList
 from gateway.engine.records import Record
 from gateway.engine.reply_shapes import ReplyShapes, reply_shapes
+from gateway.engine.station_silence import StationSilence
 from gateway.engine.turnaround import Turnaround
 from gateway.errors import LineDown
 from gateway.planning.bad_addresses import RETRIES, BadAddresses
@@ -60,7 +61,7 @@ class Device:
     last_read: Span | None = None  # the last block that was read
     monitor: MonitorList = field(default_factory=MonitorList)
     window: int = field(init=False)  # requests that may be outstanding at once
-    silence: float = field(init=False)  # seconds before each request
+    silence: StationSilence = field(init=False)
     shapes: ReplyShapes | None = field(init=False)  # None: no reply, or each has a number
     one_at_a_time: bool = False  # it loses requests that are sent together
     # Its recent use of the wire, to compare with that of other devices: the binary logarithm of
@@ -75,10 +76,12 @@ class Device:
         used = [driver.areas[tag.span.area] for tag in self.tags] or driver.areas.values()
         self.health = Health(answerable=any(area.readable for area in used))
         self.window = driver.window if isinstance(driver, Windowed) else 1
-        self.silence = self.wire.silence(self.timing)
         self.shapes = (
             None if self.broadcast else reply_shapes(driver, self.polled_tags, self.bad_addresses)
         )
+        safe = self.wire.silence(self.timing)
+        learns = self.timing.learn_silence and self.shapes is not None
+        self.silence = StationSilence(safe, min(safe, self.wire.character) if learns else safe)
         if plan_now:
             self.plan()
 
@@ -126,10 +129,12 @@ class Device:
     def diagnosis(self) -> str:
         """Returns the likely cause of its trouble as a sentence; empty when there is none."""
         driver = self.driver
-        if self.health.trouble is None and self.shapes is not None and self.shapes.answers_twice:
-            return ANSWERS_TWICE.format(station=driver.station)
-        if self.one_at_a_time and self.health.trouble is None:
-            return f"It takes one request at a time, not {self.window}: set `window: 1`"
+        if self.health.trouble is None:
+            if self.shapes is not None and self.shapes.answers_twice:
+                return ANSWERS_TWICE.format(station=driver.station)
+            if self.one_at_a_time:
+                return f"It takes one request at a time, not {self.window}: set `window: 1`"
+            return ""
         causes = driver.no_reply_causes if isinstance(driver, NoReplyCauses) else ""
         return diagnosis(self.health.trouble, causes)
 

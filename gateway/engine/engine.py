@@ -31,6 +31,7 @@ from gateway.engine.request_results import RequestResults
 from gateway.engine.requests import Request, Write, why_not_commanded
 from gateway.engine.results import Results, offline
 from gateway.engine.schedule import Schedule
+from gateway.engine.shorter_silences import ShorterSilences
 from gateway.engine.staleness import NEVER, Staleness
 from gateway.engine.stray import Stray
 from gateway.engine.unsolicited import UnsolicitedFrames
@@ -68,13 +69,23 @@ class Engine:
         gap = max(GAP, 4 * wire.character)
         requests = RequestResults(self.schedule, results, self._effects)
         self._conclusions = Conclusions(
-            self._in_flight, results, self._polls, requests, self._effects, gap
+            *(self._in_flight, results, self._polls, requests),
+            *(ShorterSilences(name, devices, self._effects), self._effects, gap),
         )
 
     # The cycle of the line
 
     def next(self, now: float) -> Job:
         """Returns the next job. All except `Idle` and `Reopen` are concluded before the next."""
+        shorter = self._conclusions.shorter
+        if shorter.suspects:
+            shorter.judge(now)
+        job = self._next(now)
+        if shorter.step:
+            shorter.before(job)
+        return job
+
+    def _next(self, now: float) -> Job:
         in_flight = self._in_flight
         if in_flight.continuation is not None:
             return in_flight.resume(now)
@@ -126,6 +137,7 @@ class Engine:
     ) -> list[Effect]:
         """Applies the result of a job. Polls of one transaction report its traffic once."""
         device, in_flight = job.device, self._in_flight
+        self._count_silence(job, result, traffic, now)
         self._count(device, traffic, now)
         if isinstance(job, Poll):
             in_flight.open_polls -= 1
@@ -153,6 +165,19 @@ class Engine:
             self._set_deadline()
         effects, self._effects.collected = self._effects.collected, []
         return effects
+
+    def _count_silence(self, job: Transacted, result: Result, traffic: Traffic, now: float) -> None:
+        shorter, device = self._conclusions.shorter, job.device
+        if isinstance(job, Poll) and not isinstance(result, Exception):
+            shorter.spoke = device
+            if traffic.silence < device.silence.tested_below:
+                shorter.answered += 1
+                if shorter.answered >= shorter.look_at:
+                    shorter.look(now)
+        else:
+            if isinstance(job, Poll):
+                shorter.failed(device, result, traffic.silence, now)
+            shorter.spoke = None
 
     def _count(self, device: Device, traffic: Traffic, now: float) -> None:
         characters = (traffic.sent + traffic.heard) * self.wire.character
@@ -200,6 +225,7 @@ class Engine:
     def received(self, data: bytes, now: float, time: int) -> list[Effect]:
         """Takes bytes that arrived outside of a transaction."""
         self.record.unasked += len(data)
+        self._conclusions.shorter.disturbed(now)
         self._stray.received(data, now, time)
         if self._unsolicited.speakers:
             self._conclusions.silence.heard()
@@ -216,6 +242,7 @@ class Engine:
         """
         if not echo:
             self._conclusions.silence.heard()
+            self._conclusions.shorter.disturbed(now)
         self._stray.unmatched(device, frame, now, time, echo=echo)
         self._unsolicited.unmatched(device, frame, now, time)
         self._set_deadline()
@@ -241,6 +268,7 @@ class Engine:
         self.record.since, self.record.trouble = now, ""
         self._in_flight.clear()
         self._conclusions.silence.opened()
+        self._conclusions.shorter.opened(now)
         for device in self.devices:
             device.restart()
         self.schedule.opened(now)

@@ -54,6 +54,7 @@ class Poll:
         """Forgets the last read, because its values turn bad. Returns their age."""
         age = 0.0 if self.last.at is None else now - self.last.at
         self.counts.worst_gap = max(self.counts.worst_gap, age)
+        self.device.record.was_good(self.last.at)
         self.last.at = self.last.scan = None
         return age
 
@@ -266,6 +267,7 @@ class Traffic:
     exchanges: int = 0  # requests with a reply
     turnaround: float = 0.0  # seconds of the station for them, without the characters
     extra: int = 0  # frames of the station that answered no request
+    silence: float = math.inf  # seconds before its request, the shortest of several
 
 
 @dataclass(frozen=True, slots=True)

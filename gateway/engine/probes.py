@@ -48,7 +48,7 @@ def _may_be_short(device: Device) -> bool:
 def probe_seconds(device: Device, timeout: float | None = None) -> float:
     """Returns the seconds of an unanswered probe. `timeout` None: a patient one."""
     wait = device.timing.reply_timeout if timeout is None else timeout
-    return device.silence + CHARACTERS * device.wire.character + wait
+    return device.silence.safe + CHARACTERS * device.wire.character + wait
 
 
 def seen_within(

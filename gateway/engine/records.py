@@ -32,6 +32,8 @@ class Record:
     heard: int = 0  # correct unsolicited frames
     overruns: int = 0  # polls that were skipped because the one before was late
     overdue: int = 0  # blocks whose values became too old
+    retries: int = 0  # failed reads that were repeated
+    last_good: float | None = None  # the last good read that a poll forgot, by the line's clock
     failures: Counter[str] = field(default_factory=Counter)  # by evidence
     refusals: Counter[str] = field(default_factory=Counter)  # by the code of the device
     turnaround: float | None = None  # measured
@@ -59,6 +61,14 @@ class Record:
 
     def count_refusal(self, error: Refused) -> None:
         self.refusals[error.code] += 1
+
+    def count_retry(self) -> None:
+        self.retries += 1
+
+    def was_good(self, at: float | None) -> None:
+        """Notes the last good read of a poll that forgets it."""
+        if at is not None:
+            self.last_good = at if self.last_good is None else max(at, self.last_good)
 
     def count_late(self) -> None:
         self.late += 1

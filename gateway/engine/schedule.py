@@ -274,6 +274,7 @@ class Schedule:
     def again(self, poll: Poll, when: float | None = None, *, counted: bool = True) -> None:
         """Polls again when the deadline is the earliest, or from `when` on."""
         poll.tries += counted
+        poll.device.record.count_retry()
         if when is not None:
             poll.due = when
         self._queue.push(poll)
@@ -296,6 +297,7 @@ class Schedule:
         for poll in self._polls[device]:
             poll.due = now
             poll.missed = 0
+            device.record.was_good(poll.last.at)
             poll.last.at = None
         self.plan(device, now)
         for poll in self._polls[device]:

@@ -79,6 +79,7 @@ class Historian:
         """The status document: `state` is `ok` or one sentence; counts since the start."""
         recent = self._recent
         oldest = min((run.first for run in recent.sorted_runs), default=None)
+        since = recent.waiting_since
         return {
             "state": self._writer.trouble
             or self._search.damage.sentence(recent.file, recent.sorted_runs)
@@ -86,6 +87,7 @@ class Historian:
             "recorded": recent.recorded,
             "stored": self._transfer.stored,
             "waiting": recent.waiting,
+            "lag": 0.0 if since is None else round(max(0, self._wall() - since) / 1e9, 3),
             "lost": recent.lost,
             "writes_stored": self._written.stored,
             "writes_lost": self._written.lost,

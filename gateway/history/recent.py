@@ -140,6 +140,15 @@ class Recent:
         with self._lock:
             return sum(len(run.samples) - run.stored for run in self._runs)
 
+    @property
+    def waiting_since(self) -> int | None:
+        """The time of the first sample that is not on disk yet, in ns since 1970."""
+        with self._lock:
+            for run in self._runs:
+                if run.stored < len(run.samples):
+                    return run.samples[run.stored].time
+        return None
+
     # -- the history thread --
 
     def close_old(self) -> None:

@@ -10,6 +10,7 @@ log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 
 PERIOD = 0.1  # seconds between two measurements: no stamp is newer by more than this
 NEVER = float("inf")
+JUMP = 0.5  # seconds between two measurements; a clock that is corrected slowly gains less
 HELD = 1.5  # seconds; a loop that is later by this much was held with its process
 
 
@@ -24,6 +25,7 @@ class ArrivalClock:
     def __init__(self, wall: Callable[[], int] = time.time_ns) -> None:
         """`wall`: ns since 1970."""
         self._wall = wall
+        self._ahead = 0  # ns, of the wall clock before the monotonic one
         self._due = NEVER  # the time of the next measurement
         self._behind = 0.0  # seconds, until that time
         self._released = -NEVER
@@ -35,6 +37,7 @@ class ArrivalClock:
         loop = asyncio.get_running_loop()
         self._now = loop.time
         self._due = loop.time() + PERIOD
+        self._ahead = self._wall() - time.monotonic_ns()
         self._timer = loop.call_at(self._due, self._measure, loop)
 
     def stop(self) -> None:
@@ -59,5 +62,17 @@ class ArrivalClock:
         if self._behind >= HELD:
             self._released = now
             log.warning("gateway stood still", seconds=round(self._behind, 1))
+        self._watch_wall()
         self._due = now + PERIOD
         self._timer = loop.call_at(self._due, self._measure, loop)
+
+    def _watch_wall(self) -> None:
+        """Logs a jump: time stamps before and after it do not belong together.
+
+        The loop's own clock may be that of the beginning of its turn.
+        """
+        ahead = self._wall() - time.monotonic_ns()
+        jump = (ahead - self._ahead) / 1e9
+        if abs(jump) >= JUMP:
+            log.warning("clock jumped", seconds=round(jump, 1), so="time stamps jump too")
+        self._ahead = ahead

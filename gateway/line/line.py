@@ -9,6 +9,7 @@ import random
 import time
 from collections.abc import Awaitable, Callable, Sequence
 from contextlib import suppress
+from dataclasses import dataclass, field
 from typing import Any, NoReturn, Protocol
 
 import structlog
@@ -16,7 +17,7 @@ import structlog
 from gateway.engine.device import Device
 from gateway.engine.effects import Effect, LogEvent, OnlineChange, Pause, RequestEnded, Samples
 from gateway.engine.engine import Engine
-from gateway.engine.jobs import Idle, Poll, Reopen, Settle, Traffic
+from gateway.engine.jobs import Idle, Poll, Reopen, Result, Settle, Traffic, Transacted
 from gateway.engine.requests import WRITE_EXPIRY, Command, Outcome, Request, Write
 from gateway.errors import GatewayError, LineDown
 from gateway.line.channel import NEVER, Alarm, Channel, Echo
@@ -37,6 +38,18 @@ class SampleSink(Protocol):
     def samples(self, samples: Sequence[Sample]) -> None: ...
 
     def online(self, device: Device, online: bool) -> None: ...
+
+
+# Called after each job with its result, and the times of its begin and end by the line's clock.
+Watcher = Callable[[Transacted, Result, float, float], None]
+
+
+@dataclass(slots=True)
+class _Expiry:
+    """Calls the line at the engine's deadline."""
+
+    alarm: Alarm = field(default_factory=Alarm)
+    at: float = NEVER  # the deadline when the alarm was set last
 
 
 class Line:
@@ -65,8 +78,8 @@ class Line:
         self._lost: LineDown | None = None
         self._outcomes: dict[Request, asyncio.Future[Any]] = {}
         self._wake = asyncio.Event()
-        self._expiry = Alarm()
-        self._armed = NEVER  # the engine's deadline when the alarm was set last
+        self._expiry = _Expiry()
+        self.watcher: Watcher | None = None
         self.tried = asyncio.Event()  # set once the port was opened, or could not be
 
     # Clients
@@ -196,6 +209,8 @@ class Line:
                     await self._perform_together((job, *engine.alongside(job, begun)), channel)
                     continue
             result = await perform(job, transaction)
+            if self.watcher is not None:
+                self.watcher(job, result, begun, now())
             traffic = transaction.traffic
             self._deliver(engine.conclude(job, result, traffic, now(), self._wall()))
         raise self._lost
@@ -208,7 +223,10 @@ class Line:
 
         async def one(poll: Poll) -> None:
             nonlocal left
+            begun = channel.now()
             result = await perform(poll, transaction)
+            if self.watcher is not None:
+                self.watcher(poll, result, begun, channel.now())
             left -= 1
             traffic = Traffic()
             if not left:
@@ -241,9 +259,9 @@ class Line:
                         self._channel.pause(seconds)
                 case LogEvent(level, event, fields):
                     getattr(log, level)(event, **fields)
-        if self.engine.deadline != self._armed:
-            self._armed = self.engine.deadline
-            self._expiry.by(self._armed, self._expire)
+        if self.engine.deadline != self._expiry.at:
+            self._expiry.at = self.engine.deadline
+            self._expiry.alarm.by(self._expiry.at, self._expire)
 
     def _end(self, request: Request, outcome: Outcome) -> None:
         waiting = self._outcomes.pop(request)

@@ -105,7 +105,7 @@ class Transaction:
     async def tell(self, frame: Any) -> None:
         data = self._codec.encode(frame)
         channel = self._channel
-        await channel.quiet(self._device.silence)
+        await channel.quiet(self._device.silence.kept)
         channel.check_duty()
         self.has_sent = True
         channel.send(data, channel.now())
@@ -124,10 +124,14 @@ class Transaction:
         channel, device = self._channel, self._device
         started = channel.now()
         if not self._open:
-            if channel.quiet_since + device.silence > started:
-                await channel.quiet(device.silence)
+            kept = device.silence.kept
+            if channel.quiet_since + kept > started:
+                await channel.quiet(kept)
                 started = channel.now()
             self._begin_hearing()
+            silence = started - channel.quiet_since
+            if silence < self.traffic.silence:
+                self.traffic.silence = silence
         if channel.guarded is not None:
             channel.check_duty()
         data, character = self._codec.encode(frame), channel.wire.character

@@ -6,9 +6,10 @@ a burst they are only counted and summarised. History keeps them apart, so that 
 write that was sent.
 """
 
+import math
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Protocol
 
 import structlog
@@ -31,12 +32,42 @@ _FAILURE_EVENTS = {
     (True, True): "command unclear",
 }
 _SENT = frozenset({Problem.UNCLEAR, Problem.REFUSED})
+# Seconds: the upper ends of the ranges in which the times of writes and commands are counted.
+TIMES = (0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0)
 
 
 class Record(Protocol):
     """Records an outcome as JSON. `time`: when it ended, in ns since 1970. Never blocks."""
 
     def __call__(self, time: int, outcome: str, /, *, refused: bool) -> None: ...
+
+
+class Counts:
+    """Every outcome since the start, and the times of those that reached a device."""
+
+    def __init__(self) -> None:
+        self._outcomes = Counter[str]()
+        self._times = Counter[float]()
+        self._seconds = 0.0
+
+    def count(self, outcome: WriteOutcome, *, was_sent: bool) -> None:
+        self._outcomes[payload.word(outcome.result)] += 1
+        if was_sent:
+            self._times[next((end for end in TIMES if outcome.took <= end), math.inf)] += 1
+            self._seconds += outcome.took
+
+    def document(self) -> Mapping[str, object]:
+        """`took`: how many took at most so many seconds."""
+        took, so_far = {}, 0
+        for end in TIMES:
+            so_far += self._times[end]
+            took[f"{end:g}"] = so_far
+        return {
+            "counts": dict(self._outcomes),
+            "sent": self._times.total(),
+            "seconds": round(self._seconds, 6),
+            "took": took,
+        }
 
 
 class Audit:
@@ -50,6 +81,7 @@ class Audit:
         """`publish` gets the outcome as JSON. It must not block."""
         self._publish = publish
         self._record = record
+        self.counts = Counts()
         self._refusals = RateLimit(BURST, EVERY)
         self._untold = Counter[str]()  # refusals of each kind since the last summary
 
@@ -61,6 +93,7 @@ class Audit:
     def __call__(self, outcome: WriteOutcome) -> None:
         result = outcome.result
         was_sent = not isinstance(result, Failure) or result.problem in _SENT
+        self.counts.count(outcome, was_sent=was_sent)
         if not was_sent and not self._refusals.allows(time.monotonic()):
             if isinstance(result, Failure):
                 self._untold[result.problem.value] += 1

@@ -1,21 +1,23 @@
 """Everything that clients send to this gateway: queries and puts, from declaration to end."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from typing import TypeVar
 
 import zenoh
 
-from gateway.northbound.acceptance import Acceptance
+from gateway.northbound.acceptance import Acceptance, Sender
 from gateway.northbound.audit import Audit
 from gateway.northbound.commands import Commands
 from gateway.northbound.inbox import Inbox
 from gateway.northbound.interfaces import History, Plant
 from gateway.northbound.keys import Keys
+from gateway.northbound.payload import Failure
 from gateway.northbound.queries import Queries, StatusDocuments
 from gateway.northbound.replies import Replies
 from gateway.northbound.tag_index import TagIndex
 from gateway.northbound.writes import PutWrites, Writes
+from gateway.tags import WriteResult
 
 T = TypeVar("T")
 
@@ -40,6 +42,8 @@ class Incoming:
         self._documents = documents
         self._history = history
         self._acceptance = acceptance
+        # Of clients that another part of the gateway has admitted: Zenoh and its writers do not.
+        self._admitted = Writes(plant, index, audit, Acceptance(plant.duty, None))
         self._queries: Queries | None = None
         self._puts: PutWrites | None = None
 
@@ -51,6 +55,15 @@ class Incoming:
         if self._puts is not None:
             counted["puts_refused"] = self._puts.refused
         return counted
+
+    def outcomes(self) -> Mapping[str, object]:
+        """Counts of writes and commands by outcome, and their times."""
+        return self._audit.counts.document()
+
+    async def write(self, tag: str, data: bytes, by: str, arrived: float) -> WriteResult | Failure:
+        """Writes for a client that another part of the gateway has admitted as `by`. `data` is the
+        payload as on Zenoh; `arrived`: by the loop's clock."""
+        return await self._admitted.write(self._keys.set(tag), data, Sender(by, None, arrived))
 
     def start(self, session: zenoh.Session) -> "Declarations":
         """Returns the declarations that send queries and puts here."""

@@ -32,6 +32,9 @@ class Plant(Protocol):
 
     def devices(self) -> Iterable[Device]: ...
 
+    def begin(self) -> None:
+        """Notes that this gateway is active now. Called before the first sample is served."""
+
     def tag(self, key: str) -> Tag | None:
         """Finds a tag by `device/name`."""
 

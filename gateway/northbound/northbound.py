@@ -21,6 +21,7 @@ from gateway.northbound.keys import Keys
 from gateway.northbound.link_monitor import LinkMonitor
 from gateway.northbound.losses import Losses
 from gateway.northbound.one_process import only_process
+from gateway.northbound.payload import Failure
 from gateway.northbound.publisher import Publisher, ScanBatches
 from gateway.northbound.republish import Republisher
 from gateway.northbound.session import (
@@ -35,7 +36,7 @@ from gateway.northbound.status_publisher import StatusPublisher
 from gateway.northbound.tag_index import TagIndex
 from gateway.northbound.watchdog import Watchdog
 from gateway.northbound.writers import Writers
-from gateway.tags import Sample
+from gateway.tags import Sample, WriteResult
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 
@@ -83,7 +84,7 @@ class Northbound:
         for exposure in _exposures(self._config, writers, group):
             log.warning("Zenoh session exposed", why=exposure)
         self._plant = plant
-        self._links = LinkMonitor()
+        self._links = LinkMonitor(is_peer=settings.mode is ZenohMode.PEER)
         index = TagIndex(self.keys, plant.devices())
         devices = [device.name for device in index.devices]
         self._admission = Admission(group, self.keys, self._config, devices, plant.duty)
@@ -129,6 +130,15 @@ class Northbound:
         """Messages out, in and dropped since the start."""
         outgoing = self._publisher.counts() | {"links": len(self._links)}
         return outgoing | self._incoming.counters()
+
+    async def documents(self, max_age: float) -> Mapping[str, Mapping[str, object]]:
+        """Returns the status documents by path, at most `max_age` seconds old."""
+        return await self._status.fields(max_age)
+
+    async def write(self, tag: str, data: bytes, by: str, arrived: float) -> WriteResult | Failure:
+        """Writes for the client `by`, whom another part of the gateway has admitted; `tag`:
+        `device/name`; `data`: the payload as on Zenoh; `arrived`: by the loop's clock."""
+        return await self._incoming.write(tag, data, by, arrived)
 
     @property
     def active(self) -> asyncio.Event:
@@ -206,6 +216,7 @@ class Northbound:
             tasks.create_task(self._admission.run(session))
             tasks.create_task(self._status.run())
             await self._admission.active.wait()
+            self._plant.begin()
             self._incoming.begin()
             self._declared += await off_loop(self._declare_plant, declarations)
             await self._republisher.publish_all()
@@ -218,11 +229,11 @@ class Northbound:
         self,
         session: zenoh.Session,
         declarations: Declarations,
-        links: Inbox[zenoh.TransportEvent],
+        links: Inbox[zenoh.TransportEvent | zenoh.LinkEvent],
     ) -> list[object]:
         """Declares everything that a standby gateway serves too."""
         token = declarations.token() if self._admission.standby.enabled else []
-        return [self._links.declare(session, links), *declarations.status(), *token]
+        return [*self._links.declare(session, links), *declarations.status(), *token]
 
     def _declare_plant(self, declarations: Declarations) -> list[object]:
         """The token comes last: a client that sees it may query at once."""
@@ -250,7 +261,8 @@ class Northbound:
         documents = dict(self._plant.status())
         documents["status"] = {**documents["status"], **self._admission.claiming.status()}
         zenoh_document = {**self.counters(), "to": self._links.kinds()}
-        return {**documents, "zenoh": zenoh_document, **self._admission.documents()}
+        own = {"zenoh": zenoh_document, "outcomes": self._incoming.outcomes()}
+        return {**documents, **own, **self._admission.documents()}
 
 
 def check(config: Config) -> list[str]:

@@ -96,10 +96,10 @@ def failure(error: GatewayError) -> Failure:
 
 
 def value(sample: Sample) -> bytes:
-    """The value with quality and time. A good one in half the time that `_sample` takes."""
+    """The value with quality and time. A good one in half the time that `sample_fields` takes."""
     known = sample.value
     if sample.quality is not _GOOD or not _has_json(known):
-        return orjson.dumps(_sample(sample))
+        return orjson.dumps(sample_fields(sample))
     return b'{"value":%b%b' % (orjson.dumps(known), _end_of_good(sample.time))
 
 
@@ -115,7 +115,7 @@ def _has_json(known: Value | None) -> bool:
 
 def value_text(sample: Sample) -> bytes | None:
     """The value alone, as text; None if it is unknown. `attachment` holds the rest."""
-    known = _sample(sample)["value"]
+    known = sample_fields(sample)["value"]
     match known:
         case None:
             return None
@@ -127,18 +127,24 @@ def value_text(sample: Sample) -> bytes | None:
 
 def attachment(sample: Sample) -> bytes:
     """`{"quality": "good", "time": …}`, and a `reason` when bad."""
-    return orjson.dumps({name: item for name, item in _sample(sample).items() if name != "value"})
+    return orjson.dumps(
+        {name: item for name, item in sample_fields(sample).items() if name != "value"}
+    )
 
 
 def block(samples: Iterable[Sample]) -> bytes:
     """`{tag: {value, quality, time}}` of one device."""
-    return orjson.dumps({sample.tag.name: _sample(sample) for sample in samples})
+    return orjson.dumps({sample.tag.name: sample_fields(sample) for sample in samples})
 
 
 def meta(tag: Tag) -> bytes:
     """The description of a tag: type, address, unit, interval, limits."""
+    return orjson.dumps(meta_fields(tag))
+
+
+def meta_fields(tag: Tag) -> dict[str, object]:
     rule, deadband = tag.write, tag.deadband
-    fields = {
+    return {
         "type": str(tag.layout.type),
         "address": tag.text,
         "unit": tag.unit,
@@ -158,7 +164,6 @@ def meta(tag: Tag) -> bytes:
         if rule is None
         else {"min": rule.min, "max": rule.max, "verify": rule.verify},
     }
-    return orjson.dumps(fields)
 
 
 def outcome(result: WriteResult | Failure) -> bytes:
@@ -167,7 +172,7 @@ def outcome(result: WriteResult | Failure) -> bytes:
 
 
 def write_outcome(ended: WriteOutcome) -> bytes:
-    """One line of the audit trail; `outcome` is `written`, `obeyed` or a `Problem`."""
+    """One line of the audit trail; `outcome` is its `word`."""
     line: dict[str, object] = {
         "key": short(ended.key),
         "value": loggable(ended.value),
@@ -175,14 +180,26 @@ def write_outcome(ended: WriteOutcome) -> bytes:
         "took": round(ended.took, 6),
         "by": ended.by,
     }
+    line["outcome"] = word(ended.result)
     match ended.result:
         case WriteResult(verified=verified):
-            line |= {"outcome": "written", "verified": verified}
+            line["verified"] = verified
         case CommandResult(answer):
-            line |= {"outcome": "obeyed", "answer": short(answer)}
-        case Failure(problem, reason, code):
-            line |= {"outcome": problem.value, "code": code, "reason": short(reason)}
+            line["answer"] = short(answer)
+        case Failure(_, reason, code):
+            line |= {"code": code, "reason": short(reason)}
     return orjson.dumps(line)
+
+
+def word(result: WriteResult | CommandResult | Failure) -> str:
+    """`written`, `obeyed` or a `Problem`."""
+    match result:
+        case WriteResult():
+            return "written"
+        case CommandResult():
+            return "obeyed"
+        case Failure(problem):
+            return problem.value
 
 
 def document(fields: Mapping[str, object]) -> bytes:
@@ -190,7 +207,7 @@ def document(fields: Mapping[str, object]) -> bytes:
     return orjson.dumps(fields, default=str, option=orjson.OPT_NON_STR_KEYS)
 
 
-def _sample(sample: Sample) -> dict[str, Value | None]:
+def sample_fields(sample: Sample) -> dict[str, Value | None]:
     known = sample.value
     time = rfc3339(sample.time)
     reason = sample.reason

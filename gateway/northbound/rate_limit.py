@@ -25,6 +25,10 @@ class RateLimit:
         self._allowance -= 1.0
         return True
 
+    def idle_since(self, now: float) -> float:
+        """Returns the seconds since the last event, allowed or not."""
+        return now - self._last
+
     def newly_suppressed(self) -> int:
         """Returns the number of events suppressed since the previous call."""
         new, self._reported = self.suppressed - self._reported, self.suppressed

@@ -23,9 +23,11 @@ def standing(device: Device) -> str:
     return _STANDING.get(state, state.value)
 
 
-def device_document(device: Device, polls: Sequence[Poll]) -> Document:
-    """One device. Times in seconds, counts since the start."""
+def device_document(device: Device, polls: Sequence[Poll], now: float) -> Document:
+    """One device. Times in seconds, counts since the start. `now` by the loop's clock."""
     record = device.record
+    read = [at for poll in polls if (at := poll.last.at) is not None]
+    last_good = max(read, default=record.last_good)
     return {
         "protocol": device.driver.protocol,
         "station": device.driver.station,
@@ -36,11 +38,14 @@ def device_document(device: Device, polls: Sequence[Poll]) -> Document:
         "slowest_write": round(record.slowest_write, 4),
         "wire_time": round(record.wire_time, 3),
         "turnaround": None if record.turnaround is None else round(record.turnaround, 4),
+        "silence": round(device.silence.shorter, 5),
         "late_replies": record.late,
         "unasked_frames": record.unasked,
         "frames_heard": record.heard,
         "overruns": record.overruns,
         "overdue": record.overdue,
+        "retries": record.retries,
+        "last_good": None if last_good is None else round(now - last_good, 3),
         "failures": dict(record.failures),
         "refusals": dict(record.refusals),
         "refused_addresses": [
@@ -84,6 +89,7 @@ def line_document(engine: Engine, expected: LineForecast, now: float) -> Documen
         "last_trouble": record.last_trouble,
         "opened": record.opened,
         "open_for": round(open_for, 1),
+        "open_time": round(open_in_all, 3),
         "baudrate": engine.wire.baudrate,
         "devices": {device.name: standing(device) for device in engine.devices},
         "busy_time": round(busy, 3),

@@ -34,7 +34,8 @@ class StatusPublisher:
         self._clock = time.monotonic
         self._collected_at = float("-inf")
         self._pause_until = float("-inf")
-        self._documents: dict[str, bytes] = {}
+        self._fields: Mapping[str, Mapping[str, object]] = {}  # by path
+        self._documents: dict[str, bytes] = {}  # by key
 
     async def run(self) -> None:
         """Runs until cancelled."""
@@ -50,19 +51,28 @@ class StatusPublisher:
 
     async def documents(self) -> dict[str, bytes]:
         """Returns every document by its key. None is older than the call."""
-        called = self._clock()
+        await self._collected_since(self._clock())
+        return self._documents
+
+    async def fields(self, max_age: float) -> Mapping[str, Mapping[str, object]]:
+        """Returns the fields of every document by its path, at most `max_age` seconds old at the
+        time of the call."""
+        await self._collected_since(self._clock() - max_age)
+        return self._fields
+
+    async def _collected_since(self, called: float) -> None:
         while self._collected_at < called:
             if (pause := self._pause_until - self._clock()) > 0:
                 await asyncio.sleep(pause)
             else:
                 self._build()
-        return self._documents
 
     def _build(self) -> None:
         self._collected_at = self._clock()
+        self._fields = self._collect()
         self._documents = {
             self._keys.status(path): payload.document(fields)
-            for path, fields in self._collect().items()
+            for path, fields in self._fields.items()
         }
         ended = self._clock()
         self._pause_until = ended + _PAUSE * (ended - self._collected_at)

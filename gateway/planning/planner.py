@@ -39,6 +39,7 @@ class Block:
     of_fields: bool = field(
         init=False, repr=False
     )  # frames protocol: the units are values, not words
+    text: str = field(init=False, repr=False, default="")  # once `describe` has made it
 
     def __post_init__(self) -> None:
         begins, place = {}, 0
@@ -185,6 +186,9 @@ def runs_of(tags: Iterable[Tag]) -> list[Span]:
 
 def describe(block: Block) -> str:
     """Returns the first and last address of a block as the file writes them: `D7.3..D10`."""
-    first = min(block.tags, key=lambda tag: tag.span)
-    last = max(block.tags, key=lambda tag: (tag.span.area, tag.span.start + tag.span.size))
-    return first.text if first is last else f"{first.text}..{last.text}"
+    if not block.text:  # kept: the status names every block every few seconds
+        first = min(block.tags, key=lambda tag: tag.span)
+        last = max(block.tags, key=lambda tag: (tag.span.area, tag.span.start + tag.span.size))
+        text = first.text if first is last else f"{first.text}..{last.text}"
+        object.__setattr__(block, "text", text)
+    return block.text

@@ -74,6 +74,7 @@ class Timing:
     silence: float = 0.005  # pause before a request
     silence_chars: float = 0.0  # pause in characters; the longer of the two counts
     retries: int = 2  # how often a read that ended unclear is repeated
+    learn_silence: bool = False  # no standard asks for `silence`: polls may find out a shorter one
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

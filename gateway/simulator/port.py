@@ -1,6 +1,7 @@
 """A simulated half-duplex line with stations: characters take time, and collide."""
 
 import asyncio
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -26,7 +27,8 @@ async def open_simulator(
     """Opens a line in memory with stations. `turnaround`: seconds from request to reply.
 
     The attribute `delay` of a station, in seconds, is added. With `paced=False` only this delay
-    takes time.
+    takes time. A station with the attribute `listens_after` does not hear the characters of a
+    request that come less than so many seconds after a reply.
     """
     return SimulatedPort(HalfDuplex(stations, wire, receiver.received, turnaround, paced=paced))
 
@@ -96,6 +98,7 @@ class HalfDuplex:
         self._turnaround = turnaround if paced else 0.0
         self._sendings: list[_Sending] = []
         self._master_until = 0.0  # bytes of the master follow each other, without collision
+        self._replied_until = -math.inf
 
     def send(self, data: bytes) -> None:
         """Sends bytes of the master."""
@@ -124,15 +127,20 @@ class HalfDuplex:
         return sending
 
     def _reach_stations(self, request: _Sending) -> None:
-        data = request.heard()
+        data, silence = request.heard(), request.start - self._replied_until
         for station in self._stations:
-            reply = b"".join(station.hear(data, request.end))
+            needed: float = getattr(station, "listens_after", 0.0)
+            early = 0
+            if 0.0 <= silence < needed and self._character:
+                early = math.ceil((needed - silence) / self._character)
+            reply = b"".join(station.hear(data[early:], request.end))
             if reply:
                 delay: float = getattr(station, "delay", 0.0)
                 self._reply(reply, request.end + self._turnaround + delay)
 
     def _reply(self, data: bytes, start: float) -> None:
         sending = self._put(data, start)
+        self._replied_until = max(self._replied_until, sending.end)
         chunk = FIFO if self._character else len(data)
         ends = [min(first + chunk, len(data)) for first in range(0, len(data), chunk)]
         pieces = iter(zip([0, *ends], ends, strict=False))

@@ -20,8 +20,19 @@ class Mirror:
         """`now`: nanoseconds since 1970."""
         self._current = {tag: bad(tag, Reason.STARTING, now) for tag in tags}
         self._published: dict[Tag, Sample] = {}
+        self._begun = False
         # Tags whose latest sample is in a scan, with their place there.
         self._places: dict[Tag, tuple[Latest, int]] = {}
+
+    def begin(self, now: int) -> None:
+        """Gives the first samples another time, once. Call it before the lines begin.
+
+        A client keeps the later of two samples. With the time of the creation of this mirror it
+        would keep the last value of the gateway that was active before.
+        """
+        if not self._begun:
+            self._begun = True
+            self._current = {tag: s._replace(time=now) for tag, s in self._current.items()}
 
     def __getitem__(self, tag: Tag) -> Sample:
         entry = self._places.get(tag)
@@ -109,7 +120,7 @@ class Mirror:
 
     def _supersede(self, latest: Latest) -> None:
         """Takes the samples out of a scan: one of its tags got another sample."""
-        latest.superseded = True
+        latest.superseded, latest.in_use = True, False
         for place, sample in enumerate(latest.scan):
             # Before its entry goes: other threads must find one or the other.
             self._current[sample.tag] = sample

@@ -100,7 +100,7 @@ async def test_a_link_that_flaps_does_not_publish_everything_each_time(tmp_path:
     file = quiet(tmp_path / "c.yaml", endpoint, 1)
     flaps = 12
     async with paced_link(endpoint) as link:
-        with await asyncio.to_thread(started, file) as program:
+        with await asyncio.to_thread(started, file, "--log-level", "debug") as program:
             async with (
                 ZenohPeer("client", connect=[endpoint]) as beside,
                 ZenohPeer("client", connect=[link.endpoint]),

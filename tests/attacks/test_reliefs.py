@@ -22,9 +22,9 @@ def make(*arguments, **named):
     made.append(weakref.ref(gateway))
     return gateway
 
-async def serve(file, withheld, stop, started):
+async def serve(file, withheld, stop, started, supervisor):
     on_zenoh = asyncio.Event()
-    await inner(file, withheld, on_zenoh, on_zenoh.set)
+    await inner(file, withheld, on_zenoh, on_zenoh.set, supervisor)
     return {} if len(made) < 4 else None
 
 inner, service._serve, service.Gateway = service._serve, serve, make

@@ -201,7 +201,7 @@ def test_files_with_secrets_are_closed_and_hold_users_or_the_gateway_does_not_st
     tmp_path: Path,
 ) -> None:
     """Each mistake in a folder of its own. No message shows what the file contains."""
-    quoted("`users_file`, `writers.file`, `gateway.secret_file`, and a `config_file` that contains")
+    quoted("`gateway.secret_file`, `web.tokens_file`, and a `config_file` that contains")
     password = json.dumps({"transport": {"auth": {"usrpwd": {"user": "a", "password": HIDDEN}}}})
     line = f"viewer:{HIDDEN}\n"
     open_files = {

@@ -83,9 +83,31 @@ RULES: dict[str, dict[str, tuple[str, ...]]] = {
         "The configuration file itself contains no password and no key. These files must be closed "
         "to other users of the machine (`chmod 640`, group of the service), or the gateway does "
         "not start: `key`, `password_file`, `users_file`, `writers.file`, `gateway.secret_file`, "
-        "and a `config_file` that contains a password.": (FILES, PASSWORDS),
+        "`web.tokens_file`, and a `config_file` that contains a password.": (
+            FILES,
+            PASSWORDS,
+            "test_a_tokens_file_that_others_can_read_is_refused",
+        ),
         "The gateway never shows their content in logs, status or messages,": (UNSHOWN, FILES),
         "and quotes nothing from a `config_file` that may contain a password.": (FILES,),
+        # The web door
+        "On loopback every program of this machine can read every value; it can write only with a "
+        "token of `web.tokens_file`.": (
+            "test_a_write_over_http_is_done_and_recorded_with_its_name",
+            "test_a_write_needs_a_token_and_a_body_that_no_form_of_another_site_sends",
+        ),
+        "On another address each request for values or states needs a token, and the file is "
+        "refused without `tokens_file`.": (
+            "test_other_addresses_need_a_token_for_every_value",
+            "test_an_address_for_other_machines_without_tokens_is_refused",
+        ),
+        "A token is a password: it is sent with each request, and HTTP does not encrypt it.": (
+            "test_an_address_for_other_machines_is_warned_of",
+        ),
+        "Pages of other sites get nothing through the browser of an operator.": (
+            "test_only_names_of_this_machine_are_answered",
+            "test_pages_of_other_sites_get_nothing",
+        ),
         # Use the command line with a secured gateway
         "`plc-gateway read`, `write`, `control`, `watch` and `health` take the address of the "
         "gateway and the certificates from the same file.": (RIGHTS, SIGNED),
@@ -236,6 +258,14 @@ NO_PROMISES: dict[str, tuple[str, ...]] = {
         (
             "How to decide who can connect, read and write. There are four levels, from the"
             " outside in:"
+        ),
+        (
+            "With `web` in the file the gateway answers HTTP too: "
+            "[page.md](page.md#who-may-use-it) has the rules."
+        ),
+        (
+            "Rules of `access_control` and `writers` are Zenoh's: they do not count here, so a "
+            "token is good for every tag that has `write`."
         ),
         ("Zenoh does not tell the gateway who sent a query, only which process forwarded it."),
         "So the clocks of both machines must agree (NTP).",

@@ -7,8 +7,9 @@ from collections.abc import Iterator
 import pytest
 import structlog
 
-from gateway.cli import logs
-from gateway.cli.logs import QueuedHandler, Repeats
+from gateway.cli import logs, repeats
+from gateway.cli.logs import QueuedHandler
+from gateway.cli.repeats import Repeats
 
 
 @pytest.fixture
@@ -60,22 +61,79 @@ def test_a_reader_that_has_gone_costs_only_the_entries(pipe: tuple[int, int]) ->
     assert handler.dropped == 5
 
 
-def test_repeated_entries_of_a_device_are_logged_now_and_then_with_their_number() -> None:
-    now = 0.0
-    repeats = Repeats(lambda: now)
+class Log:
+    """The entries that pass `Repeats`, by hand."""
 
-    def passes(**entry: object) -> dict[str, object] | None:
+    def __init__(self) -> None:
+        self.now = 0.0
+        self.repeats = Repeats(lambda: self.now)
+
+    def passes(self, event: str, **fields: object) -> bool:
         try:
-            return dict(repeats(None, "info", entry))
+            self.repeats(None, "info", {"event": event, **fields})
         except structlog.DropEvent:
-            return None
+            return False
+        return True
 
-    failed = {"event": "transaction failed", "device": "mixer", "line": "hall"}
-    found = [passes(**failed) for _ in range(100)]
-    assert [one for one in found if one is not None] == [failed] * logs.BURST
-    assert passes(**failed | {"device": "oven"})
-    assert passes(**failed | {"event": "device offline"})
-    now = logs.EVERY
-    assert passes(**failed) == failed | {"unlogged": 100 - logs.BURST}
-    assert passes(**failed) is None
-    assert all(passes(event="tag written", key="plant/mixer/speed") for _ in range(100))
+    def later(self, seconds: float) -> list[tuple[str, object]]:
+        """Flushes after so many seconds: each entry, and the number of others that it stands for.
+
+        What is logged here passes the configuration of the tests, not that of `set_up`.
+        """
+        self.now += seconds
+        with structlog.testing.capture_logs() as logged:
+            self.repeats.flush()
+        assert all(entry.pop("repeated") and entry["last"] for entry in logged)
+        return [(entry["event"], entry.get("unlogged", 0)) for entry in logged]
+
+
+def test_what_repeats_is_logged_at_once_and_then_once_a_minute_with_its_number() -> None:
+    log, mixer = Log(), {"device": "mixer", "line": "hall"}
+    found = [log.passes("transaction failed", why="no reply", **mixer) for _ in range(100)]
+    assert found == [True] + [False] * 99
+    assert log.passes("transaction failed", why="no reply", device="oven", line="hall")
+    assert log.passes("device offline", why="no reply", **mixer)
+    assert log.later(59.0) == []
+    assert log.later(1.0) == [("transaction failed", 98)]
+    assert not log.passes("transaction failed", why="no reply", **mixer)
+    assert log.later(60.0) == [("transaction failed", 0)]
+    assert log.later(60.0) == []
+    assert log.passes("transaction failed", why="no reply", **mixer)
+
+
+def test_different_reasons_are_told_apart_up_to_a_number() -> None:
+    log = Log()
+    found = [log.passes("reply dropped", device="mixer", why=str(n)) for n in range(1000)]
+    assert found.count(True) == repeats.BURST
+    assert len(log.later(60.0)) <= repeats.BURST
+    assert log.passes("reply dropped", device="mixer", why="a new one")
+
+
+def test_the_last_entry_of_a_state_that_flaps_is_the_state() -> None:
+    log = Log()
+    for _ in range(repeats.BURST):  # a cable that is plugged and unplugged is logged at once
+        assert log.passes("device offline", device="mixer")
+        assert log.passes("device online", device="mixer")
+    assert not log.passes("device offline", device="mixer")
+    for _ in range(7):
+        assert not log.passes("device online", device="mixer")
+        assert not log.passes("device offline", device="mixer")
+    assert log.later(60.0) == [("device online", 6), ("device offline", 7)]
+
+
+def test_each_write_is_logged_and_other_libraries_are_limited_each() -> None:
+    log = Log()
+    assert all(log.passes("tag written", key="plant/mixer/speed") for _ in range(100))
+    found = [log.passes("socket.send() raised exception.", logger="asyncio") for _ in range(9)]
+    assert found == [True] + [False] * 8
+    assert log.passes("port is slow", logger="serialx")
+
+
+def test_links_of_one_host_are_one_source() -> None:
+    log = Log()
+    found = [
+        log.passes("Zenoh link up", to="peer", address=f"tcp/10.0.0.5:{n}", id=str(n))
+        for n in range(100)
+    ]
+    assert found.count(True) == repeats.BURST
+    assert log.passes("Zenoh link up", to="peer", address="tcp/10.0.0.6:1", id="x")

@@ -45,6 +45,16 @@ def test_the_proposed_write_is_accepted_by_its_tag(
     made.encode(value)
 
 
+def test_no_write_to_a_real_machine_is_proposed(tmp_path: Path) -> None:
+    tags = {"t": {"address": "D1", "write": True}}
+    path = write_config(
+        tmp_path / "c.yaml", "tcp/127.0.0.1:7447", {"hall": vigor_line("/dev/ttyUSB0", tags)}
+    )
+    steps = next_steps(load(path), path, "plc-gateway")
+    assert "plc-gateway read" in steps
+    assert "plc-gateway write" not in steps
+
+
 def test_a_proposed_command_quotes_a_path_with_a_blank(tmp_path: Path) -> None:
     tags = {"t": {"address": "D1"}}
     path = write_config(

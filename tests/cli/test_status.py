@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from gateway.cli.faults import faults, warnings
 from gateway.cli.status import span, view
+from gateway.northbound.faults import faults, warnings
 from tests.e2e.processes import Done, gateway, plc_gateway, started, vigor_line, write_config
 from tests.zenoh_peer import free_endpoint
 

@@ -288,6 +288,18 @@ SECTIONS = [
         "1: web.listen: 8080 is no address to listen on: write 127.0.0.1:8080",
     ),
     bad(
+        "web for other machines",
+        'web: {listen: "0.0.0.0:8080"}\n' + tags("speed: {address: D1}"),
+        "1: web.listen: other machines can reach 0.0.0.0: name a tokens_file too (see "
+        "docs/page.md), or listen on 127.0.0.1:8080",
+    ),
+    bad(
+        "web names",
+        "web: {names: [gateway.plant:8080]}\n" + tags("speed: {address: D1}"),
+        "1: web.names[0]: 'gateway.plant:8080' is no name of a machine: write gateway.plant, "
+        "without a port",
+    ),
+    bad(
         "defaults",
         "defaults:\n  evry: 1s\n  every: 0s\n  scale: 0\n" + tags("speed: {address: D1}"),
         "2: defaults.evry: no setting of defaults: did you mean every?",
@@ -458,8 +470,8 @@ DEVICES = [
         "another protocol's setting",
         on_mixer("protocol: vigor\nframe_format: 4"),
         f"7: {M}.frame_format: no setting of a vigor device: use blocks, control, defaults, "
-        "enabled, late_guard, reply_timeout, retries, silence, station, tags, turnaround or "
-        "verify_reads",
+        "enabled, late_guard, reply_timeout, retries, silence, station, tags, tags_from, "
+        "turnaround or verify_reads",
     ),
     bad(
         "a protocol's own settings",
@@ -813,6 +825,7 @@ def test_device_settings_are_laid_over_the_protocols(file: Callable[[str], Confi
     assert device.timing.turnaround == 0.03
     assert device.turnaround == 0.03
     assert device.timing.silence == 0.0
+    assert not device.timing.learn_silence
     assert device.timing.retries == 0
     assert device.late_guard == 5.0
     assert (device.blocks, device.control, device.enabled) == (True, True, False)

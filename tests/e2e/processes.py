@@ -154,9 +154,9 @@ def gateway(*arguments: object, merged: bool = True, variables: Sequence[str] = 
     return Program(*by, sys.executable, "-m", "gateway", *arguments, merged=merged)
 
 
-def started(config: Path) -> Program:
+def started(config: Path, *options: str) -> Program:
     """Starts a gateway and waits for its Zenoh session."""
-    return _ready(gateway("run", config), "Zenoh session ready")
+    return _ready(gateway("run", config, *options), "Zenoh session ready")
 
 
 def station(*where: str, stations: tuple[int, ...] = (1,), by: tuple[str, ...] = ()) -> Program:

@@ -28,8 +28,8 @@ class Step(NamedTuple):
     shown: list[str]
 
 
-def steps() -> Iterator[Step]:
-    for block in _blocks(PAGE):
+def steps(page: str = PAGE) -> Iterator[Step]:
+    for block in _blocks(page):
         if block.language == "console":
             for entry in re.split(r"^\$ ", block.text, flags=re.MULTILINE)[1:]:
                 command, *shown = entry.splitlines()

@@ -6,6 +6,7 @@ import signal
 import sys
 from collections.abc import AsyncIterator, Sequence
 from contextlib import ExitStack, asynccontextmanager
+from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
@@ -105,10 +106,14 @@ async def test_two_gateways_of_a_group_share_one_wire(tmp_path: Path) -> None:
                     await asyncio.sleep(SETTLE_TIME + CLAIM_TIME + 1)
                     await until_states(client, "active waiting")
                     assert (line.open, line.most) == (1, 1)
-                    # A crash.
+                    # A crash. The values of the next one are later than those of the first.
+                    values = await client.subscribe("plant/mixer/speed")
+                    crashed = datetime.now(UTC).isoformat()
                     await asyncio.to_thread(a.end, signal.SIGKILL)
                     await line.until(0, within=1)
                     await line.until(1, within=3)
+                    next_one = await values.next(lambda s: s.json["reason"] == "starting")
+                    assert next_one.json["time"] > crashed
                     # The gateway that comes back is standby until the other one ends.
                     a = programs.enter_context(gateway(tmp_path, "a", router_at, port))
                     await until_states(client, "waiting active")

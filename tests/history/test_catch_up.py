@@ -293,12 +293,21 @@ class Consumer:
         await asyncio.gather(self._process.wait(), self._listening)
 
 
+# The example with short pages: a check takes many of them, while new samples arrive.
+SHORT_PAGES = """
+import runpy, sys
+example = runpy.run_path(sys.argv.pop(1))
+example["main"].__globals__.update(FIRST_PAGE=20, PAGE=20)
+example["main"]()
+"""
+
+
 @asynccontextmanager
-async def consuming(endpoint: str, since: str) -> AsyncIterator[Consumer]:
-    """Kills the consumer at the end."""
+async def consuming(endpoint: str, since: str, *program: str) -> AsyncIterator[Consumer]:
+    """Kills the consumer at the end. `program`: the arguments of Python that run the example."""
     process = await asyncio.create_subprocess_exec(
         sys.executable,
-        str(EXAMPLE),
+        *(program or [str(EXAMPLE)]),
         *("--connect", endpoint, "--since", since),
         stdout=asyncio.subprocess.PIPE,
     )
@@ -363,6 +372,22 @@ async def test_a_consumer_loses_nothing_when_its_router_is_killed(tmp_path: Path
                     await asyncio.sleep(0.01)
             async with ZenohPeer(ZenohMode.ROUTER, listen=[endpoint]):
                 await consumer.knows(poll.count + 50)
+        nothing_lost_and_nothing_twice(consumer.lines)
+
+
+async def test_a_sample_that_arrives_during_a_long_check_is_delivered_once(tmp_path: Path) -> None:
+    """It is in a page too, and not in the last one."""
+    endpoint = free_endpoint()
+    async with (
+        ZenohPeer(ZenohMode.ROUTER, listen=[endpoint]),
+        polling(tmp_path / "h.db") as poll,
+        poll.on_air(endpoint),
+    ):
+        while poll.count < 150:
+            await asyncio.sleep(0.01)
+        async with consuming(endpoint, MIDNIGHT, "-c", SHORT_PAGES, str(EXAMPLE)) as consumer:
+            await consumer.knows(poll.count)
+            await consumer.knows(poll.count + 100)
         nothing_lost_and_nothing_twice(consumer.lines)
 
 

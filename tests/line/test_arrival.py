@@ -7,6 +7,7 @@ from collections.abc import Callable
 from itertools import pairwise
 
 import pytest
+import structlog
 
 from gateway.line.arrival import PERIOD, ArrivalClock
 from gateway.transport.loop import new_event_loop
@@ -26,6 +27,19 @@ async def test_on_time_it_is_the_wall_clock() -> None:
         assert clock() == pytest.approx(loop.time() * 1e9, abs=1e5)
     clock.stop()
     assert clock() == int(loop.time() * 1e9)
+
+
+async def test_a_jump_of_the_wall_clock_is_logged_and_a_slow_correction_is_not() -> None:
+    ahead = 0.0  # seconds
+    clock = ArrivalClock(lambda: time.monotonic_ns() + int(ahead * 1e9))
+    with structlog.testing.capture_logs() as logged:
+        clock.start()
+        for step in (0.1, 0.1, 3600.0, 0.1, -7200.0, 0.0):
+            ahead += step
+            await asyncio.sleep(1.2 * PERIOD)
+        clock.stop()
+    jumps = [entry["seconds"] for entry in logged if entry["event"] == "clock jumped"]
+    assert jumps == pytest.approx([3600.0, -7200.0], abs=0.3)
 
 
 @pytest.mark.parametrize("factory", [asyncio.new_event_loop, new_event_loop])

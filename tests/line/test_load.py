@@ -22,6 +22,7 @@ async def test_an_overloaded_line_is_always_busy_and_starves_no_block() -> None:
             ],
             station=n,
             name=f"p{n}",
+            learn_silence=False,  # it is counted below
         )
         for n in (1, 2, 3)
     ]

@@ -1,15 +1,17 @@
 """The configuration of the session."""
 
+import asyncio
 import json
 from pathlib import Path
 
 import pytest
 
-from gateway.config import ZenohConfig
+from gateway.config import ZenohConfig, ZenohMode
 from gateway.errors import (
     ConfigError,
 )
-from gateway.northbound.session import configure
+from gateway.northbound.session import configure, off_loop, open_session
+from tests.zenoh_peer import ZenohPeer, free_endpoint
 
 
 def test_the_settings_override_the_zenoh_file(tmp_path: Path) -> None:
@@ -52,3 +54,14 @@ def test_a_file_that_is_no_zenoh_configuration_is_refused(tmp_path: Path, text: 
     file.write_text(text)
     with pytest.raises(ConfigError, match=r"config_file .*zenoh\.json5"):
         configure(ZenohConfig(config_file=file))
+
+
+async def test_a_client_starts_while_its_first_router_is_down() -> None:
+    absent, there = free_endpoint(), free_endpoint()
+    config = configure(ZenohConfig(mode=ZenohMode.CLIENT, connect=(absent, there)))
+    async with ZenohPeer("router", listen=[there]), asyncio.timeout(10):
+        session = await open_session(config, retry=True)
+        try:
+            assert len(session.info.routers_zid()) == 1
+        finally:
+            await off_loop(session.close)

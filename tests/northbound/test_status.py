@@ -69,7 +69,7 @@ async def test_a_failing_device_has_a_diagnosis(tmp_path: Path) -> None:
     error = NoReply("no reply")
     device.record.count_failure(error)
     device.health.unclear(error, None, 0.0)
-    document = device_document(device, [])
+    document = device_document(device, [], 0.0)
     assert document["failures"] == {"silence": 1}
     assert "check power, wiring" in str(document["diagnosis"])
 

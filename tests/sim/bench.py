@@ -25,6 +25,7 @@ class Unruly:
     seed: int = 0
     late: Callable[[random.Random], float] = lambda _: 0.0  # seconds on top, drawn for each reply
     delay: float = 0.0  # which the simulated wire adds to the turnaround
+    listens_after: float = 0.0  # seconds after a reply in which it does not listen
     lose: float = 0.0  # share of replies that are lost
     cut: float = 0.0  # share of replies that break off
     wire: WireTiming = WIRE

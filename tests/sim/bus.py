@@ -109,6 +109,8 @@ class Bus:
         self.asked = named[0]
         health = self.asked.health
         self.foreign.sent(data, start, resync=health.needs_resync or not health.online)
+        poll = not (is_write(protocol, data) or is_command(protocol, data) or health.needs_resync)
+        self._check_silence(named[0], start, poll=poll)
         self.writes[number] += is_write(protocol, data)
         self.commands[number] += is_command(protocol, data)
         if is_registration(protocol, data):
@@ -121,6 +123,16 @@ class Bus:
         heard = begin + 0.001 < start < min(until - 0.001, begin + 1.0)
         if heard and self.hurt["<"] < begin - 0.1:
             self.broke(f"{self.config.name}: spoke into a frame that was coming in")
+
+    def _check_silence(self, device: Device, start: float, *, poll: bool) -> None:
+        """Checks that the silence before a request other than a poll is not shortened."""
+        if not isinstance(self.wire, SimWire):
+            return
+        silence, safe = self.wire.silence_at(start), device.wire.silence(device.timing)
+        if 0.0 <= silence < safe - 1e-6 and self.wire.behind < start - 1.0:
+            self.story.counts["shorter silences"] += 1
+            if not (poll and device.timing.learn_silence):
+                self.broke(f"{device.name}: {silence:.5f} s of silence before what is no poll")
 
     def number_of(self, device: Device) -> int:
         """Returns the number of the device in a request, as `station_in` finds it."""
@@ -145,6 +157,11 @@ class Bus:
         if self._late_in_another_protocol(device):
             return  # such a reply is noise to the driver that waits for another
         self.broke(f"{self.config.name}: spoke while {device.name} did")
+
+    def lost_by_silence(self, request: bytes, station: Speaker | None) -> None:
+        number = station_in(protocol_of(self.protocol, request), request)
+        addressed = station is None or getattr(station, "number", None) == number
+        self.story.counts["lost by silence"] += addressed
 
     def damaged(self, way: str) -> None:
         self.hurt_at = self.hurt[way] = self.now()

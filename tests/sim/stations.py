@@ -60,6 +60,8 @@ class Troubled:
     chance: random.Random
     character: float
     turnaround: float = 0.005
+    listens_after: float = 0.0  # seconds after any reply for which it does not listen
+    drives_for: float = 0.0  # seconds after its reply for which it damages the next request
     deaf: bool = False  # receives nothing: switched off, or without its cable
     mute: bool = False  # carries out requests; its replies are lost
     lose: float = 0.0  # share of lost replies

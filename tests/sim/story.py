@@ -9,6 +9,7 @@ _RULES = {
     "which was not said": "wrong value",
     "is not fresh": "wrong value",
     "came after its time-out": "answer after its time-out",
+    "of silence before": "silence",
     "write of": "write",
     "writes were sent": "sent twice",
     "is told as done": "write",

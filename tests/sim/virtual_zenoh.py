@@ -176,6 +176,10 @@ class _Info:
         self._session.link_listeners.append(handler.callback)
         return object()
 
+    def declare_link_events_listener(self, handler: Any, history: bool) -> object:
+        """Links of this network have no addresses."""
+        return object()
+
 
 class Session:
     """The session of the gateway."""

@@ -5,6 +5,7 @@ clock, and all chance comes from one `random.Random`.
 """
 
 import asyncio
+import math
 import random
 from collections.abc import Callable, Sequence
 from contextvars import copy_context
@@ -27,9 +28,19 @@ class Speaker(Protocol):
     def copies(self) -> list[tuple[float, bool]]:
         """Returns the copies of its last reply: seconds after it, and if they are on the wire."""
 
+    @property
+    def listens_after(self) -> float:
+        """Seconds after any reply for which it does not listen."""
+
+    @property
+    def drives_for(self) -> float:
+        """Seconds after its own reply for which it damages the characters of others."""
+
 
 class Master:
     """Another master. It only asks; the replies reach every master."""
+
+    listens_after = drives_for = 0.0
 
     def hear(self, data: bytes, now: float) -> None: ...
 
@@ -45,6 +56,9 @@ class Watch(Protocol):
 
     def overlapped(self, station: Speaker | None) -> None:
         """The gateway and this station send at the same time."""
+
+    def lost_by_silence(self, request: bytes, station: Speaker | None) -> None:
+        """A station does not get the first characters, because they came too early. None: all."""
 
     def damaged(self, way: str) -> None:
         """Damaged bytes arrive at the stations (>) or at the gateway (<)."""
@@ -72,6 +86,8 @@ class Sending:
     station: Speaker | None
     request: bytes = b""  # of another master, or answered by an unknown station
     spoilt: bool = False
+    silence: float = math.inf  # seconds before it, after a reply
+    after: Speaker | None = None  # which replied
 
 
 @dataclass(eq=False)
@@ -101,6 +117,7 @@ class SimWire:
         self._generation = 0
         self._sendings: list[Sending] = []
         self._ours_until = 0.0
+        self._replied: tuple[float, Speaker | None] = (-math.inf, None)  # until when, and who
         self.server = DeviceServer(self)
         self._context = copy_context()  # the world's, also where the gateway sends
 
@@ -137,6 +154,7 @@ class SimWire:
         request = data if master is not None else b""
         end = start + len(data) * self.wire.character
         sending = Sending(start, end, data, master, request)
+        sending.silence, sending.after = start - self._replied[0], self._replied[1]
         for other in self._collide(sending):
             if other.station is not None and master is None:
                 self.watch.overlapped(other.station)
@@ -186,7 +204,7 @@ class SimWire:
         return hit
 
     def _reach_stations(self, request: Sending) -> None:
-        data = self._through(request, request.data, ">")
+        data = self._through(request, self._after_a_reply(request), ">")
         if not data or self.hanging:
             return
         if not request.request:
@@ -194,10 +212,33 @@ class SimWire:
         # Without damage the other stations ignore the request; this saves their time.
         well = self.addressed is not None and data is request.data
         for station in self.addressed(data) if well and self.addressed else self.stations:
+            early = self._early(station.listens_after, request)
+            if early:
+                self.watch.lost_by_silence(request.data, station)
             if not self.server.keeps_from(station, data, request.request):
-                self.ask(station, data, request.end, request.request)
+                self.ask(station, data[early:], request.end, request.request)
         for station in self.twins:
             self.ask(station, data, request.end, data)
+
+    def _after_a_reply(self, request: Sending) -> bytes:
+        """Returns the request, damaged while the station that replied still drives the pair."""
+        after = request.after
+        early = 0 if after is None else self._early(after.drives_for, request)
+        if not early:
+            return request.data
+        self.watch.lost_by_silence(request.data, None)
+        self.watch.damaged(">")
+        damaged = (self.chance.randrange(1 << self.shape.data_bits) for _ in request.data[:early])
+        return bytes(damaged) + request.data[early:]
+
+    def _early(self, needed: float, request: Sending) -> int:
+        """Returns the number of its characters that are sent before so many seconds of silence."""
+        missing = needed - request.silence - 1e-6
+        return math.ceil(missing / self.wire.character) if 0.0 < missing <= needed else 0
+
+    def silence_at(self, start: float) -> float:
+        """Returns the seconds of silence before a request, after a reply."""
+        return start - self._replied[0]
 
     def ask(self, station: Speaker, data: bytes, end: float, request: bytes) -> None:
         """The request, which ended at `end`, reaches the station."""
@@ -234,6 +275,9 @@ class SimWire:
         for other in self._collide(sending):
             if other.station is None:
                 self.watch.overlapped(sending.station)
+        self._replied = max(
+            self._replied, (sending.end, sending.station), key=lambda reply: reply[0]
+        )
         self.server.replies(sending.end)
         if self.server.holds(sending):
             return

@@ -69,6 +69,7 @@ class World:
         for line, settings in zip(gateway.lines, config.lines, strict=True):
             self._lines[line.engine.name].line = line
             self._lines[line.engine.name].config = settings
+        self._learn_soon()
         self.devices = {d.name: d for line in gateway.lines for d in line.engine.devices}
         self._settings = {d.name: d for line in config.lines for d in line.devices}
         self._buses = {d.name: self._lines[s.name] for s in config.lines for d in s.devices}
@@ -178,10 +179,31 @@ class World:
         station.manners = self.drawn.manners.get(device.name, Manners())
         station.turnaround = chance.choice((0.001, 0.005, 0.02, 0.05))
         station.other = random.Random(f"other {self.story.seed} {device.name}")
+        self._needs_silence(station, device, line)
         told = [tag for d in line.devices if d.driver.station == 0 for tag in d.tags]
         set_going(station, device.tags, device.driver.areas, told)
         self.stations[device.name] = station
         return station
+
+    def _needs_silence(self, station: Troubled, device: DeviceSettings, line: LineConfig) -> None:
+        """Lets the station need a part of the silence that is safe for it, or for all."""
+        chance = random.Random(f"silence {self.story.seed} {device.name}")
+        safe = line.wire.silence(device.timing)
+        least = min(line.wire.silence(one.timing) for one in line.devices)
+        if chance.random() < 0.3:
+            station.listens_after = safe * chance.uniform(0.0, 0.98)
+        if chance.random() < 0.3:
+            station.drives_for = least * chance.uniform(0.0, 0.98)
+
+    def _learn_soon(self) -> None:
+        """Lets most lines try shorter silences although they have time, and after few replies."""
+        chance = random.Random(f"silence {self.story.seed}")
+        for line in self.gateway.lines:
+            shorter = line.engine._conclusions.shorter  # private: no setting of the file
+            shorter.needed = chance.choice((0.0, 0.0, shorter.needed))
+            shorter.proof = chance.choice((3, 10, shorter.proof))
+            shorter.pause = chance.choice((1.0, 10.0, shorter.pause))
+            shorter.look_at = min(shorter.look_at, shorter.proof)
 
     def _twin(self, name: str) -> Troubled:
         """Makes a second PLC with the number of this device, and other values."""

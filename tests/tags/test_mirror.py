@@ -29,6 +29,16 @@ def test_before_the_first_reading_a_tag_is_starting() -> None:
     assert list(mirror.samples()) == [mirror[tag]]
 
 
+def test_the_first_samples_get_the_time_when_the_gateway_became_active() -> None:
+    read, other = make_tag("D0"), make_tag("D1")
+    mirror = Mirror([read, other], 5)
+    mirror.begin(9)
+    assert list(mirror.samples()) == [bad(tag, Reason.STARTING, 9) for tag in (read, other)]
+    mirror.update([good(read, 1, 10)])
+    mirror.begin(11)  # once only
+    assert [sample.time for sample in mirror.samples()] == [10, 9]
+
+
 def test_a_change_is_published_and_an_equal_value_is_not() -> None:
     assert values(make_tag("D0"), 1, 1, 2, 2, 1) == [1, 2, 1]
 

@@ -113,6 +113,7 @@ class ComputerLink:
             turnaround=max(0.02, self.message_wait),
             silence=0.02,  # about two scans of the PLC before the next ENQ
             retries=2,
+            learn_silence=self.sum_check,  # without it, a damaged request may read another address
         )
 
     def address(self, text: str) -> Address:

@@ -54,7 +54,7 @@ _REFUSALS = {
     "28": (Refusal.ADDRESS, "data address out of range"),
 }
 _TRAITS = Traits(baudrate=19200, format="7E1")
-_TIMING = Timing(reply_timeout=0.5, turnaround=0.005, silence=0.005, retries=2)
+_TIMING = Timing(reply_timeout=0.5, turnaround=0.005, silence=0.005, retries=2, learn_silence=True)
 _PROBE_SIZES = (1, 3, 5, 7, 9, 11, 13, 15)  # odd byte counts: no read of words has these
 
 

@@ -1,0 +1,75 @@
+"""A publisher with several routers, one of which is killed: `python -m benchmarks.routers`.
+
+Three routers are linked to each other; a client is connected to the last one. A session without a
+gateway, as a client or a peer of two or three of the routers, publishes five values a second and
+has a token. The program kills the first router, starts it again, and counts in how many rounds the
+client missed values for three seconds, received values twice, or did not see the token afterwards.
+"""
+
+import argparse
+import asyncio
+from contextlib import AsyncExitStack, suppress
+from typing import NamedTuple
+
+from tests.zenoh_peer import ZenohPeer, free_endpoint
+
+EVERY, DEAD, BACK = 0.2, 3.0, 4.0  # seconds
+
+
+class Round(NamedTuple):
+    stopped: bool  # no value arrived while the router was away
+    twice: bool
+    lost_token: bool
+
+
+async def play(mode: str, known: int) -> Round:
+    """`known`: the number of routers that the publisher connects to."""
+    ends = [free_endpoint() for _ in range(3)]
+    async with AsyncExitStack() as stack:
+        start = stack.enter_async_context
+        first = await start(ZenohPeer("router", [ends[0]]))
+        await start(ZenohPeer("router", [ends[1]], ends[:1]))
+        await start(ZenohPeer("router", [ends[2]], ends[:2]))
+        client = await start(ZenohPeer("client", connect=ends[2:]))
+        source = await start(ZenohPeer(mode, connect=ends[:known]))
+        await source.declare_token("alive")
+        tokens, values = await client.liveliness("alive"), await client.subscribe("value")
+
+        async def publish() -> None:
+            number = 0
+            while True:
+                number += 1
+                await source.put("value", str(number).encode())
+                await asyncio.sleep(EVERY)
+
+        publishing = asyncio.create_task(publish())
+        await values.next(lambda _: True)
+        await asyncio.sleep(1.0)
+        before = len(values.samples)
+        await first.kill()
+        await asyncio.sleep(DEAD)
+        stopped = len(values.samples) - before < DEAD / EVERY / 2
+        await start(ZenohPeer("router", ends[:1], ends[1:]))
+        await asyncio.sleep(BACK)
+        publishing.cancel()
+        with suppress(asyncio.CancelledError):
+            await publishing
+        numbers = [sample.payload for sample in values.samples]
+        is_alive = tokens.samples[-1].kind == "PUT"
+        return Round(stopped, len(numbers) > len(set(numbers)), not is_alive)
+
+
+async def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--rounds", type=int, default=10)
+    rounds = parser.parse_args().rounds
+    print("| mode | routers | rounds | values stopped | values twice | token lost |")
+    print("|---|---|---|---|---|---|")
+    for mode, known in (("client", 2), ("peer", 2), ("peer", 3)):
+        found = [await play(mode, known) for _ in range(rounds)]
+        counts = " | ".join(str(sum(column)) for column in zip(*found, strict=True))
+        print(f"| {mode} | {known} | {rounds} | {counts} |", flush=True)
+
+
+if __name__ == "__main__":
+    asyncio.run(main())

@@ -1,0 +1,195 @@
+"""The cost of an open status page: `python -m benchmarks.web`.
+
+A plant has 64 lines of simulated Vigor stations and 50,000 tags. First its lines run on virtual
+time, in turn without a page and with one that shows a line and a device: both do the same work on
+the wire, so that the processor times can be compared on a busy computer too. Zenoh is left out:
+with it the share of the page is smaller. Then a real gateway runs: one scrape of /metrics, and with
+Chromium at hand the time to the first paint.
+"""
+
+import argparse
+import asyncio
+import gc
+import logging
+import shutil
+import statistics
+import subprocess
+import tempfile
+import time
+import urllib.request
+from pathlib import Path
+
+import structlog
+
+from benchmarks.start import HERE, Sizes, rows, started
+from gateway.app import Gateway
+from gateway.config import Config, load
+from gateway.northbound import payload
+from gateway.northbound.audit import Counts
+from gateway.web.api import Api
+from gateway.web.events import WIRE_EVERY, Events, Loads, Page
+from gateway.web.sources import Documents, Sources
+from tests.e2e.processes import free_port
+from tests.sim.virtual import run_virtual
+from tests.web.browser import browser
+from tests.web.serving import PlainNorth
+from tests.zenoh_peer import free_endpoint
+
+SIZES = Sizes(lines=64, devices=8, tags=98)
+PUBLISHED_EVERY = 5.0  # seconds
+
+
+class North(PlainNorth):
+    """Collects the documents as the gateway does: also with their JSON."""
+
+    def __init__(self, gateway: Gateway) -> None:
+        super().__init__()
+        self._gateway = gateway
+        self._at = float("-inf")
+        self._found: Documents = {}
+
+    async def documents(self, max_age: float) -> Documents:
+        now = asyncio.get_running_loop().time()
+        if now - self._at > max_age:
+            found = dict(self._gateway.status())
+            found["status"] = {**found["status"], "refused_devices": {}}
+            found |= {"zenoh": {"to": []}, "outcomes": Counts().document()}
+            for document in found.values():
+                payload.document(document)
+            self._at, self._found = now, found
+        return self._found
+
+    async def publish(self) -> None:
+        while True:
+            await self.documents(0.0)
+            await asyncio.sleep(PUBLISHED_EVERY)
+
+
+async def play(gateway: Gateway, seconds: float, made: list[float] | None) -> None:
+    north = North(gateway)
+    tasks = [asyncio.create_task(line.run()) for line in gateway.lines]
+    tasks.append(asyncio.create_task(north.publish()))
+    if made is not None:
+        tasks.append(asyncio.create_task(show(Sources(gateway, north, None, lambda: True), made)))
+    await asyncio.sleep(seconds)
+    for task in tasks:
+        task.cancel()
+    await asyncio.gather(*tasks, return_exceptions=True)
+
+
+async def show(sources: Sources, made: list[float]) -> None:
+    """Makes the events of one page. Adds the processor time of each to `made`."""
+    api, loads = Api(sources), Loads(sources)
+    events, measuring = Events(sources, api, loads), asyncio.create_task(loads.run())
+    try:
+        with events.wires.watched("line0") as recorder:
+            page = Page(sources, events, api.select("d0-0", "", None, 200), recorder)
+            while True:
+                begun = time.process_time()  # nothing else runs meanwhile
+                await page.next()
+                made.append(time.process_time() - begun)
+                await asyncio.sleep(WIRE_EVERY)
+    finally:
+        measuring.cancel()
+
+
+def spent(config: Config, seconds: float, made: list[float] | None) -> tuple[float, int]:
+    """Seconds of the processor for so many seconds of the plant, and its exchanges."""
+    gateway = Gateway(config)
+    gc.collect()
+    begun = time.process_time()
+    run_virtual(play(gateway, seconds, made))
+    used = time.process_time() - begun
+    return used, sum(device.record.exchanges for device in gateway.enabled_devices)
+
+
+def compare(config: Config, seconds: float, rounds: int) -> None:
+    ratios, bases, counts = [], [], set()
+    made: list[float] = []
+    for _ in range(rounds):
+        before, exchanges = spent(config, seconds, None)
+        after, with_page = spent(config, seconds, made)
+        ratios.append(after / before - 1)
+        bases.append(before / seconds)
+        counts |= {exchanges, with_page}
+    base, events = statistics.median(bases), sum(made) / seconds / rounds
+    print(
+        f"the lines take {base:.1%} of a processor, the events of a page {events:.2%}: "
+        f"{events / base:+.1%}. As a whole: "
+        f"{', '.join(f'{ratio:+.1%}' for ratio in ratios)}. Exchanges: {sorted(counts)}. "
+        f"The longest event took {max(made) * 1000:.1f} ms",
+        flush=True,
+    )
+
+
+def fetched(port: int, path: str) -> bytes:
+    with urllib.request.urlopen(f"http://127.0.0.1:{port}{path}", timeout=60) as reply:
+        body: bytes = reply.read()
+        return body
+
+
+def processor(process: subprocess.Popen[bytes]) -> float:
+    """Seconds of the processor since its start."""
+    fields = Path(f"/proc/{process.pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / 100
+
+
+def until_up(port: int, devices: int) -> None:
+    while True:
+        try:
+            text = fetched(port, "/metrics").decode()
+        except OSError:
+            text = ""
+        if text.count('state="up"} 1.0') == devices:
+            return
+        time.sleep(1)
+
+
+async def first_paint(port: int, chromium: str, profile: Path) -> tuple[float, float]:
+    """Seconds until something is painted, and until every value of a device is shown."""
+    async with browser(chromium, profile) as tab:
+        begun = time.monotonic()
+        await tab.open(f"http://127.0.0.1:{port}/#line=line0&device=d0-0")
+        await tab.until(
+            'document.body?.className === "" && document.querySelectorAll("#values tr").length > 90'
+        )
+        live = time.monotonic() - begun
+        paint = await tab.value('performance.getEntriesByName("first-paint")[0].startTime')
+        return paint / 1000, live
+
+
+def measure(process: subprocess.Popen[bytes], port: int, folder: Path) -> None:
+    until_up(port, SIZES.lines * SIZES.devices)
+    begun, used = time.monotonic(), processor(process)
+    size = len(fetched(port, "/metrics"))
+    taken = time.monotonic() - begun
+    print(
+        f"one scrape: {size / 1e6:.1f} MB in {taken:.2f} s, {processor(process) - used:.2f} s CPU"
+    )
+    if chromium := shutil.which("chromium"):
+        paint, live = asyncio.run(first_paint(port, chromium, folder / "profile"))
+        print(f"first paint after {paint:.2f} s, all values live after {live:.2f} s")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seconds", type=float, default=20.0, help="of the plant, in each round")
+    parser.add_argument("--rounds", type=int, default=5)
+    arguments = parser.parse_args()
+    structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.ERROR))
+    with tempfile.TemporaryDirectory() as folder:
+        port, path = free_port(), Path(folder) / "plant.yaml"
+        text = "\n".join(rows(SIZES, free_endpoint(), alike=True))
+        path.write_text(f'web: {{listen: "127.0.0.1:{port}"}}\n{text}\n')
+        print(f"{SIZES.all_tags} tags on {SIZES.lines} lines", flush=True)
+        compare(load(path), arguments.seconds, arguments.rounds)
+        process = started(HERE, "run", path)
+        try:
+            measure(process, port, Path(folder))
+        finally:
+            process.kill()
+            process.wait()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,23 @@
+"""The `backup` command: a copy of the history, also while the gateway runs."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from gateway.cli.terminal import ConfigPath
+from gateway.config import load
+from gateway.errors import GatewayError
+from gateway.history.backup import backup as copied
+
+
+def backup(
+    config: ConfigPath,
+    copy: Annotated[Path, typer.Argument(metavar="COPY", help="A file that does not exist yet.")],
+) -> None:
+    """Copy the history to a file. The gateway may run: nothing waits for it."""
+    loaded = load(config)
+    if loaded.history is None:
+        raise GatewayError(f"{config} has no `history:` section")
+    size = copied(loaded.history.path, copy)
+    print(f"{copy}: {size / 1e6:.1f} MB")

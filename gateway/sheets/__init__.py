@@ -1,0 +1,10 @@
+"""Sheets of tags: rows of a spreadsheet as settings of tags, and tags as rows.
+
+A sheet is a CSV or text file of any spreadsheet or PLC program, or an .xlsx file. Columns are found
+by their titles. Nothing here knows addresses or limits: the configuration checks those.
+"""
+
+from gateway.sheets.grid import Grid, read_grid
+from gateway.sheets.sheet import Sheet, SheetMistake, devices_in, read_sheet
+
+__all__ = ["Grid", "Sheet", "SheetMistake", "devices_in", "read_grid", "read_sheet"]

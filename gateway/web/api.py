@@ -1,0 +1,203 @@
+"""The JSON API: tags, devices, lines, history, writes. `openapi.json` describes it.
+
+Lists come in pages: `limit` items, and `next` for the parameter `after` of the next page. Answers
+are made on threads, because those of a large plant take long.
+"""
+
+import asyncio
+import time
+from collections.abc import Callable, Mapping
+from itertools import islice
+from typing import Any
+
+import orjson
+from aiohttp import web
+
+from gateway.errors import BadValue, GatewayError
+from gateway.northbound import payload
+from gateway.northbound.faults import below, faults, warnings
+from gateway.northbound.payload import Failure, Problem
+from gateway.northbound.session import off_loop
+from gateway.tags import Tag
+from gateway.web.guard import BY, answer
+from gateway.web.sources import Documents, Sources
+
+STATE_AGE = 2.0  # seconds that the state of lines and devices may be old
+MOST_ITEMS = 1000  # of one page
+MOST_SAMPLES = 10_000
+_ITEMS = 200
+_SAMPLES = 1000
+BODY_WITHIN = 5.0  # seconds
+HISTORY_AT_ONCE = 4  # queries; they read the disk
+# 200 only for an acknowledged write. 502 and above: it was sent, or the device cannot be reached.
+_STATUS = {
+    Problem.BAD_VALUE: 400,
+    Problem.NOT_WRITABLE: 403,
+    Problem.NOT_ALLOWED: 403,
+    Problem.UNKNOWN_TAG: 404,
+    Problem.REFUSED: 502,
+    Problem.LINE_DOWN: 503,
+    Problem.NO_REPLY: 503,
+    Problem.BUSY: 503,
+    Problem.UNCLEAR: 504,
+}
+
+
+class Api:
+    """The handlers."""
+
+    def __init__(self, sources: Sources) -> None:
+        self._plant = sources.plant
+        self._north = sources.north
+        self._history = sources.history
+        self._devices = {device.name: tuple(device.tags) for device in sources.plant.devices()}
+        self._history_turns = asyncio.Semaphore(HISTORY_AT_ONCE)
+
+    def routes(self) -> list[web.RouteDef]:
+        return [
+            web.get("/api/status", self._status),
+            web.get("/api/lines", self._lines),
+            web.get("/api/devices", self._device_page),
+            web.get("/api/devices/{device}", self._device),
+            web.get("/api/tags", self._tags),
+            web.get("/api/history", self._samples),
+            web.post("/api/write", self._write),
+        ]
+
+    async def _status(self, _: web.Request) -> web.Response:
+        return _json(overview(await self._north.documents(STATE_AGE)))
+
+    async def _lines(self, _: web.Request) -> web.Response:
+        documents = await self._north.documents(STATE_AGE)
+        return await _json_off_loop(lambda: {"lines": dict(below("lines/", documents))})
+
+    async def _device_page(self, request: web.Request) -> web.Response:
+        limit, after = _limit(request, _ITEMS, MOST_ITEMS), request.query.get("after", "")
+        line = request.query.get("line")
+        documents = await self._north.documents(STATE_AGE)
+
+        def page() -> object:
+            names = [name for name, _ in below("devices/", documents) if name > after]
+            if line is not None:
+                names = [name for name in names if name in _devices_of(line, documents)]
+            shown = {name: _without_requests(documents, name) for name in names[:limit]}
+            return {"devices": shown, "next": names[limit - 1] if len(names) > limit else None}
+
+        return await _json_off_loop(page)
+
+    async def _device(self, request: web.Request) -> web.Response:
+        documents = await self._north.documents(STATE_AGE)
+        name = request.match_info["device"]
+        if (document := documents.get(f"devices/{name}")) is None:
+            return answer(404, f"there is no device {payload.short(name)}")
+        return _json(document)
+
+    async def _tags(self, request: web.Request) -> web.Response:
+        limit, after = _limit(request, _ITEMS, MOST_ITEMS), request.query.get("after")
+        device, find = request.query.get("device"), request.query.get("find", "").lower()
+        if device is not None and device not in self._devices:
+            return answer(404, f"there is no device {payload.short(device)}")
+
+        def page() -> object:
+            found = self.select(device, find, after, limit + 1)
+            more = len(found) > limit
+            tags = [{"tag": tag.key, **self._fields(tag)} for tag in found[:limit]]
+            return {"tags": tags, "next": tags[-1]["tag"] if more else None}
+
+        return await _json_off_loop(page)
+
+    def select(self, device: str | None, find: str, after: str | None, limit: int) -> list[Tag]:
+        """Returns tags in the order of the file, after the tag `after`."""
+        names = [*self._devices] if device is None else [device]
+        if after is not None and (start := after.partition("/")[0]) in names:
+            names = names[names.index(start) :]
+        tags = (tag for name in names for tag in self._devices.get(name, ()))
+        if after is not None:
+            for tag in tags:
+                if tag.key == after:
+                    break
+        matching = (tag for tag in tags if find in tag.key.lower())
+        return list(islice(matching if find else tags, limit))
+
+    def _fields(self, tag: Tag) -> Mapping[str, object]:
+        return {**payload.sample_fields(self._plant.sample(tag)), **payload.meta_fields(tag)}
+
+    async def _samples(self, request: web.Request) -> web.Response:
+        key = request.query.get("tag", "")
+        tag, history = self._plant.tag(key), self._history
+        if tag is None:
+            return answer(404, f"there is no tag {payload.short(key)}")
+        if history is None or not tag.history:
+            return answer(404, f"no history is kept of {tag.key}: it needs `history: true`")
+        limit = _limit(request, _SAMPLES, MOST_SAMPLES)
+        period = request.query.get("time", "[now(-1h)..]")
+
+        def read() -> object:
+            try:
+                found = [*history.samples(tag, period, limit, time.time_ns())]
+            except GatewayError as error:
+                return error
+            samples = [payload.sample_fields(sample) for sample in found]
+            return {"tag": tag.key, "samples": samples, "complete": len(samples) < limit}
+
+        async with self._history_turns:
+            found = await off_loop(read)
+        if isinstance(found, GatewayError):
+            return answer(400 if isinstance(found, BadValue) else 503, str(found))
+        return await _json_off_loop(lambda: found)
+
+    async def _write(self, request: web.Request) -> web.Response:
+        arrived = asyncio.get_running_loop().time()
+        if request.content_type != "application/json":
+            return answer(415, "send the value as Content-Type: application/json")
+        try:
+            async with asyncio.timeout(BODY_WITHIN):
+                key, data = request.query.get("tag", ""), await request.read()
+        except TimeoutError:
+            return answer(408, f"the body did not arrive within {BODY_WITHIN:g} s")
+        # The server does not cancel this when the client leaves: the write may be on the wire.
+        result = await self._north.write(key, data, f"web {request[BY]}", arrived)
+        status = _STATUS.get(result.problem, 500) if isinstance(result, Failure) else 200
+        return _raw(payload.outcome(result), status)
+
+
+def overview(documents: Documents) -> dict[str, Any]:
+    """Returns the state of the gateway, and sentences about what is wrong."""
+    parts = ("status", "zenoh", "outcomes", "history", "standby")
+    return {
+        **{name: documents[name] for name in parts if name in documents},
+        "faults": [*faults(documents)],
+        "warnings": [*warnings(documents)],
+    }
+
+
+def _devices_of(line: str, documents: Documents) -> Mapping[str, Any]:
+    known: Mapping[str, Any] = documents.get(f"lines/{line}", {}).get("devices", {})
+    return known
+
+
+def _without_requests(documents: Documents, name: str) -> Mapping[str, Any]:
+    document = documents[f"devices/{name}"]
+    return {field: value for field, value in document.items() if field != "requests"}
+
+
+def _limit(request: web.Request, default: int, most: int) -> int:
+    text = request.query.get("limit", str(default))
+    if not (text.isascii() and text.isdigit() and len(text) < 9 and 1 <= int(text) <= most):
+        raise web.HTTPBadRequest(reason=f"limit is no count from 1 to {most}")
+    return int(text)
+
+
+async def _json_off_loop(make: Callable[[], object]) -> web.Response:
+    def body() -> bytes:
+        return orjson.dumps(make(), default=str, option=orjson.OPT_NON_STR_KEYS)
+
+    return _raw(await off_loop(body))
+
+
+def _json(found: object) -> web.Response:
+    return _raw(orjson.dumps(found, default=str, option=orjson.OPT_NON_STR_KEYS))
+
+
+def _raw(body: bytes, status: int = 200) -> web.Response:
+    return web.Response(body=body, status=status, content_type="application/json")

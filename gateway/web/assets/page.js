@@ -1,0 +1,488 @@
+// The status page. It shows values only while they are live: when the event stream breaks or is
+// late, everything turns grey at once, with the time of the last event.
+
+const byId = (id) => document.getElementById(id);
+const SILENT = 2500; // ms without an event until nothing is live
+const LATE = 3000; // ms that an event may be later than the fastest one
+const SHOWN = 200; // rows of devices
+const WINDOW = 10000; // ms of the wire
+
+const known = { devices: new Map(), lines: [], loads: new Map(), exchanges: [], tags: new Map() };
+let token = "";
+let choice = readHash();
+let stream = null; // of the current choice
+let heard = 0; // performance.now() of the last event
+let serverTime = 0; // ms since 1970, of the last event
+let fastest = Infinity; // the least difference of the two steady clocks, in this stream
+let live = false;
+let valuesLive = false; // values of the chosen device came by the current stream
+let nextAfter = null;
+
+function readHash() {
+  const found = new URLSearchParams(location.hash.slice(1));
+  return { line: found.get("line") ?? "", device: found.get("device") ?? "", after: found.get("after") ?? "" };
+}
+
+function choose(change) {
+  const next = new URLSearchParams();
+  for (const [name, value] of Object.entries({ ...choice, ...change })) if (value) next.set(name, value);
+  location.hash = next.toString();
+}
+
+function element(name, text, className) {
+  const made = document.createElement(name);
+  if (text !== undefined) made.textContent = text;
+  if (className) made.className = className;
+  return made;
+}
+
+function clock(ms) {
+  return new Date(ms).toLocaleTimeString([], { hour12: false });
+}
+
+function span(seconds) {
+  if (seconds < 10) return `${seconds.toFixed(1)} s`;
+  if (seconds < 120) return `${Math.round(seconds)} s`;
+  if (seconds < 7200) return `${Math.round(seconds / 60)} min`;
+  return seconds < 172800 ? `${Math.round(seconds / 3600)} h` : `${Math.round(seconds / 86400)} d`;
+}
+
+// -- live or not --
+
+function setLive(now, why) {
+  live = now;
+  const isStale = !live || (choice.device !== "" && !valuesLive);
+  if (isStale !== document.body.classList.contains("stale")) {
+    document.body.classList.toggle("stale", isStale);
+    for (const tag of known.tags.values()) if (tag.last && tag.cells) showQuality(tag);
+  }
+  const since = serverTime ? `not live since ${clock(serverTime)}` : "not connected";
+  put("live", live ? "live" : `${since}${why ? `: ${why}` : ""}`);
+  put("values-live", !isStale ? "" : `These values are not live${serverTime ? `: they are of ${clock(serverTime)}` : ""}.`);
+}
+
+function put(id, text) {
+  if (byId(id).textContent !== text) byId(id).textContent = text;
+}
+
+setInterval(() => {
+  if (live && performance.now() - heard > SILENT) setLive(false, "no event arrives");
+  showAges();
+}, 500);
+
+// -- the event stream --
+
+function headers() {
+  return token ? { Authorization: `Bearer ${token}` } : {};
+}
+
+async function follow() {
+  stream?.abort();
+  const mine = (stream = new AbortController());
+  valuesLive = false;
+  fastest = Infinity;
+  known.exchanges = [];
+  known.loads.clear();
+  const query = new URLSearchParams();
+  for (const [name, value] of Object.entries(choice)) if (value) query.set(name, value);
+  while (stream === mine) {
+    let why = "the connection ended";
+    try {
+      const reply = await fetch(`api/events?${query}`, { headers: headers(), signal: mine.signal, cache: "no-store" });
+      if (reply.ok) await read(reply.body, mine);
+      else {
+        why = `${reply.status} ${(await reply.json()).error}`;
+        if (reply.status === 401) byId("login").hidden = false;
+      }
+    } catch (error) {
+      if (mine.signal.aborted) return;
+      why = "no connection to the gateway";
+    }
+    if (stream !== mine) return;
+    valuesLive = false;
+    known.devices.clear();
+    known.loads.clear();
+    setLive(false, why);
+    await new Promise((done) => setTimeout(done, 1000));
+  }
+}
+
+async function read(body, mine) {
+  const reader = body.pipeThrough(new TextDecoderStream()).getReader();
+  let rest = "";
+  for (;;) {
+    const { value, done } = await reader.read();
+    if (done || stream !== mine) return;
+    const events = (rest + value).split("\n\n");
+    rest = events.pop();
+    for (const event of events) {
+      const [, kind, data] = event.match(/^event: (\w+)\ndata: (.*)$/s) ?? [];
+      if (kind) take(kind, JSON.parse(data));
+    }
+  }
+}
+
+function take(kind, data) {
+  if (kind === "time") return takeTime(data);
+  if (kind === "state") return takeState(data);
+  if (kind === "loads") return takeLoads(data);
+  if (kind === "values") return takeValues(data);
+  if (kind === "wire") return takeWire(data);
+}
+
+function takeTime([now, steady]) {
+  heard = performance.now();
+  const behind = heard - steady;
+  fastest = Math.min(fastest, behind);
+  if (behind - fastest > LATE) return setLive(false, "events are late"); // they wait on their way
+  serverTime = now;
+  setLive(true);
+  drawWire();
+}
+
+// -- state --
+
+function takeState(state) {
+  const standby = state.standby ? `, ${state.standby}` : "";
+  put("name", state.name);
+  document.title = `${state.faults.length ? `(${state.faults.length}) ` : ""}${state.name}`;
+  const history = state.history === null ? "" : `, history ${state.history === "ok" ? "ok" : "not ok"}`;
+  put("about", `${state.version}, up ${span(state.up)}, ${state.tags} tags, ${state.links.length} Zenoh links${history}${standby}`);
+  const sentences = [
+    ...(state.ready ? [] : [["warning", "the gateway does not serve its plant: it starts, or is the standby"]]),
+    ...state.faults.map((text) => ["wrong", text]),
+    ...state.warnings.map((text) => ["warning", text]),
+    ...(state.more ? [["warning", `and ${state.more} more`]] : []),
+  ];
+  const items = sentences.length ? sentences : [["good", "nothing"]];
+  if (JSON.stringify(items) !== known.items) {
+    known.items = JSON.stringify(items);
+    byId("wrong").replaceChildren(...items.map(([kind, text]) => element("li", text, kind)));
+  }
+  known.lines = state.lines;
+  for (const [name, device] of Object.entries(state.devices)) known.devices.set(name, device);
+  showLines();
+  if (Object.keys(state.devices).length) showDevices();
+}
+
+function takeLoads(loads) {
+  for (const [name, added] of Object.entries(loads)) {
+    known.loads.set(name, [...(known.loads.get(name) ?? []), ...added].slice(-360));
+  }
+  showLines();
+}
+
+function showLines() {
+  const body = byId("lines");
+  known.lines.forEach(([name, open, trouble, expected, requests], number) => {
+    const row = body.children[number] ?? body.appendChild(lineRow());
+    const [button, state, picture, load, planned, rate] = row.cells;
+    const shown = button.firstChild;
+    if (shown.textContent !== name) shown.textContent = name;
+    shown.setAttribute("aria-pressed", String(choice.line === name));
+    const text = open ? "open" : `down: ${trouble || "not opened yet"}`;
+    if (state.textContent !== text) state.textContent = text;
+    state.className = open ? "open" : "down";
+    const loads = known.loads.get(name) ?? [];
+    const last = loads.at(-1);
+    load.textContent = last === undefined ? "" : `${Math.round(last * 100)} %`;
+    planned.textContent = `${Math.round(expected * 100)} %`;
+    rate.textContent = requests === null ? "" : requests.toFixed(1);
+    const step = 360 / Math.max(60, loads.length); // five minutes at least
+    const points = loads.map((share, at) => `${360 - (loads.length - 1 - at) * step},${20 - share * 18}`).join(" ");
+    const chart = picture.firstChild;
+    if (chart.dataset.count !== String(loads.length) || chart.dataset.last !== String(last)) {
+      chart.dataset.count = loads.length;
+      chart.dataset.last = last;
+      chart.firstChild.setAttribute("points", points);
+      chart.setAttribute("aria-label", `load of ${name}: now ${load.textContent}, highest ${Math.round(Math.max(0, ...loads) * 100)} %`);
+    }
+  });
+  while (body.children.length > known.lines.length) body.lastChild.remove();
+}
+
+function lineRow() {
+  const row = element("tr");
+  const button = element("button", "", "link");
+  button.type = "button";
+  button.addEventListener("click", () => choose({ line: choice.line === button.textContent ? "" : button.textContent }));
+  const chart = document.createElementNS("http://www.w3.org/2000/svg", "svg");
+  chart.setAttribute("viewBox", "0 0 360 22");
+  chart.setAttribute("preserveAspectRatio", "none");
+  chart.setAttribute("class", "load");
+  chart.setAttribute("role", "img");
+  chart.append(document.createElementNS("http://www.w3.org/2000/svg", "polyline"));
+  const cells = [element("td"), element("td"), element("td"), element("td", "", "number"), element("td", "", "number less"), element("td", "", "number less")];
+  cells[0].append(button);
+  cells[2].append(chart);
+  row.append(...cells);
+  return row;
+}
+
+const ORDER = { silent: 0, failing: 1, starting: 2, up: 3 };
+
+function showDevices() {
+  const find = byId("find").value.toLowerCase();
+  const all = [...known.devices].filter(([name, [line]]) => `${line} ${name}`.toLowerCase().includes(find));
+  all.sort(([a, [, one]], [b, [, other]]) => (ORDER[one] ?? 0) - (ORDER[other] ?? 0) || a.localeCompare(b));
+  const focused = document.activeElement?.dataset?.device;
+  byId("devices").replaceChildren(...all.slice(0, SHOWN).map(([name, [line, state, why]]) => {
+    const row = element("tr");
+    const button = element("button", name, "link");
+    button.type = "button";
+    button.dataset.device = name;
+    button.setAttribute("aria-pressed", String(choice.device === name));
+    button.addEventListener("click", () => choose({ device: choice.device === name ? "" : name, after: "" }));
+    const first = element("td");
+    first.append(button);
+    row.append(first, element("td", line), element("td", state, state), element("td", why));
+    return row;
+  }));
+  if (focused) byId("devices").querySelector(`[data-device="${CSS.escape(focused)}"]`)?.focus();
+  put("device-count", all.length > SHOWN ? `${SHOWN} of ${all.length}` : `${all.length}`);
+}
+
+byId("find").addEventListener("input", showDevices);
+
+// -- values --
+
+async function showTags() {
+  const { device, after } = choice;
+  byId("values-section").hidden = !device;
+  byId("trend").hidden = true;
+  byId("values").replaceChildren();
+  known.tags.clear();
+  if (!device) return;
+  put("values-title", `Values of ${device}`);
+  const query = new URLSearchParams({ device, limit: "200" });
+  if (after) query.set("after", after);
+  const reply = await fetch(`api/tags?${query}`, { headers: headers(), cache: "no-store" });
+  if (!reply.ok || choice.device !== device || choice.after !== after) return;
+  const { tags, next } = await reply.json();
+  nextAfter = next;
+  byId("next").disabled = next === null;
+  byId("first").disabled = !after;
+  byId("write-tag").replaceChildren(...tags.filter((tag) => tag.write).map((tag) => element("option", tag.tag)));
+  byId("writing").hidden = !tags.some((tag) => tag.write);
+  for (const tag of tags) {
+    const row = element("tr");
+    const name = tag.tag.slice(device.length + 1);
+    const title = element("th", name);
+    title.scope = "row";
+    title.title = [tag.description, tag.type, tag.address].filter(Boolean).join(", ");
+    const cells = [element("td", "", "number value"), element("td", tag.unit), element("td"), element("td", "", "number"), element("td")];
+    if (tag.history) {
+      const button = element("button", "trend", "link");
+      button.type = "button";
+      button.setAttribute("aria-label", `trend of ${tag.tag}`);
+      button.addEventListener("click", () => showTrend(tag));
+      cells[4].append(button);
+    }
+    row.append(title, ...cells);
+    byId("values").append(row);
+    const { last } = known.tags.get(name) ?? {}; // its value may have come before its row
+    known.tags.set(name, { cells, last });
+    if (last) showValue(last);
+  }
+}
+
+function takeValues(values) {
+  for (const value of values) {
+    if (!known.tags.has(value[0])) known.tags.set(value[0], {});
+    showValue(value);
+  }
+  valuesLive = true;
+}
+
+function showValue(last) {
+  const tag = known.tags.get(last[0]);
+  tag.last = last;
+  if (!tag.cells) return;
+  tag.cells[0].textContent = last[2] ? last[1] : "–";
+  showQuality(tag);
+}
+
+function showQuality({ cells, last: [, , good, , why] }) {
+  const isStale = document.body.classList.contains("stale");
+  cells[2].textContent = isStale ? "not live" : good ? "good" : `bad: ${why}`;
+  cells[2].className = isStale ? "" : good ? "good" : "bad";
+}
+
+function showAges() {
+  if (!serverTime) return;
+  const now = serverTime + (performance.now() - heard);
+  for (const tag of known.tags.values()) {
+    if (tag.cells && tag.last) {
+      const text = span(Math.max(0, (now - tag.last[3]) / 1000));
+      if (tag.cells[3].textContent !== text) tag.cells[3].textContent = text;
+    }
+  }
+}
+
+byId("next").addEventListener("click", () => choose({ after: nextAfter ?? "" }));
+byId("first").addEventListener("click", () => choose({ after: "" }));
+
+async function showTrend(tag) {
+  byId("trend").hidden = false;
+  put("trend-title", `${tag.tag}, the last 15 minutes`);
+  put("trend-text", "reading …");
+  byId("trend-chart").replaceChildren();
+  const query = new URLSearchParams({ tag: tag.tag, time: "[now(-15m)..]", limit: "10000" });
+  const reply = await fetch(`api/history?${query}`, { headers: headers(), cache: "no-store" });
+  const found = await reply.json();
+  if (!reply.ok) return put("trend-text", found.error);
+  drawTrend(found, tag);
+}
+
+function drawTrend({ samples, complete }, tag) {
+  const good = samples.filter((sample) => sample.quality === "good" && typeof sample.value !== "string");
+  if (!good.length) return put("trend-text", `${samples.length} samples, none with a good number`);
+  const numbers = good.map((sample) => Number(sample.value));
+  const [low, high] = [Math.min(...numbers), Math.max(...numbers)];
+  const times = samples.map((sample) => Date.parse(sample.time));
+  const [from, to] = [times[0], Math.max(times.at(-1), times[0] + 1000, serverTime)];
+  const x = (time) => (600 * (time - from)) / (to - from);
+  const y = (value) => (high === low ? 75 : 140 - (130 * (value - low)) / (high - low));
+  const lines = [[]]; // a bad sample breaks the line
+  samples.forEach((sample, at) => {
+    if (sample.quality !== "good") return lines.at(-1).length && lines.push([]);
+    const here = lines.at(-1);
+    if (here.length) here.push(`${x(times[at])},${here.at(-1).split(",")[1]}`); // a value stays until the next
+    here.push(`${x(times[at])},${y(Number(sample.value))}`);
+  });
+  const drawn = lines.filter((line) => line.length).map((line) => {
+    const made = document.createElementNS("http://www.w3.org/2000/svg", "polyline");
+    made.setAttribute("points", line.join(" "));
+    return made;
+  });
+  byId("trend-chart").replaceChildren(...drawn);
+  const bad = samples.length - good.length;
+  put("trend-text", `${clock(from)} to ${clock(to)}: ${samples.length} samples${bad ? `, ${bad} bad` : ""}, ` +
+    `least ${low} ${tag.unit}, greatest ${high} ${tag.unit}${complete ? "" : "; there are more"}`);
+}
+
+// -- writing --
+
+byId("write-form").addEventListener("submit", async (event) => {
+  event.preventDefault();
+  token = byId("write-token").value.trim() || token;
+  const [tag, value] = [byId("write-tag").value, byId("write-value").value.trim()];
+  if (!confirm(`Write ${tag} = ${value} ?`)) return;
+  put("write-result", "writing …");
+  const query = new URLSearchParams({ tag });
+  try {
+    const reply = await fetch(`api/write?${query}`, {
+      method: "POST", body: asJson(value), headers: { ...headers(), "Content-Type": "application/json" },
+    });
+    const found = await reply.json();
+    const done = found.acknowledged ? (found.verified ? "acknowledged and read back" : "acknowledged") : "sent to all, which no device acknowledges";
+    put("write-result", reply.ok ? `${tag} = ${found.value}: ${done}` : `${tag}: ${found.error}${found.reason ? `: ${found.reason}` : ""}`);
+  } catch {
+    put("write-result", `${tag}: the connection ended; it is not known whether the value was written`);
+  }
+});
+
+// A number or true and false go out as they are typed: a number of JavaScript would round them.
+function asJson(text) {
+  return /^(true|false|-?\d+(\.\d+)?([eE][+-]?\d+)?)$/.test(text) ? text : JSON.stringify(text);
+}
+
+byId("token-form").addEventListener("submit", (event) => {
+  event.preventDefault();
+  token = byId("token").value.trim();
+  byId("login").hidden = true;
+  show();
+});
+
+// -- the wire --
+
+function takeWire({ missed, exchanges }) {
+  for (const [number, begun, took, device, kind, what, result, failed] of exchanges) {
+    known.exchanges.push({ number, begun, took, device, kind, what, result, failed });
+  }
+  known.missed = missed;
+  const oldest = exchanges.at(-1)[1] - WINDOW - 2000;
+  known.exchanges = known.exchanges.filter((one) => one.begun >= oldest).slice(-5000);
+  showExchanges();
+}
+
+function showExchanges() {
+  const last = known.exchanges.slice(-15).reverse();
+  byId("exchanges").replaceChildren(...last.map((one) => {
+    const row = element("tr");
+    row.append(
+      element("td", new Date(one.begun).toISOString().slice(11, 23)), element("td", one.device), element("td", one.what),
+      element("td", `${(one.took * 1000).toFixed(0)} ms`, "number"), element("td", one.failed ? `failed: ${one.result}` : one.result, one.failed ? "bad" : ""),
+    );
+    return row;
+  }));
+}
+
+function drawWire() {
+  byId("wire-section").hidden = !choice.line;
+  if (!choice.line) return;
+  put("wire-title", `The wire of ${choice.line}, the last 10 seconds`);
+  const canvas = byId("wire");
+  const shown = known.exchanges.filter((one) => one.begun + one.took * 1000 > serverTime - WINDOW);
+  const of = (device) => shown.filter((one) => one.device === device);
+  const names = [...known.devices].filter(([, [line]]) => line === choice.line).map(([name]) => name);
+  const devices = names.length > 24 ? names.filter((name) => of(name).length).slice(0, 24) : names;
+  const failed = shown.filter((one) => one.failed).length;
+  const busy = shown.reduce((sum, one) => sum + one.took, 0);
+  put("wire-sum", `${shown.length} exchanges, ${failed} failed, in use ${Math.min(100, Math.round((100 * busy * 1000) / WINDOW))} % of the time` +
+    `${known.missed ? `; ${known.missed} are not shown` : ""}. ${devices.map((name) => `${name}: ${of(name).length}`).join(", ")}`);
+  canvas.setAttribute("aria-label", `strip chart of ${choice.line}`);
+  const [width, row, left] = [canvas.clientWidth, 22, Math.min(140, canvas.clientWidth / 4)];
+  const height = row * Math.max(1, devices.length) + 20;
+  const scale = devicePixelRatio;
+  if (canvas.width !== Math.round(width * scale) || canvas.height !== Math.round(height * scale)) {
+    canvas.width = Math.round(width * scale);
+    canvas.height = Math.round(height * scale);
+    canvas.style.height = `${height}px`;
+  }
+  const pen = canvas.getContext("2d");
+  const style = getComputedStyle(document.documentElement);
+  const color = (name) => style.getPropertyValue(`--${name}`);
+  pen.setTransform(scale, 0, 0, scale, 0, 0);
+  pen.clearRect(0, 0, width, height);
+  pen.font = "13px system-ui, sans-serif";
+  const x = (time) => left + ((width - left) * (time - serverTime + WINDOW)) / WINDOW;
+  for (let second = 0; second <= 10; second += 2) {
+    const at = x(serverTime - WINDOW + second * 1000);
+    pen.fillStyle = color("edge");
+    pen.fillRect(at, 0, 1, height - 18);
+    pen.fillStyle = color("soft");
+    pen.textAlign = second === 10 ? "right" : "center";
+    pen.fillText(second === 10 ? "now" : `${second - 10} s`, at, height - 4);
+  }
+  devices.forEach((name, number) => {
+    const top = number * row;
+    pen.fillStyle = color("ink");
+    pen.textAlign = "left";
+    pen.fillText(name, 0, top + 15, left - 8);
+    for (const one of of(name)) {
+      const from = Math.max(left, x(one.begun));
+      const wide = Math.max(2, x(one.begun + one.took * 1000) - from);
+      pen.fillStyle = color(one.failed ? "bad" : { read: "read", write: "write", probe: "probe" }[one.kind] ?? "wait");
+      pen.fillRect(from, top + (one.failed ? 2 : 6), wide, one.failed ? 18 : 10);
+      if (one.failed) pen.fillText("×", Math.min(from + wide + 1, width - 9), top + 12);
+    }
+  });
+}
+
+// -- begin --
+
+byId("skip").addEventListener("click", () => byId("find").focus());
+
+function show() {
+  choice = readHash();
+  setLive(false);
+  showLines();
+  showDevices();
+  drawWire();
+  showTags();
+  follow();
+}
+
+addEventListener("hashchange", show);
+show();

@@ -1,0 +1,47 @@
+"""The parts of the gateway that the HTTP side uses. It changes none of them but by a write."""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from gateway.line.line import Watcher
+from gateway.northbound.interfaces import Device, History
+from gateway.northbound.payload import Failure
+from gateway.tags import Sample, Tag, WriteResult
+
+Documents = Mapping[str, Mapping[str, Any]]  # by path: `status`, `lines/hall-1`, `devices/mixer`
+
+
+class Plant(Protocol):
+    """The devices and their samples."""
+
+    def devices(self) -> Iterable[Device]: ...
+
+    def tag(self, key: str) -> Tag | None:
+        """Finds a tag by `device/name`."""
+
+    def sample(self, tag: Tag) -> Sample:
+        """Returns the current sample; any thread may call it."""
+
+    def watch(self, line: str, watcher: Watcher | None) -> bool:
+        """Sets or removes the watcher of a line. False: there is no such line."""
+
+
+class North(Protocol):
+    """The status documents, and the one path of writes."""
+
+    async def documents(self, max_age: float) -> Documents:
+        """Returns the status documents by path, at most `max_age` seconds old."""
+
+    async def write(self, tag: str, data: bytes, by: str, arrived: float) -> WriteResult | Failure:
+        """Writes for the client `by`. `arrived`: by the loop's clock."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sources:
+    """Everything that the HTTP side shows. `ready`: the gateway serves its plant on Zenoh."""
+
+    plant: Plant
+    north: North
+    history: History | None
+    ready: Callable[[], bool]

@@ -1,0 +1,152 @@
+"""The HTTP side over a plant of plain data, without Zenoh, and a client of it."""
+
+import asyncio
+import json
+from collections.abc import AsyncIterator, Mapping
+from contextlib import asynccontextmanager
+from typing import Any, NamedTuple
+
+from gateway.config import WebConfig
+from gateway.northbound.audit import Counts
+from gateway.northbound.payload import Failure, Problem
+from gateway.tags import WriteResult
+from gateway.web import metrics
+from gateway.web.server import Server
+from gateway.web.sources import Documents, Sources
+from tests.e2e.processes import free_port
+from tests.northbound.plant import PlainPlant, mixer
+
+TOKEN = "0123456789-0123456789"  # noqa: S105  (of these tests only)
+ZENOH = {"to": ["client"], "published": 7}
+
+
+DOCUMENTS: Mapping[str, Mapping[str, Any]] = {
+    "lines/hall": {
+        "open": True,
+        "trouble": "",
+        "opened": 1,
+        "open_time": 5.0,
+        "busy_time": 1.0,
+        "unasked_bytes": 0,
+        "devices": {"mixer": "up", "oven": "silent"},
+        "expected": {"load": 0.3},
+        "measured": {"load": 0.2, "requests_per_second": 5.0},
+    },
+    **{
+        f"devices/{name}": {
+            "protocol": "vigor",
+            "standing": standing,
+            "diagnosis": diagnosis,
+            "failures": {"silence": 2},
+            "refusals": {},
+            "refused_addresses": [],
+            "requests": [],
+            **dict.fromkeys([field for _, field, _ in metrics.DEVICE], 1),
+        }
+        for name, standing, diagnosis in (
+            ("mixer", "up", ""),
+            ("oven", "silent", "No byte came back: check power, wiring and station number"),
+        )
+    },
+}
+
+
+class PlainNorth:
+    """Documents from a dict, and writes that end as `endings` says for their payload."""
+
+    def __init__(self) -> None:
+        self.changed: dict[str, Mapping[str, Any]] = {}
+        self.endings: dict[bytes, WriteResult | Failure] = {}
+        self.written: list[tuple[str, bytes, str]] = []
+        self.began = asyncio.Event()
+        self.gate = asyncio.Event()  # writes wait for it
+        self.gate.set()
+
+    async def documents(self, max_age: float) -> Documents:
+        status = {"name": "demo", "version": "1", "up": 5.0, "tags": 4, "refused_devices": {}}
+        return {
+            "status": status,
+            "zenoh": ZENOH,
+            "outcomes": Counts().document(),
+            **DOCUMENTS,
+            **self.changed,
+        }
+
+    async def write(self, tag: str, data: bytes, by: str, arrived: float) -> WriteResult | Failure:
+        self.began.set()
+        await self.gate.wait()
+        self.written.append((tag, data, by))
+        return self.endings.get(data, Failure(Problem.UNKNOWN_TAG, "no such tag"))
+
+
+class Answer(NamedTuple):
+    status: int
+    headers: Mapping[str, str]
+    body: bytes
+
+    @property
+    def json(self) -> Any:
+        return json.loads(self.body)
+
+
+class Client:
+    """Sends requests as they are given; `host` is what a browser would name."""
+
+    def __init__(self, port: int, north: PlainNorth, plant: PlainPlant) -> None:
+        self.port = port
+        self.north = north
+        self.plant = plant
+
+    async def ask(
+        self, path: str, method: str = "GET", body: bytes = b"", **headers: str
+    ) -> Answer:
+        """Underscores of the names of headers stand for hyphens."""
+        fields = {"Host": f"127.0.0.1:{self.port}", "Connection": "close"}
+        fields |= {name.replace("_", "-"): value for name, value in headers.items()}
+        if body:
+            fields["Content-Length"] = str(len(body))
+        lines = [f"{method} {path} HTTP/1.1", *(f"{k}: {v}" for k, v in fields.items()), "", ""]
+        reader, writer = await asyncio.open_connection("127.0.0.1", self.port)
+        try:
+            writer.write("\r\n".join(lines).encode() + body)
+            whole = await asyncio.wait_for(reader.read(), 10)
+        finally:
+            writer.close()
+            await writer.wait_closed()
+        head, _, rest = whole.partition(b"\r\n\r\n")
+        first, *others = head.decode().split("\r\n")
+        found = dict(line.split(": ", 1) for line in others)
+        return Answer(int(first.split()[1]), found, rest)
+
+
+def local(**settings: Any) -> WebConfig:
+    return WebConfig(**{"host": "127.0.0.1", "port": free_port(), **settings})
+
+
+@asynccontextmanager
+async def serving(**settings: Any) -> AsyncIterator[Client]:
+    """Serves at a free port; `settings`: those of `WebConfig`, `history`, `plant`."""
+    history, plant = settings.pop("history", None), settings.pop("plant", None) or mixer()
+    config, north = local(**settings), PlainNorth()
+    server = Server(config, Sources(plant, north, history, lambda: True))
+    serves = asyncio.create_task(server.run())
+    binds = asyncio.create_task(_until_bound(config.port))
+    try:
+        await asyncio.wait([serves, binds], return_when=asyncio.FIRST_COMPLETED)
+        yield Client(config.port, north, plant)
+    finally:
+        for task in (serves, binds):
+            task.cancel()
+        await asyncio.gather(serves, binds, return_exceptions=True)
+
+
+async def _until_bound(port: int) -> None:
+    while True:
+        try:
+            _, writer = await asyncio.open_connection("127.0.0.1", port)
+        except OSError:
+            await asyncio.sleep(0.01)  # the server binds without a notice
+            continue
+        writer.close()
+        await writer.wait_closed()
+        return

@@ -1,0 +1,236 @@
+"""The JSON API: its description, its pages, and what a write is answered with."""
+
+import asyncio
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gateway.northbound.payload import Failure, Problem
+from gateway.tags import WriteResult, good
+from gateway.web.server import Server
+from gateway.web.sources import Sources
+from tests.history.recorded import SPEED, history
+from tests.northbound.plant import PlainDevice, PlainPlant, mixer, tag
+from tests.schema_check import violations
+from tests.web.serving import TOKEN, Client, PlainNorth, local, serving
+
+DESCRIBED = json.loads((Path(__file__).parents[2] / "gateway/web/assets/openapi.json").read_text())
+PAGE = {"/", "/page.js", "/page.css", "/openapi.json"}
+AS_JSON = {"Content_Type": "application/json", "Authorization": f"Bearer {TOKEN}"}
+
+
+@pytest.fixture
+def tokens(tmp_path: Path) -> Path:
+    path = tmp_path / "tokens.txt"
+    path.write_text(f"alice:{TOKEN}\n")
+    path.chmod(0o600)
+    return path
+
+
+def schema(path: str, status: int, method: str = "get") -> dict[str, Any]:
+    """The schema of an answer, with the definitions that it refers to."""
+    answer = DESCRIBED["paths"][path][method]["responses"][str(status)]
+    found = {**answer["content"]["application/json"]["schema"]}
+    found["$defs"] = DESCRIBED["components"]["schemas"]
+    renamed: dict[str, Any] = json.loads(
+        json.dumps(found).replace("#/components/schemas/", "#/$defs/")
+    )
+    return renamed
+
+
+async def test_the_description_has_every_address_and_no_other() -> None:
+    server = Server(local(), Sources(mixer(), PlainNorth(), None, lambda: True))
+    served = {(path, method.lower()) for path, method in server.addresses() if method != "HEAD"}
+    described = {(path, method) for path, one in DESCRIBED["paths"].items() for method in one}
+    assert served - {(path, "get") for path in PAGE} == described
+
+
+@pytest.mark.parametrize(
+    ("address", "path", "status"),
+    [
+        ("/api/status", "/api/status", 200),
+        ("/api/lines", "/api/lines", 200),
+        ("/api/devices", "/api/devices", 200),
+        ("/api/devices?line=hall&limit=1", "/api/devices", 200),
+        ("/api/devices?limit=0", "/api/devices", 400),
+        ("/api/devices/oven", "/api/devices/{device}", 200),
+        ("/api/devices/none", "/api/devices/{device}", 404),
+        ("/api/tags", "/api/tags", 200),
+        ("/api/tags?limit=1001", "/api/tags", 400),
+        ("/api/tags?device=none", "/api/tags", 404),
+        ("/api/history?tag=mixer/speed", "/api/history", 404),
+    ],
+)
+async def test_an_answer_is_as_described(address: str, path: str, status: int) -> None:
+    async with serving() as client:
+        answer = await client.ask(address)
+        assert answer.status == status
+        assert violations(answer.json, schema(path, status)) == []
+
+
+async def test_the_pages_of_a_list_have_every_tag_once() -> None:
+    async with serving() as client:
+        found: list[str] = []
+        after = ""
+        while after is not None:
+            page = (await client.ask(f"/api/tags?limit=1{after and '&after=' + after}")).json
+            found += [one["tag"] for one in page["tags"]]
+            after = page["next"]
+        assert found == ["mixer/speed", "mixer/alarms/door", "mixer/recipe", "oven/temperature"]
+        some = (await client.ask("/api/tags?find=DOOR")).json["tags"]
+        assert [one["tag"] for one in some] == ["mixer/alarms/door"]
+
+
+async def test_history_is_answered_as_described(tmp_path: Path) -> None:
+    now = time.time_ns()
+    plant = PlainPlant(PlainDevice(SPEED.device, (SPEED,)))
+    with history(tmp_path / "history.db") as historian:
+        historian.record([good(SPEED, number, now - 10**9 + number) for number in range(5)])
+        async with serving(history=historian, plant=plant) as client:
+            answer = await client.ask(f"/api/history?tag={SPEED.key}&limit=3")
+            assert violations(answer.json, schema("/api/history", 200)) == []
+            assert [one["value"] for one in answer.json["samples"]] == [0, 1, 2]
+            assert answer.json["complete"] is False
+            whole = await client.ask(f"/api/history?tag={SPEED.key}&limit=6")
+            assert whole.json["complete"] is True
+            wrong = await client.ask(f"/api/history?tag={SPEED.key}&time=yesterday")
+            assert (wrong.status, "no range" in wrong.json["error"]) == (400, True)
+
+
+ENDINGS = [
+    (WriteResult(7, 0, 0.03, verified=True), 200),
+    (Failure(Problem.BAD_VALUE, "41 is above max 40"), 400),
+    (Failure(Problem.NOT_WRITABLE, "no `write`"), 403),
+    (Failure(Problem.UNKNOWN_TAG, "no tag"), 404),
+    (Failure(Problem.REFUSED, "refused with 28", "28"), 502),
+    (Failure(Problem.BUSY, "too many"), 503),
+    (Failure(Problem.LINE_DOWN, "no such port"), 503),
+    (Failure(Problem.NO_REPLY, "offline"), 503),
+    (Failure(Problem.UNCLEAR, "it may be done"), 504),
+]
+
+
+@pytest.mark.parametrize(("result", "status"), ENDINGS)
+async def test_only_an_acknowledged_write_is_answered_with_200(
+    result: WriteResult | Failure, status: int, tokens: Path
+) -> None:
+    async with serving(tokens_file=tokens) as client:
+        client.north.endings[b"7"] = result
+        answer = await client.ask("/api/write?tag=mixer/recipe", "POST", b"7", **AS_JSON)
+        assert answer.status == status
+        assert violations(answer.json, schema("/api/write", status, "post")) == []
+        assert client.north.written == [("mixer/recipe", b"7", "web alice")]
+
+
+async def test_a_write_needs_a_token_and_a_body_that_no_form_of_another_site_sends(
+    tokens: Path,
+) -> None:
+    async with serving(tokens_file=tokens) as client:
+        for headers, status in (
+            ({"Content_Type": "application/json"}, 401),
+            ({**AS_JSON, "Authorization": "Bearer " + TOKEN[:-1]}, 401),
+            ({**AS_JSON, "Origin": "http://evil.example"}, 403),
+            ({**AS_JSON, "Sec_Fetch_Site": "cross-site"}, 403),
+            ({**AS_JSON, "Content_Type": "text/plain"}, 415),
+        ):
+            answer = await client.ask("/api/write?tag=mixer/recipe", "POST", b"7", **headers)
+            assert answer.status == status
+        assert client.north.written == []
+    async with serving() as client:
+        answer = await client.ask("/api/write?tag=mixer/recipe", "POST", b"7", **AS_JSON)
+        assert (answer.status, client.north.written) == (403, [])
+
+
+async def test_a_write_goes_on_when_its_client_leaves(tokens: Path) -> None:
+    async with serving(tokens_file=tokens) as client:
+        client.north.gate.clear()
+        asking = asyncio.create_task(
+            client.ask("/api/write?tag=mixer/recipe", "POST", b"7", **AS_JSON)
+        )
+        async with asyncio.timeout(5):
+            await client.north.began.wait()
+        asking.cancel()
+        await asyncio.gather(asking, return_exceptions=True)
+        client.north.gate.set()
+        async with asyncio.timeout(5):
+            while not client.north.written:
+                await asyncio.sleep(0.001)
+
+
+async def test_a_body_that_does_not_arrive_is_not_waited_for(
+    tokens: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gateway.web.api.BODY_WITHIN", 0.05)
+    async with serving(tokens_file=tokens) as client:
+        address = "/api/write?tag=mixer/recipe"
+        answer = await client.ask(address, "POST", b"", Content_Length="9", **AS_JSON)
+        assert answer.status == 408
+        assert client.north.written == []
+
+
+async def events(client: Client, query: str) -> "dict[str, Any]":
+    """The first event of each kind."""
+    reader, writer = await asyncio.open_connection("127.0.0.1", client.port)
+    found: dict[str, Any] = {}
+    try:
+        writer.write(f"GET /api/events?{query} HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n".encode())
+        async with asyncio.timeout(5):
+            while "time" not in found:
+                line = await reader.readline()
+                if line.startswith(b"event: "):
+                    kind = line[7:].strip().decode()
+                    found[kind] = json.loads((await reader.readline()).removeprefix(b"data: "))
+    finally:
+        writer.close()
+        await writer.wait_closed()
+    return found
+
+
+async def test_the_page_gets_large_integers_as_text_and_no_text_of_a_bad_value() -> None:
+    plant = PlainPlant(PlainDevice("big", (tag("big", "count"), tag("big", "unread"))))
+    plant.now("big/count", 2**53 + 1)
+    async with serving(plant=plant) as client:
+        found = await events(client, "device=big")
+    [count, unread] = found["values"]
+    assert count[:3] == ["count", "9007199254740993", True]
+    assert unread[:3] == ["unread", "", False]
+    assert unread[4] == "starting"
+    assert found["state"]["devices"]["oven"][1:] == [
+        "silent",
+        "No byte came back: check power, wiring and station number",
+    ]
+
+
+async def test_a_line_is_watched_only_while_a_page_shows_it() -> None:
+    async with serving() as client:
+        reader, writer = await asyncio.open_connection("127.0.0.1", client.port)
+        writer.write(b"GET /api/events?line=hall HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+        async with asyncio.timeout(5):
+            await reader.readuntil(b"event: time")
+            assert set(client.plant.watchers) == {"hall"}
+            writer.close()
+            await writer.wait_closed()
+            while client.plant.watchers:
+                await asyncio.sleep(0.001)
+
+
+async def test_a_page_that_takes_nothing_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gateway.web.events.SLOW", 0.2)
+    monkeypatch.setattr("gateway.web.events.WIRE_EVERY", 0.0)
+    monkeypatch.setattr("gateway.web.events.STATE_EVERY", 0.0)
+    async with serving() as client:
+        refused = ["D512..D519 of mixer: refused with 28 " + "x" * 1000] * 50
+        known = {"standing": "up", "diagnosis": "", "refused_addresses": refused}
+        client.north.changed["devices/mixer"] = known
+        _, writer = await asyncio.open_connection("127.0.0.1", client.port, limit=1024)
+        writer.write(b"GET /api/events?line=hall HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+        async with asyncio.timeout(10):
+            while not client.plant.watchers:
+                await asyncio.sleep(0.001)
+            while client.plant.watchers:  # the reader takes 2 kB, then nothing
+                await asyncio.sleep(0.01)
+        assert (await client.ask("/healthz")).status == 200
+        writer.close()

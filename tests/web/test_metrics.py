@@ -1,0 +1,60 @@
+"""The metrics: every fault of the documents is in them."""
+
+from prometheus_client.parser import text_string_to_metric_families
+
+from gateway.northbound.audit import Counts
+from gateway.northbound.payload import Failure, Problem, WriteOutcome
+from gateway.tags import WriteResult
+from gateway.web import metrics
+from tests.northbound.plant import mixer
+from tests.web.serving import PlainNorth
+
+
+def outcome(took: float, problem: Problem | None = None) -> WriteOutcome:
+    result = WriteResult(1, 0, took) if problem is None else Failure(problem, "no")
+    return WriteOutcome("k", 1, result, 0, took)
+
+
+async def scraped(north: PlainNorth) -> dict[tuple[str, ...], float]:
+    """The samples: by name and values of the labels, sorted by the names of the labels."""
+    text = metrics.exposition(await north.documents(0.0), mixer(), ready=True)
+    return {
+        (sample.name, *(sample.labels[label] for label in sorted(sample.labels))): sample.value
+        for family in text_string_to_metric_families(text.decode())
+        for sample in family.samples
+    }
+
+
+async def test_writes_are_counted_by_outcome_and_time() -> None:
+    counts = Counts()
+    counts.count(outcome(0.03), was_sent=True)
+    counts.count(outcome(0.3, Problem.UNCLEAR), was_sent=True)
+    counts.count(outcome(20.0), was_sent=True)
+    counts.count(outcome(0.0, Problem.BUSY), was_sent=False)
+    north = PlainNorth()
+    north.changed["outcomes"] = counts.document()
+    found = await scraped(north)
+    writes = "plc_gateway_writes_total"
+    assert (found[writes, "written"], found[writes, "unclear"], found[writes, "busy"]) == (2, 1, 1)
+    assert found[writes, "refused"] == 0  # a counter begins at 0: otherwise its first is not seen
+    bucket = "plc_gateway_write_seconds_bucket"
+    assert [found[bucket, end] for end in ("0.025", "0.05", "0.5", "5", "+Inf")] == [0, 1, 2, 2, 3]
+    assert found["plc_gateway_write_seconds_count",] == 3
+
+
+async def test_history_that_is_not_written_is_not_ok() -> None:
+    fields = ("recorded", "stored", "lost", "waiting", "lag", "bytes")
+    north = PlainNorth()
+    north.changed["history"] = {"state": "no space left on device", **dict.fromkeys(fields, 3)}
+    found = await scraped(north)
+    assert found["plc_gateway_history_ok",] == 0
+    assert found["plc_gateway_faults",] == 2  # that, and the silent oven
+    assert found["plc_gateway_history_lost_total",] == 3
+
+
+async def test_values_are_counted_by_quality() -> None:
+    found = await scraped(PlainNorth())
+    assert found["plc_gateway_device_tags", "mixer", "hall", "bad"] == 3
+    assert found["plc_gateway_device_tags", "mixer", "hall", "good"] == 0
+    assert found["plc_gateway_device_state", "oven", "hall", "silent"] == 1
+    assert found["plc_gateway_device_failures_total", "mixer", "silence", "hall"] == 2
