@@ -65,16 +65,22 @@ asyncio.run(main())
 
 
 class Counting:
-    """Updates a mirror as the gateway does; sets `done` after so many exchanges."""
+    """Updates a mirror as the gateway does; sets `done` after so many exchanges.
 
-    def __init__(self, tags: Sequence[Tag], exchanges: int) -> None:
+    `take`: takes the samples to publish, as the publisher does.
+    """
+
+    def __init__(self, tags: Sequence[Tag], exchanges: int, *, take: bool = False) -> None:
+        self._take = take
         self._mirror = Mirror(tags, 0)
         self._left = exchanges
         self.done = asyncio.Event()
         self.cpu = 0.0
 
     def samples(self, samples: Sequence[Sample]) -> None:
-        self._mirror.update(samples)
+        to_publish = self._mirror.update(samples)
+        if self._take:
+            list(to_publish)
         self._left -= 1
         if self._left == 0:
             self.cpu = time.process_time()
@@ -95,6 +101,8 @@ async def ours(
     each: int,
     where: Callable[[Receiver], Awaitable[Port]],
     count: int,
+    *,
+    take: bool = False,
 ) -> float:
     """Seconds of processor time per exchange, without silences: they would only add sleep."""
     timing = replace(driver.timing, silence=0.0, silence_chars=0.0)
@@ -103,7 +111,7 @@ async def ours(
     settings = DeviceSettings(name="plc", driver=driver, timing=timing, turnaround=1.0, tags=chosen)
     device = Device(settings, wire)
     assert len(device.blocks) == 1, device.blocks
-    sink = Counting(chosen, count)
+    sink = Counting(chosen, count, take=take)
     line = Line(Engine("bench", [device], wire), where, sink)
     begun = time.process_time()
     task = asyncio.create_task(line.run())
@@ -242,13 +250,17 @@ def beside(
             step: int,
             opener: Callable[[Receiver], Awaitable[Port]],
             on: Callable[[Coroutine[Any, Any, float]], float] = on,
+            *,
+            take: bool = False,
         ) -> Callable[[int], float]:
-            return lambda count: on(ours(driver, area, step, opener, count))
+            return lambda count: on(ours(driver, area, step, opener, count, take=take))
 
         for tags, step in ((2, 63), (64, 1)):
             runs[f"ours, {tags} tags{suffix}"] = read(step, opener)
             if changing is not None:
                 runs[f"ours, {tags} changing tags{suffix}"] = read(step, changing)
+        if changing is not None:
+            runs[f"ours, 64 made samples{suffix}"] = read(1, changing, take=True)
         if client is not None:
             runs["pymodbus client" + suffix] = partial(_of_pymodbus, on, client)
     if in_c is not None:

@@ -120,7 +120,7 @@ class Mirror:
 
     def _supersede(self, latest: Latest) -> None:
         """Takes the samples out of a scan: one of its tags got another sample."""
-        latest.superseded = True
+        latest.superseded, latest.in_use = True, False
         for place, sample in enumerate(latest.scan):
             # Before its entry goes: other threads must find one or the other.
             self._current[sample.tag] = sample

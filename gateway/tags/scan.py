@@ -21,18 +21,14 @@ class Latest:
     next read of the block is then compared with nothing.
     """
 
-    __slots__ = ("by_rule", "scan", "superseded", "unasked", "used")
+    __slots__ = ("by_rule", "in_use", "scan", "superseded", "unasked")
 
     def __init__(self) -> None:
         self.scan: Scan
-        self.used = False  # the mirror finds the samples of the tags here
+        self.in_use = False  # the mirror finds the samples of the tags here
         self.superseded = False
         self.by_rule: Collection[int] = ()  # places of tags with a deadband, a heartbeat ...
         self.unasked: Collection[int] = ()  # of these, tags that are published without a change
-
-    @property
-    def in_use(self) -> bool:
-        return self.used and not self.superseded
 
     def adopt(self, scan: "Scan") -> None:
         """Begins with a scan."""
@@ -40,7 +36,7 @@ class Latest:
         eager = [p for p, tag in places if tag.heartbeat or tag.publish is Publish.ALWAYS]
         self.by_rule = frozenset(eager).union(p for p, tag in places if tag.deadband is not None)
         self.unasked = tuple(eager)
-        self.scan, self.used = scan, True
+        self.scan, self.in_use = scan, True
 
 
 class Samples(Sequence[Sample]):

@@ -226,7 +226,7 @@ MUTANTS = (
     Mutant(
         "a scan goes on after another sample of its tags",
         "tags/mirror.py",
-        "        latest.superseded = True\n",
+        "        latest.superseded, latest.in_use = True, False\n",
         "        pass\n",
         "tests/tags/test_scan.py",
     ),
