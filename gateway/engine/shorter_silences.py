@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Hashable, Sequence
+from typing import NamedTuple
 
 from gateway.engine.device import Device
 from gateway.engine.effects import Effects
@@ -11,10 +12,17 @@ from gateway.engine.station_silence import MOST_DOUBLED
 from gateway.errors import Garbled, NoReply, Refusal, Refused
 from gateway.protocols.unsolicited import Unsolicited
 
-NEEDED = 0.5  # share of the wire time for polls; below it, shorter silences gain nothing
 PROOF = 50  # replies for each station at one step, without a loss, before the next step
 HELD = 10_000  # replies at the last step after which earlier losses count no more
 PAUSE = 60.0  # seconds of safe silences after a loss; doubled after each
+
+
+class Pace(NamedTuple):
+    """The speed of learning; the simulation learns sooner than a plant."""
+
+    needed: float = 0.5  # share of the wire time for polls; below it, nothing is gained
+    proof: int = PROOF
+    pause: float = PAUSE
 
 
 class ShorterSilences:
@@ -44,12 +52,9 @@ class ShorterSilences:
         "_losses",
         "_next",
         "_shape",
-        "_silence",
         "answered",
         "look_at",
-        "needed",
-        "pause",
-        "proof",
+        "pace",
         "spoke",
         "step",
         "suspects",
@@ -61,13 +66,13 @@ class ShorterSilences:
         self._learning = [device for device in devices if device.silence.learns]
         if any(isinstance(d.driver, Unsolicited) and d.driver.sends_unsolicited for d in devices):
             self._learning.clear()  # the silence lets their frames begin
-        self.needed, self.proof, self.pause = NEEDED, PROOF, PAUSE
+        self.pace = Pace()
         self.step = 0  # so many times the safe silences are halved
         self.answered = 0  # polls at this step, after its silence
         self.look_at = float(PROOF) if self._learning else math.inf
         self.spoke: Device | None = None  # its good reply to a poll is the last frame on the wire
-        self.suspects: tuple[Device, ...] = ()  # a request was lost between these,
-        self._silence = 0.0  # after so many seconds
+        # A request was lost to the first, perhaps because of the second, after so many seconds.
+        self.suspects: tuple[tuple[Device, ...], float] | None = None
         self._held = 0  # polls at shorter silences without a loss
         self._losses = 0
         self._next = -math.inf  # when the next step may be taken
@@ -91,7 +96,7 @@ class ShorterSilences:
     def look(self, now: float) -> None:
         """Takes the next step, if the replies are enough and the polls need it."""
         online = sum(device.health.online for device in self._learning)
-        self.look_at = self.proof * max(1, online)
+        self.look_at = self.pace.proof * max(1, online)
         if self.answered < self.look_at:
             return
         self.answered, self._held = 0, self._held + self.answered
@@ -100,7 +105,7 @@ class ShorterSilences:
             return
         if self.suspects or now < self._next:
             return
-        if sum(device.load for device in self._devices) < self.needed:
+        if sum(device.load for device in self._devices) < self.pace.needed:
             return
         self.step += 1
         self.spoke = None
@@ -134,8 +139,8 @@ class ShorterSilences:
                 return  # the request arrived
         self.answered = 0
         if self.step and silence < device.silence.safe:
-            self.suspects = (device,) if self.spoke in (None, device) else (device, self.spoke)
-            self._silence = silence
+            near = (device,) if self.spoke in (None, device) else (device, self.spoke)
+            self.suspects = near, silence
             self._restore(str(result), now)
 
     def judge(self, now: float) -> None:
@@ -143,15 +148,15 @@ class ShorterSilences:
 
         If the device is offline instead, the silence was not the reason.
         """
-        device = self.suspects[0]
-        if device.state is State.FAILING:
+        if self.suspects is None or self.suspects[0][0].state is State.FAILING:
             return
+        (device, *_), silence = self.suspects
         if device.state is State.ONLINE:
-            for times, each in enumerate(self.suspects, 1):  # not both are tried again together
+            for times, each in enumerate(self.suspects[0], 1):  # not both are tried together
                 if each.silence.learns:
-                    each.silence.was_too_short(self._silence, now, times)
+                    each.silence.was_too_short(silence, now, times)
             self._pause(now)
-        self.suspects = ()
+        self.suspects = None
 
     def disturbed(self, now: float) -> None:
         """Takes bytes that answer no request: a silence lets them pass."""
@@ -162,19 +167,19 @@ class ShorterSilences:
 
     def opened(self, now: float) -> None:
         """Starts again with the safe silences, because the port was opened."""
-        self.suspects = ()
+        self.suspects = None
         if self.step:
             self._restore("the port was opened", now)
 
     def _pause(self, now: float) -> None:
         """Tries no shorter silence for a while, longer after each loss."""
-        self._next = now + self.pause * 2**self._losses
+        self._next = now + self.pace.pause * 2**self._losses
         self._losses = min(self._losses + 1, MOST_DOUBLED)
 
     def _restore(self, why: str, now: float) -> None:
         self.step = self.answered = self._held = 0
         self.spoke = self._shape = None
-        self.look_at = self.proof
+        self.look_at = self.pace.proof
         for device in self._devices:
             device.silence.take_step(0, now)
             device.silence.keep_safe(at_rest=True)

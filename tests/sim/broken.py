@@ -1682,8 +1682,8 @@ MUTANTS = (
     Mutant(
         "the pause after a loss does not grow",
         "engine/shorter_silences.py",
-        "        self._next = now + self.pause * 2**self._losses\n",
-        "        self._next = now + self.pause\n",
+        "        self._next = now + self.pace.pause * 2**self._losses\n",
+        "        self._next = now + self.pace.pause\n",
         "tests/engine/test_shorter_silences.py",
     ),
     Mutant(
@@ -1731,7 +1731,7 @@ MUTANTS = (
     Mutant(
         "a line with time to spare shortens silences",
         "engine/shorter_silences.py",
-        "for device in self._devices) < self.needed:",
+        "for device in self._devices) < self.pace.needed:",
         "for device in self._devices) < 0.0:",
         "tests/engine/test_shorter_silences.py",
     ),

@@ -20,6 +20,7 @@ import structlog
 from gateway.app import Gateway
 from gateway.config import LineConfig, load
 from gateway.engine.device import DeviceSettings
+from gateway.engine.shorter_silences import Pace
 from gateway.protocols.frames import FrameDriver
 from gateway.protocols.frames.driver import LISTENED
 from gateway.tags import Sample
@@ -200,10 +201,13 @@ class World:
         chance = random.Random(f"silence {self.story.seed}")
         for line in self.gateway.lines:
             shorter = line.engine._conclusions.shorter  # private: no setting of the file
-            shorter.needed = chance.choice((0.0, 0.0, shorter.needed))
-            shorter.proof = chance.choice((3, 10, shorter.proof))
-            shorter.pause = chance.choice((1.0, 10.0, shorter.pause))
-            shorter.look_at = min(shorter.look_at, shorter.proof)
+            usual = shorter.pace
+            shorter.pace = Pace(
+                chance.choice((0.0, 0.0, usual.needed)),
+                chance.choice((3, 10, usual.proof)),
+                chance.choice((1.0, 10.0, usual.pause)),
+            )
+            shorter.look_at = min(shorter.look_at, shorter.pace.proof)
 
     def _twin(self, name: str) -> Troubled:
         """Makes a second PLC with the number of this device, and other values."""
