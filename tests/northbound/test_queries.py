@@ -78,7 +78,8 @@ async def test_status_is_answered_and_published() -> None:
         keys = {reply.key for reply in await client.get("plant/@gateway/*/**")}
         own = "plant/@gateway/demo"
         claim = next(key for key in keys if key is not None and "/claim/" in key)
-        assert keys == {f"{own}/status", f"{own}/lines/hall-1", f"{own}/zenoh", claim}
+        documents = {f"{own}/{name}" for name in ("status", "lines/hall-1", "zenoh", "outcomes")}
+        assert keys == documents | {claim}
         [reply] = await client.get(f"{own}/lines/*")
         assert reply.json == {"load": 0.5}
         received = await client.subscribe("plant/@gateway/*/status")
