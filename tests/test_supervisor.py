@@ -62,7 +62,9 @@ async def test_a_loop_that_stands_still_gives_no_sign_of_life(systemd: socket.so
     assert heard(systemd) == []  # the service has ended
 
 
-@pytest.mark.parametrize(("process", "signs"), [("1", 0), (str(os.getpid()), 1)])
+@pytest.mark.parametrize(
+    ("process", "signs"), [("1", 0), (str(os.getpid()), 1)], ids=["another", "this"]
+)
 async def test_signs_of_life_are_those_of_the_process_that_systemd_watches(
     systemd: socket.socket, process: str, signs: int
 ) -> None:

@@ -1759,8 +1759,8 @@ MUTANTS = (
     Mutant(
         "a peer of several routers is not warned of",
         "northbound/link_monitor.py",
-        '.count("router") == 2:\n',
-        '.count("router") == 99:\n',
+        "self._is_peer and routers == 2:",
+        "self._is_peer and routers == 99:",
         "tests/northbound/test_link_monitor.py",
     ),
     Mutant(

@@ -4,6 +4,7 @@
 const byId = (id) => document.getElementById(id);
 const SILENT = 2500; // ms without an event until nothing is live
 const LATE = 3000; // ms that an event may be later than the fastest one
+const SLEPT = 10000; // ms in which this program did not run
 const SHOWN = 200; // rows of devices
 const WINDOW = 10000; // ms of the wire
 
@@ -14,6 +15,7 @@ let stream = null; // of the current choice
 let heard = 0; // performance.now() of the last event
 let serverTime = 0; // ms since 1970, of the last event
 let fastest = Infinity; // the least difference of the two steady clocks, in this stream
+let awake = Date.now();
 let live = false;
 let valuesLive = false; // values of the chosen device came by the current stream
 let nextAfter = null;
@@ -65,7 +67,20 @@ function put(id, text) {
   if (byId(id).textContent !== text) byId(id).textContent = text;
 }
 
+// A computer that slept gets old events in a burst: they must not look live, so the stream begins again.
+function slept() {
+  const before = awake;
+  awake = Date.now();
+  if (Math.abs(awake - before) < SLEPT) return false;
+  if (!document.hidden) {
+    setLive(false, "the page slept");
+    follow();
+  }
+  return true;
+}
+
 setInterval(() => {
+  if (slept()) return;
   if (live && performance.now() - heard > SILENT) setLive(false, "no event arrives");
   showAges();
 }, 500);
@@ -116,6 +131,7 @@ async function read(body, mine) {
     const events = (rest + value).split("\n\n");
     rest = events.pop();
     for (const event of events) {
+      if (stream !== mine) return;
       const [, kind, data] = event.match(/^event: (\w+)\ndata: (.*)$/s) ?? [];
       if (kind) take(kind, JSON.parse(data));
     }
@@ -131,6 +147,7 @@ function take(kind, data) {
 }
 
 function takeTime([now, steady]) {
+  if (slept()) return;
   heard = performance.now();
   const behind = heard - steady;
   fastest = Math.min(fastest, behind);
