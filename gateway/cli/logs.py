@@ -62,7 +62,9 @@ class QueuedHandler(logging.Handler):
         if isinstance(record.msg, _Rendered) or not self._processors:
             self.write(record.getMessage())
             return
-        entry: Any = {"event": record.getMessage(), "logger": record.name}
+        entry: Any = {"event": record.getMessage()}
+        if not record.name.startswith("gateway."):  # a library
+            entry["logger"] = record.name
         if record.exc_info:
             entry["exc_info"] = record.exc_info
         with suppress(structlog.DropEvent):

@@ -49,7 +49,7 @@ def test_read_as_json_prints_one_document_per_line(running: Path) -> None:
     text = "x" * 128  # a line longer than any terminal
     assert plc_gateway("write", running, "mixer/name", text).code == 0
     done = plc_gateway("read", running, "mixer/name", "mixer/run", "--json", "--max-age", "0s")
-    assert done.code == 0
+    assert done.code == 0, done
     name, run = documents(done.out)
     assert (name["tag"], name["value"], name["quality"]) == ("mixer/name", text, "good")
     assert (run["tag"], run["quality"]) == ("mixer/run", "good")
