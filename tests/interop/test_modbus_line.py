@@ -158,7 +158,7 @@ async def test_a_whole_line_with(name: str, request: pytest.FixtureRequest, tmp_
             for text, value in (("holding:100", 0xBEEF), ("coil:4", True), ("coil:3", False)):
                 await _write_and_read(line, device, text, value)
         assert device.record.failures == {}
-        assert device.record.exchanges > 20
+        assert device.record.exchanges > 10  # how many polls fit in depends on the machine
 
 
 @pytest.mark.usefixtures("socat")
