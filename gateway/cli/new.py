@@ -1,6 +1,5 @@
 """The `new` command: a configuration by asking: scan, stations, names, tags, check."""
 
-import asyncio
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,10 +12,9 @@ import typer
 from gateway.cli import scan as scanning
 from gateway.cli.check import check, size
 from gateway.cli.import_command import add_tags
-from gateway.cli.logs import LogFormat, LogLevel, set_up
 from gateway.cli.scan import Found
-from gateway.cli.scan_command import noises
-from gateway.cli.terminal import FAILED, end, err
+from gateway.cli.scan_command import BaudOption, FormatOption, TimeoutOption, scanned
+from gateway.cli.terminal import err
 from gateway.config import load, parsers
 from gateway.config.messages import one_of
 from gateway.config.yaml_insert import written
@@ -62,11 +60,9 @@ def new(
     stations: Annotated[
         str | None, typer.Option(help="the stations to look for, e.g. 1-31,40")
     ] = None,
-    baud: Annotated[str | None, typer.Option(help="9600,19200 (default: the usual ones)")] = None,
-    serial_format: Annotated[
-        str | None, typer.Option("--format", help="7E1,8N1 (default: the usual ones)")
-    ] = None,
-    timeout: Annotated[str, typer.Option(help="the longest turnaround of a station")] = "200ms",
+    baud: BaudOption = None,
+    serial_format: FormatOption = None,
+    timeout: TimeoutOption = "200ms",
     use: Annotated[
         str | None, typer.Option(help="the stations to use of those found, e.g. 1,5; or all")
     ] = None,
@@ -94,7 +90,7 @@ def new(
     plan = scanning.planned(port, protocol, stations, baud, serial_format, timeout)
     gateway_name = parsers.name(_asked("name", "Name of the gateway", name, "demo"))
     line_name = parsers.name(_asked("line", "Name of the line", line, "hall-1"))
-    found = _scanned(plan, port)
+    found = scanned(plan, f"no station replied at {port}: nothing was written").found
     numbers = ", ".join(str(one.driver.station) for one in found)
     chosen = _chosen(found, _asked("use", f"Stations found: {numbers}. Use", use, "all"))
     devices = _named(chosen, names)
@@ -174,16 +170,6 @@ def _asked(option: str, question: str, given: str | None, usual: str | None = No
 def _ports() -> str:
     found = [str(path) for pattern in _PORTS for path in sorted(Path("/dev").glob(pattern))]
     return f" ({', '.join(found)})" if found else " (such as /dev/ttyUSB0 or tcp://10.0.0.7:4001)"
-
-
-def _scanned(plan: scanning.Plan, port: str) -> list[Found]:
-    set_up(LogFormat.TEXT, LogLevel.ERROR)
-    report = asyncio.run(scanning.scan(plan, err.print))
-    for sentence in noises(report):
-        err.print(sentence)
-    if not report.found:
-        end(f"no station replied at {port}: nothing was written", FAILED)
-    return report.found
 
 
 def _chosen(found: Sequence[Found], text: str) -> list[Found]:

@@ -12,6 +12,12 @@ from gateway.cli.scan import Report, spoken
 from gateway.cli.tables import value_text
 from gateway.cli.terminal import FAILED, end, err
 
+BaudOption = Annotated[str | None, typer.Option(help="9600,19200 (default: the usual ones)")]
+FormatOption = Annotated[
+    str | None, typer.Option("--format", help="7E1,8N1 (default: the usual ones)")
+]
+TimeoutOption = Annotated[str, typer.Option(help="the longest turnaround of a station")]
+
 
 def scan(
     port: Annotated[str, typer.Option(help="/dev/ttyUSB0, COM3, tcp://host:port, rfc2217://...")],
@@ -19,24 +25,27 @@ def scan(
     stations: Annotated[
         str | None, typer.Option(help="the stations, e.g. 1-31,40 (default: up to 31)")
     ] = None,
-    baud: Annotated[str | None, typer.Option(help="9600,19200 (default: the usual ones)")] = None,
-    serial_format: Annotated[
-        str | None, typer.Option("--format", help="7E1,8N1 (default: the usual ones)")
-    ] = None,
-    timeout: Annotated[str, typer.Option(help="the longest turnaround of a station")] = "200ms",
+    baud: BaudOption = None,
+    serial_format: FormatOption = None,
+    timeout: TimeoutOption = "200ms",
 ) -> None:
     """Find the stations at a port, their speed and their format.
 
     Sends only requests that change nothing. No gateway may be running at that port.
     """
     plan = scanning.planned(port, protocol, stations, baud, serial_format, timeout)
+    print(found_stations(scanned(plan, f"no station replied at {port}"), port))
+
+
+def scanned(plan: scanning.Plan, none_replied: str) -> Report:
+    """Scans; ends the command with the sentence `none_replied` if no station replied."""
     set_up(LogFormat.TEXT, LogLevel.ERROR)
     report = asyncio.run(scanning.scan(plan, err.print))
     for sentence in noises(report):
         err.print(sentence)
     if not report.found:
-        end(f"no station replied at {port}", FAILED)
-    print(found_stations(report, port))
+        end(none_replied, FAILED)
+    return report
 
 
 def found_stations(report: Report, port: str) -> str:

@@ -40,8 +40,8 @@ class BadRange:
     def retry(self) -> float:
         """Seconds until it is tried again; not long after a damaged reply, for the device has the
         address."""
-        slowest = RETRIES[1] if self.code == DAMAGED else RETRIES[-1]
-        return min(RETRIES[min(self.refusals, len(RETRIES) - 1)], slowest)
+        last = 1 if self.code == DAMAGED else len(RETRIES) - 1
+        return RETRIES[min(self.refusals, last)]
 
     @property
     def how(self) -> str:

@@ -497,8 +497,8 @@ MUTANTS = (
     Mutant(
         "an address with damaged replies is tried as rarely as a missing one",
         "planning/bad_addresses.py",
-        "        slowest = RETRIES[1] if self.code == DAMAGED else RETRIES[-1]\n",
-        "        slowest = RETRIES[-1]\n",
+        "        last = 1 if self.code == DAMAGED else len(RETRIES) - 1\n",
+        "        last = len(RETRIES) - 1\n",
         "tests/engine/test_results.py",
     ),
     Mutant(

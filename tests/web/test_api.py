@@ -22,14 +22,6 @@ PAGE = {"/", "/page.js", "/page.css", "/openapi.json"}
 AS_JSON = {"Content_Type": "application/json", "Authorization": f"Bearer {TOKEN}"}
 
 
-@pytest.fixture
-def tokens(tmp_path: Path) -> Path:
-    path = tmp_path / "tokens.txt"
-    path.write_text(f"alice:{TOKEN}\n")
-    path.chmod(0o600)
-    return path
-
-
 def schema(path: str, status: int, method: str = "get") -> dict[str, Any]:
     """The schema of an answer, with the definitions that it refers to."""
     answer = DESCRIBED["paths"][path][method]["responses"][str(status)]

@@ -10,14 +10,6 @@ from gateway.web.server import MOST_CONNECTIONS
 from tests.web.serving import TOKEN, Client, serving
 
 
-@pytest.fixture
-def tokens(tmp_path: Path) -> Path:
-    path = tmp_path / "tokens.txt"
-    path.write_text(f"alice:{TOKEN}\n")
-    path.chmod(0o600)
-    return path
-
-
 @pytest.mark.parametrize(
     ("host", "status"),
     [
