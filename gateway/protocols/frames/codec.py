@@ -27,7 +27,8 @@ class FrameReader:
         self._framing = framing = written_out(framing)
         self._header = octets(framing.header)
         self._mark = framing.mark
-        self._unit = 2 if framing.conversion else 1
+        self._longest = framing.longest_on_line
+        self._counted = False  # the last frame ended by its count: its terminator may follow
         self._after = (2 if framing.sum_check else 0) + len(framing.tail)
         self._buffer = bytearray()
         self._aligned = quiet or bool(self._header)
@@ -62,7 +63,7 @@ class FrameReader:
             while (cut := self._cut()) is not None:  # a whole frame behind a false header
                 _append(found, cut)
         self._buffer.clear()
-        self._aligned = True
+        self._aligned, self._counted = True, False
         return found
 
     def settle(self) -> None:
@@ -73,7 +74,7 @@ class FrameReader:
 
     def _ended_by_gap(self) -> bytes | Garbled:
         framing, body = self._framing, len(self._header)
-        if not self._mark and framing.length is None:
+        if framing.ends_by_gap and (not self._mark or self._end_of_data(len(self._buffer)) is None):
             data = bytes(self._buffer[body:])
             self._buffer.clear()
             return self._data(data)
@@ -85,8 +86,9 @@ class FrameReader:
 
     def _missing(self) -> str:
         framing, body = self._framing, len(self._header)
-        if framing.length is not None and len(self._buffer) - body < framing.length * self._unit:
-            return f"fewer than {framing.length} bytes of data"
+        if framing.ends_by_count or framing.length is not None:
+            if len(self._buffer) - body < self._longest:
+                return f"fewer than {framing.longest} bytes of data"
         at = self._end_of_data(len(self._buffer))
         if at is None:
             return self._no_mark()
@@ -102,12 +104,16 @@ class FrameReader:
         """Takes one frame, or one piece of damage, off the buffer; None while it is incomplete."""
         if not self._hunt():
             return None
-        framing, body = self._framing, len(self._header)
-        most = body + framing.longest * self._unit
+        framing, most = self._framing, len(self._header) + self._longest
+        if not self._mark and not framing.ends_by_count and framing.length is None:
+            return self._no_gap(most) if len(self._buffer) > most else None
         if not self._mark:
             return self._finish(most) if len(self._buffer) >= most else None
-        at = self._end_of_data(most)
+        by_count = framing.ends_by_count
+        at = self._end_of_data(most - 1 if by_count else most)
         if at is None:
+            if by_count:
+                return self._counted_out(most) if len(self._buffer) >= most else None
             if len(self._buffer) < most + len(self._mark):
                 return None
             return self._endless(most)
@@ -118,6 +124,17 @@ class FrameReader:
                 self._drop(again)
                 return self._cut()
         return self._finish(at)
+
+    def _no_gap(self, most: int) -> Garbled:
+        why = f"no gap after {self._framing.longest} bytes of data"
+        return self._damage(why, most, evidence=Evidence.TRUNCATED)
+
+    def _counted_out(self, end: int) -> bytes | Garbled:
+        """Takes a frame that its count ended, before a terminator came."""
+        result = self._data(bytes(self._buffer[len(self._header) : end]))
+        self._drop(end)
+        self._counted = True
+        return result
 
     def _endless(self, most: int) -> Garbled:
         why = f"{self._no_mark()} after {self._framing.longest} bytes of data"
@@ -133,7 +150,7 @@ class FrameReader:
     def _end_of_data(self, most: int) -> int | None:
         """Returns the place of the mark, with data up to `most`; None: not received (yet)."""
         if self._framing.length is not None:
-            at = len(self._header) + self._framing.length * self._unit
+            at = len(self._header) + self._longest
             return at if self._buffer.startswith(self._mark, at) else None
         at = self._buffer.find(self._mark, len(self._header), most + len(self._mark))
         return at if at >= 0 else None
@@ -159,16 +176,29 @@ class FrameReader:
             end += 1
         result = self._data(data)
         if isinstance(result, Garbled):
-            return self._damage(str(result), end, aligned=bool(self._mark))
+            return self._damage(
+                str(result), end, evidence=result.evidence, aligned=bool(self._mark)
+            )
         self._drop(end)
         return result + self._mark if framing.keep_terminator else result
 
     def _data(self, data: bytes) -> bytes | Garbled:
-        if not self._framing.conversion:
-            return data
-        if len(data) % 2 or not _HEX.issuperset(data):
-            return Garbled("error 3, a character that is no hex digit", data)
-        return bytes.fromhex(data.decode("ascii"))
+        """Returns the data without conversion and check."""
+        framing, plain = self._framing, data
+        if framing.conversion:
+            if len(data) % 2 or not _HEX.issuperset(data):
+                return Garbled("error 3, a character that is no hex digit", data)
+            plain = bytes.fromhex(data.decode("ascii"))
+        if framing.check is None:
+            return plain
+        payload = plain[: len(plain) - framing.check_size]
+        got, wanted = plain[len(payload) :], framing.check_of(payload)
+        if framing.check == "lrc" and not framing.conversion:
+            got = got.upper()
+        if got != wanted:
+            why = f"{framing.check} {got.hex()} is not {wanted.hex()}"
+            return Garbled(why, data, evidence=Evidence.CHECKSUM)
+        return payload
 
     def _damage(
         self,
@@ -194,6 +224,10 @@ class FrameReader:
             return self._buffer.startswith(self._header)
         if not self._aligned:
             self._align()
+        if self._counted and self._buffer:
+            self._counted = False
+            if self._mark and self._buffer.startswith(self._mark):
+                self._drop(len(self._mark))
         return self._aligned and bool(self._buffer)
 
     def _align(self) -> None:
