@@ -86,9 +86,9 @@ class FrameReader:
 
     def _missing(self) -> str:
         framing, body = self._framing, len(self._header)
-        if framing.ends_by_count or framing.length is not None:
-            if len(self._buffer) - body < self._longest:
-                return f"fewer than {framing.longest} bytes of data"
+        is_counted = framing.ends_by_count or framing.length is not None
+        if is_counted and len(self._buffer) - body < self._longest:
+            return f"fewer than {framing.longest} bytes of data"
         at = self._end_of_data(len(self._buffer))
         if at is None:
             return self._no_mark()
@@ -98,6 +98,8 @@ class FrameReader:
         return "error 8, LF missing" if missing == 1 and framing.ending == "CR LF" else _NO_CR
 
     def _no_mark(self) -> str:
+        if not self._mark:
+            return "no gap"
         return "error 10, terminator missing" if self._framing.terminator else _NO_CR
 
     def _cut(self) -> bytes | Garbled | None:
@@ -105,16 +107,12 @@ class FrameReader:
         if not self._hunt():
             return None
         framing, most = self._framing, len(self._header) + self._longest
-        if not self._mark and not framing.ends_by_count and framing.length is None:
-            return self._no_gap(most) if len(self._buffer) > most else None
-        if not self._mark:
-            return self._finish(most) if len(self._buffer) >= most else None
         by_count = framing.ends_by_count
-        at = self._end_of_data(most - 1 if by_count else most)
+        at = self._end_of_data(most - 1 if by_count else most) if self._mark else None
         if at is None:
             if by_count:
-                return self._counted_out(most) if len(self._buffer) >= most else None
-            if len(self._buffer) < most + len(self._mark):
+                return self._finish(most, counted=True) if len(self._buffer) >= most else None
+            if len(self._buffer) < most + max(1, len(self._mark)):
                 return None
             return self._endless(most)
         if framing.length is None and self._header:
@@ -124,17 +122,6 @@ class FrameReader:
                 self._drop(again)
                 return self._cut()
         return self._finish(at)
-
-    def _no_gap(self, most: int) -> Garbled:
-        why = f"no gap after {self._framing.longest} bytes of data"
-        return self._damage(why, most, evidence=Evidence.TRUNCATED)
-
-    def _counted_out(self, end: int) -> bytes | Garbled:
-        """Takes a frame that its count ended, before a terminator came."""
-        result = self._data(bytes(self._buffer[len(self._header) : end]))
-        self._drop(end)
-        self._counted = True
-        return result
 
     def _endless(self, most: int) -> Garbled:
         why = f"{self._no_mark()} after {self._framing.longest} bytes of data"
@@ -155,11 +142,14 @@ class FrameReader:
         at = self._buffer.find(self._mark, len(self._header), most + len(self._mark))
         return at if at >= 0 else None
 
-    def _finish(self, at: int) -> bytes | Garbled | None:
-        """Checks the bytes behind the data, which ends at `at`, and takes the frame."""
+    def _finish(self, at: int, *, counted: bool = False) -> bytes | Garbled | None:
+        """Checks the bytes behind the data, which ends at `at`, and takes the frame.
+
+        `counted`: its count ended it, before a terminator came.
+        """
         framing, body = self._framing, len(self._header)
         data = bytes(self._buffer[body:at])
-        end = at + len(self._mark)
+        end = at if counted else at + len(self._mark)
         if framing.sum_check:
             end += 2
             if len(self._buffer) < end:
@@ -180,7 +170,8 @@ class FrameReader:
                 str(result), end, evidence=result.evidence, aligned=bool(self._mark)
             )
         self._drop(end)
-        return result + self._mark if framing.keep_terminator else result
+        self._counted = counted
+        return result + self._mark if framing.keep_terminator and not counted else result
 
     def _data(self, data: bytes) -> bytes | Garbled:
         """Returns the data without conversion and check."""

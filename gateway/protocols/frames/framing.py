@@ -62,10 +62,7 @@ class Framing:
                 raise ConfigError(f"{name} {text!r} is longer than 4 bytes")
         if self.preset is None:
             self._check_by_hand()
-        if self.keep_terminator and not self.terminator:
-            raise ConfigError("keep_terminator needs a terminator")
-        if self.keep_terminator and (self.sum_check or self.ending):
-            raise ConfigError("keep_terminator: a sum, CR or LF cannot follow")
+        self._check_sums()
         for name, count in (("length", self.length), ("max_length", self.max_length)):
             if count is not None and not 1 <= count <= self.capacity:
                 raise ConfigError(f"{name} {count} is not 1..{self.capacity}")
@@ -73,6 +70,12 @@ class Framing:
             raise ConfigError("length is exact, max_length is not: write one of them")
         self._check_gap()
         self._check_ends()
+
+    def _check_sums(self) -> None:
+        if self.keep_terminator and not self.terminator:
+            raise ConfigError("keep_terminator needs a terminator")
+        if self.keep_terminator and (self.sum_check or self.ending):
+            raise ConfigError("keep_terminator: a sum, CR or LF cannot follow")
         if self.check == "crc16" and self.mark and self.length is None and not self.conversion:
             raise ConfigError(
                 "crc16 is two bytes of any value: end the frame by length or gap, or set conversion"
