@@ -65,8 +65,7 @@ class Field:
     or, with neither, the group of its name in `match`. Its type: `uint8` to `float64` and BCD as
     raw bytes, with `hex` as two hex characters each; `text`, `integer`, `decimal` as characters.
     `bit` picks one bit of an unsigned number, `byte` one half of a `uint16`. `format` is the
-    format of a number to write, as in
-    Python: `06.2f`, `+8.1f`, `04d`.
+    format of a number to write, as in Python: `06.2f`, `+8.1f`, `04d`.
     """
 
     type: FieldType
