@@ -116,7 +116,7 @@ def endpoint(running: Path) -> str:
 
 def shape(line: str) -> str:
     """Replaces everything that differs from one run to the next."""
-    line = re.sub(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d+Z", "TIME", line)
+    line = re.sub(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d+(Z|[+-]\d\d:\d\d)", "TIME", line)
     line = re.sub(r"\b(True|False|true|false)\b", "BOOL", line)
     return re.sub(r"(?<![\w.])-?\d+(\.\d+)?(?![\w.])", "N", line)
 
