@@ -135,6 +135,7 @@ def test_every_page_with_files_is_checked() -> None:
     assert set(counted) == {
         *("/README.md", "configuration.md", "vigor.md", "computer-link.md", "modbus.md"),
         *("first-plant.md", "import.md", "peek.md", "systems.md"),
+        *("tutorial-computer-link.md", "tutorial-modbus.md", "tutorial-vigor.md"),
     }
     assert sum(counted.values()) >= 11
     assert {block.page for block in DEVICES} == {OF_DEVICES}
