@@ -69,6 +69,8 @@ class Plant:
         self._gateways: set[str] = set()
         self._alive: dict[str, set[str]] = {}  # device: the gateways that report it as answering
         self._served_by: dict[str, str] = {}  # device: the last of them
+        self._asked: set[str] = set()  # devices whose descriptions are being read
+        self._trusted: set[str] = set()  # devices that answer, described since they do
         self._live: set[str] = set()  # keys that changed after the last query began
         live, own = session.liveliness(), f"{prefix}/@gateway/*"
         self._declared = [
@@ -114,6 +116,7 @@ class Plant:
         if device and there:
             self._alive.setdefault(device, set()).add(gateway)
             self._served_by[device] = gateway
+            self._asked.discard(device)
         elif device:
             self._gone(gateway, device, "no-reply")  # the gateway tells the exact reason
         elif there:
@@ -132,6 +135,8 @@ class Plant:
         alive.discard(gateway)
         if alive:
             return
+        self._asked.discard(device)
+        self._trusted.discard(device)
         for key, known in list(self.values.items()):
             of_device = key.startswith(f"{device}/")
             if of_device and (known["quality"] == "good" or reason == "no-gateway"):
@@ -167,8 +172,8 @@ class Plant:
             return bad("garbled")  # from another program
 
     def _take(self, key: str, known: Known) -> None:
-        # A good value without the token of its device may be from before the token went.
-        if known["quality"] == "bad" or self._alive.get(key.partition("/")[0]):
+        # Without a token it may be from before the token went, or belong to a new description.
+        if known["quality"] == "bad" or key.partition("/")[0] in self._trusted:
             self._store(key, known)
 
     def _store(self, key: str, known: Known) -> None:
@@ -188,14 +193,18 @@ class Plant:
 
     async def _query(self) -> bool:
         """Returns True if every tag of every device with a token was answered."""
+        self._asked = {device for device, gateways in self._alive.items() if gateways}
+        described = set()
         for reply in await self.ask("**/@meta"):
             if (sample := reply.ok) is not None:
                 key = self.key(str(sample.key_expr)).removesuffix("/@meta")
                 meta = json.loads(sample.payload.to_bytes())
+                described.add(key.partition("/")[0])
                 if self.tags.get(key) != meta:
                     self.tags[key] = meta
                     self._described(key, meta)
                     self.values.get(key) or self._store(key, bad("starting"))
+        self._trusted |= self._asked & described
         self._live.clear()
         answered, failed = set(), False
         for reply in await self.ask("**"):
@@ -213,7 +222,10 @@ class Plant:
         for key, known in list(self.values.items()):
             if known["quality"] == "good" and key not in answered | self._live:
                 self._store(key, bad("no-gateway"))
-        return all(key in answered for key in self.tags if self._alive.get(key.partition("/")[0]))
+        alive = {device for device, gateways in self._alive.items() if gateways}
+        return alive <= self._trusted and all(
+            key in answered for key in self.tags if key.partition("/")[0] in alive
+        )
 
     async def ask(self, selector: str, **options: Any) -> list[zenoh.Reply]:
         """Returns all replies to a query."""

@@ -7,9 +7,9 @@
 `INFLUX_TOKEN`), VictoriaMetrics, or Telegraf's `inputs.influxdb_v2_listener`. Without it the lines
 go to the standard output, for Telegraf's `inputs.execd`.
 
-    plc,device=mixer,tag=speed value=12.5,good=true 1763640000123456000
-    plc,device=mixer,tag=name text="AB",good=true 1763640000123456000
-    plc,device=mixer,tag=speed good=false,reason="no-reply" 1763640003500000000
+    plc,device=mixer,name=speed value=12.5,good=true 1763640000123456000
+    plc,device=mixer,name=name text="AB",good=true 1763640000123456000
+    plc,device=mixer,name=speed good=false,reason="no-reply" 1763640003500000000
     plc_bridge lost=120i,refused=0i 1763640010000000000
 
 * Numbers and bits (0, 1) are in `value`, texts in `text`. Beyond 2^53 a number is exact in `text`
@@ -36,7 +36,6 @@ from datetime import datetime
 from gateway_values import Known, Plant, arguments, opened, run, say, utc_now
 
 BATCH = 5000  # lines of one request
-COLLECT = 1.0  # seconds, at most, until a line is sent
 ANSWER_WITHIN = 10.0  # seconds
 LONGEST_PAUSE = 30.0  # seconds between two attempts
 REFUSED = (400, 413, 422)  # for ever; other errors are those of the server or of its settings
@@ -54,7 +53,7 @@ def line_of(key: str, known: Known) -> str:
         if isinstance(value, int) and abs(value) > 2**53:
             fields += f",text={quoted(str(value))}"
     nanoseconds = round(datetime.fromisoformat(known["time"]).timestamp() * 1_000_000) * 1000
-    return f"plc,device={device},tag={tag} {fields} {nanoseconds}"
+    return f"plc,device={device},name={tag} {fields} {nanoseconds}"
 
 
 def quoted(text: str) -> str:
@@ -64,8 +63,8 @@ def quoted(text: str) -> str:
 
 
 class Bridge:
-    def __init__(self, to: str | None, most: int) -> None:
-        self._to, self._most = to, most
+    def __init__(self, to: str | None, every: float, most: int) -> None:
+        self._to, self._every, self._most = to, every, most
         self._lines: deque[str] = deque()
         self._last: dict[str, tuple[str, bool]] = {}  # of each key: time, is good
         self._news = asyncio.Event()
@@ -93,7 +92,7 @@ class Bridge:
 
     async def serve(self) -> None:
         """Sends the lines in batches, in their order, each until the server has answered."""
-        pause = COLLECT
+        pause = self._every
         while True:
             await self._news.wait()
             await asyncio.sleep(pause)
@@ -103,7 +102,7 @@ class Bridge:
                     pause = min(2 * pause, LONGEST_PAUSE)
                     self._news.set()
                     break
-                pause = COLLECT
+                pause = self._every
 
     async def _send(self) -> bool:
         """Sends one batch. Returns False if it must be sent again."""
@@ -145,9 +144,10 @@ class Bridge:
 async def main() -> None:
     parser = arguments(__doc__)
     parser.add_argument("--to", help="address of a write API; left out: the standard output")
+    parser.add_argument("--every", type=float, default=1.0, help="seconds between two requests")
     parser.add_argument("--queue", type=int, default=500_000, help="lines that may wait")
     given = parser.parse_args()
-    bridge = Bridge(given.to, given.queue)
+    bridge = Bridge(given.to, given.every, given.queue)
     with await opened(given) as session:
         plant = Plant(session, given.prefix, bridge.described, bridge.changed)
         async with asyncio.TaskGroup() as group:

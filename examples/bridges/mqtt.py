@@ -16,11 +16,13 @@ way to it is gone, all its values are `bad` (`no-gateway`). When the bridge is g
 publishes the last will, and forgets the retained values after `--expire` seconds (MQTT 5).
 
 Commands are accepted with `--writes`. Everyone who may publish to `plant/@set/#` may then write, so
-restrict this topic in the broker. Each command has one outcome: `written` only when the device has
-acknowledged, an error of docs/zenoh.md, or `unclear`: it may or may not have been done. The bridge
-never repeats a command. MQTT may deliver a command of QoS 1 or 2 twice: it needs an `id`, a new one
-for each command. A known id is not written again, also after a restart (`--commands`); the bridge
-publishes its outcome again. With `time` the gateway refuses a command that is older than 5 s.
+restrict this topic in the broker. A command has one outcome: `written` only when the device has
+acknowledged, an error of docs/zenoh.md, or `unclear`: it may or may not have been done. No outcome
+within twenty seconds means the same. The bridge never repeats a command.
+
+MQTT may deliver a command of QoS 1 or 2 twice. So it needs an `id`, a new one for each command. A
+known id is not written again, also after a restart (`--commands`); the bridge publishes its outcome
+again. With `time` the gateway refuses a command that is older than five seconds.
 """
 
 import asyncio
@@ -29,9 +31,10 @@ import os
 import sqlite3
 import ssl
 import time
-from collections import defaultdict, deque
+from collections import deque
 from contextlib import suppress
 from urllib.parse import urlsplit
+from weakref import WeakValueDictionary
 
 import aiomqtt
 from gateway_values import Known, Plant, arguments, bad, opened, run, say
@@ -40,7 +43,7 @@ from paho.mqtt.properties import Properties
 from paho.mqtt.subscribeoptions import SubscribeOptions
 
 RECONNECT_AFTER = 1.0  # seconds
-MOST_COMMANDS = 100  # that wait; the next one is refused
+MOST_COMMANDS = 100  # that wait; the next one is dropped, without an outcome
 LATEST = 5.0  # seconds: a command that waited longer is not sent
 
 
@@ -102,7 +105,7 @@ class Bridge:
         self._outcomes: deque[tuple[str, bytes]] = deque(maxlen=1000)
         self._news = asyncio.Event()
         self._open: set[asyncio.Task[None]] = set()
-        self._turns: defaultdict[str, asyncio.Lock] = defaultdict(asyncio.Lock)
+        self._turns: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
 
     def described(self, key: str, meta: Known) -> None:
         self._keep(f"{self._root}/@meta/{key}", meta)
@@ -147,12 +150,14 @@ class Bridge:
             await self._clear(broker)
             self._pending |= dict.fromkeys(self._retained)
             await self._publish(broker)
+            if self._writes:
+                options = SubscribeOptions(qos=1, retainAsPublished=True, retainHandling=2)
+                await broker.subscribe(f"{self._root}/@set/#", options=options)
             await broker.publish(state, "online", qos=1, retain=True)
             say("connected to the broker")
             async with asyncio.TaskGroup() as group:
                 group.create_task(self._publish_changes(broker))
-                if self._writes:
-                    group.create_task(self._receive(broker))
+                group.create_task(self._receive(broker))
         finally:
             with suppress(aiomqtt.MqttError):  # then the broker publishes the last will
                 await broker.publish(state, "offline", qos=1, retain=True, timeout=1.0)
@@ -174,6 +179,8 @@ class Bridge:
                 empty = b"" if "/@" in topic else json.dumps(bad("no-gateway"))
                 await broker.publish(topic, empty, retain=True, properties=self._expiring())
         await broker.unsubscribe(everything)
+        while len(broker.messages):  # own ones
+            await anext(broker.messages)
 
     def _expiring(self) -> Properties:
         properties = Properties(PacketTypes.PUBLISH)
@@ -203,9 +210,10 @@ class Bridge:
             self._pending |= dict.fromkeys(self._retained)
 
     async def _receive(self, broker: aiomqtt.Client) -> None:
-        options = SubscribeOptions(qos=1, retainAsPublished=True, retainHandling=2)
-        await broker.subscribe(f"{self._root}/@set/#", options=options)
         async for message in broker.messages:
+            if len(self._open) >= MOST_COMMANDS:
+                say(f"too many commands wait: {message.topic} is dropped")
+                continue
             task = asyncio.create_task(self._command(message, time.monotonic()))
             self._open.add(task)
             task.add_done_callback(self._open.discard)
@@ -227,15 +235,14 @@ class Bridge:
 
     async def _outcome(self, key: str, command: Known, arrived: float) -> Known:
         number, value = command.get("id"), command["value"]
-        if key not in self.plant.tags:
-            return {"outcome": "unknown-tag", "reason": "no gateway has described this tag"}
-        if len(self._open) > MOST_COMMANDS:
-            return {"outcome": "busy", "reason": "too many commands wait"}
-        async with self._turns[key]:  # commands to a tag in their order
+        turn = self._turns.setdefault(key, asyncio.Lock())
+        async with turn:  # commands to a tag in their order
             known = number and self._commands.begin(key, number, json.dumps(value))
             if known:
                 return known
-            if time.monotonic() - arrived > LATEST:
+            if key not in self.plant.tags:
+                outcome = {"outcome": "unknown-tag", "reason": "no gateway has described this tag"}
+            elif time.monotonic() - arrived > LATEST:
                 outcome = {"outcome": "busy", "reason": "it waited longer than five seconds"}
             else:
                 outcome = await self.plant.write(key, value, command.get("time"))

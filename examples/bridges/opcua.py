@@ -45,13 +45,6 @@ NOT_DONE = {  # by the outcome of a write
 MOST_WRITES = 100  # that wait; the next one is refused
 
 
-class Users:
-    """Every client is a user: asyncua's own would take the name `admin` for an administrator."""
-
-    def get_user(self, *_: object, **__: object) -> User:
-        return User(role=UserRole.User)
-
-
 class Processor(UaProcessor):
     """Lets a client read on while a write of its own waits for the device."""
 
@@ -170,7 +163,7 @@ class Bridge(AttributeService):
             return Code.BadNotWritable
         if item.AttributeId != ua.AttributeIds.Value or item.IndexRange:
             return Code.BadWriteNotSupported
-        if not self._writes:
+        if not self._writes or not self.plant.tags[key]["write"]:
             return Code.BadNotWritable
         if item.Value.StatusCode is not None and item.Value.StatusCode.value != Code.Good:
             return Code.BadWriteNotSupported
@@ -190,12 +183,14 @@ async def main() -> None:
     given = parser.parse_args()
     logging.basicConfig(level=logging.ERROR)
     binary_server_asyncio.UaProcessor = Processor
-    server = Server(user_manager=Users())
+    server = Server()
     bridge = Bridge(server, given.writes)
     await server.init()
     server.set_endpoint(given.listen)
     server.set_server_name("zenoh-plc-gateway")
     server.set_security_policy([ua.SecurityPolicyType.NoSecurity])
+    # Only these: asyncua takes a user named `admin` for its own, and lets it write all nodes.
+    server.set_identity_tokens([ua.AnonymousIdentityToken])
     with await opened(given) as session:
         bridge.plant = Plant(session, given.prefix, bridge.described, bridge.changed)
         server.iserver.history_manager = History(server.iserver, bridge.plant)

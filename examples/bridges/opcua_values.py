@@ -2,7 +2,7 @@
 
 import json
 import struct
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 
 import zenoh
 from asyncua import ua
@@ -39,6 +39,7 @@ TYPES = {  # by the type of a tag; the others are texts
     "bcd16": Type.UInt16,
     "bcd32": Type.UInt32,
 }
+STEP = timedelta(microseconds=1)
 MOST_SAMPLES = 10_000  # in one answer; the client gets the rest with the continuation point
 
 
@@ -75,9 +76,13 @@ def variant_of(value: object, kind: ua.VariantType) -> ua.Variant | None:
     variant = ua.Variant(value, kind)
     try:
         variant_to_binary(variant)
-    except (struct.error, OverflowError):
+    except (ua.UaError, struct.error, OverflowError):
         return None
     return variant
+
+
+def _text(time: datetime | None) -> str:
+    return "" if time is None else f"{time:%Y-%m-%dT%H:%M:%S.%fZ}"
 
 
 class History(HistoryManager):
@@ -112,20 +117,19 @@ class History(HistoryManager):
             None if time is None or time <= ua.get_win_epoch() else time.astimezone(UTC)
             for time in (details.StartTime, details.EndTime)
         )
-        if start is None:  # backwards without an end
+        if start is None:  # the last ones before a time
             raise ua.uaerrors.BadHistoryOperationUnsupported
         backwards = end is not None and end < start
+        if item.ContinuationPoint:
+            try:
+                start = datetime.fromisoformat(item.ContinuationPoint.decode())
+            except ValueError:
+                raise ua.uaerrors.BadContinuationPointInvalid from None
+        # The bound where it starts is included. The gateway keeps nanoseconds, and shows less.
+        bounds = f"[{_text(start)}..{_text(end)}["
         if backwards:
-            start, end = end, start
-        begin, until = (
-            ("" if time is None else f"{time:%Y-%m-%dT%H:%M:%S.%fZ}") for time in (start, end)
-        )
-        if item.ContinuationPoint and backwards:
-            until = item.ContinuationPoint.decode()
-        elif item.ContinuationPoint:
-            begin = item.ContinuationPoint.decode()
+            bounds = f"]{_text(end)}..{_text(start + STEP)}["
         wanted = min(details.NumValuesPerNode or MOST_SAMPLES, MOST_SAMPLES)
-        bounds = f"]{begin}..{until}]" if backwards else f"[{begin}..{until}["
         samples = await self._samples(key, bounds, None if backwards else wanted + 1)
         samples.sort(key=lambda known: known["time"], reverse=backwards)
         rest = samples[wanted]["time"].encode() if len(samples) > wanted else None
