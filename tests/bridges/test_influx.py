@@ -37,7 +37,8 @@ class Influx:
             f'reporting-disabled = true\nbind-address = "127.0.0.1:{free_port()}"\n'
             f'[meta]\ndir = "{folder}/meta"\n'
             f'[data]\ndir = "{folder}/data"\nwal-dir = "{folder}/wal"\n'
-            f'[http]\nbind-address = "{where}"\nlog-enabled = false\n[monitor]\nstore-enabled = false\n'
+            f'[http]\nbind-address = "{where}"\nlog-enabled = false\n'
+            "[monitor]\nstore-enabled = false\n"
         )
 
     def run(self) -> Program:
