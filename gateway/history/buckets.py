@@ -50,7 +50,19 @@ class Bucket(NamedTuple):
 class _Open:
     """The bucket that gets samples now."""
 
-    __slots__ = ("bad", "good", "known", "last", "max", "mean", "min", "reason", "start", "time")
+    __slots__ = (
+        "bad",
+        "good",
+        "has_begun",
+        "known",
+        "last",
+        "max",
+        "mean",
+        "min",
+        "reason",
+        "start",
+        "time",
+    )
 
     def __init__(self, time: int, start: int) -> None:
         self.time = time
@@ -61,24 +73,41 @@ class _Open:
         self.mean = 0.0
         self.last: Value | None = None
         self.reason: str | None = None
+        self.has_begun = False  # the value at its beginning counts only if it stays valid
+
+    def enter(self, value: Value) -> None:
+        """The value is valid from now on."""
+        self.has_begun = True
+        self.last = value
+        if isinstance(value, str):
+            self.mean = math.nan
+        elif self.min is None or self.max is None:
+            self.min = self.max = value
+        elif value < self.min:  # type: ignore[operator]  # both are numbers
+            self.min = value
+        elif value > self.max:  # type: ignore[operator]
+            self.max = value
+
+    def count(self, value: Value | None, reason: str | None) -> None:
+        """Counts a sample at this moment."""
+        if value is not None:
+            self.good += 1
+            self.enter(value)
+        elif reason != NOT_RECORDED:
+            self.bad += 1
+            self.reason = reason
 
     def hold(self, value: Value | None, reason: str | None, duration: int) -> None:
-        """The value is valid for this time; without a value it is a gap."""
+        """The value stays valid for this time, in ns; without a value it is a gap."""
         if value is None:
             self.reason = reason
             return
-        self.last = value
+        if not self.has_begun:
+            self.enter(value)
         self.known += duration
-        if isinstance(value, str):
-            self.mean = math.nan
-            return
-        if self.min is None or value < self.min:  # type: ignore[operator]  # both are numbers
-            self.min = value
-        if self.max is None or value > self.max:  # type: ignore[operator]
-            self.max = value
         # A running mean: a sum of large numbers would overflow.
-        if duration:
-            self.mean += (float(value) - self.mean) * (duration / self.known)
+        if value.__class__ is not str:
+            self.mean += (value - self.mean) * (duration / self.known)  # type: ignore[operator]
 
     def closed(self, end: int) -> Bucket:
         return Bucket(
@@ -133,13 +162,8 @@ def buckets(steps: Iterable[Step], width: int, period: TimeRange, now: int) -> I
             bucket.hold(held, why, time - since)
             since = time
         held, why = value, reason
-        if first <= time and reason != NOT_RECORDED:
-            if value is None:
-                bucket.bad += 1
-                bucket.reason = reason
-            else:
-                bucket.good += 1
-                bucket.hold(value, None, 0)
+        if time >= first:
+            bucket.count(value, reason)
     if not begun:
         return
     stop = min(last + 1, max(now, since + bool(bucket.good or bucket.bad)))

@@ -4,6 +4,7 @@ A value is valid until the next sample of its tag, as long as a gateway ran. A s
 the value before it is valid until the last sample of any tag that was recorded before the start.
 """
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from heapq import merge
 from itertools import chain
@@ -20,6 +21,7 @@ from gateway.history.search import StoredRuns
 from gateway.history.timerange import EARLIEST, LATEST, TimeRange
 from gateway.tags import Quality, Reason, Sample, Tag
 
+_MOST = math.inf
 DAMAGED = "damaged"  # samples of this time are lost
 Pause = Callable[[], None]
 _TIME = itemgetter(0)
@@ -179,7 +181,9 @@ def _rows(
         if rows is None:
             raise Busy("the next samples were dropped meanwhile: ask again")
         yield [
-            step(time, value, kind, bad)
+            (time, value, None)
+            if bad is None and kind is None and value.__class__ is float and -_MOST < value < _MOST
+            else step(time, value, kind, bad)
             for number, time, _, value, kind, bad in rows
             if number in numbers and first <= time <= last
         ]

@@ -89,7 +89,7 @@ def compare(found: Sequence[Bucket], expected: Sequence[dict[str, Any]]) -> None
             assert mean is None
         else:
             assert mean == pytest.approx(float(exact), rel=1e-9, abs=1e-6)
-            assert wanted["min"] <= mean <= wanted["max"]
+            assert float(wanted["min"]) <= mean <= float(wanted["max"])
         covered = wanted["end"] - wanted["start"]
         is_whole = wanted["known"] == covered and not wanted["bad"]
         assert (bucket.quality == "good") is is_whole
