@@ -13,7 +13,7 @@ from gateway.errors import BadValue
 from gateway.history.timerange import EARLIEST, TimeRange
 from gateway.values import Value
 
-MOST_BUCKETS = 10_000  # of one tag
+MOST_BUCKETS = 10_000  # of one tag, in one answer
 NOT_RECORDED = "not-recorded"  # nothing is known: before the first sample, or no gateway ran
 
 # From `time` on (ns since 1970) the value is valid; None: there is none, for the reason.
@@ -133,12 +133,14 @@ class _Open:
         return min(max(self.mean, float(self.min)), float(self.max))
 
 
-def buckets(steps: Iterable[Step], width: int, period: TimeRange, now: int) -> Iterator[Bucket]:
+def buckets(
+    steps: Iterable[Step], width: int, period: TimeRange, now: int, most: int = MOST_BUCKETS
+) -> Iterator[Bucket]:
     """Divides the period into buckets of `width` ns, which begin at multiples of it since 1970.
 
     `steps` are in the order of time; those before the period tell the value at its beginning. An
     open period begins with the first step, and every period ends with `now` or the last step.
-    Yields nothing without a step. Raises `BadValue` if there would be too many buckets.
+    Yields nothing without a step. Raises `BadValue` for more than `most` buckets.
     """
     first, last = period
     held: Value | None = None
@@ -149,12 +151,12 @@ def buckets(steps: Iterable[Step], width: int, period: TimeRange, now: int) -> I
         if not begun:
             begun = True
             begin = since = time if first == EARLIEST else first
-            _check(since, min(last, max(now, time)), width)
+            _check(since, min(last, max(now, time)), width, most)
             bucket, end = _Open(since // width * width, since), (since // width + 1) * width
         if time > last:
             break
         while time >= end:
-            _check(begin, end, width)  # the clock may have been wrong once
+            _check(begin, end, width, most)  # the clock may have been wrong once
             bucket.hold(held, why, end - since)
             yield bucket.closed(end)
             bucket, since, end = _Open(end, end), end, end + width
@@ -174,11 +176,11 @@ def buckets(steps: Iterable[Step], width: int, period: TimeRange, now: int) -> I
         bucket, since, end = _Open(end, until), until, end + width
 
 
-def _check(first: int, last: int, width: int) -> None:
+def _check(first: int, last: int, width: int, most: int) -> None:
     count = (last - first) // width + 1
-    if count > MOST_BUCKETS:
-        needed = -(-(last - first + 1) // MOST_BUCKETS / 10**9)
+    if count > most:
+        needed = -(-(last - first + 1) // most / 10**9)
         raise BadValue(
-            f"the range has {count} buckets, more than {MOST_BUCKETS}: take a shorter range, or "
+            f"the range has {count} buckets, more than {most}: take a shorter range, or "
             f"buckets of at least {max(needed, 0.001):.3g} s"
         )

@@ -12,7 +12,7 @@ from operator import itemgetter
 from typing import NamedTuple
 
 from gateway.errors import Busy, Damaged
-from gateway.history.buckets import NOT_RECORDED, Bucket, Step, buckets
+from gateway.history.buckets import MOST_BUCKETS, NOT_RECORDED, Bucket, Step, buckets
 from gateway.history.damage import Damage
 from gateway.history.reader import Reader
 from gateway.history.recent import Identity, Recent, SortedRun
@@ -45,10 +45,13 @@ class Now(NamedTuple):
 class Course:
     """Used by the answering threads."""
 
-    def __init__(self, recent: Recent, reader: Reader, damage: Damage) -> None:
+    def __init__(
+        self, recent: Recent, reader: Reader, damage: Damage, most: int = MOST_BUCKETS
+    ) -> None:
         self._recent = recent
         self._reader = reader
         self._damage = damage
+        self._most = most
 
     def buckets(
         self, tag: Tag, period: TimeRange, width: int, now: Now, pause: Pause
@@ -68,7 +71,7 @@ class Course:
                 begin = begin[0], None, DAMAGED
         parts += [_in_memory(samples) for run in newest if (samples := _steps_of(run, period))]
         steps = _with_gaps(begin, _merged(parts), look, now, min(self._recent.latest, now.time))
-        yield from buckets(steps, width, period, now.time)
+        yield from buckets(steps, width, period, now.time, self._most)
         if (lost := stored.lost()) is not None:
             raise lost
 

@@ -23,8 +23,8 @@ _Placed = tuple[int, Tag, int, Stored, int | None, str | None]  # a row with its
 class Search:
     """Used by the answering threads. What a damaged file still has is answered first."""
 
-    def __init__(self, recent: Recent, reader: Reader) -> None:
-        self.damage = Damage()
+    def __init__(self, recent: Recent, reader: Reader, damage: Damage | None = None) -> None:
+        self.damage = damage or Damage()
         self._recent = recent
         self._reader = reader
 
