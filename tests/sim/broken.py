@@ -1911,6 +1911,11 @@ MUTANTS = (
         "tests/tags/test_scan.py",
     ),
     Mutant(
+        "a wrong LRC or CRC of a frame is taken",
+        "protocols/frames/codec.py",
+        "        if got != wanted:\n            why",
+        "        if False:\n            why",
+        "tests/protocols/test_frames_codec.py",
         "a value is drawn until the start of the next gateway",
         "history/course.py",
         "if found[2] == Reason.STARTING and value is not None:",
