@@ -1916,6 +1916,8 @@ MUTANTS = (
         "        if got != wanted:\n            why",
         "        if False:\n            why",
         "tests/protocols/test_frames_codec.py",
+    ),
+    Mutant(
         "a value is drawn until the start of the next gateway",
         "history/course.py",
         "if found[2] == Reason.STARTING and value is not None:",
