@@ -100,13 +100,19 @@ class Registers:
     def read_points(self, area: str, start: int, count: int) -> list[int]:
         """Returns bits that travel together in one byte or word.
 
-        Those without a tag are 0, if at least one has a tag. Raises `Denied`.
+        Those without a tag are 0, if at least one has a tag. Those that the master writes are 0
+        until then: to write some bits, it first reads all of their byte. Raises `Denied`.
         """
         cells = [(area, number) for number in range(start, start + count)]
         if not any(map(self._has, cells)):
             raise Denied(Why.NO_TAG)
         known: dict[Row, Sequence[int]] = {}
-        return [self._unit(cell, known) if self._has(cell) else 0 for cell in cells]
+        return [self._point(cell, known) for cell in cells]
+
+    def _point(self, cell: Cell, known: dict[Row, Sequence[int]]) -> int:
+        if cell in self._accepted:
+            return self._written.get(cell, 0)
+        return self._unit(cell, known) if cell in self._cells else 0
 
     def _has(self, cell: Cell) -> bool:
         return cell in self._cells or cell in self._accepted
@@ -152,8 +158,10 @@ class Registers:
         """As `write_cells`, for neighbours."""
         return self.write_cells([((area, start + i), unit) for i, unit in enumerate(units)])
 
-    def write_points(self, points: Iterable[tuple[Cell, int]]) -> Written:
-        """As `write_cells`, for bits that travel together in bytes or words.
+    def write_points(
+        self, points: Iterable[tuple[Cell, int]], others: Sequence[tuple[Cell, int]] = ()
+    ) -> Written:
+        """As `write_cells`, with bits that travel together in bytes or words.
 
         A master that writes some bits of a byte has read the others before: a bit outside
         `accept` is left alone if it is written with the value that the master reads there.
@@ -163,11 +171,11 @@ class Registers:
         for cell, bit in points:
             if cell in self._accepted:
                 inside.append((cell, bit))
-            elif bit != (self._unit(cell, known) if self._has(cell) else 0):
+            elif bit != self._point(cell, known):
                 raise Denied(Why.NOT_ACCEPTED)
         if not inside:
             raise Denied(Why.NOT_ACCEPTED)
-        return self.write_cells(inside)
+        return self.write_cells([*others, *inside])
 
     def write_cells(self, cells: Sequence[tuple[Cell, int]]) -> Written:
         """Writes all cells of one request. Returns the tags with their values, by address.

@@ -5,6 +5,8 @@ from typing import NamedTuple
 
 from gateway.serving import modbus_wire
 from gateway.serving.answering import Answerer, Stations, Wire
+from gateway.serving.computer_link import computer_link
+from gateway.serving.vigor import vigor
 
 MakeAnswerer = Callable[[Stations, Wire], Answerer]
 
@@ -20,6 +22,8 @@ _SERVED: dict[str, _Served] = {
     "modbus-tcp": _Served(modbus_wire.tcp),
     "modbus-rtu": _Served(modbus_wire.rtu),
     "modbus-ascii": _Served(modbus_wire.ascii_line),
+    "vigor": _Served(vigor),
+    "computer-link": _Served(computer_link, ("frame_format", "sum_check")),
 }
 
 

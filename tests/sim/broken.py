@@ -1920,7 +1920,9 @@ MUTANTS = (
     Mutant(
         "a master writes outside `accept`",
         "serving/registers.py",
-        "            if cell not in self._accepted:\n                raise Denied(Why.NOT_ACCEPTED)\n            touched",
+        "            if cell not in self._accepted:\n"
+        "                raise Denied(Why.NOT_ACCEPTED)\n"
+        "            touched",
         "            touched",
         "tests/serving/test_modbus_tcp.py",
     ),
@@ -1986,5 +1988,48 @@ MUTANTS = (
         "                await asyncio.to_thread(self._file.save, changed)\n",
         "                pass\n",
         "tests/line/test_serving.py",
+    ),
+    Mutant(
+        "a master writes some bits of a byte outside `accept`",
+        "serving/registers.py",
+        "            elif bit != self._point(cell, known):\n"
+        "                raise Denied(Why.NOT_ACCEPTED)\n",
+        "            elif False:\n                raise Denied(Why.NOT_ACCEPTED)\n",
+        "tests/serving/test_vigor.py",
+    ),
+    Mutant(
+        "half a Vigor request waits for its end",
+        "serving/vigor.py",
+        "            self._reader = RequestReader()  # half",
+        "            pass  # half",
+        "tests/serving/test_vigor.py",
+    ),
+    Mutant(
+        "the reply of another Vigor station ends a request",
+        "serving/vigor.py",
+        " or ACK in request:",
+        ":",
+        "tests/serving/test_vigor.py",
+    ),
+    Mutant(
+        "half a Computer Link request waits for its end",
+        "serving/computer_link.py",
+        "        self._reader.expire(now, _TIME_OUT)\n",
+        "        pass\n",
+        "tests/serving/test_computer_link.py",
+    ),
+    Mutant(
+        "a Computer Link request that another follows is done",
+        "serving/computer_link.py",
+        "        if station is None or self._reader.begun > NOISE:\n",
+        "        if station is None:\n",
+        "tests/serving/test_computer_link.py",
+    ),
+    Mutant(
+        "a reply does not wait for the message wait",
+        "serving/computer_link.py",
+        "            wait = int(request.wait, 16) * _STEP\n",
+        "            pass\n",
+        "tests/serving/test_computer_link.py",
     ),
 )
