@@ -2,6 +2,7 @@
 
 import asyncio
 import os
+import select
 import signal
 import tty
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Any, Self
 
 from gateway.protocols.checksums import crc16
 from tests.e2e.processes import free_port, started, write_config
+from tests.serving.easy_link import EXAMPLE, EasyLink
 from tests.zenoh_peer import Subscription, ZenohPeer, free_endpoint
 
 TAGS = {
@@ -50,6 +52,15 @@ class Wire:
                 reply += os.read(self._master, 4096)
         return reply
 
+    def exchange(self, request: bytes) -> bytes:
+        """Returns one reply that ends with ETX and a sum; blocks."""
+        os.write(self._master, request)
+        reply = b""
+        while b"\x03" not in reply[:-2]:
+            assert select.select([self._master], [], [], 5)[0], f"only {reply!r}"
+            reply += os.read(self._master, 4096)
+        return reply
+
 
 class Tcp:
     """A master on Modbus TCP."""
@@ -75,11 +86,17 @@ def rtu(text: str) -> bytes:
     return body + crc16(body)
 
 
-def _plant(folder: Path, endpoint: str, number: int, tty_: str) -> Path:
+def _plant(folder: Path, endpoint: str, number: int, *ttys: str) -> Path:
     served: dict[str, Any] = {"serve": True}
     panel = {**STATION, "protocol": "modbus-tcp", "tags": TAGS}
     plc = {**STATION, "protocol": "modbus-rtu", "stale_after": "1h"}
     plc["tags"] = {"order": TAGS["order"]}
+    words = {f"d{n}": {"address": f"D{n}", "source": "mixer/speed"} for n in range(10, 20)}
+    bits = {f"m{n}": {"address": f"M{n}"} for n in range(100, 130)}
+    five = {"protocol": "vigor", "station": 5, "tags": words}
+    two = {"protocol": "vigor", "station": 2, "accept": ["M100..M129"], "tags": bits}
+    liyan = {"protocol": "computer-link", "frame_format": 4, "station": 3, "accept": ["D0000"]}
+    liyan["tags"] = {"order": {"address": "D0000"}}
     mixer = {"protocol": "vigor", "station": 1, "tags": MIXER}
     return write_config(
         folder / "config.yaml",
@@ -87,7 +104,9 @@ def _plant(folder: Path, endpoint: str, number: int, tty_: str) -> Path:
         {
             "hall": {"port": "simulator", "devices": {"mixer": mixer}},
             "panel": {"port": f"tcp://127.0.0.1:{number}", **served, "devices": {"hmi": panel}},
-            "wire": {"port": tty_, "baudrate": 19200, **served, "devices": {"plc": plc}},
+            "wire": {"port": ttys[0], "baudrate": 19200, **served, "devices": {"plc": plc}},
+            "link": {"port": ttys[1], **served, "devices": {"five": five, "two": two}},
+            "lnk485": {"port": ttys[2], **served, "devices": {"liyan": liyan}},
         },
         gateway={"name": "demo", "state": "state.json"},
     )
@@ -99,12 +118,13 @@ def _values(seen: Subscription, key: str) -> list[Any]:
 
 async def test_a_master_and_a_client_exchange_values(tmp_path: Path) -> None:
     endpoint, number = free_endpoint(), free_port()
-    with Wire() as wire:
-        path = _plant(tmp_path, endpoint, number, wire.path)
+    with Wire() as wire, Wire() as link, Wire() as lnk485:
+        path = _plant(tmp_path, endpoint, number, wire.path, link.path, lnk485.path)
         with started(path) as program:
             async with ZenohPeer("client", connect=[endpoint]) as client:
                 seen = await client.subscribe("plant/**")
-                program.says("line open", "line=wire")
+                for line in ("wire", "link", "lnk485"):
+                    program.says("line open", f"line={line}")
                 panel = Tcp(*await asyncio.open_connection("127.0.0.1", number))
                 # What the master writes is published once, and with one time.
                 assert await wire.ask(rtu("01 10 0064 0002 04 0001 0002"), 8) == rtu(
@@ -124,6 +144,19 @@ async def test_a_master_and_a_client_exchange_values(tmp_path: Path) -> None:
                 [answer] = await client.get("plant/mixer/speed/@set", b"258")
                 await seen.next(lambda one: one.key.endswith("speed") and one.json["value"] == 258)
                 assert await panel.ask("03 0000 0001") == "03 02 01 02"
+                # Easy Link, with the table of the manual, and an EX485LNK.
+                master = EasyLink(link.exchange)
+                master.devices = {(3, n): n % 2 for n in range(30)}
+                assert await asyncio.to_thread(master.perform, EXAMPLE) == ["00", "00"]
+                assert [master.devices[13, n] for n in range(10)] == [258] * 10
+                await seen.next(lambda one: one.key == "plant/two/m129" and one.json["value"])
+                assert _values(seen, "plant/two/m128")[-1:] == [False]
+                write = b"\x0503FFWW0D0000011234"
+                write += b"%02X\r\n" % (sum(write[1:]) & 0xFF)
+                assert await lnk485.ask(write, 7) == b"\x0603FF\r\n"
+                await seen.next(
+                    lambda one: one.key == "plant/liyan/order" and one.json["value"] == 0x1234
+                )
                 # A silent master.
                 await seen.next(
                     lambda one: one.key == "plant/hmi/order" and one.json["value"] is None
