@@ -18,9 +18,10 @@ import orjson
 
 from gateway.engine.requests import CommandResult
 from gateway.errors import BadValue, Busy, Damaged, GatewayError, LineDown, Offline, Refused
+from gateway.numerals import parse_decimal
 from gateway.tags import Quality, Reason, Sample, Tag, WriteResult
 from gateway.tags.timestamps import rfc3339
-from gateway.values import Value, parse_decimal
+from gateway.values import Value
 
 LONGEST_WRITE = 64 * 1024  # bytes; a tag holds 250 characters at most
 LONGEST_REASON = 300

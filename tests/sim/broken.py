@@ -700,8 +700,8 @@ MUTANTS = (
     Mutant(
         "a scaled integer is written as a float",
         "tags/scaling.py",
-        "round((_decimal(value) - _decimal(offset)) / _decimal(scale))",
-        "round((value - offset) / scale)",
+        "round((decimal(value) - line.summand) / line.factor)",
+        "round((value - float(line.summand)) / float(line.factor))",
         "tests/tags/test_scaling.py",
     ),
     Mutant(
