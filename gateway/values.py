@@ -103,6 +103,14 @@ class ValueType:
         """The number of bits of a number."""
         return 8 if self.kind in BYTES else 16 * self.words
 
+    def holds(self, number: int) -> bool:
+        """Returns True if a number of this type can be `number`."""
+        try:
+            to_words(Layout(self))(number)
+        except BadValue:
+            return False
+        return True
+
     @property
     def is_number(self) -> bool:
         return self.kind not in (Kind.BOOL, Kind.STRING)

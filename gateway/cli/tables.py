@@ -19,6 +19,8 @@ def row_of(sample: Sample) -> Row:
         "quality": sample.quality.value,
         "time": rfc3339(sample.time),
     }
+    if sample.tag.names is not None and (text := sample.tag.names.text(sample.value)):
+        document["text"] = text
     if sample.reason is not None:
         document["reason"] = sample.reason.value
     return Row(sample.tag.key, document)
@@ -48,12 +50,18 @@ def table_of(rows: Iterable[Row], tags: dict[str, Tag]) -> Table:
         tag = tags.get(row.tag)
         table.add_row(
             Text(row.tag),
-            Text("-" if document.get("value") is None else value_text(document["value"])),
+            Text("-" if document.get("value") is None else _named(document)),
             Text(tag.unit if tag else ""),
             Text(printable(quality), style="" if good else "red"),
             Text(printable(str(document.get("time", "")))),
         )
     return table
+
+
+def _named(document: dict[str, object]) -> str:
+    """Returns the value, behind its name if it has one: `auto (1)`."""
+    value = value_text(document["value"])
+    return printable(f"{document['text']} ({value})") if document.get("text") else value
 
 
 def value_text(value: object) -> str:

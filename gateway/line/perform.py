@@ -143,7 +143,7 @@ async def _read_once(talk: Talk[Any], device: Device, block: Block, span: Span) 
 
 
 async def _write(write: Write, talk: Transaction) -> Sent:
-    """Writes one value, and reads it back if its tag has `verify`. A part is changed in its word."""
+    """Writes one value, and reads it back if its tag has `verify`. A part changes in its word."""
     driver, tag = write.device.settings.driver, write.tag
     units = write.units
     if write.resyncs.before is not None:

@@ -17,6 +17,8 @@ _READERS: dict[str, Callable[[str], object]] = {
     "history": cells.flag,
     "word_order": cells.order,
     "byte_order": cells.order,
+    "invert": cells.flag,
+    "enum": cells.names,
 }
 _SCALINGS = ("", "none", "no", "keine", "linear")
 _KEPT = 3  # examples in a note

@@ -52,7 +52,7 @@ def decoder(
 
     `single`: it takes one unit, otherwise a sequence.
     """
-    return _shaped(_scaled(_plain(layout, unit, single, bit), layout, line), shaping)
+    return with_shaping(_scaled(_plain(layout, unit, single, bit), layout, line), shaping)
 
 
 def _plain(layout: Layout, unit: Unit, single: bool, bit: int | None) -> Decode:
@@ -91,7 +91,8 @@ def _scaled(plain: Decode, layout: Layout, line: Linear | None) -> Decode:
     return integer
 
 
-def _shaped(decode: Decode, shaping: Shaping | None) -> Decode:
+def with_shaping(decode: Decode, shaping: Shaping | None) -> Decode:
+    """Returns the function with the shaping behind it, if there is one."""
     shape = None if shaping is None else shaped(shaping)
     if shape is None:
         return decode
@@ -110,4 +111,4 @@ def field_decoder(layout: Layout, line: Linear | None, shaping: Shaping | None) 
     def plain(raw: Value | Garbled) -> Value | None:
         return None if isinstance(raw, Garbled) else raw
 
-    return _shaped(_scaled(plain, layout, line), shaping)
+    return with_shaping(_scaled(plain, layout, line), shaping)

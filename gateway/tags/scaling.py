@@ -20,8 +20,6 @@ _WHOLE = (Kind.UINT16, Kind.INT32, Kind.UINT32, Kind.INT64, Kind.UINT64)
 _DIGITS = {Kind.BCD16: 4, Kind.BCD32: 8}
 
 
-
-
 class Ends(NamedTuple):
     """Two values of the device, and the values of the tag there: `from` and `to` in the file."""
 

@@ -67,7 +67,7 @@ def shaped(shaping: Shaping) -> Convert | None:
         if low <= value <= high:
             return value
         limit = low if value < low else high
-        return limit if isinstance(value, float) else int(limit)
+        return float(limit) if isinstance(value, float) else int(limit)
 
     return limited
 

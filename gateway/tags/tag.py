@@ -8,7 +8,15 @@ from typing import Any, NamedTuple
 from gateway.errors import BadValue, Garbled
 from gateway.protocols.driver import Address, Span, Unit
 from gateway.protocols.typed_fields import Shape
-from gateway.tags.decoding import Decode, Part, decoder, field_decoder, part_of
+from gateway.tags.decoding import (
+    Decode,
+    Part,
+    decoder,
+    field_decoder,
+    part_of,
+    with_shaping,
+)
+from gateway.tags.formula import Formula
 from gateway.tags.scaling import Linear, exact_below, linear, type_of, unscaled, unscaled_float
 from gateway.tags.shaping import Names, Shaping
 from gateway.values import Layout, Value, to_words
@@ -73,6 +81,8 @@ class Tag:
     event: bool = False  # every value is published, also an equal one
     shaping: Shaping | None = None
     names: Names | None = None
+    formula: Formula | None = None  # of a computed tag: no address, read or write
+    inputs: tuple["Tag", ...] = ()  # of the formula, in its order
     part: Part | None = field(init=False, repr=False)  # of its word; None: whole words
     # From the unit of the span to the value, or from its units if it has several.
     convert: Decode = field(init=False, repr=False)
@@ -83,6 +93,8 @@ class Tag:
         object.__setattr__(self, "convert", self._decoder(self.shaping))
 
     def _decoder(self, shaping: Shaping | None) -> Decode:
+        if self.formula is not None:
+            return with_shaping(self.formula.value, shaping)
         if self.shape is not None:
             return field_decoder(self.layout, self._line, shaping)
         bit = self.address.bit
