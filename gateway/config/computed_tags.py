@@ -36,7 +36,11 @@ class _Names:
         known = [key.removeprefix(near) for key in (*self.tags, *self.sources)]
         close = similar(name, known)
         quotes = "'" if close and not close.replace("_", "a").isalnum() else ""
-        hint = f"did you mean {quotes}{close}{quotes}?" if close else "use tag, or 'device/tag'"
+        hint = (
+            f"did you mean {quotes}{close}{quotes}?"
+            if close
+            else "one of another device is written 'device/tag'"
+        )
         raise ConfigError(f"{name} is no tag of {source.device}: {hint}")
 
 

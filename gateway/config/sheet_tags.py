@@ -119,6 +119,7 @@ def other_settings() -> list[str]:
     """Returns the settings of a tag that a column may have under their own names."""
     own = {"address", "type", "unit", "description", "scale", "offset", "every", "deadband"}
     own |= {"word_order", "byte_order", "history", "write", "enum", "invert"}
+    own.add("computed")
     return [name for name in settings_of(TagSection) if name not in own]
 
 

@@ -8,7 +8,7 @@ from gateway.tags.shaping import PLAIN, Bounds
 
 def meta(tag: Tag) -> bytes:
     """The description of a tag: type, address, unit, interval, limits."""
-    return orjson.dumps(meta_fields(tag), option=orjson.OPT_NON_STR_KEYS)
+    return orjson.dumps(meta_fields(tag))
 
 
 def meta_fields(tag: Tag) -> dict[str, object]:
@@ -29,7 +29,9 @@ def meta_fields(tag: Tag) -> dict[str, object]:
         "clamp": None if shaping.clamp is None else {"min": low, "max": high},
         "invert": shaping.invert,
         "computed": None if tag.formula is None else tag.formula.text,
-        "enum": None if tag.names is None else tag.names.by_number,
+        "enum": None
+        if tag.names is None
+        else {str(number): name for number, name in tag.names.by_number.items()},
         "publish": tag.publish.value,
         "deadband": None
         if deadband is None

@@ -54,6 +54,7 @@ _TITLES = {
     "scaling": "scaling",
     "enum": "enum, states, state names, value names, zustände, zustandsnamen, 狀態名稱, 状态名称",
     "invert": "invert, inverted, invertiert",
+    "computed": "computed",
     "bit": "bit, bit no, bit number, bitnummer, bit nr, 位元, 位號, 位号",
     # Columns that change a value or its source, in a way that no setting has: see `UNUSABLE`.
     "divisor": "divisor, divide, divide by, divider, teiler, 除數, 除数",

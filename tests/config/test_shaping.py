@@ -154,6 +154,15 @@ def test_an_inverted_bit_is_read_and_written_the_other_way_round() -> None:
         coil.encode(2)
 
 
+def test_a_write_of_a_part_keeps_the_rest_of_the_word() -> None:
+    bit = tags_of("t: {address: D1.3, write: true}")[0].part
+    high = only("type: uint8, byte: high").part
+    assert bit is not None
+    assert high is not None
+    assert (bit.into(0xFFFF, 0), bit.into(0, 1), bit.of(0b1000)) == (0xFFF7, 0b1000, 1)
+    assert (high.into(0x12FE, 0xAB), high.of(0x12FE)) == (0xABFE, 0x12)
+
+
 def test_bits_of_a_word_are_tags_of_one_address() -> None:
     pump, fault = tags_of(
         "status: {address: D2, every: 2s, bits: {0: pump, 3: {name: fault, invert: true}}}"
@@ -201,7 +210,7 @@ def test_meta_has_the_shaping() -> None:
     assert described["to"] == (0, 100)
     assert described["decimals"] == 1
     assert described["clamp"] == {"min": 0, "max": 100}
-    assert meta_fields(only(MODE))["enum"] == {0: "off", 1: "auto", 2: "manual"}
+    assert meta_fields(only(MODE))["enum"] == {"0": "off", "1": "auto", "2": "manual"}
 
 
 WHOLE = "the values are whole numbers (int16)"
