@@ -235,7 +235,8 @@ def test_every_setting_of_a_protocol_is_on_the_page_and_no_other(protocol: str) 
 
 
 def test_every_section_of_the_file_is_on_the_page() -> None:
-    headings = set(re.findall(r"^## (\w+)$", CONFIGURATION, re.MULTILINE))
+    pages = CONFIGURATION + TEXT["templates.md"]
+    headings = set(re.findall(r"^## (\w+)$", pages, re.MULTILINE))
     assert set(schema()["properties"]) - {"defaults", "lines"} <= headings
 
 

@@ -1952,4 +1952,18 @@ MUTANTS = (
         "if self.known:",
         "tests/history/test_buckets.py",
     ),
+    Mutant(
+        "two templates of a device may have one tag",
+        "config/templates.py",
+        "if first is not template and first.name not in template.bases:",
+        "if False:",
+        "tests/config/test_templates.py",
+    ),
+    Mutant(
+        "a parameter without a value is nothing",
+        "config/templates.py",
+        "            if default is None:\n",
+        "            if False:\n",
+        "tests/config/test_templates.py",
+    ),
 )
