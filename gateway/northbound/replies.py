@@ -13,6 +13,7 @@ from gateway.history.rows import has_value
 from gateway.northbound import buckets, encoding, pages, past, payload
 from gateway.northbound.interfaces import History, Plant
 from gateway.northbound.keys import Family, Keys, ParsedKey
+from gateway.northbound.meta import meta
 from gateway.northbound.payload import Failure, Problem
 from gateway.northbound.tag_index import TagIndex
 from gateway.northbound.turns import Pause, Rank, Turns
@@ -86,7 +87,7 @@ class Replies:
 
     def _current(self, family: Family, query: zenoh.Query, tag: Tag) -> None:
         if family is Family.META:
-            self._reply(query, self._keys.meta(tag.key), payload.meta(tag), self._stamp())
+            self._reply(query, self._keys.meta(tag.key), meta(tag), self._stamp())
         elif family is not Family.LAST or tag.device not in self._only_blocks:
             # An AdvancedSubscriber would keep a value whose key is never put.
             self._value(query, tag)

@@ -21,6 +21,7 @@ from gateway.history.rows import has_value
 from gateway.northbound import buckets, past, payload
 from gateway.northbound.faults import below, faults, warnings
 from gateway.northbound.interfaces import History
+from gateway.northbound.meta import meta_fields
 from gateway.northbound.payload import Failure, Problem
 from gateway.northbound.session import off_loop
 from gateway.tags import Tag
@@ -126,7 +127,7 @@ class Api:
         return list(islice(matching if find else tags, limit))
 
     def _fields(self, tag: Tag) -> Mapping[str, object]:
-        return {**payload.sample_fields(self._plant.sample(tag)), **payload.meta_fields(tag)}
+        return {**payload.sample_fields(self._plant.sample(tag)), **meta_fields(tag)}
 
     async def _samples(self, request: web.Request) -> web.Response:
         key = request.query.get("tag", "")
