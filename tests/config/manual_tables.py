@@ -85,9 +85,28 @@ MODEM = {
     **{f"D{number}": "telephone number" for number in range(9110, 9116)},
 }
 # FNC 89 and FNC 149: the upper 8 bits of the first word of the working area
-LINK_CODES = (0, 2, 4, 5, 6, 0xA, 0xB)
+LINK_CODES = {
+    0: "normal",
+    2: "length",
+    4: "device type",
+    5: "device number",
+    6: "differ",
+    0xA: "no response",
+    0xB: "abnormal communication",
+}
 # LS MASTER-K120S, MODCOM, S3: bit 0 done, bit 1 error, code in bits 8 to 15
-MODCOM_CODES = range(1, 11)
+MODCOM_CODES = {
+    1: "illegal function",
+    2: "illegal address",
+    3: "illegal data value",
+    4: "slave device failure",
+    5: "acknowledge",
+    6: "slave device busy",
+    7: "time-out",
+    8: "number error",
+    9: "parameter error",
+    10: "station error",
+}
 # Liyan EX485LNK, 2.18 Status BFM#28 (the table; the text below it is of another module)
 EX485LNK_STATUS = {
     1: "send completion",

@@ -376,20 +376,45 @@ def test_data_of_parallel_link_are_those_of_the_manual(tmp_path: Path, speed: st
     assert all(found[address].name.startswith("parallel-link/to-master/") for address in to_master)
 
 
-def test_codes_are_in_the_descriptions(tmp_path: Path) -> None:
-    link = shipped(tmp_path, "vigor/cpu-link", VIGOR)
-    for code, words in manual.CPU_LINK_CODES.items():
-        assert f"{code} {words}" in link["D9212"].description
-    for use in ("vigor/easy-link", "vigor/mbus"):
-        found = shipped(tmp_path, use, f"{VIGOR}, status: 100")
-        codes = re.findall(r"(?<=[ ])(\d+) [a-z]", found["D100"].description)
-        assert tuple(map(int, codes)) == manual.LINK_CODES
-        assert "M9199" in found
+def parts(folder: Path, use: str, device: str) -> dict[str, tuple[str, dict[int, str]]]:
+    """Address, byte and names of the values of each tag."""
+    path = folder / "plant.yaml"
+    line = f"{{port: simulator, devices: {{p: {{use: {use}, {device}}}}}}}"
+    path.write_text(f"lines: {{hall: {line}}}\n")
+    return {
+        tag.name: (tag.text, {} if tag.names is None else dict(tag.names.by_number))
+        for tag in load(path).devices[0].tags
+    }
+
+
+def test_codes_have_the_words_of_the_manual(tmp_path: Path) -> None:
+    def same(found: dict[int, str], expected: dict[int, str]) -> bool:
+        return found.keys() == expected.keys() and all(
+            words in found[code] for code, words in expected.items()
+        )
+
+    link = parts(tmp_path, "vigor/cpu-link", VIGOR)
+    for slave in range(1, 8):
+        address, names = link[f"cpu-link/error-code/slave-{slave}"]
+        assert (address, same(names, manual.CPU_LINK_CODES)) == (f"D{9211 + slave}", True)
+    for use in ("easy-link", "mbus"):
+        found = parts(tmp_path, f"vigor/{use}", f"{VIGOR}, status: 100")
+        assert found[f"{use}/status"][0] == found[f"{use}/station"][0] == "D100"
+        assert same(found[f"{use}/status"][1], manual.LINK_CODES)
+        assert found[f"{use}/done"][0] == "M9199"
     k120s = "protocol: modbus-rtu, addressing: k120s, station: 1, status: D0110"
-    modcom = shipped(tmp_path, "k120s/modcom", k120s)
-    codes = re.findall(r"(?<=[ ])(\d+) [a-z]", modcom["D0110"].description)
-    assert [*map(int, codes)] == [*manual.MODCOM_CODES]
-    assert (modcom["D0110.0"].name, modcom["D0110.1"].name) == ("modcom/done", "modcom/error")
+    modcom = parts(tmp_path, "k120s/modcom", k120s)
+    assert (modcom["modcom/done"][0], modcom["modcom/error"][0]) == ("D0110.0", "D0110.1")
+    assert modcom["modcom/code"][0] == "D0110"
+    assert same(modcom["modcom/code"][1], manual.MODCOM_CODES)
+
+
+def test_a_status_word_is_read_as_the_manual_divides_it(tmp_path: Path) -> None:
+    path = tmp_path / "plant.yaml"
+    device = f"{{use: vigor/easy-link, {VIGOR}, status: 100}}"
+    path.write_text(f"lines: {{hall: {{port: simulator, devices: {{p: {device}}}}}}}\n")
+    found = {tag.name: tag.decode([0x0A07]) for tag in load(path).devices[0].tags[:2]}
+    assert found == {"easy-link/status": 10, "easy-link/station": 7}
 
 
 def test_ex485lnk(tmp_path: Path) -> None:
