@@ -2137,4 +2137,18 @@ MUTANTS = (
         "Decimal(value) if",
         "tests/tags/test_computed.py",
     ),
+    Mutant(
+        "two templates of a device may have one tag",
+        "config/templates.py",
+        "if first is not template and first.name not in template.bases:",
+        "if False:",
+        "tests/config/test_templates.py",
+    ),
+    Mutant(
+        "a parameter without a value is nothing",
+        "config/templates.py",
+        "            if default is None:\n",
+        "            if False:\n",
+        "tests/config/test_templates.py",
+    ),
 )
