@@ -66,6 +66,7 @@ class ServedLine:
         self.openings = 0
         self.trouble = ""  # why it is closed
         self.stale = 0  # requests that later bytes have followed
+        self.unsent = 0  # replies that later bytes have followed
         self._sink = sink
         self._open_port = open_port
         self._wall = wall
@@ -279,6 +280,7 @@ class Conversation:
         if self._reply is not None:
             self._reply.cancel()
             self._reply = None
+            self._line.unsent += 1
 
     def lost(self, error: Exception) -> None:
         self.close()

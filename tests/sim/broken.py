@@ -2032,4 +2032,18 @@ MUTANTS = (
         "            pass\n",
         "tests/serving/test_computer_link.py",
     ),
+    Mutant(
+        "a reply is sent into the next request",
+        "line/served_line.py",
+        "        if self._following > NOISE:\n",
+        "        if False:\n",
+        "tests/sim/test_served.py",
+    ),
+    Mutant(
+        "a silent master is not noticed",
+        "serving/station.py",
+        "        if now < self._due:\n",
+        "        if True:\n",
+        "tests/serving/test_modbus_tcp.py",
+    ),
 )
