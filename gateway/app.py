@@ -166,6 +166,8 @@ class Gateway:
                 if sample.tag in self._waiting:
                     self._answer(sample)
         if changed:
+            if self.mirror.dependents:
+                changed = [*changed, *self.mirror.computed_after(changed)]
             self._publish(changed)
 
     def online(self, device: Device | Station, online: bool) -> None:
@@ -234,6 +236,8 @@ class Gateway:
 
         The age is monotonic time: a change of the system clock must not change it.
         """
+        if tag.formula is not None:
+            return all(self.is_fresh(one, max_age) for one in tag.inputs)
         poll = self._poll(tag)
         if poll is None or not self._places[tag.device][0].engine.is_open:
             return True
@@ -247,6 +251,9 @@ class Gateway:
         Several clients share one read. The sample is bad if the device does not answer. Raises
         `Busy` if the line had no time for the read.
         """
+        if tag.formula is not None:
+            await asyncio.gather(*(self.fresh(one, max_age) for one in tag.inputs))
+            return self.mirror[tag]
         poll = self._poll(tag)
         if poll is None or self.is_fresh(tag, max_age):
             return self.mirror[tag]

@@ -36,6 +36,7 @@ from gateway.history import Historian
 from gateway.line.duty import Duty
 from gateway.northbound import GroupSettings, payload
 from gateway.northbound.keys import Keys
+from gateway.northbound.meta import meta
 from gateway.northbound.payload import Problem
 from gateway.northbound.secrets import exposures
 from gateway.northbound.standby import Standby
@@ -205,6 +206,8 @@ def settings(heading: str) -> dict[str, str]:
     """The settings of a section with the defaults that its page names."""
     page = "configuration-protocols.md" if heading in PROTOCOLS else "configuration.md"
     rows = table(page, heading, "setting")
+    if heading == "A tag":
+        rows += table("shaping.md", "Settings", "setting")
     return {bare(name): bare(default) for name, _, default, _ in rows}
 
 
@@ -435,9 +438,12 @@ def test_the_reference_lists_every_command_and_every_option() -> None:
     group: Any = typer.main.get_command(cli)
     listed = [name.split()[0] for name in names("commands.md", "Commands", "command")]
     assert listed == list(group.commands)
+    single = {name: one for name, one in group.commands.items() if not hasattr(one, "commands")}
+    for name, group_of in group.commands.items() - single.items():
+        single |= {f"{name} {sub}": command for sub, command in group_of.commands.items()}
     options = {
         (name, option)
-        for name, command in group.commands.items()
+        for name, command in single.items()
         for param in command.params
         if param.param_type_name == "option"
         for option in (*param.opts, *param.secondary_opts)
@@ -632,7 +638,7 @@ def test_a_value_has_the_fields_of_the_page() -> None:
 def test_a_description_has_the_fields_of_the_page() -> None:
     tag = load(EXAMPLE).devices[0].tags[0]
     sentence = TEXT["zenoh.md"].partition("A description holds ")[2].partition(": `null`")[0]
-    assert set(re.findall(r"`(\w+)`", sentence)) == set(json.loads(payload.meta(tag)))
+    assert set(re.findall(r"`(\w+)`", sentence)) == set(json.loads(meta(tag)))
 
 
 def test_the_status_documents_have_the_fields_of_the_page(endpoint: str, tmp_path: Path) -> None:

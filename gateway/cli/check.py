@@ -59,9 +59,10 @@ def check(
 def _notes(config: Config) -> Iterator[str]:
     tags = [tag for one in config.devices if one.served is None for tag in one.tags]
     for tag in tags:
-        if tag.write is not None and tag.address.bit is not None:
+        if tag.write is not None and tag.part is not None:
+            part = "one bit" if tag.address.bit is not None else "one byte"
             yield (
-                f"writing {tag.key} ({tag.text}) reads the word, changes one bit and writes "
+                f"writing {tag.key} ({tag.text}) reads the word, changes {part} and writes "
                 "the word back; changes by the PLC in between are lost"
             )
     for tag in tags:

@@ -7,6 +7,7 @@ from pathlib import Path as FilePath
 from typing import Any
 
 from gateway.config import parsers
+from gateway.config.computed_tags import with_computed
 from gateway.config.device_tags import DeviceTags, mapping
 from gateway.config.line_rules import check_line, line_wire
 from gateway.config.messages import Mistakes, Path, meant, shown
@@ -84,6 +85,7 @@ class Builder:
                 lines.append(line)
         if raw_lines == {}:
             self.mistakes.add(("lines",), "no lines: a gateway has at least one")
+        lines = with_computed(lines, self._tags.computed, self.mistakes)
         self._check_ports(lines, raw_lines)
         check_sources(lines, self.mistakes)
         if top is None:

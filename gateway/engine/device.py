@@ -47,6 +47,11 @@ class DeviceSettings:
     enabled: bool = True
     tags: tuple[Tag, ...] = ()
     served: Served | None = None  # it is a station of the gateway, for a master on its line
+    wire_tags: tuple[Tag, ...] = field(init=False, repr=False)  # those with an address
+
+    def __post_init__(self) -> None:
+        found = tuple(tag for tag in self.tags if tag.formula is None)
+        object.__setattr__(self, "wire_tags", found)
 
 
 @dataclass(slots=True, eq=False)
@@ -101,7 +106,7 @@ class Device:
 
     @property
     def tags(self) -> tuple[Tag, ...]:
-        return self.settings.tags
+        return self.settings.wire_tags
 
     @property
     def broadcast(self) -> bool:
