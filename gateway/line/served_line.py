@@ -240,6 +240,7 @@ class Conversation:
         self._machine = line.machine()
         self._port: Port | None = None
         self._reply: asyncio.TimerHandle | None = None
+        self._closing: asyncio.Task[None] | None = None
         self._following = 0  # bytes since the request of the waiting reply
 
     def opened(self, port: Port) -> None:
@@ -251,7 +252,7 @@ class Conversation:
         if self._port is None:
             return
         if line.why_not(now):  # what waited in the system while this process was held
-            self._machine = line.machine()
+            self._begin_again()
             return
         self._following += len(data)
         if self._following > NOISE:
@@ -265,6 +266,16 @@ class Conversation:
             else:
                 self._send(heard.reply)
         line.take(heard, now)
+        if heard.lost:
+            self._begin_again()
+
+    def _begin_again(self) -> None:
+        """Drops what was received. A connection is closed: its next frame begins anywhere."""
+        self._cancel()
+        self._machine = self._line.machine()
+        if self._network and self._port is not None:
+            self._closing = asyncio.create_task(self._port.close())
+            self._port = None
 
     def _send(self, reply: bytes) -> None:
         self._reply = None

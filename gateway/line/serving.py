@@ -39,7 +39,7 @@ class Serving:
         self.lines = [
             ServedLine(line, sink, sample, wall=wall, duty=duty)
             for line in config.lines
-            if line.serve
+            if line.serve and any(device.enabled for device in line.devices)
         ]
         self._sink = sink
         self._wall = wall
