@@ -1,7 +1,7 @@
 """Modbus TCP stations of the gateway, without a connection."""
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gateway.tags import Quality, Reason
@@ -165,6 +165,7 @@ def test_bytes_that_are_no_modbus_end_the_connection() -> None:
     assert heard.reply == b""
 
 
+@settings(max_examples=40, deadline=None)
 @given(st.lists(st.binary(max_size=40), max_size=8), st.binary(max_size=12))
 def test_any_bytes_write_nothing_outside_accept(pieces: list[bytes], pdu: bytes) -> None:
     made = bench()
