@@ -167,7 +167,10 @@ class Gateway:
                     self._answer(sample)
         if changed:
             if self.mirror.dependents:
-                changed = [*changed, *self.mirror.computed_after(changed)]
+                computed = self.mirror.computed_after(changed)
+                if self.serving.remembers:
+                    self.serving.remember(computed)
+                changed = [*changed, *computed]
             self._publish(changed)
 
     def online(self, device: Device | Station, online: bool) -> None:

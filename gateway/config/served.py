@@ -165,17 +165,21 @@ class ServedDevice:
         return {}
 
     def _check_overlaps(self, rows: Sequence[Row]) -> None:
-        """Two tags may show one word only where both are bits of it, or where a master writes."""
+        """Two tags may show one word only as different parts of it, or where a master writes."""
         known: dict[tuple[str, int], list[Row]] = {}
         for row in rows:
             for cell in cells_of(row.tag.span):
                 others = known.setdefault(cell, [])
                 for other in others:
-                    bits = {row.tag.address.bit, other.tag.address.bit}
-                    if not row.accepted and (None in bits or len(bits) == 1):
+                    if not row.accepted and _mask(row.tag) & _mask(other.tag):
                         text = f"{other.tag.name} of this device is at {row.tag.text} already"
                         self._note(("tags", row.tag.name, "address"), text)
                 others.append(row)
+
+
+def _mask(tag: Tag) -> int:
+    """Returns the bits of its word that a tag has."""
+    return -1 if tag.part is None else tag.part.mask << tag.part.shift
 
 
 def _role_problems(

@@ -13,6 +13,7 @@ TAGS = {
     "kept": {"address": "holding:5", "source": "mixer/speed", "hold_last": True},
     "run": {"address": "coil:0", "source": "mixer/run"},
     "bit": {"address": "holding:6.3", "source": "mixer/run"},
+    "high": {"address": "holding:6", "type": "uint8", "byte": "high", "source": "mixer/gear"},
     "limit": {"address": "input:7", "write": True},
     "setpoint": {"address": "holding:100", "type": "int16"},
     "ramp": {"address": "holding:102", "type": "float32", "word_order": "high_first"},
@@ -30,7 +31,8 @@ HMI = {
 
 def bench() -> Bench:
     made = Bench("tcp://127.0.0.1:5020", {"hmi": HMI})
-    made.values = {"mixer/speed": 1234, "mixer/level": 1.5, "mixer/run": True, "hmi/limit": 9}
+    made.values = {"mixer/speed": 1234, "mixer/level": 1.5, "mixer/run": True, "mixer/gear": 5}
+    made.values["hmi/limit"] = 9
     return made
 
 
@@ -48,7 +50,7 @@ def test_a_master_reads_the_values_of_other_tags_in_their_own_types() -> None:
     made = bench()
     assert ask(made, "03 0000 0003") == "03 06 04 d2 00 00 3f c0"  # 1.5, low word first
     assert ask(made, "01 0000 0001") == "01 01 01"
-    assert ask(made, "03 0006 0001") == "03 02 00 08"
+    assert ask(made, "03 0006 0001") == "03 02 05 08"
     assert ask(made, "04 0007 0001") == "04 02 00 09"
 
 
@@ -139,7 +141,7 @@ def test_what_a_silent_master_wrote_turns_bad_until_it_writes_again() -> None:
     assert ask(made, "03 0064 0001") == "83 04"  # the master may have started again
     assert made.online_given == [("hmi", True), ("hmi", True)]
     ask(made, "06 0064 0008")
-    assert ask(made, "03 0064 0001") == "03 02 00 08"
+    assert ask(made, "03 0064 0001") == "03 02 05 08"
 
 
 def test_units_of_other_stations_have_no_path_and_a_single_station_has_two_more() -> None:
