@@ -159,7 +159,7 @@ class Gateway:
 
     def samples(self, samples: Sequence[Sample]) -> None:
         changed = self.mirror.update(samples)
-        if self.serving.remembers:
+        if self.serving.remembering:
             self.serving.remember(samples)
         if self._waiting:
             for sample in samples:
@@ -168,7 +168,7 @@ class Gateway:
         if changed:
             if self.mirror.dependents:
                 computed = self.mirror.computed_after(changed)
-                if self.serving.remembers:
+                if self.serving.remembering:
                     self.serving.remember(computed)
                 changed = [*changed, *computed]
             self._publish(changed)

@@ -158,6 +158,35 @@ def test_an_unknown_function_is_refused_and_the_next_request_answered() -> None:
     assert made.ask(READ, after=0.01) == VALUE
 
 
+def test_a_vigor_master_finds_the_addresses_of_its_maker() -> None:
+    """MBUS: D0 is register 0, C200 two registers from 8648 on, M0 coil 512."""
+    tags = {
+        "order": {"address": "D0"},
+        "count": {"address": "C200"},
+        "lamp": {"address": "M0"},
+        "speed": {"address": "T1", "source": "mixer/speed"},
+    }
+    plc = {"protocol": "modbus-rtu", "station": 9, "addressing": "vigor", "tags": tags}
+    made = Bench("/dev/ttyS98", {"plc": {**plc, "accept": ["D0", "C200", "M0..M7"]}})
+    made.values = {"mixer/speed": 0x1234}
+    assert made.ask(rtu("09 10 21c8 0002 04 5678 1234")) == rtu("09 10 21c8 0002")
+    assert made.ask(rtu("09 06 21c8 5678")) == rtu("09 86 02")  # one half
+    assert made.ask(rtu("09 05 0200 ff00")) == rtu("09 05 0200 ff00")
+    assert made.ask(rtu("09 04 2001 0001")) == rtu("09 04 02 1234")
+    assert made.ask(rtu("09 03 21c9 0001")) == rtu("09 03 02 1234")
+    assert made.written == [{"count": 0x12345678}, {"lamp": True}]
+
+
+def test_an_ex485lnk_gets_10_ms_of_silence() -> None:
+    plc = {"protocol": "modbus-rtu", "station": 1, "addressing": "ex485lnk"}
+    plc["tags"] = {"speed": {"address": "BFM#0", "source": "mixer/speed"}}
+    made = Bench("/dev/ttyS98", {"plc": plc})
+    made.values = {"mixer/speed": 0x1234}
+    assert made.hear(READ).delay == 0.010
+    plc["turnaround"] = "2ms"
+    assert Bench("/dev/ttyS98", {"plc": plc}).hear(READ).delay == 0.002
+
+
 @settings(max_examples=40, deadline=None)
 @given(st.lists(st.tuples(st.binary(max_size=20), st.sampled_from([0.0, 0.001, 0.01, 1.0]))))
 def test_any_bytes_at_any_time_are_answered_only_where_a_sound_request_is(

@@ -2139,7 +2139,7 @@ MUTANTS = (
     ),
     Mutant(
         "a reply is sent into the next request",
-        "line/served_line.py",
+        "line/conversation.py",
         "        if self._following > NOISE:\n",
         "        if False:\n",
         "tests/sim/test_served.py",
