@@ -159,7 +159,7 @@ class Gateway:
 
     def samples(self, samples: Sequence[Sample]) -> None:
         changed = self.mirror.update(samples)
-        if self.serving.remembers:
+        if self.serving.remembering:
             self.serving.remember(samples)
         if self._waiting:
             for sample in samples:
@@ -167,7 +167,10 @@ class Gateway:
                     self._answer(sample)
         if changed:
             if self.mirror.dependents:
-                changed = [*changed, *self.mirror.computed_after(changed)]
+                computed = self.mirror.computed_after(changed)
+                if self.serving.remembering:
+                    self.serving.remember(computed)
+                changed = [*changed, *computed]
             self._publish(changed)
 
     def online(self, device: Device | Station, online: bool) -> None:

@@ -2151,4 +2151,18 @@ MUTANTS = (
         "            if False:\n",
         "tests/config/test_templates.py",
     ),
+    Mutant(
+        "a reply is sent into the next request",
+        "line/conversation.py",
+        "        if self._following > NOISE:\n",
+        "        if False:\n",
+        "tests/sim/test_served.py",
+    ),
+    Mutant(
+        "a silent master is not noticed",
+        "serving/station.py",
+        "        if now < self._due:\n",
+        "        if True:\n",
+        "tests/serving/test_modbus_tcp.py",
+    ),
 )
