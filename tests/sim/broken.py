@@ -1911,6 +1911,13 @@ MUTANTS = (
         "tests/tags/test_scan.py",
     ),
     Mutant(
+        "a wrong LRC or CRC of a frame is taken",
+        "protocols/frames/codec.py",
+        "        if got != wanted:\n            why",
+        "        if False:\n            why",
+        "tests/protocols/test_frames_codec.py",
+    ),
+    Mutant(
         "a number without a name is written",
         "tags/shaping.py",
         "        if value not in self.by_number:\n",
