@@ -1,12 +1,12 @@
 """The latest sample of every tag, and the choice of samples to publish."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import compress, count
 from operator import ne
 
 from gateway.tags import Publish, Quality, Reason, Sample, Tag, bad
 from gateway.tags.computed import Dependents, computed
-from gateway.tags.kept import kept, memory_of
+from gateway.tags.kept import Counted, CounterState, kept, memory_of
 from gateway.tags.scan import Latest, Samples, Scan
 
 
@@ -61,6 +61,21 @@ class Mirror:
         if type(samples) is Scan and not samples.latest.superseded:
             self._adopt(samples.latest, samples)
         return to_publish
+
+    def counters(self) -> dict[str, CounterState]:
+        """Returns the states of all counters that were read, by `device/name`."""
+        known = ((tag.key, memory) for tag, memory in self.memories.items())
+        return {
+            key: memory.state
+            for key, memory in known
+            if isinstance(memory, Counted) and memory.state is not None
+        }
+
+    def restore(self, counters: Mapping[str, CounterState]) -> None:
+        """Goes on with the totals of an earlier gateway. Reads are missing since then."""
+        for tag, memory in self.memories.items():
+            if isinstance(memory, Counted) and (state := counters.get(tag.key)) is not None:
+                memory.state, memory.gap = state, True
 
     def follow(self, samples: Sequence[Sample]) -> list[Sample]:
         """Derives the values that follow from samples to publish. Returns all to publish.
