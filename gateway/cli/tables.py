@@ -62,12 +62,6 @@ def table_of(rows: Iterable[Row], tags: dict[str, Tag], *, utc: bool = False) ->
     return table
 
 
-def _named(document: dict[str, object]) -> str:
-    """Returns the value, behind its name if it has one: `auto (1)`."""
-    value = value_text(document["value"])
-    return printable(f"{document['text']} ({value})") if document.get("text") else value
-
-
 def time_text(text: str, *, utc: bool = False) -> str:
     """Returns a time of a payload in this machine's zone: `2026-11-20T13:00:00.123+01:00`.
 
@@ -79,6 +73,12 @@ def time_text(text: str, *, utc: bool = False) -> str:
         return datetime.fromisoformat(text).astimezone().isoformat(timespec="milliseconds")
     except (ValueError, OverflowError):
         return printable(text)
+
+
+def _named(document: dict[str, object]) -> str:
+    """Returns the value, behind its name if it has one: `auto (1)`."""
+    value = value_text(document["value"])
+    return printable(f"{document['text']} ({value})") if document.get("text") else value
 
 
 def value_text(value: object) -> str:

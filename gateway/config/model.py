@@ -237,6 +237,8 @@ class TagDefaults(Section, ShapingDefaults):
         Discriminator(_write_shape),
     ] = False
     """Permission to write the tag, with its rules."""
+    hold_last: bool = False
+    """On a served line: answer the master with the last good value instead of an error."""
 
 
 class ComputedSection(Section):
@@ -267,6 +269,10 @@ class TagSection(TagDefaults, ShapingSettings):
     """As the maker writes it: D100, X17, D7.3, holding:100; for frames the name of a field."""
     event: bool = False
     """Publish every frame, even with the same value as the last: a bar code."""
+    source: Text | None = None
+    """On a served line: the tag, as device/tag, whose value the master reads here."""
+    retain: bool = False
+    """On a served line: keep the value that clients wrote across restarts."""
 
 
 class DeviceSection(Section):
@@ -294,6 +300,10 @@ class DeviceSection(Section):
     """Permission for commands to the device, such as run and stop."""
     enabled: bool = True
     """false: the device stays in the file and gets no requests."""
+    accept: list[Text] = []
+    """On a served line: the addresses that the master may write, such as D100..D119."""
+    stale_after: Interval | None = None
+    """On a served line: what the master wrote turns bad when it sends no request for so long."""
     defaults: dict[str, Any] = {}
     tags: dict[str, Any] = {}
     """The values of the device, by name."""
@@ -314,6 +324,8 @@ class LineSection(Section):
     """Data bits, parity, stop bits: 7E1, 8N1; left out: the default of the protocol."""
     echo: bool | None = None
     """true: the port receives its own requests, as with some two-wire RS-485 converters."""
+    serve: bool = False
+    """true: the devices are stations of this gateway, and a master on the line asks them."""
     defaults: dict[str, Any] = {}
     devices: dict[str, Any]
     """The devices on this line, by name."""
