@@ -2,7 +2,7 @@
 
 import asyncio
 import time
-from collections.abc import AsyncIterator, Collection, Sequence
+from collections.abc import AsyncIterator, Collection, Iterable, Sequence
 from collections.abc import Set as AbstractSet
 from contextlib import asynccontextmanager, suppress
 from dataclasses import replace
@@ -16,6 +16,7 @@ from gateway.errors import BadValue, LineDown
 from gateway.line import build
 from gateway.line.line import Line, SampleSink
 from gateway.tags import Reason, Sample, Tag, WriteResult, bad
+from gateway.tags.mirror import Mirror
 from gateway.values import Value
 
 LISTEN_FOR = 5.0  # seconds, for unsolicited frames
@@ -42,15 +43,27 @@ class _Once:
 
 async def read(config: Config, tags: Sequence[Tag]) -> list[Sample]:
     """Returns one sample of each tag, good or bad, in the order of `tags`."""
+    known = _with_inputs(tags)
     found: dict[Tag, Sample] = {}
     for line_config in config.lines:
         enabled = {device.name for device in line_config.devices if device.enabled}
-        mine = [tag for tag in tags if tag in line_config.tags]
+        names = {device.name for device in line_config.devices}
+        mine = [tag for tag in known if tag.device in names and not tag.inputs]
         wanted = [tag for tag in mine if tag.device in enabled]
         found |= {tag: bad(tag, Reason.DISABLED, time.time_ns()) for tag in mine}
         found |= {tag: bad(tag, Reason.STARTING, time.time_ns()) for tag in wanted}
         found |= await _read(line_config, wanted)
-    return [found[tag] for tag in tags]
+    mirror = Mirror(known, time.time_ns())
+    mirror.follow(mirror.update(found.values()))
+    return [mirror[tag] for tag in tags]
+
+
+def _with_inputs(tags: Iterable[Tag]) -> list[Tag]:
+    """Returns the tags, and those that their values are made of, each once."""
+    known: dict[Tag, None] = {}
+    for tag in tags:
+        known |= dict.fromkeys((*_with_inputs(tag.inputs), tag))
+    return list(known)
 
 
 async def _read(config: LineConfig, tags: Sequence[Tag]) -> dict[Tag, Sample]:

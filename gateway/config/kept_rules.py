@@ -29,7 +29,7 @@ def kept_tag(
     fits = kind.kind is Kind.BOOL and tag.write is None and not tag.event
     if settings.debounce and fits:
         raw = _raw(tag)
-        kept = replace(tag, kept=settings.debounce, inputs=(raw,), shaping=None, shape=None)
+        kept = replace(tag, kept=settings.debounce, inputs=(raw,), shape=None)
         return replace(kept, heartbeat=None, publish=Publish.CHANGE)
     return tag
 
@@ -70,7 +70,8 @@ def _misfits(own: TagSection, kind: ValueType) -> Iterator[tuple[str, str]]:
     elif own.counter:
         yield from _counter_misfits(own, kind)
     for setting in _EACH_READ:
-        if (debounced or own.counter) and own.model_fields_set & {setting}:
+        default = type(own).model_fields[setting].default
+        if (debounced or own.counter) and getattr(own, setting) != default:
             what = "a debounced bit" if debounced else "a total"
             why = "cannot be written" if setting == "write" else "is published when it changes"
             yield setting, f"{what} {why}: remove {setting}"

@@ -108,7 +108,8 @@ class Tag:
         if self.formula is not None:
             return with_shaping(self.formula.value, shaping)
         if self.kept is not None:
-            return field_decoder(self.layout, self._line, shaping)
+            counter = isinstance(self.kept, CounterRule)  # the reads of a bit are inverted already
+            return field_decoder(self.layout, self._line, shaping if counter else None)
         if self.shape is not None:
             return field_decoder(self.layout, self._line, shaping)
         bit = self.address.bit
