@@ -53,6 +53,10 @@ def raw(address: int, ms: int) -> int:
     return int(halves[5 - address])
 
 
+def word(address: int, seconds: float) -> int:
+    return raw(address, int(seconds * 1000))
+
+
 def shut(ms: int) -> bool:
     """The contact of the door: it bounces for 300 ms every 10 s, and changes every minute."""
     return bool(ms // 60_000 % 2) != (ms % 10_000 < 300)
@@ -131,8 +135,7 @@ async def test_every_setting_holds_on_a_line_with_faults(
     world.listeners.append(judge.samples)
     station = world.stations[0]
     for address in (1, 2, 3, 4, 5, 8):
-        motion = partial(raw, address)
-        station.memory.animate("D", address, lambda now, of=motion: of(int(now * 1000)))
+        station.memory.animate("D", address, partial(word, address))
     station.memory.animate("M", 5, lambda now: shut(int(now * 1000)))
     station.lose, station.cut = 0.005, 0.003
     async with running(world):
