@@ -135,7 +135,8 @@ def test_every_page_with_files_is_checked() -> None:
     counted = Counter(block.page for block in FILES)
     assert set(counted) == {
         *("/README.md", "configuration.md", "vigor.md", "computer-link.md", "modbus.md"),
-        *("first-plant.md", "import.md", "peek.md", "serve.md", "systems.md", "templates.md"),
+        *("first-plant.md", "import.md", "peek.md", "serve.md", "shaping.md", "systems.md"),
+        "templates.md",
         *("tutorial-computer-link.md", "tutorial-modbus.md", "tutorial-vigor.md"),
     }
     assert sum(counted.values()) >= 11

@@ -18,6 +18,7 @@ from gateway.engine.forecast import LineForecast
 from gateway.history.place import trouble
 from gateway.planning.planner import describe
 from gateway.planning.wire_timing import NETWORK_BAUD, WireTiming
+from gateway.tags.tag import CounterRule
 from gateway.web import exposure
 
 
@@ -73,12 +74,18 @@ def _notes(config: Config) -> Iterator[str]:
                 "the word back; changes by the PLC in between are lost"
             )
     for tag in tags:
-        if (limit := tag.exact_below) is not None:
+        if tag.kept is None and (limit := tag.exact_below) is not None:
             yield (
                 f"{tag.key} ({tag.text}): a JSON number has 53 bits. Beyond {limit:.4g}"
                 " either way two values of the device can look equal, and a write can be one"
                 " step off"
             )
+    totals = [tag.key for tag in tags if isinstance(tag.kept, CounterRule)]
+    if totals and config.state_file is None:
+        yield (
+            f"{', '.join(totals[:5])}: a total begins again at each start of the gateway: "
+            "write `state: state.json` below `gateway:`"
+        )
     for sheet in config.sheets:
         yield from (f"{sheet.file.name}: {note}" for note in sheet.notes)
 
