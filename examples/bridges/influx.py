@@ -33,7 +33,8 @@ import urllib.request
 from collections import deque
 from datetime import datetime
 
-from gateway_values import Known, Plant, arguments, opened, run, say, utc_now
+from gateway_values import Known, Plant, utc_now
+from program import arguments, opened, run, say
 
 BATCH = 5000  # lines of one request
 ANSWER_WITHIN = 10.0  # seconds

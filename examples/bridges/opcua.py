@@ -27,8 +27,9 @@ from asyncua.server import binary_server_asyncio
 from asyncua.server.address_space import AttributeService
 from asyncua.server.uaprocessor import UaProcessor
 from asyncua.ua.ua_binary import nodeid_from_binary
-from gateway_values import Known, Plant, arguments, opened, run, say
+from gateway_values import Known, Plant
 from opcua_values import History, data_value, type_of
+from program import arguments, opened, run, say
 
 Code = ua.StatusCodes
 NOT_DONE = {  # by the outcome of a write

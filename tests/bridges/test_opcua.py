@@ -43,11 +43,14 @@ def plant(node: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Plant
     endpoint, url = free_endpoint(), f"opc.tcp://127.0.0.1:{free_port()}"
     folder = tmp_path_factory.mktemp("opcua")
     options = ("--connect", endpoint, "--listen", url, "--writes")
-    with PlayedGateway(endpoint, TAGS) as gateway, bridge("opcua.py", *options) as server:
+    with (
+        PlayedGateway(endpoint, TAGS) as gateway,
+        bridge("opcua.py", *options) as server,
+        Program(node, INTEROP / "opcua_client.js", folder) as client,
+    ):
         server.says("listening")
-        with Program(node, INTEROP / "opcua_client.js", url, folder) as client:
-            client.says("ready")
-            yield Plant(endpoint, gateway, client)
+        client.tell(f"connect {url}")
+        yield Plant(endpoint, gateway, client)
     assert "Traceback" not in "\n".join(server.lines)
 
 

@@ -1,6 +1,7 @@
-// npm's OPC UA client, controlled by commands: `node opcua_client.js ENDPOINT FOLDER`. It prints
-// `ready`, then executes commands from its standard input and prints `ok` and JSON after each:
+// npm's OPC UA client, controlled by commands: `node opcua_client.js FOLDER`, for its certificates. It
+// executes commands from its standard input and prints `ok` and JSON after each:
 //
+//     connect opc.tcp://127.0.0.1:4840       the first command
 //     browse i=85                 the nodes below: their ids
 //     read ns=2;s=mixer/speed     value, type, status, source time
 //     meta ns=2;s=mixer/speed     data type, access level, description, unit and range
@@ -13,8 +14,6 @@
 const readline = require("node:readline");
 const ua = require("node-opcua-client");
 const { OPCUACertificateManager } = require("node-opcua-certificate-manager");
-
-const [endpointUrl, folder] = process.argv.slice(2);
 
 function shown(value) {
     return {
@@ -105,15 +104,12 @@ async function watch(session, nodeId) {
     });
 }
 
-async function main() {
-    const clientCertificateManager = new OPCUACertificateManager({ rootFolder: folder });
+async function main(folder) {
     const client = ua.OPCUAClient.create({
-        clientCertificateManager,
+        clientCertificateManager: new OPCUACertificateManager({ rootFolder: folder }),
         endpointMustExist: false,
-        connectionStrategy: { initialDelay: 100, maxDelay: 200, maxRetry: 100 },
     });
-    await client.connect(endpointUrl);
-    const session = await client.createSession();
+    let session;
     let started;
     const commands = {
         browse,
@@ -121,13 +117,16 @@ async function main() {
         write,
         history,
         watch,
+        connect: async (_, endpointUrl) => {
+            await client.connect(endpointUrl);
+            session = await client.createSession();
+        },
         read: async (_, nodeId) => shown(await session.read({ nodeId })),
         start: async (...given) => {
             started = write(...given);
         },
         written: () => started,
     };
-    console.log("ready");
     for await (const line of readline.createInterface({ input: process.stdin })) {
         const [name, ...given] = line.split(" ");
         const answer = await commands[name](session, ...given);
@@ -137,4 +136,4 @@ async function main() {
     await client.disconnect();
 }
 
-main();
+main(...process.argv.slice(2));
