@@ -12,9 +12,10 @@
 | `plant/@set/mixer/recipe` | no | a command: `7`, or `{"value": 7, "id": "a1", "time": "…"}` |
 | `plant/@outcome/mixer/recipe` | no | `{"id": "a1", "outcome": "written", "value": 7, …}` |
 
-Use a value only while its quality is `good` and `plant/@bridge` is `online`. When a gateway or the
-way to it is gone, all its values are `bad` (`no-gateway`). When the bridge is gone, the broker
-publishes the last will, and forgets the retained values after `--expire` seconds (MQTT 5).
+Use a value only while its quality is `good` and `plant/@bridge` is `online`. It is `offline` also
+while a change has waited for more than a second. When a gateway or the way to it is gone, all its
+values are `bad` (`no-gateway`). When the bridge is gone, the broker publishes the last will, and
+forgets the retained values after `--expire` seconds (MQTT 5).
 
 Commands are accepted with `--writes`. Everyone who may publish to `plant/@set/#` may then write, so
 restrict this topic in the broker. A command has one outcome: `written` only when the device has
