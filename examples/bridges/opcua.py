@@ -140,10 +140,11 @@ class Bridge(AttributeService):
             shown = ua.LocalizedText(unit)
             about = ua.EUInformation("urn:zenoh-plc-gateway", -1, shown, shown)
             await node.add_property(self._node(f"{key}@unit"), "0:EngineeringUnits", about)
-        low, high = ((meta["write"] or {}).get(end) for end in ("min", "max"))
+        limits = meta["write"] or meta.get("clamp") or {}
+        low, high = limits.get("min"), limits.get("max")
         if low is not None and high is not None:
-            limits = ua.Range(Low=low, High=high)
-            await node.add_property(self._node(f"{key}@range"), "0:EURange", limits)
+            about = ua.Range(Low=low, High=high)
+            await node.add_property(self._node(f"{key}@range"), "0:EURange", about)
 
     async def write(self, params: ua.WriteParameters, user: User) -> list[ua.StatusCode]:
         if user.role == UserRole.Admin:  # this program itself

@@ -7,7 +7,8 @@
 //     meta ns=2;s=mixer/speed     data type, access level, description, unit and range
 //     write ns=2;s=mixer/recipe Int16 7      the status code
 //     start …  /  written         the same write in the background; waits for its status code
-//     history ns=2;s=mixer/speed SECONDS COUNT [back]     of the last seconds; counts and values
+//     history ns=2;s=mixer/speed SECONDS COUNT [back|last]   of the last seconds; `back`: the newest
+//                                            first; `last`: the newest first, without a start
 //     watch ns=2;s=mixer/speed    prints `changed ns=2;s=mixer/speed STATUS VALUE` from now on
 "use strict";
 
@@ -55,10 +56,11 @@ async function write(session, nodeId, type, text) {
     return code.name;
 }
 
-async function history(session, nodeId, seconds, count, back) {
+async function history(session, nodeId, seconds, count, order) {
     const now = new Date();
     const begin = new Date(now - seconds * 1000);
-    const [startTime, endTime] = back ? [now, begin] : [begin, now];
+    const times = { back: [now, begin], last: [null, now] };
+    const [startTime, endTime] = times[order] ?? [begin, now];
     const historyReadDetails = new ua.ReadRawModifiedDetails({
         isReadModified: false,
         startTime,
