@@ -271,6 +271,9 @@ class Expectations:
         patience = 4 * load * every + 6 * longest * len(bus.line.engine.devices)
         if bus.collides or tag.span.area == LISTENED:
             patience += 20 * every + LONGEST_PAUSE
+        if bus.collides and tag.span.area == LISTENED:
+            # Without a header a frame counts after 50 ms of silence, which a busy line rarely has.
+            patience += 180 * every
         if station.manners.unknown == SILENT:  # its blocks are halved by time-outs
             if device.driver.protocol == "vigor":  # every second resync reads M0, which it lacks
                 return math.inf
