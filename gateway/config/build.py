@@ -7,7 +7,7 @@ from pathlib import Path as FilePath
 from typing import Any
 
 from gateway.config import parsers
-from gateway.config.computed_tags import with_computed
+from gateway.config.computed_tags import check_totals, with_computed
 from gateway.config.device_tags import DeviceTags, mapping
 from gateway.config.line_rules import check_line, line_wire
 from gateway.config.messages import Mistakes, Path, meant, shown
@@ -87,6 +87,8 @@ class Builder:
             self.mistakes.add(("lines",), "no lines: a gateway has at least one")
         lines = with_computed(lines, self._tags.computed, self.mistakes)
         self._check_ports(lines, raw_lines)
+        if top is not None and top.gateway.standby is not None:
+            check_totals(lines, self.mistakes)
         check_sources(lines, self.mistakes)
         if top is None:
             return None

@@ -132,6 +132,12 @@ class ServedDevice:
         own = self._own(tag.name)
         place = ("tags", tag.name)
         source, retain = own.get("source"), own.get("retain") is True
+        if tag.kept is not None:
+            for setting in ("debounce", "counter"):
+                if setting in own:
+                    text = f"{setting} is for values that the gateway reads: remove it here"
+                    self._note((*place, setting), text)
+            tag = replace(tag, kept=None, inputs=(), shaping=tag.inputs[0].shaping)
         hold_last = own.get("hold_last", self.defaults.hold_last) is True
         inside = [served.takes(*cell) for cell in cells_of(tag.span)]
         accepted = any(inside)
@@ -172,15 +178,15 @@ class ServedDevice:
             for cell in cells_of(row.tag.span):
                 others = known.setdefault(cell, [])
                 for other in others:
-                    if not row.accepted and _mask(row.tag) & _mask(other.tag):
+                    if not row.accepted and _bits(row.tag) & _bits(other.tag):
                         text = f"{other.tag.name} of this device is at {row.tag.text} already"
                         self._note(("tags", row.tag.name, "address"), text)
                 others.append(row)
 
 
-def _mask(tag: Tag) -> int:
-    """Returns the bits of its word that a tag has."""
-    return -1 if tag.part is None else tag.part.mask << tag.part.shift
+def _bits(tag: Tag) -> int:
+    """Returns the bits of each word that a tag has."""
+    return 0xFFFF_FFFF if tag.part is None else tag.part.mask << tag.part.shift
 
 
 def _role_problems(

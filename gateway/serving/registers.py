@@ -211,10 +211,9 @@ def _encoded(tag: Tag, sample: Sample | None) -> list[int] | None:
     if sample is None or sample.quality is not Quality.GOOD or sample.value is None:
         return None
     value = sample.value
-    kind, shaping = tag.layout.type, tag.shaping
-    plain = tag.scale == 1 and tag.offset == 0 and (shaping is None or shaping.ends is None)
+    whole = tag.layout.type.is_number and not tag.value_type.startswith("float")
     try:
-        if plain and kind.is_number and not kind.is_float and isinstance(value, float):
+        if whole and isinstance(value, float):
             value = round(value)
         return tag.encode(value)
     except (BadValue, OverflowError, ValueError):
