@@ -159,7 +159,7 @@ class Gateway:
 
     def samples(self, samples: Sequence[Sample]) -> None:
         changed = self.mirror.update(samples)
-        if self.serving.remembers:
+        if self.serving.remembering:
             self.serving.remember(samples)
         if self._waiting:
             for sample in samples:
@@ -167,6 +167,8 @@ class Gateway:
                     self._answer(sample)
         if self.mirror.derives and (changed or self.mirror.pending):
             changed = self.mirror.follow(changed)
+            if self.serving.remembering:
+                self.serving.remember(changed)
         if changed:
             self._publish(changed)
 

@@ -13,7 +13,7 @@ from gateway import app, northbound
 from gateway.cli.progress import progress
 from gateway.cli.served_plan import served_plan
 from gateway.cli.terminal import FAILED, ConfigPath, err, out
-from gateway.config import Config, load, state_folder
+from gateway.config import Config, expanded_text, load, state_folder
 from gateway.engine.forecast import LineForecast
 from gateway.history.place import trouble
 from gateway.planning.planner import describe
@@ -31,8 +31,15 @@ def check(
     strict: Annotated[
         bool, typer.Option("--strict", help="End with 1 if a line is overloaded.")
     ] = False,
+    expand: Annotated[
+        bool, typer.Option("--expand", help="Print the file with its templates expanded instead.")
+    ] = False,
 ) -> None:
     """Validate the file and print the plan of each line. Sends nothing."""
+    if expand:
+        load(config)
+        print(expanded_text(config), end="")
+        return
     with progress(err) as report:
         loaded = load(config, report)
         warnings = northbound.check(loaded) + exposure.check(loaded)

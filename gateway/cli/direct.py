@@ -19,6 +19,7 @@ from gateway.tags import Reason, Sample, Tag, WriteResult, bad
 from gateway.tags.mirror import Mirror
 from gateway.values import Value
 
+SERVED = "is on a served line: only the running gateway has it, without --direct"
 LISTEN_FOR = 5.0  # seconds, for unsolicited frames
 
 
@@ -47,8 +48,11 @@ async def read(config: Config, tags: Sequence[Tag]) -> list[Sample]:
     found: dict[Tag, Sample] = {}
     for line_config in config.lines:
         enabled = {device.name for device in line_config.devices if device.enabled}
-        names = {device.name for device in line_config.devices}
-        mine = [tag for tag in known if tag.device in names and not tag.inputs]
+        own = set(line_config.tags)
+        mine = [tag for tag in known if tag in own and not tag.inputs]
+        if line_config.serve:  # a request on the wire of a master would disturb it
+            found |= {tag: bad(tag, Reason.LINE_DOWN, time.time_ns(), SERVED) for tag in mine}
+            continue
         wanted = [tag for tag in mine if tag.device in enabled]
         found |= {tag: bad(tag, Reason.DISABLED, time.time_ns()) for tag in mine}
         found |= {tag: bad(tag, Reason.STARTING, time.time_ns()) for tag in wanted}
@@ -94,7 +98,7 @@ async def _listen(once: _Once, unsolicited: AbstractSet[Tag]) -> None:
 
 async def follow(config: Config, sink: SampleSink) -> None:
     """Reads all tags at their intervals until it is cancelled."""
-    lines = [build.line_of(line, line.devices, sink) for line in config.lines]
+    lines = [build.line_of(line, line.devices, sink) for line in config.lines if not line.serve]
     await asyncio.gather(*(line.run() for line in lines))
 
 
@@ -102,6 +106,8 @@ async def write(config: Config, tag: Tag, value: Value) -> WriteResult:
     """Writes one tag. Raises `GatewayError`; `BadValue` only before anything is sent."""
     units = tag.encode(value)
     (line_config,) = (line for line in config.lines if tag in line.tags)
+    if line_config.serve:
+        raise BadValue(f"{tag.key} {SERVED}")
     if not any(device.enabled for device in line_config.devices if device.name == tag.device):
         raise BadValue(f"device {tag.device} is disabled")
     line = _line(line_config, {tag.device}, [tag], _Once())

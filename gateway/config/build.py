@@ -29,10 +29,10 @@ from gateway.config.records import (
 from gateway.config.served import (
     ServedDevice,
     ServedView,
+    check_retained,
     check_served_line,
     check_sources,
     only_served,
-    retained,
 )
 from gateway.config.sheet_tags import SheetTags
 from gateway.config.tag_rules import inherit
@@ -92,7 +92,7 @@ class Builder:
         check_sources(lines, self.mistakes)
         if top is None:
             return None
-        self._check_retain(top, lines)
+        check_retained(lines, self._state_file(top), top.gateway.standby, self.mistakes)
         self._check_history(top)
         return Config(
             name=top.gateway.name,
@@ -260,15 +260,6 @@ class Builder:
                 f"history is kept in {top.history.path}: two files are needed, such as "
                 "history.db and state.json",
             )
-
-    def _check_retain(self, top: FileSection, lines: list[LineConfig]) -> None:
-        why = ""
-        if self._state_file(top) is None:
-            why = "the gateway has no file for it: write `gateway: {state: state.json}`"
-        elif top.gateway.standby is not None:
-            why = "a standby would answer with the values of its own file, which are old"
-        for place in retained(lines) if why else ():
-            self.mistakes.add((*place, "retain"), why)
 
     def _zenoh(self, top: FileSection) -> ZenohConfig:
         found, own = top.zenoh, ("zenoh",)

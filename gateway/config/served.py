@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path as FilePath
 from typing import Any
 
 from gateway.config import parsers
@@ -171,7 +172,7 @@ class ServedDevice:
         return {}
 
     def _check_overlaps(self, rows: Sequence[Row]) -> None:
-        """Two tags may show one word only where both are bits of it, or where a master writes."""
+        """Two tags may show one word only as different parts of it, or where a master writes."""
         known: dict[tuple[str, int], list[Row]] = {}
         for row in rows:
             for cell in cells_of(row.tag.span):
@@ -270,9 +271,19 @@ def _sort(tag: Tag) -> str:
     return "number" if kind.is_number else "bit" if kind.kind is Kind.BOOL else "text"
 
 
-def retained(lines: Sequence[LineConfig]) -> Iterator[Path]:
-    """Yields the places of the tags with `retain: true`."""
-    return (path for path, row in _rows(lines) if row.retain)
+def check_retained(
+    lines: Sequence[LineConfig], state_file: FilePath | None, standby: str | None, to: Mistakes
+) -> None:
+    """Notes tags with `retain` in a gateway that cannot keep their values."""
+    if state_file is None:
+        why = "the gateway has no file for it: write `gateway: {state: state.json}`"
+    elif standby is not None:
+        why = "a standby would answer with the values of its own file, which are old"
+    else:
+        return
+    for path, row in _rows(lines):
+        if row.retain:
+            to.add((*path, "retain"), why)
 
 
 def _rows(lines: Sequence[LineConfig]) -> Iterator[tuple[Path, Row]]:

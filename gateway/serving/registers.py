@@ -130,7 +130,7 @@ class Registers:
                 units = known[row] = self._units(row)
             tag = row.tag
             if tag.part is not None:
-                unit |= units[0] << tag.part.shift
+                unit = tag.part.into(unit, units[0])
             else:
                 unit |= units[cell[1] - tag.span.start]
         return unit
