@@ -62,7 +62,7 @@ def _counted(tag: Tag, rule: CounterSection) -> Tag:
 
 def _misfits(own: TagSection, kind: ValueType) -> Iterator[tuple[str, str]]:
     """Yields settings with their mistake."""
-    debounced = "debounce" in own.model_fields_set
+    debounced = bool(own.debounce)
     if debounced and kind.kind is not Kind.BOOL:
         yield "debounce", f"a {kind} has no debounce: only bits have; for numbers use deadband"
     if own.counter and (not kind.is_number or kind.is_float):

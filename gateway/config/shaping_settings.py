@@ -55,9 +55,9 @@ class CounterSection(BaseModel):
 
     bits: Annotated[int, Field(ge=1, le=64)] | None = None
     """The width of the counter."""
-    top: Annotated[int, Field(ge=1, lt=2**63)] | None = None
+    top: Annotated[int, Field(ge=1, le=2**63 - 1)] | None = None
     """The greatest count, such as 9999; instead of `bits`."""
-    most: Annotated[int, Field(ge=1, lt=2**63)] | None = None
+    most: Annotated[int, Field(ge=1, le=2**63 - 1)] | None = None
     """The greatest step from one read to the next; more is no count. Left out: half the range."""
 
 
