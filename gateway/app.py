@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import NamedTuple, Protocol
 
 from gateway import __version__
+from gateway.alarms import Alarms
+from gateway.alarms.watched import watch
 from gateway.config import Config, LineConfig
 from gateway.config.commands import check_command, every_command, speaker
 from gateway.engine.device import Device, DeviceSettings
@@ -19,6 +21,7 @@ from gateway.line.line import Line, Watcher
 from gateway.northbound.status import Document, device_document, line_document, standing
 from gateway.tags import Quality, Reason, Sample, Tag, WriteResult, bad
 from gateway.tags.mirror import Mirror
+from gateway.tags.scan import Scan
 from gateway.tags.timestamps import rfc3339
 from gateway.values import Value
 
@@ -84,8 +87,11 @@ class Gateway:
         self._places: dict[str, tuple[Line, Device]] = {}
         self._forecasts: dict[str, LineForecast] = {}
         self._waiting: dict[Tag, list[_Reader]] = {}
+        self.alarms = Alarms(self._tags.values(), wall)
+        self.add_document("alarms", self.alarms.counts)
         for seed, line in enumerate(config.lines):
             self._add_line(line, open_line(line), seed)
+        watch(self.alarms, self.lines, config.alarms)
         if plan_now:
             for made in self.lines:
                 self.planned(made, self.plan(made))
@@ -151,6 +157,8 @@ class Gateway:
 
     def samples(self, samples: Sequence[Sample]) -> None:
         changed = self.mirror.update(samples)
+        if self.alarms.of_tags and not (type(samples) is Scan and samples.latest.alarmed == ()):
+            self.alarms.judge(samples)
         if self._waiting:
             for sample in samples:
                 if sample.tag in self._waiting:

@@ -20,6 +20,7 @@ from pydantic import (
 from pydantic import Tag as Choice
 
 from gateway.config import parsers
+from gateway.config.alarm_rules import check_alarm
 from gateway.config.setting_types import (
     DEADBAND_SCHEMA,
     FORMAT_SCHEMA,
@@ -152,6 +153,18 @@ class HistorySection(Section):
     """The oldest samples are deleted when the file grows beyond this size."""
 
 
+class AlarmsSection(Section):
+    """The alarms of the gateway."""
+
+    path: FilePath | None = None
+    """Keeps alarms across restarts; left out: alarms.json in $STATE_DIRECTORY, or beside this file
+    if a tag has an alarm."""
+    devices: bool = True
+    """A device that does not reply is an alarm."""
+    lines: bool = True
+    """A line that is down is an alarm."""
+
+
 class WebSection(Section):
     """The status page and /metrics."""
 
@@ -181,6 +194,34 @@ class WriteSection(Section):
     def _order(self) -> Self:
         if self.min is not None and self.max is not None and self.min > self.max:
             raise ValueError(f"min {self.min:.15g} is above max {self.max:.15g}")
+        return self
+
+
+class AlarmSection(Section):
+    """The alarm of a number or a bit: docs/alarms.md."""
+
+    high_high: Finite | None = None
+    """A value from here on is in alarm, of the worse level."""
+    high: Finite | None = None
+    """A value from here on is in alarm."""
+    low: Finite | None = None
+    """A value from here downwards is in alarm."""
+    low_low: Finite | None = None
+    """A value from here downwards is in alarm, of the worse level."""
+    on: bool = False
+    """A bit is in alarm while it is on."""
+    off: bool = False
+    """A bit is in alarm while it is off."""
+    hysteresis: Annotated[Finite, Field(ge=0)] = 0.0
+    """A limit is left when the value is so far from it, in the unit of the tag."""
+    delay: Duration = 0.0
+    """A limit counts when it is reached for so long."""
+    text: Text = ""
+    """A sentence for people; left out: the description of the tag."""
+
+    @model_validator(mode="after")
+    def _together(self) -> Self:
+        check_alarm({name: getattr(self, name) for name in type(self).model_fields})
         return self
 
 
@@ -243,6 +284,8 @@ class TagSection(TagDefaults):
     """As the maker writes it: D100, X17, D7.3, holding:100; for frames the name of a field."""
     event: bool = False
     """Publish every frame, even with the same value as the last: a bar code."""
+    alarm: AlarmSection | None = None
+    """Raise an alarm at a limit of the value, or while a bit is on."""
 
 
 class DeviceSection(Section):
@@ -303,6 +346,7 @@ class FileSection(Section):
     writers: WritersSection | None = None
     history: HistorySection | None = None
     web: WebSection | None = None
+    alarms: AlarmsSection = AlarmsSection()
     defaults: dict[str, Any] = {}
     lines: dict[str, Any]
     """The lines, by name."""

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 from gateway.errors import BadValue, Garbled
 from gateway.protocols.driver import Address, Span, Unit
 from gateway.protocols.typed_fields import Shape
+from gateway.tags.alarm import AlarmRule
 from gateway.tags.scaling import exact_below, scaled, unscaled
 from gateway.values import Kind, Layout, Value, from_word, from_words, to_words
 
@@ -69,6 +70,7 @@ class Tag:
     history: bool = False
     payload: Form = Form.JSON
     write: WriteRule | None = None
+    alarm: AlarmRule | None = None
     shape: Shape | None = None  # for a field of a frame: a read gives the value itself
     event: bool = False  # every value is published, also an equal one
     # From the unit of the span to the value, or from its units if it has several.

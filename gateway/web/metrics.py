@@ -97,6 +97,10 @@ def _metrics(documents: Documents, plant: Plant, *, ready: bool) -> Iterator[Met
     yield from _writes(documents["outcomes"])
     for name, field, text in _ZENOH:
         yield _one(name, text, {}, documents["zenoh"].get(field, 0))
+    alarms = _family("alarms", "Alarms by state", "state")
+    for state, count in documents["alarms"].items():
+        alarms.add_metric([state], count)
+    yield alarms
     links = _family("zenoh_links", "Connections by kind", "to")
     for kind in ("router", "peer", "client"):
         links.add_metric([kind], documents["zenoh"]["to"].count(kind))
