@@ -27,6 +27,7 @@ from gateway.config.setting_types import (
     SCALE_SCHEMA,
     TYPE_SCHEMA,
     Baudrate,
+    Distance,
     Duration,
     Endpoint,
     Endpoints,
@@ -212,7 +213,7 @@ class AlarmSection(Section):
     """A bit is in alarm while it is on."""
     off: bool = False
     """A bit is in alarm while it is off."""
-    hysteresis: Annotated[Finite, Field(ge=0)] = 0.0
+    hysteresis: Distance = 0.0
     """A limit is left when the value is so far from it, in the unit of the tag."""
     delay: Duration = 0.0
     """A limit counts when it is reached for so long."""

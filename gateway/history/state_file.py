@@ -21,7 +21,7 @@ LATEST = 2**63 - 1  # ns since 1970: the year 2262
 
 
 class StateFile:
-    """What is known of the devices, in one file."""
+    """One file with what was learned of the devices."""
 
     def __init__(self, path: Path) -> None:
         self._file = SavedFile(path)

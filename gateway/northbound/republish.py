@@ -45,7 +45,7 @@ class Republisher:
         links: LinkMonitor,
         losses: Losses,
         refresh: float,
-        alarms: Callable[[], Awaitable[None]],
+        alarms: Callable[[], Awaitable[None]] | None = None,
     ) -> None:
         """`refresh`: seconds in which every tag is published at least once. `alarms` publishes all
         alarms."""
@@ -62,7 +62,8 @@ class Republisher:
         for start in range(0, len(tags), _BATCH_SIZE):
             self._publish_again(tags[start : start + _BATCH_SIZE])
             await asyncio.sleep(0)
-        await self._alarms()
+        if self._alarms is not None:
+            await self._alarms()
 
     def _publish_again(self, tags: Sequence[Tag]) -> None:
         current = [self._plant.sample(tag) for tag in tags]
@@ -107,7 +108,7 @@ class Republisher:
     async def _lost_alarms(self) -> None:
         """Publishes all alarms once per `refresh`, and some time after a link was full."""
         full, due = self._losses.congested, _now() + self._refresh
-        while True:
+        while self._alarms is not None:
             await asyncio.sleep(_LOSS_CHECK)
             if (now_full := self._losses.congested) > full:
                 full, due = now_full, _now() + _ALARMS_AFTER
