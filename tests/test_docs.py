@@ -501,7 +501,14 @@ def _example_keys() -> set[str]:
         *(keys.status(f"devices/{name}") for name in devices),
         *(keys.status(f"lines/{line.name}") for line in config.lines),
         *(keys.alive(name) for name in devices),
-        *(keys.own, keys.status("alarms"), keys.alarm("**"), keys.status("status"), keys.writes, keys.page),
+        *(
+            keys.own,
+            keys.status("alarms"),
+            keys.alarm("**"),
+            keys.status("status"),
+            keys.writes,
+            keys.page,
+        ),
         *(
             keys.command(name, command)
             for name, commands in every_command(config).items()

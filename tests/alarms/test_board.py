@@ -84,6 +84,14 @@ async def test_bad_quality_is_reported_and_changes_no_state() -> None:
     ]
 
 
+def gateway_of(tags: list[Tag]) -> Any:
+    """Returns a gateway with only what a scan meets."""
+    gateway: Any = object.__new__(Gateway)
+    gateway.alarms, gateway.mirror = Alarms(tags), Mirror(tags, 0)
+    gateway._waiting, gateway._subscribers = {}, []
+    return gateway
+
+
 def _scans(tags: list[Tag], values: list[list[int]]) -> list[Any]:
     """Returns scans of one block, as the engine makes them."""
     decoder = Decoder(tags, range(len(tags)))
@@ -95,25 +103,22 @@ def _scans(tags: list[Tag], values: list[list[int]]) -> list[Any]:
 
 @on_virtual_time
 async def test_each_read_is_judged_also_within_the_deadband() -> None:
-    board, mirror = Board(AT_ONCE), Mirror([AT_ONCE, LEVEL], 0)
+    gateway = gateway_of([AT_ONCE, LEVEL])
+    entry = gateway.alarms.entries["mixer/speed"]
     for scan, state in zip(
         _scans([AT_ONCE, LEVEL], [[79, 0], [80, 0], [79, 0]]),
         (State.NORMAL, State.ACTIVE, State.RETURNED),
         strict=True,
     ):
-        mirror.update(scan)
-        board.alarms.judge(scan)
-        assert board.state() is state
+        gateway.samples(scan)
+        assert entry.status.state is state
 
 
 @on_virtual_time
 async def test_a_scan_without_alarms_costs_nothing() -> None:
     """No call into this room, however many alarms other blocks have."""
     others = [tag("mixer", f"n{number}") for number in range(50)]
-    mirror = Mirror([SPEED, *others], 0)
-    gateway: Any = object.__new__(Gateway)  # only what a scan meets
-    gateway.alarms, gateway.mirror = Alarms([SPEED, *others]), mirror
-    gateway._waiting, gateway._subscribers = {}, []
+    gateway = gateway_of([SPEED, *others])
     plain, alarmed = _scans(others, [[1] * 50] * 3), _scans([SPEED], [[1], [2], [3]])
     gateway.samples(plain[0])
     gateway.samples(alarmed[0])
