@@ -1980,4 +1980,11 @@ MUTANTS = (
         "            self.alarms.judge(changed)\n",
         "tests/alarms/test_board.py",
     ),
+    Mutant(
+        "a wrong LRC or CRC of a frame is taken",
+        "protocols/frames/codec.py",
+        "        if got != wanted:\n            why",
+        "        if False:\n            why",
+        "tests/protocols/test_frames_codec.py",
+    ),
 )
