@@ -186,7 +186,7 @@ function takeState(state) {
 
 // -- alarms --
 
-const LEVELS = { high_high: "far too high", high: "too high", low: "too low", low_low: "far too low", on: "on", off: "off", offline: "no reply", down: "line down" };
+const LEVELS = { high_high: "far too high", high: "too high", low: "too low", low_low: "far too low", on: "on", off: "off" };
 
 function showAlarms({ shown, more }) {
   const text = JSON.stringify(shown);
@@ -197,16 +197,17 @@ function showAlarms({ shown, more }) {
     const title = element("th", one.alarm);
     title.scope = "row";
     const limit = typeof one.limit === "number" ? ` (${one.limit})` : "";
-    const value = typeof one.value === "boolean" ? (one.value ? "on" : "off") : one.value;
+    const value = !("time" in one) ? "" : typeof one.value === "boolean" ? (one.value ? "on" : "off") : one.value;
+    const since = Date.parse(one.since);
     const good = one.quality === "good";
     const shownValue = !good ? `bad: ${one.reason ?? "not known"}` : one.unit ? `${value} ${one.unit}` : value;
     const by = one.acknowledged;
     row.append(
       title,
       element("td", one.state, one.state === "acknowledged" ? "acknowledged" : `unacknowledged ${one.state}`),
-      element("td", [one.text, `${LEVELS[one.level]}${limit}`, one.detail].filter(Boolean).join(": ")),
+      element("td", [one.text, LEVELS[one.level] && `${LEVELS[one.level]}${limit}`, one.detail].filter(Boolean).join(": ")),
       element("td", String(shownValue), good ? "number value" : "number bad"),
-      element("td", clock(Date.parse(one.since)), "less"),
+      element("td", Date.now() - since < 86400e3 ? clock(since) : new Date(since).toLocaleString(), "less"),
       element("td", by ? `${by.by}, ${clock(Date.parse(by.time))}` : "no"),
     );
     return row;
