@@ -7,13 +7,17 @@ Documents = Mapping[str, Mapping[str, Any]]  # by path: `status`, `lines/hall-1`
 
 
 def faults(documents: Documents) -> Iterator[str]:
-    """Yields what needs a person: lines that are down, silent devices, history not written."""
+    """Yields what needs a person: lines that are down, silent devices, a lost router,
+    history not written."""
     for line, document in below("lines/", documents):
         if not document["open"]:
             yield f"line {line} is down: {document['trouble'] or 'not opened yet'}"
     for device, document in below("devices/", documents):
         if document["standing"] == "silent":
             yield f"{device} is silent: {document['diagnosis']}"
+    zenoh = documents.get("zenoh", {})
+    if (wanted := zenoh.get("connect")) and not {"router", "peer"} & set(zenoh["to"]):
+        yield f"Zenoh: not connected to {' or '.join(wanted)}: its clients get no values"
     history = documents.get("history", {"state": "ok"})
     if history["state"] != "ok":
         yield f"history: {history['state']}"

@@ -28,6 +28,7 @@ from gateway.northbound.republish import Republisher
 from gateway.northbound.session import (
     CLOSE_WITHIN,
     configure,
+    connect_endpoints,
     drop_limit,
     off_loop,
     open_session,
@@ -272,7 +273,8 @@ class Northbound:
     def _collect_status(self) -> Mapping[str, Mapping[str, object]]:
         documents = dict(self._plant.status())
         documents["status"] = {**documents["status"], **self._admission.claiming.status()}
-        zenoh_document = {**self.counters(), "to": self._links.kinds()}
+        links = {"to": self._links.kinds(), "connect": connect_endpoints(self._config)}
+        zenoh_document = {**self.counters(), **links}
         own = {"zenoh": zenoh_document, "outcomes": self._incoming.outcomes()}
         return {**documents, **own, **self._admission.documents()}
 

@@ -32,6 +32,7 @@ from tests.zenoh_peer import free_endpoint
 WITHIN = 10.0  # seconds
 LOOK_EVERY = 0.25
 HEALTHY_WITHIN = 30.0
+SETTLED = 3.0  # the page shows state of up to two seconds ago
 DISK = 8  # MB
 ROUTER = """
 import sys, zenoh
@@ -202,7 +203,8 @@ def same_name(plant: Plant) -> None:
     other = orjson.loads(plant.config.read_bytes())
     other["zenoh"]["listen"] = [free_endpoint()]
     other["lines"]["hall"]["port"] = "simulator"
-    del other["history"], other["alarms"], other["web"]
+    other["history"]["path"] = str(plant.folder / "other.db")
+    del other["alarms"], other["web"]
     copy = plant.folder / "copy.yaml"
     copy.write_bytes(orjson.dumps(other))
     done = plc_gateway("run", copy)
@@ -226,6 +228,7 @@ def observe(name: str, make: Callable[[Plant], None]) -> Iterator[tuple[str, flo
     """Makes one fault. Yields place, seconds after the fault, and the new text there."""
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
         plant = Plant(Path(folder), stack)
+        time.sleep(SETTLED)
         before = plant.seen()
         old, lines = set(before["page"]), len(plant.gateway.lines)
         old_metrics = dict(before["metrics"])
