@@ -17,6 +17,7 @@ from gateway.cli import (
     check,
     control,
     export,
+    history,
     import_command,
     new,
     peek,
@@ -111,6 +112,7 @@ cli.command()(status.status)
 cli.command()(status.health)
 cli.command()(alarms.alarms)
 cli.command()(backup.backup)
+cli.add_typer(history.cli, name="history")
 
 
 @cli.command()
