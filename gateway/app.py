@@ -175,7 +175,9 @@ class Gateway:
                     self._answer(sample)
         if changed:
             if self.mirror.dependents:
-                changed = [*changed, *self.mirror.computed_after(changed)]
+                computed = self.mirror.computed_after(changed)
+                self.alarms.judge(computed)
+                changed = [*changed, *computed]
             self._publish(changed)
 
     def online(self, device: Device | Station, online: bool) -> None:

@@ -104,6 +104,7 @@ async def _serve(
     if state_file is not None:
         state_file.restore(gateway.enabled_devices)
     alarm_file = AlarmFile(config.alarms.path, gateway.alarms)
+    gateway.add_document("clock", clock.document)
     gateway.subscribe(northbound)
     if history is not None:  # clients may have missed what was published
         gateway.subscribe(_Recording(history))

@@ -302,6 +302,8 @@ class ComputedSection(Section):
     """Store the values on disk."""
     payload: Payload = Form.JSON
     """json: value, quality and time; raw: the bare value as text."""
+    alarm: AlarmSection | None = None
+    """Raise an alarm at a limit of the value."""
 
 
 class TagSection(TagDefaults, ShapingSettings):

@@ -101,6 +101,8 @@ def _metrics(documents: Documents, plant: Plant, *, ready: bool) -> Iterator[Met
     for state, count in documents["alarms"].items():
         alarms.add_metric([state], count)
     yield alarms
+    if (clock := documents.get("clock")) is not None:
+        yield _one("clock_jumps_total", "Jumps of the clock of the machine", {}, clock["jumps"])
     links = _family("zenoh_links", "Connections by kind", "to")
     for kind in ("router", "peer", "client"):
         links.add_metric([kind], documents["zenoh"]["to"].count(kind))

@@ -13,9 +13,11 @@ from structlog.testing import capture_logs
 from gateway.alarms import Alarms, Entry, Event, Reading, State
 from gateway.alarms.file import AlarmFile
 from gateway.app import Gateway
+from gateway.config import load
 from gateway.tags import AlarmRule, Deadband, Level, Reason, Tag, bad, good
 from gateway.tags.mirror import Mirror
 from gateway.tags.scan import Decoder
+from tests.e2e.processes import vigor_line, write_config
 from tests.northbound.plant import tag
 from tests.sim.virtual import on_virtual_time
 
@@ -84,11 +86,16 @@ async def test_bad_quality_is_reported_and_changes_no_state() -> None:
     ]
 
 
+class Nothing:
+    remembers = False
+
+
 def gateway_of(tags: list[Tag]) -> Any:
     """Returns a gateway with only what a scan meets."""
     gateway: Any = object.__new__(Gateway)
     gateway.alarms, gateway.mirror = Alarms(tags), Mirror(tags, 0)
     gateway._waiting, gateway._subscribers = {}, []
+    gateway.serving = Nothing()
     return gateway
 
 
@@ -219,3 +226,18 @@ async def test_each_change_is_on_disk_at_once(tmp_path: Path) -> None:
             ):
                 await asyncio.sleep(0.01)
     assert file.close(5)
+
+
+@on_virtual_time
+async def test_a_computed_tag_has_an_alarm(tmp_path: Path) -> None:
+    tags = {
+        "a": {"address": "D1"},
+        "twice": {"computed": "a * 2", "alarm": {"high": 80}},
+    }
+    lines = {"hall": vigor_line("simulator", tags)}
+    gateway = Gateway(load(write_config(tmp_path / "c.yaml", "tcp/127.0.0.1:7447", lines)))
+    [one] = [tag for device in gateway.config.devices for tag in device.tags if tag.name == "a"]
+    entry = gateway.alarms.entries["mixer/twice"]
+    for value, state in ((39, State.NORMAL), (40, State.ACTIVE), (39, State.RETURNED)):
+        gateway.samples([good(one, value, 1)])
+        assert entry.status.state is state

@@ -151,3 +151,12 @@ def test_a_lost_router_is_said() -> None:
     for to in ("router", "peer"):
         documents["zenoh"]["to"] = ["client", to]
         assert list(faults(documents)) == []
+
+
+def test_a_jump_of_the_clock_is_said_for_an_hour() -> None:
+    documents: dict[str, Any] = {"status": {"refused_devices": {}}}
+    documents["clock"] = {"jumps": 1, "last": -600.0, "ago": 61.0}
+    [said] = warnings(documents)
+    assert said.startswith("the clock of this machine jumped by -600.0 s 1 min ago")
+    documents["clock"]["ago"] = 3601.0
+    assert list(warnings(documents)) == []

@@ -54,7 +54,7 @@ main()
 """
 _METRICS = re.compile(
     r'^plc_gateway_((?:alarms{state="(?!normal)|faults|warnings|line_up|history_ok|ready|'
-    r'device_state{.*state="(?:silent|failing|starting)"|zenoh_links)\S*) (\S+)$',
+    r'device_state{.*state="(?:silent|failing|starting)"|zenoh_links|clock_jumps_total)\S*) (\S+)$',
     re.MULTILINE,
 )
 
@@ -252,8 +252,8 @@ def observe(name: str, make: Callable[[Plant], None]) -> Iterator[tuple[str, flo
                     yield "metrics", passed, f"{metric} {value.removesuffix('.0')}"
             time.sleep(LOOK_EVERY)
         done = plc_gateway("status", plant.config)
-        _, _, wrong = done.out.partition("\nwrong:\n")
-        shown = [line.strip() for line in (wrong or done.err).splitlines() if line.strip()]
+        sentences = [line for line in done.out.splitlines() if line.startswith("  ")]
+        shown = sentences or done.err.splitlines()
         shown += [line for line in done.out.splitlines() if line.startswith(("Zenoh", "alarms"))]
         for line in shown:
             yield "status", WITHIN, _plain(" ".join(line.split()), folder)
