@@ -2,6 +2,7 @@
 
 import json
 import sqlite3
+import time
 from contextlib import closing
 from pathlib import Path
 
@@ -113,10 +114,10 @@ def test_changes_of_alarms_have_a_ring_of_their_own(tmp_path: Path) -> None:
     with closing(sqlite3.connect(path)) as database:
         database.execute("DROP TABLE alarms")
     with history(path) as historian:
-        historian.record_alarm(5, '{"event": "raised"}')
+        historian.record_alarm(time.time_ns(), '{"event": "raised"}')
         assert [*historian.alarms("[..]")] == ['{"event": "raised"}']
         until(historian, alarms_stored=1)
-        historian.record_alarm(6, '{"event": "ended"}')
+        historian.record_alarm(time.time_ns(), '{"event": "ended"}')
         assert [*historian.alarms("[..]", 1)] == ['{"event": "raised"}']
         assert len([*historian.alarms("[..]")]) == 2
         assert written(historian) == [1]
