@@ -167,17 +167,19 @@ class Gateway:
         changed = self.mirror.update(samples)
         if self.alarms.of_tags and not (type(samples) is Scan and samples.latest.alarmed == ()):
             self.alarms.judge(samples)
-        if self.serving.remembers:
+        if self.serving.remembering:
             self.serving.remember(samples)
         if self._waiting:
             for sample in samples:
                 if sample.tag in self._waiting:
                     self._answer(sample)
+        if self.mirror.derives and (changed or self.mirror.pending):
+            changed = self.mirror.follow(changed)
+            if self.alarms.of_tags:
+                self.alarms.judge([sample for sample in changed if sample.tag.inputs])
+            if self.serving.remembering:
+                self.serving.remember(changed)
         if changed:
-            if self.mirror.dependents:
-                computed = self.mirror.computed_after(changed)
-                self.alarms.judge(computed)
-                changed = [*changed, *computed]
             self._publish(changed)
 
     def online(self, device: Device | Station, online: bool) -> None:
@@ -246,7 +248,7 @@ class Gateway:
 
         The age is monotonic time: a change of the system clock must not change it.
         """
-        if tag.formula is not None:
+        if tag.inputs:
             return all(self.is_fresh(one, max_age) for one in tag.inputs)
         poll = self._poll(tag)
         if poll is None or not self._places[tag.device][0].engine.is_open:
@@ -261,7 +263,7 @@ class Gateway:
         Several clients share one read. The sample is bad if the device does not answer. Raises
         `Busy` if the line had no time for the read.
         """
-        if tag.formula is not None:
+        if tag.inputs:
             await asyncio.gather(*(self.fresh(one, max_age) for one in tag.inputs))
             return self.mirror[tag]
         poll = self._poll(tag)

@@ -13,11 +13,12 @@ from gateway import app, northbound
 from gateway.cli.progress import progress
 from gateway.cli.served_plan import served_plan
 from gateway.cli.terminal import FAILED, ConfigPath, err, out
-from gateway.config import Config, load, state_folder
+from gateway.config import Config, expanded_text, load, state_folder
 from gateway.engine.forecast import LineForecast
 from gateway.history.place import trouble
 from gateway.planning.planner import describe
 from gateway.planning.wire_timing import NETWORK_BAUD, WireTiming
+from gateway.tags.tag import CounterRule
 from gateway.web import exposure
 
 
@@ -30,8 +31,15 @@ def check(
     strict: Annotated[
         bool, typer.Option("--strict", help="End with 1 if a line is overloaded.")
     ] = False,
+    expand: Annotated[
+        bool, typer.Option("--expand", help="Print the file with its templates expanded instead.")
+    ] = False,
 ) -> None:
     """Validate the file and print the plan of each line. Sends nothing."""
+    if expand:
+        load(config)
+        print(expanded_text(config), end="")
+        return
     with progress(err) as report:
         loaded = load(config, report)
         warnings = northbound.check(loaded) + exposure.check(loaded)
@@ -66,12 +74,18 @@ def _notes(config: Config) -> Iterator[str]:
                 "the word back; changes by the PLC in between are lost"
             )
     for tag in tags:
-        if (limit := tag.exact_below) is not None:
+        if tag.kept is None and (limit := tag.exact_below) is not None:
             yield (
                 f"{tag.key} ({tag.text}): a JSON number has 53 bits. Beyond {limit:.4g}"
                 " either way two values of the device can look equal, and a write can be one"
                 " step off"
             )
+    totals = [tag.key for tag in tags if isinstance(tag.kept, CounterRule)]
+    if totals and config.state_file is None:
+        yield (
+            f"{', '.join(totals[:5])}: a total begins again at each start of the gateway: "
+            "write `state: state.json` below `gateway:`"
+        )
     for sheet in config.sheets:
         yield from (f"{sheet.file.name}: {note}" for note in sheet.notes)
 

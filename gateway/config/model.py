@@ -386,6 +386,10 @@ class FileSection(Section):
     history: HistorySection | None = None
     web: WebSection | None = None
     alarms: AlarmsSection = AlarmsSection()
+    templates: dict[str, Any] = {}
+    """Devices with parameters, which devices `use`: docs/templates.md."""
+    templates_from: str | list[str] = []
+    """Files with more templates."""
     defaults: dict[str, Any] = {}
     lines: dict[str, Any]
     """The lines, by name."""

@@ -2,7 +2,7 @@
 
 It holds the addresses that each device refuses and the places where its requests must be split, so
 that the search for them is made once and not after every start. Without the file, or with a
-damaged one, the search is made again.
+damaged one, the search is made again. It also holds the totals of counters, which then begin again.
 """
 
 from collections.abc import Iterable, Mapping
@@ -15,15 +15,18 @@ from gateway.engine.device import Device
 from gateway.history.saved_file import SavedFile
 from gateway.planning.bad_addresses import KnownBad
 from gateway.protocols.driver import Span
+from gateway.tags.kept import CounterState
 
 FORMAT = 1
 LATEST = 2**63 - 1  # ns since 1970: the year 2262
+_Content = tuple[Mapping[str, KnownBad], Mapping[str, CounterState]]
 
 
 class StateFile:
     """One file with what was learned of the devices."""
 
     def __init__(self, path: Path) -> None:
+        self.counters: Mapping[str, CounterState] = {}  # by tag, as `restore` has read them
         self._file = SavedFile(path)
         self.start, self.close = self._file.start, self._file.close
         self.save, self.save_soon = self._file.save, self._file.save_soon
@@ -34,28 +37,38 @@ class StateFile:
 
         Moves a file aside that cannot be parsed.
         """
-        learned_by_name = self._file.load(_parse) or {}
+        learned_by_name, self.counters = self._file.load(_parse) or ({}, {})
         for device in devices:
             if (learned := learned_by_name.get(device.name)) is not None:
                 device.bad_addresses.restore(learned, device.tags)
                 if device.blocks:
                     device.plan()
 
-    def snapshot(self, devices: Iterable[Device]) -> bytes:
+    def snapshot(
+        self, devices: Iterable[Device], counters: Mapping[str, CounterState] | None = None
+    ) -> bytes:
         """Returns the content of the file for the present state of the devices."""
         return orjson.dumps(
             {
                 "form": FORMAT,
                 "devices": {d.name: _to_json(d.bad_addresses.known()) for d in devices},
+                "counters": {
+                    key: list(state) for key, state in {**self.counters, **(counters or {})}.items()
+                },
             },
             option=orjson.OPT_INDENT_2 | orjson.OPT_SORT_KEYS,
         )
 
 
-def _parse(document: Any) -> dict[str, KnownBad]:
+def _parse(document: Any) -> _Content:
     if document["form"] != FORMAT:
         raise ValueError(f"form {document['form']} is not {FORMAT}")
-    return {name: _from_json(entry) for name, entry in document["devices"].items()}
+    devices = {name: _from_json(entry) for name, entry in document["devices"].items()}
+    counters = {
+        str(key): CounterState(int(last), int(total))
+        for key, (last, total) in document.get("counters", {}).items()
+    }
+    return devices, counters
 
 
 def _to_json(learned: KnownBad) -> dict[str, object]:

@@ -87,7 +87,7 @@ async def test_bad_quality_is_reported_and_changes_no_state() -> None:
 
 
 class Nothing:
-    remembers = False
+    remembering = False
 
 
 def gateway_of(tags: list[Tag]) -> Any:
@@ -229,10 +229,11 @@ async def test_each_change_is_on_disk_at_once(tmp_path: Path) -> None:
 
 
 @on_virtual_time
-async def test_a_computed_tag_has_an_alarm(tmp_path: Path) -> None:
+async def test_a_computed_tag_and_a_debounced_bit_have_alarms(tmp_path: Path) -> None:
     tags = {
         "a": {"address": "D1"},
         "twice": {"computed": "a * 2", "alarm": {"high": 80}},
+        "door": {"address": "M1", "debounce": "1s", "alarm": {"on": True}},
     }
     lines = {"hall": vigor_line("simulator", tags)}
     gateway = Gateway(load(write_config(tmp_path / "c.yaml", "tcp/127.0.0.1:7447", lines)))
@@ -241,3 +242,12 @@ async def test_a_computed_tag_has_an_alarm(tmp_path: Path) -> None:
     for value, state in ((39, State.NORMAL), (40, State.ACTIVE), (39, State.RETURNED)):
         gateway.samples([good(one, value, 1)])
         assert entry.status.state is state
+    door = next(tag for device in gateway.config.devices for tag in device.tags if tag.kept)
+    [reads] = door.inputs
+    for value, at, state in (
+        (False, 1, State.NORMAL),
+        (True, 2, State.NORMAL),
+        (True, 2 * 10**9, State.ACTIVE),
+    ):
+        gateway.samples([good(reads, value, at)])
+        assert gateway.alarms.entries["mixer/door"].status.state is state
