@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import NamedTuple, Protocol
 
 from gateway import __version__
+from gateway.alarms import Alarms
+from gateway.alarms.watched import watch
 from gateway.config import Config, LineConfig
 from gateway.config.commands import check_command, every_command, speaker
 from gateway.engine.device import Device, DeviceSettings
@@ -22,6 +24,7 @@ from gateway.northbound.status import Document, device_document, line_document, 
 from gateway.serving.station import Station
 from gateway.tags import Quality, Reason, Sample, Tag, WriteResult, bad
 from gateway.tags.mirror import Mirror
+from gateway.tags.scan import Scan
 from gateway.tags.timestamps import rfc3339
 from gateway.values import Value
 
@@ -89,9 +92,12 @@ class Gateway:
         self._places: dict[str, tuple[Line, Device]] = {}
         self._forecasts: dict[str, LineForecast] = {}
         self._waiting: dict[Tag, list[_Reader]] = {}
+        self.alarms = Alarms(self._tags.values(), wall)
+        self.add_document("alarms", self.alarms.counts)
         self.serving = Serving(config, self, self._find_sample, wall=wall, duty=self.duty)
         for seed, line in enumerate(config.lines):
             self._add_line(line, open_line(line), seed)
+        watch(self.alarms, self.lines, config.alarms)
         if plan_now:
             for made in self.lines:
                 self.planned(made, self.plan(made))
@@ -159,6 +165,8 @@ class Gateway:
 
     def samples(self, samples: Sequence[Sample]) -> None:
         changed = self.mirror.update(samples)
+        if self.alarms.of_tags and not (type(samples) is Scan and samples.latest.alarmed == ()):
+            self.alarms.judge(samples)
         if self.serving.remembering:
             self.serving.remember(samples)
         if self._waiting:
@@ -167,6 +175,8 @@ class Gateway:
                     self._answer(sample)
         if self.mirror.derives and (changed or self.mirror.pending):
             changed = self.mirror.follow(changed)
+            if self.alarms.of_tags:
+                self.alarms.judge([sample for sample in changed if sample.tag.inputs])
             if self.serving.remembering:
                 self.serving.remember(changed)
         if changed:

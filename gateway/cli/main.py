@@ -12,6 +12,7 @@ import typer
 
 from gateway import __version__
 from gateway.cli import (
+    alarms,
     backup,
     check,
     control,
@@ -109,6 +110,7 @@ cli.command()(export.export)
 cli.command()(simulate.simulate)
 cli.command()(status.status)
 cli.command()(status.health)
+cli.command()(alarms.alarms)
 cli.command()(backup.backup)
 cli.add_typer(history.cli, name="history")
 

@@ -59,6 +59,15 @@ class HistoryConfig:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class AlarmsConfig:
+    """The file that keeps alarms, and the alarms that need no setting."""
+
+    path: Path | None = None  # None: a restart forgets them
+    devices: bool = True
+    lines: bool = True
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class WebConfig:
     """The address of the status page, and who may use it."""
 
@@ -110,6 +119,7 @@ class Config:
     zenoh: ZenohConfig
     history: HistoryConfig | None
     web: WebConfig | None
+    alarms: AlarmsConfig = AlarmsConfig()
     lines: tuple[LineConfig, ...]
     sheets: tuple[SheetUse, ...] = ()  # files that the tags of some devices come from
 

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Literal, Protocol
 
+from gateway.alarms import Alarms
 from gateway.engine.requests import CommandResult
 from gateway.history.buckets import Bucket
 from gateway.history.course import Now
@@ -32,6 +33,9 @@ class Plant(Protocol):
 
     @property
     def duty(self) -> Duty: ...
+
+    @property
+    def alarms(self) -> Alarms: ...
 
     def devices(self) -> Iterable[Device]: ...
 
@@ -105,6 +109,12 @@ class History(Protocol):
 
     def writes(self, time_range: str, limit: int | None, now: int) -> Iterator[str]:
         """Outcomes of writes and commands, as on the `writes` key. Raises like `samples`."""
+
+    def alarms(self, time_range: str, limit: int | None, now: int) -> Iterator[str]:
+        """Changes of alarms, as JSON in the order of time. Raises like `samples`."""
+
+    def record_alarm(self, time: int, change: str) -> None:
+        """Records one change; `time`: ns since 1970. Never blocks."""
 
     def record_write(self, time: int, outcome: str, *, refused: bool) -> None:
         """Records one outcome, as on the `writes` key; `time`: ns since 1970. `refused`: nothing

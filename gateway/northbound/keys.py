@@ -10,6 +10,7 @@ declared for a single device, tag or command below `<prefix>/`: the wildcards be
     <prefix>/<device>/@run              a command; also @stop, @loopback, @model
     <prefix>/<device>/@block            all tags of the device that changed in one scan
     <prefix>/@gateway/<name>/…          state and statistics, the outcome of every write
+    <prefix>/@gateway/<name>/alarms/…   its alarms
     <prefix>/@gateway/<name>/alive/…    liveliness tokens of its devices
     <prefix>/@gateway/<name>/page     the last reply to a query with `page`
     <prefix>/@gateway/<name>/claim/…    its claim to its devices: a document, and a token
@@ -39,6 +40,7 @@ class Family(StrEnum):
     META = "meta"
     BLOCK = "block"
     STATUS = "status"
+    ALARM = "alarm"
     COMMAND = "command"
 
 
@@ -66,6 +68,9 @@ def parse_key(key: str) -> ParsedKey:
     if late:
         return ParsedKey(Family.LAST, stem)
     if "@gateway" in (chunks := key.split("/")):
+        below = chunks[chunks.index("@gateway") + 2 :]
+        if below[:1] == ["alarms"] and len(below) > 1:
+            return ParsedKey(Family.ALARM, key)
         is_command = chunks[-3:-2] == ["lines"] and chunks[-1] == "global"
         return ParsedKey(Family.COMMAND if is_command else Family.STATUS, key)
     return ParsedKey(Family.VALUE, key)
@@ -122,6 +127,10 @@ class Keys:
     def writes(self) -> str:
         """The outcome of every write."""
         return f"{self.own}/writes"
+
+    def alarm(self, name: str) -> str:
+        """An alarm: `device/tag`, `device`, or `line:name`."""
+        return f"{self.own}/alarms/{name}"
 
     @property
     def page(self) -> str:

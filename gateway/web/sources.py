@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+from gateway.alarms import Alarms
 from gateway.line.line import Watcher
 from gateway.northbound.interfaces import Device, History
 from gateway.northbound.payload import Failure
@@ -14,6 +15,9 @@ Documents = Mapping[str, Mapping[str, Any]]  # by path: `status`, `lines/hall-1`
 
 class Plant(Protocol):
     """The devices and their samples."""
+
+    @property
+    def alarms(self) -> Alarms: ...
 
     def devices(self) -> Iterable[Device]: ...
 
@@ -35,6 +39,9 @@ class North(Protocol):
 
     async def write(self, tag: str, data: bytes, by: str, arrived: float) -> WriteResult | Failure:
         """Writes for the client `by`. `arrived`: by the loop's clock."""
+
+    def acknowledge(self, alarm: str, data: bytes, by: str, arrived: float) -> bytes | Failure:
+        """Acknowledges for the client `by`. Returns the document of the alarm."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,6 +7,7 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from gateway.alarms import Alarms
 from gateway.config import ZenohConfig
 from gateway.engine.requests import CommandResult
 from gateway.errors import (
@@ -50,6 +51,7 @@ class PlainPlant:
         self.duty = Duty()
         self._devices = devices
         self._tags = {tag.key: tag for device in devices for tag in device.tags}
+        self.alarms = Alarms(self._tags.values())
         self.samples = {
             key: bad(tag, Reason.STARTING, time.time_ns()) for key, tag in self._tags.items()
         }
