@@ -15,7 +15,8 @@ from gateway.engine.requests import WRITE_EXPIRY, CommandResult
 from gateway.errors import Busy, Offline
 from gateway.line.build import OpenPort, line_of, opener
 from gateway.line.duty import Duty
-from gateway.line.line import Line, Watcher
+from gateway.line.line import Line
+from gateway.line.wire_log import WireLog
 from gateway.northbound.status import Document, device_document, line_document, standing
 from gateway.tags import Quality, Reason, Sample, Tag, WriteResult, bad
 from gateway.tags.mirror import Mirror
@@ -136,12 +137,8 @@ class Gateway:
         """Adds a document of another part to the status."""
         self._documents[path] = document
 
-    def watch(self, line: str, watcher: Watcher | None) -> bool:
-        """Sets or removes the watcher of a line. False: there is no such line."""
-        found = [one for one in self.lines if one.engine.name == line]
-        for one in found:
-            one.watcher = watcher
-        return bool(found)
+    def wire_logs(self) -> Mapping[str, WireLog]:
+        return {line.engine.name: line.wire_log for line in self.lines}
 
     @property
     def enabled_devices(self) -> Sequence[Device]:

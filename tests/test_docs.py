@@ -497,6 +497,7 @@ def _example_keys() -> set[str]:
         *(key for name in devices for key in (keys.device(name), keys.block(name))),
         *(keys.status(f"devices/{name}") for name in devices),
         *(keys.status(f"lines/{line.name}") for line in config.lines),
+        *(keys.trace(line.name) for line in config.lines),
         *(keys.alive(name) for name in devices),
         *(keys.own, keys.status("status"), keys.writes, keys.page),
         *(

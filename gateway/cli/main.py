@@ -24,6 +24,7 @@ from gateway.cli import (
     scan_command,
     simulate,
     status,
+    trace,
     watch,
     write,
 )
@@ -108,6 +109,7 @@ cli.command()(export.export)
 cli.command()(simulate.simulate)
 cli.command()(status.status)
 cli.command()(status.health)
+cli.command()(trace.trace)
 cli.command()(backup.backup)
 
 

@@ -5,6 +5,7 @@ from typing import Literal, Protocol
 
 from gateway.engine.requests import CommandResult
 from gateway.line.duty import Duty
+from gateway.line.wire_log import WireLog
 from gateway.tags import Sample, Tag, WriteResult
 from gateway.tags.recorded import Recorded, RecordedQuery
 from gateway.values import Value
@@ -24,7 +25,14 @@ class Device(Protocol):
         """True: each scan is also published as one `@block`. "only": single values are not."""
 
 
-class Plant(Protocol):
+class Lines(Protocol):
+    """The lines of the plant."""
+
+    def wire_logs(self) -> Mapping[str, WireLog]:
+        """Returns the wire logs by line."""
+
+
+class Plant(Lines, Protocol):
     """The devices, their samples, writes and commands. All but `sample` on the event loop."""
 
     @property
