@@ -14,6 +14,7 @@ from gateway.cli.progress import progress
 from gateway.cli.terminal import FAILED, ConfigPath, err, out
 from gateway.config import Config, load, state_folder
 from gateway.engine.forecast import LineForecast
+from gateway.engine.listening import why_not_learned
 from gateway.history.place import trouble
 from gateway.planning.planner import describe
 from gateway.planning.wire_timing import NETWORK_BAUD, WireTiming
@@ -37,6 +38,8 @@ def check(
         lines = app.forecasts(loaded, report)
     few = sum(len(line.blocks) for line in lines) <= 100
     out.print(plan(lines, every_block=few if blocks is None else blocks))
+    for sentence in _listening(loaded):
+        out.print(sentence)
     for note in _notes(loaded):
         err.print(f"note: {note}")
     for line in lines:
@@ -51,6 +54,24 @@ def check(
     print(f"{config}: good, {size(loaded)}")
     if strict and any(line.overloaded for line in lines):
         sys.exit(FAILED)
+
+
+def _listening(config: Config) -> Iterator[str]:
+    """Yields which tags of the listen-only lines can be learned."""
+    for line in config.lines:
+        if not line.listen_only:
+            continue
+        reasons = {
+            tag.key: why
+            for device in line.devices
+            for tag in device.tags
+            if (why := why_not_learned(device.driver, tag))
+        }
+        yield (
+            f"line {line.name} only listens: {len(line.tags) - len(reasons)} of "
+            f"{_counted(len(line.tags), 'tag')} can be learned, when another master reads them"
+        )
+        yield from (f"  {key} cannot: {why}" for key, why in reasons.items())
 
 
 def _notes(config: Config) -> Iterator[str]:

@@ -20,6 +20,7 @@ from gateway.cli import (
     new,
     peek,
     read,
+    replay,
     run,
     scan_command,
     simulate,
@@ -110,6 +111,7 @@ cli.command()(simulate.simulate)
 cli.command()(status.status)
 cli.command()(status.health)
 cli.command()(trace.trace)
+cli.command()(replay.replay)
 cli.command()(backup.backup)
 
 

@@ -290,6 +290,8 @@ class LineSection(Section):
     """Data bits, parity, stop bits: 7E1, 8N1; left out: the default of the protocol."""
     echo: bool | None = None
     """true: the port receives its own requests, as with some two-wire RS-485 converters."""
+    listen_only: bool = False
+    """true: learns the values from another master's traffic, and sends nothing, ever."""
     defaults: dict[str, Any] = {}
     devices: dict[str, Any]
     """The devices on this line, by name."""

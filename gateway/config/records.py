@@ -85,6 +85,7 @@ class LineConfig:
     serial: SerialSettings
     wire: WireTiming
     echo: bool | None  # the port receives its own requests; None: unknown
+    listen_only: bool = False  # another master owns the wire: nothing is ever sent
     devices: tuple[DeviceSettings, ...]
 
     @property

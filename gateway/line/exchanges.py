@@ -34,7 +34,7 @@ class Exchange(NamedTuple):
     """One job of a line, decoded."""
 
     device: str
-    kind: str  # read, write, probe, wait, other
+    kind: str  # read, write, probe, wait, heard, other
     what: str  # `read D100..D119`
     result: str  # decoded values, or why it failed
     failed: bool
@@ -52,6 +52,13 @@ def decoded(performed: Performed) -> Exchange:
     else:
         text = ""
     return Exchange(job.device.name, kind, what, text, failed)
+
+
+def heard(samples: Sequence[Sample]) -> Exchange:
+    """Returns the texts of samples that arrived without a request of this gateway."""
+    reasons = {f"{one.reason}: {one.detail}" for one in samples if one.value is None}
+    text = "; ".join(sorted(reasons)) or shown(samples)
+    return Exchange(samples[0].tag.device, "heard", "heard", text, bool(reasons))
 
 
 def samples_of(performed: Performed) -> Sequence[Sample]:

@@ -123,7 +123,12 @@ class Line:
         if channel.echo.strip:
             data = channel.echo.without_rest(data)
         if data:
-            self._deliver(self.engine.received(data, now, self._wall()))
+            effects = self.engine.received(data, now, self._wall())
+            if self.wire_log.active:
+                for effect in effects:
+                    if isinstance(effect, Samples):
+                        self.wire_log.learned(effect.samples)
+            self._deliver(effects)
             self._wake.set()
 
     def lost(self, error: Exception) -> None:

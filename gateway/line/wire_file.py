@@ -8,6 +8,7 @@ value that the gateway decoded. All other lines of text are notes.
 import json
 import re
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 _PIECE = re.compile(
@@ -46,7 +47,8 @@ def entries(lines: Iterable[str], line: str | None = None) -> Iterator[LoggedPie
                 at = None if match["at"] is None else float(match["at"])
                 yield LoggedPiece(at, match["way"], bytes.fromhex(match["data"]))
         elif (found := _VALUE.match(text)) is not None:
-            yield LoggedValue(float(found[1]), found[2], json.loads(found[3]))
+            with suppress(ValueError):  # no JSON: another note
+                yield LoggedValue(float(found[1]), found[2], json.loads(found[3]))
 
 
 def event_lines(event: dict[str, Any]) -> str:

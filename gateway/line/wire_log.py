@@ -1,9 +1,10 @@
 """The wire log: every byte and every job of a line, for those who watch it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from gateway.engine.jobs import Result, Transacted
+from gateway.tags import Sample
 
 
 class Piece(NamedTuple):
@@ -22,7 +23,13 @@ class Performed(NamedTuple):
     ended: float
 
 
-Event = Piece | Performed
+class Learned(NamedTuple):
+    """Samples of bytes that were received without a request of this gateway."""
+
+    samples: Sequence[Sample]
+
+
+Event = Piece | Performed | Learned
 Listener = Callable[[Event], None]
 
 
@@ -52,6 +59,9 @@ class WireLog:
 
     def performed(self, job: Transacted, result: Result, begun: float, ended: float) -> None:
         self._pass_on(Performed(job, result, begun, ended))
+
+    def learned(self, samples: Sequence[Sample]) -> None:
+        self._pass_on(Learned(samples))
 
     def _pass_on(self, event: Event) -> None:
         for listener in self._listeners:

@@ -9,8 +9,8 @@ from typing import Any
 import orjson
 import zenoh
 
-from gateway.line.exchanges import decoded, samples_of
-from gateway.line.wire_log import Event, Piece
+from gateway.line.exchanges import decoded, heard, samples_of
+from gateway.line.wire_log import Event, Learned, Piece
 from gateway.northbound.inbox import Inbox
 from gateway.northbound.interfaces import Lines
 from gateway.northbound.keys import Keys
@@ -96,6 +96,10 @@ class Tap:
 
     def _fields(self, at: float, event: Event) -> dict[str, Any]:
         """Returns one event; times in seconds since 1970."""
+        if isinstance(event, Learned):
+            return {"time": self._since_1970(at), "took": 0.0, **heard(event.samples)._asdict()} | {
+                "values": {one.tag.key: one.value for one in event.samples}
+            }
         if isinstance(event, Piece):
             return {"time": self._since_1970(at), "way": event.way, "bytes": event.data.hex(" ")}
         return {

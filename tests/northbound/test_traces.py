@@ -34,10 +34,10 @@ async def test_a_line_is_watched_only_while_a_client_subscribes_to_its_trace() -
             sample = await asyncio.to_thread(first.recv)
             [event] = json.loads(sample.payload.to_bytes())["events"]
             assert (event["way"], event["bytes"]) == (">", "02 30")
-            first.undeclare()
-            second.undeclare()
+            first.undeclare()  # type: ignore[no-untyped-call]
+            second.undeclare()  # type: ignore[no-untyped-call]
             await _until(False, plant.hall)  # a client of all status keys does not start it
-            of_all.undeclare()
+            of_all.undeclare()  # type: ignore[no-untyped-call]
 
 
 async def test_events_beyond_the_limit_are_counted_and_not_kept() -> None:
