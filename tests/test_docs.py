@@ -134,8 +134,7 @@ def test_every_page_with_files_is_checked() -> None:
     counted = Counter(block.page for block in FILES)
     assert set(counted) == {
         *("/README.md", "configuration.md", "vigor.md", "computer-link.md", "modbus.md"),
-        "trace.md",
-        *("first-plant.md", "import.md", "peek.md", "systems.md"),
+        *("first-plant.md", "import.md", "peek.md", "systems.md", "trace.md"),
     }
     assert sum(counted.values()) >= 11
     assert {block.page for block in DEVICES} == {OF_DEVICES}
