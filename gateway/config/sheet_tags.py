@@ -11,7 +11,7 @@ from gateway.config.model import TagDefaults, TagSection
 from gateway.config.yaml_events import plain_data
 from gateway.errors import ConfigError
 from gateway.protocols.driver import AnyDriver
-from gateway.sheets import Grid, Sheet, read_grid, read_sheet
+from gateway.sheets import Grid, Sheet, link_table, read_grid, read_sheet
 from gateway.tags import Tag
 
 
@@ -65,6 +65,8 @@ class SheetTags:
         if grid is None:
             return ()
         try:
+            if driver is not None and link_table.is_table(grid):
+                grid = link_table.of_station(grid, driver.station)
             sheet = read_sheet(grid, device, other_settings(), parsed)
         except ConfigError as error:
             self.mistakes.add(path, f"{file}: {error}")
@@ -99,6 +101,11 @@ def preview(
 
     Raises `ConfigErrors` with the mistakes that need no device.
     """
+    if link_table.is_table(grid):
+        raise ConfigError(
+            f"{file} is a communication table: name the file with --into, whose devices tell which "
+            "station is which"
+        )
     sheet = read_sheet(grid, device, other_settings(), parsed)
     mistakes = _mistakes(file, sheet)
     DeviceTags(mistakes).build(device, sheet.tags, (), TagDefaults(), None)

@@ -1911,6 +1911,13 @@ MUTANTS = (
         "tests/tags/test_scan.py",
     ),
     Mutant(
+        "a wrong LRC or CRC of a frame is taken",
+        "protocols/frames/codec.py",
+        "        if got != wanted:\n            why",
+        "        if False:\n            why",
+        "tests/protocols/test_frames_codec.py",
+    ),
+    Mutant(
         "a listen-only line can send",
         "line/build.py",
         "        opens = _without_writing(opens)\n",
