@@ -10,9 +10,10 @@ from typing import Annotated
 
 import typer
 
+from gateway.cli.capture import Capture
 from gateway.cli.terminal import FAILED, printable
-from gateway.cli.trace import check_line
-from gateway.config import Config, LineConfig, load
+from gateway.cli.trace import line_named
+from gateway.config import load
 from gateway.errors import ConfigError, GatewayError
 from gateway.line.exchanges import shown
 from gateway.line.replay import Difference, Learned, Replay
@@ -36,10 +37,20 @@ def replay(
     check: Annotated[
         bool, typer.Option("--check", help="Only compare with the values in the recording.")
     ] = False,
+    pcapng: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write the bytes for Wireshark instead.")
+    ] = None,
 ) -> None:
     """Decode a recording: the values of each reply, with its time. Sends nothing."""
     files = _files(logs)
-    replayed = Replay(_line(load(config), line or _recorded_line(files)))
+    of = line_named(load(config), line or _recorded_line(files))
+    if pcapng is not None:
+        with Capture(pcapng, of) as capture:
+            for entry in _entries(files, line):
+                if isinstance(entry, LoggedPiece):
+                    capture.add(entry.at or 0.0, entry.way, entry.data)
+        return
+    replayed = Replay(of)
     for event in replayed.run(_entries(files, line)):
         if isinstance(event, Difference):
             at, tag, value = event.logged
@@ -83,12 +94,6 @@ def _recorded_line(files: Sequence[Path]) -> str:
     if len(names) != 1:
         raise ConfigError(f"name the line with --line: {', '.join(sorted(names)) or 'not noted'}")
     return str(names.pop())
-
-
-def _line(config: Config, name: str) -> LineConfig:
-    check_line(config, name)
-    (line,) = (line for line in config.lines if line.name == name)
-    return line
 
 
 def _entries(files: Sequence[Path], line: str | None) -> Entries:

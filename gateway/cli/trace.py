@@ -9,10 +9,11 @@ from typing import Annotated, Any
 
 import typer
 
+from gateway.cli.capture import Capture
 from gateway.cli.client import connected
 from gateway.cli.recording import Recording
 from gateway.cli.terminal import AsJson, ConfigPath, err, printable
-from gateway.config import Config, load, parsers
+from gateway.config import Config, LineConfig, load, parsers
 from gateway.config.messages import meant
 from gateway.errors import ConfigError
 from gateway.line.wire_file import event_lines
@@ -33,6 +34,9 @@ def trace(
     keep: Annotated[
         str, typer.Option(metavar="SIZE", help="The most that the recording may take.")
     ] = "100MB",
+    pcapng: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write the bytes for Wireshark.")
+    ] = None,
     for_: Annotated[
         str | None, typer.Option("--for", metavar="TIME", help="End after this time: 30s, 2min.")
     ] = None,
@@ -40,7 +44,7 @@ def trace(
 ) -> None:
     """Print each exchange of a line, decoded, as it passes. Ctrl-C ends it."""
     loaded = load(config)
-    check_line(loaded, line)
+    found = line_named(loaded, line)
     size = parsers.size(keep)
     until = None if for_ is None else time.monotonic() + parsers.duration(for_)
     with ExitStack() as stack:
@@ -49,21 +53,25 @@ def trace(
         if record is not None:
             recording = stack.enter_context(Recording(record, line, size))
             err.print(f"recording {line} into {recording.path}; Ctrl-C ends it")
+        capture = None if pcapng is None else stack.enter_context(Capture(pcapng, found))
         stack.enter_context(suppress(KeyboardInterrupt))
         for event in _events(client.trace(line, until)):
             if recording is not None:
                 recording.add(event_lines(event))
+            if capture is not None and "way" in event:
+                capture.add(event["time"], event["way"], bytes.fromhex(event["bytes"]))
             if as_json:
                 print(json.dumps(event), flush=True)
             elif record is None and ("way" not in event or show_bytes):
                 print(printable(shown(event)), flush=True)
 
 
-def check_line(config: Config, line: str) -> None:
+def line_named(config: Config, name: str) -> LineConfig:
     """Raises `ConfigError` for a line that is not in the file."""
-    names = [one.name for one in config.lines]
-    if line not in names:
-        raise ConfigError(f"there is no line {line}: {meant(line, names)}")
+    lines = {line.name: line for line in config.lines}
+    if name not in lines:
+        raise ConfigError(f"there is no line {name}: {meant(name, lines)}")
+    return lines[name]
 
 
 def shown(event: dict[str, Any]) -> str:

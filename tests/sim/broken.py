@@ -1925,13 +1925,6 @@ MUTANTS = (
         "tests/line/test_replay.py",
     ),
     Mutant(
-        "a listen-only line has jobs",
-        "engine/listening.py",
-        "        return Idle(math.inf)\n",
-        "        return None  # type: ignore[return-value]\n",
-        "tests/engine/test_listening.py",
-    ),
-    Mutant(
         "a write to a listen-only line waits",
         "engine/engine.py",
         "        if device.settings.listen_only:\n",
@@ -1983,8 +1976,8 @@ MUTANTS = (
     Mutant(
         "a learned value never turns stale",
         "engine/listening.py",
-        "        return tag in self._heard and self._heard[tag] + stale_after(tag) <= now\n",
-        "        return False\n",
+        "    return max(SHORTEST, INTERVALS * tag.every)\n",
+        "    return 1e9\n",
         "tests/engine/test_listening.py",
     ),
     Mutant(

@@ -135,6 +135,7 @@ class ModbusRtu(_Modbus):
     protocol: Literal["modbus-rtu"] = "modbus-rtu"
 
     scan_hints: ClassVar = ScanHints(formats=("8N1", "8E1", "8O1", "8N2"))
+    dissector: ClassVar = "mbrtu"
     _traits: ClassVar = Traits(baudrate=9600, format="8E1", binary=True, word_type=Kind.UINT16)
 
     @property
@@ -178,6 +179,7 @@ class ModbusTcp(_Modbus):
     window: int = 1  # the most outstanding requests that the device accepts
 
     scan_hints: ClassVar = ScanHints(formats=())
+    dissector: ClassVar = "mbtcp"
     _traits: ClassVar = Traits(baudrate=None, word_type=Kind.UINT16)
 
     @property
