@@ -16,8 +16,11 @@ from gateway.errors import Busy, Offline
 from gateway.line.build import OpenPort, line_of, opener
 from gateway.line.duty import Duty
 from gateway.line.line import Line
+from gateway.line.serving import Serving
 from gateway.line.wire_log import WireLog
+from gateway.northbound.served_status import served_documents
 from gateway.northbound.status import Document, device_document, line_document, standing
+from gateway.serving.station import Station
 from gateway.tags import Quality, Reason, Sample, Tag, WriteResult, bad
 from gateway.tags.mirror import Mirror
 from gateway.tags.timestamps import rfc3339
@@ -35,6 +38,8 @@ def forecasts(
     """
     found = []
     for line in config.lines:
+        if line.serve:
+            continue
         devices = [Device(device, line.wire) for device in line.devices if device.enabled]
         found.append(forecast(line.name, devices, line.wire))
         if report is not None:
@@ -85,6 +90,7 @@ class Gateway:
         self._places: dict[str, tuple[Line, Device]] = {}
         self._forecasts: dict[str, LineForecast] = {}
         self._waiting: dict[Tag, list[_Reader]] = {}
+        self.serving = Serving(config, self, self._find_sample, wall=wall, duty=self.duty)
         for seed, line in enumerate(config.lines):
             self._add_line(line, open_line(line), seed)
         if plan_now:
@@ -100,6 +106,8 @@ class Gateway:
             self.mirror.begin(self._wall())
 
     def _add_line(self, config: LineConfig, open_port: OpenPort, seed: int) -> None:
+        if config.serve:
+            return
         devices = [device for device in config.devices if device.enabled]
         line = line_of(
             config,
@@ -138,7 +146,8 @@ class Gateway:
         self._documents[path] = document
 
     def wire_logs(self) -> Mapping[str, WireLog]:
-        return {line.engine.name: line.wire_log for line in self.lines}
+        polled = {line.engine.name: line.wire_log for line in self.lines}
+        return polled | {line.name: line.wire_log for line in self.serving.lines}
 
     @property
     def enabled_devices(self) -> Sequence[Device]:
@@ -148,14 +157,18 @@ class Gateway:
 
     def samples(self, samples: Sequence[Sample]) -> None:
         changed = self.mirror.update(samples)
+        if self.serving.remembers:
+            self.serving.remember(samples)
         if self._waiting:
             for sample in samples:
                 if sample.tag in self._waiting:
                     self._answer(sample)
         if changed:
+            if self.mirror.dependents:
+                changed = [*changed, *self.mirror.computed_after(changed)]
             self._publish(changed)
 
-    def online(self, device: Device, online: bool) -> None:
+    def online(self, device: Device | Station, online: bool) -> None:
         for subscriber in self._subscribers:
             subscriber.set_online(device.name, online)
 
@@ -174,6 +187,11 @@ class Gateway:
     def sample(self, tag: Tag) -> Sample:
         return self.mirror[tag]
 
+    def _find_sample(self, key: str) -> Sample | None:
+        """Returns the sample of `device/tag`; None: no such tag in this process."""
+        tag = self._tags.get(key)
+        return None if tag is None else self.mirror[tag]
+
     def mark_published(self, samples: Sequence[Sample]) -> None:
         if changed := self.mirror.mark_published(samples):
             self._publish(changed)  # history keeps it too
@@ -183,6 +201,8 @@ class Gateway:
 
         Raises `BadValue` before anything is sent, otherwise a `GatewayError`.
         """
+        if self.serving.holds(tag):
+            return await self.serving.write(tag, value)
         if tag.device not in self._places:
             raise Offline(f"device {tag.device} is disabled; nothing was sent")
         units = tag.encode(value)
@@ -214,6 +234,8 @@ class Gateway:
 
         The age is monotonic time: a change of the system clock must not change it.
         """
+        if tag.formula is not None:
+            return all(self.is_fresh(one, max_age) for one in tag.inputs)
         poll = self._poll(tag)
         if poll is None or not self._places[tag.device][0].engine.is_open:
             return True
@@ -227,6 +249,9 @@ class Gateway:
         Several clients share one read. The sample is bad if the device does not answer. Raises
         `Busy` if the line had no time for the read.
         """
+        if tag.formula is not None:
+            await asyncio.gather(*(self.fresh(one, max_age) for one in tag.inputs))
+            return self.mirror[tag]
         poll = self._poll(tag)
         if poll is None or self.is_fresh(tag, max_age):
             return self.mirror[tag]
@@ -278,8 +303,10 @@ class Gateway:
                 "time": rfc3339(self._wall()),
                 "up": round(time.monotonic() - self._started, 1),
                 "tags": len(self._tags),
-                "lines": {line.engine.name: line.engine.is_open for line in self.lines},
-                "devices": {name: standing(d) for name, (_, d) in self._places.items()},
+                "lines": {line.engine.name: line.engine.is_open for line in self.lines}
+                | {line.name: line.is_open for line in self.serving.lines},
+                "devices": {name: standing(d) for name, (_, d) in self._places.items()}
+                | {station.name: station.presence.value for station in self.serving.stations},
             }
         }
         for line in self.lines:
@@ -290,4 +317,5 @@ class Gateway:
         for name, (line, device) in self._places.items():
             polls = line.engine.schedule.polls(device)
             documents[f"devices/{name}"] = device_document(device, polls, now)
+        documents |= served_documents(self.serving.lines, now)
         return documents | {path: document() for path, document in self._documents.items()}

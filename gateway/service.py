@@ -216,6 +216,8 @@ async def _start_lines(
         asyncio.create_task(_run_planned(line, plan), name=line.engine.name)
         for line, plan in zip(gateway.lines, plans, strict=True)
     ]
+    gateway.serving.restore()
+    lines += [asyncio.create_task(one.run(), name=one.name) for one in gateway.serving.lines]
     cleanup.push_async_callback(_end, lines)  # first, so that the last outcomes are published
     return lines
 

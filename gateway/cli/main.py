@@ -16,6 +16,7 @@ from gateway.cli import (
     check,
     control,
     export,
+    history,
     import_command,
     new,
     peek,
@@ -113,6 +114,7 @@ cli.command()(status.health)
 cli.command()(trace.trace)
 cli.command()(replay.replay)
 cli.command()(backup.backup)
+cli.add_typer(history.cli, name="history")
 
 
 @cli.command()

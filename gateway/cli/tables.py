@@ -20,6 +20,8 @@ def row_of(sample: Sample) -> Row:
         "quality": sample.quality.value,
         "time": rfc3339(sample.time),
     }
+    if sample.tag.names is not None and (text := sample.tag.names.text(sample.value)):
+        document["text"] = text
     if sample.reason is not None:
         document["reason"] = sample.reason.value
     return Row(sample.tag.key, document)
@@ -52,7 +54,7 @@ def table_of(rows: Iterable[Row], tags: dict[str, Tag], *, utc: bool = False) ->
         tag = tags.get(row.tag)
         table.add_row(
             Text(row.tag),
-            Text("-" if document.get("value") is None else value_text(document["value"])),
+            Text("-" if document.get("value") is None else _named(document)),
             Text(tag.unit if tag else ""),
             Text(printable(quality), style="" if good else "red"),
             Text(time_text(str(document.get("time", "")), utc=utc)),
@@ -71,6 +73,12 @@ def time_text(text: str, *, utc: bool = False) -> str:
         return datetime.fromisoformat(text).astimezone().isoformat(timespec="milliseconds")
     except (ValueError, OverflowError):
         return printable(text)
+
+
+def _named(document: dict[str, object]) -> str:
+    """Returns the value, behind its name if it has one: `auto (1)`."""
+    value = value_text(document["value"])
+    return printable(f"{document['text']} ({value})") if document.get("text") else value
 
 
 def value_text(value: object) -> str:

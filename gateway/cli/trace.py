@@ -45,6 +45,10 @@ def trace(
     """Print each exchange of a line, decoded, as it passes. Ctrl-C ends it."""
     loaded = load(config)
     found = line_named(loaded, line)
+    if found.serve:
+        raise ConfigError(
+            f"{line} is a served line: only the lines that the gateway asks are traced"
+        )
     size = parsers.size(keep)
     until = None if for_ is None else time.monotonic() + parsers.duration(for_)
     with ExitStack() as stack:

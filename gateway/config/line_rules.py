@@ -108,6 +108,11 @@ def _check_listening(
     line: LineSection, devices: Sequence[DeviceSettings], path: Path, mistakes: Mistakes
 ) -> None:
     """Another master's requests and replies must be known, and found by one reader."""
+    if line.serve:
+        mistakes.add(
+            (*path, "listen_only"),
+            "a line with `serve: true` answers its master, so it cannot only listen: remove one",
+        )
     if isinstance(line.port, SimulatorAddress):
         mistakes.add((*path, "port"), "listen_only: the simulator has no other master to listen to")
     framings = dict[object, str]()

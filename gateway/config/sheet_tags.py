@@ -8,6 +8,7 @@ from typing import NamedTuple
 from gateway.config.device_tags import DeviceTags
 from gateway.config.messages import Mistakes, Path, dotted, one_of
 from gateway.config.model import TagDefaults, TagSection
+from gateway.config.validate import settings_of
 from gateway.config.yaml_events import plain_data
 from gateway.errors import ConfigError
 from gateway.protocols.driver import AnyDriver
@@ -124,8 +125,9 @@ def _mistakes(file: FilePath, sheet: Sheet) -> Mistakes:
 def other_settings() -> list[str]:
     """Returns the settings of a tag that a column may have under their own names."""
     own = {"address", "type", "unit", "description", "scale", "offset", "every", "deadband"}
-    own |= {"word_order", "byte_order", "history", "write"}
-    return [name for name in TagSection.model_fields if name not in own]
+    own |= {"word_order", "byte_order", "history", "write", "enum", "invert"}
+    own.add("computed")
+    return [name for name in settings_of(TagSection) if name not in own]
 
 
 def parsed(text: str) -> object:

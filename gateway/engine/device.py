@@ -17,6 +17,7 @@ from gateway.planning.monitor_lists import with_monitor_list
 from gateway.planning.planner import Block, around, plan, runs_of
 from gateway.planning.wire_timing import Transactions, WireTiming
 from gateway.protocols.driver import AnyDriver, Cost, Monitor, NoReplyCauses, Span, Timing, Windowed
+from gateway.serving.registers import Served
 from gateway.tags import Tag
 
 MOST_PLANNED = 1000  # tags times intervals: planning them takes some tenths of a second
@@ -46,6 +47,12 @@ class DeviceSettings:
     listen_only: bool = False  # another master asks it; nothing is ever sent
     enabled: bool = True
     tags: tuple[Tag, ...] = ()
+    served: Served | None = None  # it is a station of the gateway, for a master on its line
+    wire_tags: tuple[Tag, ...] = field(init=False, repr=False)  # those with an address
+
+    def __post_init__(self) -> None:
+        found = tuple(tag for tag in self.tags if tag.formula is None)
+        object.__setattr__(self, "wire_tags", found)
 
 
 @dataclass(slots=True, eq=False)
@@ -101,7 +108,7 @@ class Device:
 
     @property
     def tags(self) -> tuple[Tag, ...]:
-        return self.settings.tags
+        return self.settings.wire_tags
 
     @property
     def broadcast(self) -> bool:

@@ -24,7 +24,7 @@ def opener(line: LineConfig) -> OpenPort:
 
         def simulated(receiver: Receiver) -> Awaitable[Port]:
             if not stations:  # made when the line opens: a large plant has many
-                stations.extend(station_for(one.driver, one.tags) for one in line.devices)
+                stations.extend(station_for(one.driver, one.wire_tags) for one in line.devices)
             return open_simulator(stations, line.wire, receiver)
 
         return simulated
