@@ -49,6 +49,7 @@ class _Station:
     driver: Listenable
     reads: dict[bytes, "_Read"] = field(default_factory=dict)  # by the bytes of the request
     last: Sequence[Tag] = ()  # learned from the last reply
+    before: "_Read | None" = None  # the read of the reply before
 
     def read(self, asked: Asked) -> "_Read":
         found = self.reads.get(asked.content)
@@ -58,13 +59,29 @@ class _Station:
             found = self.reads[asked.content] = _Read(self, asked)
         return found
 
+    def may_be_repeated(self, read: "_Read", data: Any) -> bool:
+        """Notes a reply. Returns True if it equals the reply to the read before, and is news.
+
+        A device server that repeats a reply makes one of it for the next request. Equal values at
+        two places come again with the next read, and count then.
+        """
+        before, self.before = self.before, read
+        equal = before is not None and before is not read and before.data == data
+        suspect = equal and data not in (read.learned, read.data)
+        read.data = data
+        if not suspect:
+            read.learned = data
+        return suspect
+
 
 class _Read:
     """The tags in one read, and their decoder."""
 
-    __slots__ = ("_decoder", "_learn", "stale_after", "tags")
+    __slots__ = ("_decoder", "_learn", "data", "learned", "stale_after", "tags")
 
     def __init__(self, station: _Station, asked: Asked) -> None:
+        self.data: Any = None  # of the last reply
+        self.learned: Any = None  # of the last reply that counted
         self.tags: list[Tag] = []
         self._learn: list[Learn] = []
         begins, units = list[int](), 0
@@ -149,6 +166,9 @@ class Listening:
         if asked.read is None or told.is_error:
             return
         read = station.read(asked)
+        if station.may_be_repeated(read, told.data):
+            self._pairing.not_answered(asked, now)
+            return
         if samples := read.samples(told.data, time):
             station.last = read.tags
             self._heard |= dict.fromkeys(read.tags, now)

@@ -126,10 +126,16 @@ class Pairing:
             self._open[asked.station] = kept
             self._keep(asked, at)
             return None
-        if older:  # one of these equal requests is still without a reply
+        if older:  # it may be the reply to the oldest of these equal requests
+            first = older[0][1]
+            self._open[asked.station] = [one for one in kept if one[1] > first]
             self._keep(asked, at)
         self._quiet = True
         return asked
+
+    def not_answered(self, asked: Asked, now: float) -> None:
+        """Takes back a pair: the reply was not that of the request, whose own may still arrive."""
+        self._keep(asked, now)
 
     def was_extra(self) -> bool:
         """Returns True if the last reply followed a paired one without a request between them.

@@ -97,6 +97,12 @@ def test_an_equal_request_is_answered_by_either_reply() -> None:
     assert paired((0.0, A), (0.6, A), (0.65, REPLY), (0.7, B), (0.75, REPLY)) == [b"a", None]
 
 
+def test_a_reply_that_may_be_the_first_of_equal_requests_ends_no_doubt_about_later_ones() -> None:
+    """Found by misleading traffic: A B A, and the reply to the first A."""
+    steps: list[Step] = [(0.0, LONGER), (0.1, A), (0.2, LONGER), (0.3, LONG_REPLY), (0.4, B)]
+    assert paired(*steps, (0.41, REPLY)) == [b"c", None]
+
+
 def test_after_noise_no_reply_is_certain_for_a_while() -> None:
     """It may have hidden a request."""
     steps: list[Step] = [(0.0, NOISE), (0.5, A), (0.6, REPLY), (1.1, LONGER), (1.2, LONG_REPLY)]

@@ -2187,6 +2187,20 @@ MUTANTS = (
         "tests/protocols/test_listening.py",
     ),
     Mutant(
+        "a repeated reply is learned as the reply to the next request",
+        "engine/listening.py",
+        "        suspect = equal and data",
+        "        suspect = False and data",
+        "tests/line/test_misleading_traffic.py",
+    ),
+    Mutant(
+        "a reply ends the doubt about requests after its own",
+        "protocols/listening.py",
+        "[one for one in kept if one[1] > first]",
+        "[]",
+        "tests/protocols/test_listening.py",
+    ),
+    Mutant(
         "values before a second reply stay good",
         "engine/listening.py",
         "            if self._pairing.was_extra():\n",
