@@ -123,7 +123,7 @@ def plan(lines: Sequence[LineForecast], *, every_block: bool) -> RenderableType:
     parts: list[RenderableType] = []
     for line in lines:
         parts.append(_line(line))
-        if every_block:
+        if every_block and (line.blocks or line.unsolicited):
             parts.append(_blocks(line))
         parts.append(Text())
     return Group(*parts)

@@ -7,9 +7,10 @@ from typing import Any, cast
 
 from gateway.engine.device import Device
 from gateway.engine.effects import Effects
+from gateway.engine.health import State
 from gateway.engine.jobs import Idle
 from gateway.engine.results import Results
-from gateway.errors import Evidence, Garbled
+from gateway.errors import Evidence, Garbled, Unclear
 from gateway.planning.wire_timing import WireTiming
 from gateway.protocols.driver import AnyDriver
 from gateway.protocols.listening import Asked, Learn, Listenable, Noise, Pairing, Told
@@ -191,11 +192,19 @@ class Listening:
                 del self._heard[tag]
                 detail = UNHEARD.format(limit=stale_after(tag))
                 self._effects.bad([tag], Reason.OVERDUE, time, detail)
-            if old and device.health.online and not any(tag in self._heard for tag in device.tags):
-                device.restart()
-                self._effects.online(device, False)
-                self._effects.warning("device offline", device=device.name, why=UNHEARD)
+            if old and not any(tag in self._heard for tag in device.tags):
+                self._went_silent(device, max(map(stale_after, device.tags)), now)
         self._look()
+
+    def _went_silent(self, device: Device, limit: float, now: float) -> None:
+        if device.health.state is State.OFFLINE:
+            return
+        was_online, why = device.health.online, UNHEARD.format(limit=limit)
+        device.health.unclear(Unclear(why), None, now)
+        device.health.gave_up(now, 1.0)
+        if was_online:
+            self._effects.online(device, False)
+        self._effects.warning("device offline", device=device.name, why=why)
 
     def _is_old(self, tag: Tag, now: float) -> bool:
         return tag in self._heard and self._heard[tag] + stale_after(tag) <= now

@@ -5,6 +5,7 @@ import math
 from gateway.engine.device import Device, DeviceSettings
 from gateway.engine.effects import Effect, OnlineChange, RequestEnded, Samples
 from gateway.engine.engine import Engine
+from gateway.engine.health import State
 from gateway.engine.jobs import Idle
 from gateway.engine.requests import Command, Write
 from gateway.errors import BadValue
@@ -102,7 +103,10 @@ def test_a_value_that_is_not_heard_any_more_turns_overdue() -> None:
     assert OnlineChange(heard.device, False) not in heard.effects
     assert [one.tag for one in heard.until(180.1)] == [SLOW]  # never heard at all
     assert OnlineChange(heard.device, False) in heard.effects
+    assert heard.device.state is State.OFFLINE
+    assert heard.device.diagnosis() == "not heard for 180 s: does the other master read it?"
     assert len(heard.hear(200.0, READ, REPLY)) == 2
+    assert (heard.device.state, heard.device.diagnosis()) == (State.ONLINE, "")
 
 
 def test_a_second_reply_turns_the_values_of_the_first_one_bad() -> None:
