@@ -232,9 +232,12 @@ class Engine:
 
     def received(self, data: bytes, now: float, time: int) -> list[Effect]:
         """Takes bytes that arrived outside of a transaction."""
-        self.record.unasked += len(data)
-        self._conclusions.shorter.disturbed(now)
-        self._stray.received(data, now, time)
+        if isinstance(self._unsolicited, Listening):
+            self.record.busy += len(data) * self.wire.character  # of another master
+        else:
+            self.record.unasked += len(data)
+            self._conclusions.shorter.disturbed(now)
+            self._stray.received(data, now, time)
         if self._unsolicited.speakers:
             self._conclusions.silence.heard()
         self._unsolicited.received(data, now, time)

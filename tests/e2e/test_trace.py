@@ -12,7 +12,7 @@ from tests.e2e.processes import plc_gateway, started, write_config
 from tests.zenoh_peer import Subscription, ZenohPeer, free_endpoint
 
 BAUD = 9600
-ENOUGH = 12  # values
+ENOUGH = 8  # values
 
 
 class Bus:
@@ -65,7 +65,7 @@ def values(heard: Subscription, device: str) -> list[int]:
 async def test_a_listen_only_line_learns_what_another_master_reads(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    bus, endpoint = Bus(), free_endpoint()
+    bus, endpoint, recording = Bus(), free_endpoint(), tmp_path / "recording"
     polled = await asyncio.start_server(bus.master, "127.0.0.1", 0)
     heard = await asyncio.start_server(bus.ear, "127.0.0.1", 0)
 
@@ -83,7 +83,7 @@ async def test_a_listen_only_line_learns_what_another_master_reads(
                 news = await client.subscribe("plant/**")
                 await news.until(lambda told: len(values(told, "copy")) >= ENOUGH)
                 [refused] = await client.get("plant/copy/count/@set", b"5")
-                record = "trace", config, "ear", "--for", "1s", "--record", tmp_path / "recording"
+                record = "trace", config, "ear", "--for", "600ms", "--record", recording
                 assert (await asyncio.to_thread(plc_gateway, *record)).code == 0
             assert gateway.end() == 0
     copied, polled_values = values(news, "copy"), values(news, "meter")
@@ -94,7 +94,7 @@ async def test_a_listen_only_line_learns_what_another_master_reads(
     assert not refused.ok
     assert "line ear is listen-only: the gateway sends nothing on it" in refused.json["reason"]
     assert bus.spoken == b""
-    replay([tmp_path / "recording"], config, check=True)
+    replay([recording], config, check=True)
     words = capsys.readouterr().out.splitlines()[-1].split()
-    assert int(words[0]) > 5
+    assert int(words[0]) > 2
     assert words[1:] == ["values", "as", "recorded,", "0", "others,", "0", "not", "learned"]

@@ -1717,8 +1717,8 @@ MUTANTS = (
     Mutant(
         "bytes that nothing asked for leave the silences short",
         "engine/engine.py",
-        "        self._conclusions.shorter.disturbed(now)\n        self._stray.received",
-        "        self._stray.received",
+        "            self._conclusions.shorter.disturbed(now)\n            self._stray.received",
+        "            self._stray.received",
         "tests/engine/test_shorter_silences.py",
     ),
     Mutant(
