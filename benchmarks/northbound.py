@@ -38,6 +38,7 @@ from gateway.alarms import Alarms
 from gateway.config import ZenohConfig, ZenohMode
 from gateway.engine.requests import CommandResult
 from gateway.line.duty import Duty
+from gateway.line.wire_log import WireLog
 from gateway.northbound import Northbound
 from gateway.northbound.session import configure
 from gateway.protocols.driver import Address, Span, Unit
@@ -73,6 +74,9 @@ class Plant:
 
     def devices(self) -> list[Device]:
         return self.made
+
+    def wire_logs(self) -> dict[str, WireLog]:
+        return {}
 
     def begin(self) -> None:
         pass

@@ -17,8 +17,9 @@ from gateway.engine.requests import WRITE_EXPIRY, CommandResult
 from gateway.errors import Busy, Offline
 from gateway.line.build import OpenPort, line_of, opener
 from gateway.line.duty import Duty
-from gateway.line.line import Line, Watcher
+from gateway.line.line import Line
 from gateway.line.serving import Serving
+from gateway.line.wire_log import WireLog
 from gateway.northbound.served_status import served_documents
 from gateway.northbound.status import Document, device_document, line_document, standing
 from gateway.serving.station import Station
@@ -150,12 +151,9 @@ class Gateway:
         """Adds a document of another part to the status."""
         self._documents[path] = document
 
-    def watch(self, line: str, watcher: Watcher | None) -> bool:
-        """Sets or removes the watcher of a line. False: there is no such line."""
-        found = [one for one in self.lines if one.engine.name == line]
-        for one in found:
-            one.watcher = watcher
-        return bool(found)
+    def wire_logs(self) -> Mapping[str, WireLog]:
+        polled = {line.engine.name: line.wire_log for line in self.lines}
+        return polled | {line.name: line.wire_log for line in self.serving.lines}
 
     @property
     def enabled_devices(self) -> Sequence[Device]:

@@ -136,7 +136,7 @@ def test_every_page_with_files_is_checked() -> None:
     assert set(counted) == {
         *("/README.md", "configuration.md", "vigor.md", "computer-link.md", "modbus.md"),
         *("first-plant.md", "import.md", "peek.md", "serve.md", "shaping.md", "systems.md"),
-        *("templates.md", "alarms.md"),
+        *("templates.md", "trace.md", "alarms.md"),
         *("tutorial-computer-link.md", "tutorial-modbus.md", "tutorial-vigor.md"),
     }
     assert sum(counted.values()) >= 11
@@ -523,6 +523,7 @@ def _example_keys() -> set[str]:
         *(key for name in devices for key in (keys.device(name), keys.block(name))),
         *(keys.status(f"devices/{name}") for name in devices),
         *(keys.status(f"lines/{line.name}") for line in config.lines),
+        *(keys.trace(line.name) for line in config.lines),
         *(keys.alive(name) for name in devices),
         *(
             keys.own,

@@ -22,10 +22,12 @@ from gateway.cli import (
     new,
     peek,
     read,
+    replay,
     run,
     scan_command,
     simulate,
     status,
+    trace,
     watch,
     write,
 )
@@ -111,6 +113,8 @@ cli.command()(simulate.simulate)
 cli.command()(status.status)
 cli.command()(status.health)
 cli.command()(alarms.alarms)
+cli.command()(trace.trace)
+cli.command()(replay.replay)
 cli.command()(backup.backup)
 cli.add_typer(history.cli, name="history")
 

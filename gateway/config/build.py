@@ -1,7 +1,7 @@
 """Builds the configuration from the data of the file, and notes every mistake."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from os.path import realpath
 from pathlib import Path as FilePath
 from typing import Any
@@ -147,8 +147,9 @@ class Builder:
             serial=serial,
             wire=wire,
             echo=line.echo,
+            listen_only=line.listen_only,
             serve=line.serve,
-            devices=tuple(devices),
+            devices=tuple(replace(one, listen_only=line.listen_only) for one in devices),
         )
 
     def _device(

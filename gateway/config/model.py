@@ -372,6 +372,8 @@ class LineSection(Section):
     """true: the port receives its own requests, as with some two-wire RS-485 converters."""
     serve: bool = False
     """true: the devices are stations of this gateway, and a master on the line asks them."""
+    listen_only: bool = False
+    """true: learns the values from another master's traffic, and sends nothing, ever."""
     defaults: dict[str, Any] = {}
     devices: dict[str, Any]
     """The devices on this line, by name."""

@@ -95,6 +95,7 @@ class LineConfig:
     wire: WireTiming
     echo: bool | None  # the port receives its own requests; None: unknown
     serve: bool = False  # a master on the line asks, and the devices are stations of the gateway
+    listen_only: bool = False  # another master owns the wire: nothing is ever sent
     devices: tuple[DeviceSettings, ...]
 
     @property

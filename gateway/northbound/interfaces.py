@@ -9,6 +9,7 @@ from gateway.history.buckets import Bucket
 from gateway.history.course import Now
 from gateway.history.question import Question
 from gateway.line.duty import Duty
+from gateway.line.wire_log import WireLog
 from gateway.tags import Sample, Tag, WriteResult
 from gateway.tags.recorded import Recorded, RecordedQuery
 from gateway.values import Value
@@ -28,7 +29,14 @@ class Device(Protocol):
         """True: each scan is also published as one `@block`. "only": single values are not."""
 
 
-class Plant(Protocol):
+class Lines(Protocol):
+    """The lines of the plant."""
+
+    def wire_logs(self) -> Mapping[str, WireLog]:
+        """Returns the wire logs by line."""
+
+
+class Plant(Lines, Protocol):
     """The devices, their samples, writes and commands. All but `sample` on the event loop."""
 
     @property

@@ -12,6 +12,7 @@ declared for a single device, tag or command below `<prefix>/`: the wildcards be
     <prefix>/@gateway/<name>/…          state and statistics, the outcome of every write
     <prefix>/@gateway/<name>/alarms/…   its alarms
     <prefix>/@gateway/<name>/alive/…    liveliness tokens of its devices
+    <prefix>/@gateway/<name>/lines/<line>/@trace    the exchanges of a line, while it is watched
     <prefix>/@gateway/<name>/page     the last reply to a query with `page`
     <prefix>/@gateway/<name>/claim/…    its claim to its devices: a document, and a token
     <prefix>/@standby/<group>/…         liveliness tokens of the gateways of a standby group
@@ -184,6 +185,11 @@ class Keys:
     def to_all(self, line: str) -> str:
         """A command to every station of a line."""
         return f"{self.own}/lines/{line}/global"
+
+    def trace(self, line: str) -> str:
+        """The exchanges of a line. No wildcard matches it: a client of all status keys must not
+        start the traces of all lines."""
+        return f"{self.own}/lines/{line}/@trace"
 
     def block(self, device: str) -> str:
         return f"{self.prefix}/{device}/@block"

@@ -36,6 +36,7 @@ from gateway.northbound.session import (
 from gateway.northbound.standby import GroupSettings
 from gateway.northbound.status_publisher import StatusPublisher
 from gateway.northbound.tag_index import TagIndex
+from gateway.northbound.traces import Traces
 from gateway.northbound.watchdog import Watchdog
 from gateway.northbound.writers import Writers
 from gateway.tags import Sample, WriteResult
@@ -232,6 +233,8 @@ class Northbound:
             self._plant.begin()
             self._incoming.begin()
             self._declared += await off_loop(self._declare_plant, declarations)
+            traces = Traces(self.keys, self._plant, self._publisher.document)
+            self._declared += await off_loop(traces.declare, session, traces.inbox())
             await self._republisher.publish_all()
             self._status.publish()
             self.opened.set()

@@ -5,15 +5,14 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from gateway.alarms import Alarms
-from gateway.line.line import Watcher
-from gateway.northbound.interfaces import Device, History
+from gateway.northbound.interfaces import Device, History, Lines
 from gateway.northbound.payload import Failure
 from gateway.tags import Sample, Tag, WriteResult
 
 Documents = Mapping[str, Mapping[str, Any]]  # by path: `status`, `lines/hall-1`, `devices/mixer`
 
 
-class Plant(Protocol):
+class Plant(Lines, Protocol):
     """The devices and their samples."""
 
     @property
@@ -26,9 +25,6 @@ class Plant(Protocol):
 
     def sample(self, tag: Tag) -> Sample:
         """Returns the current sample; any thread may call it."""
-
-    def watch(self, line: str, watcher: Watcher | None) -> bool:
-        """Sets or removes the watcher of a line. False: there is no such line."""
 
 
 class North(Protocol):

@@ -9,6 +9,7 @@ from gateway.engine.device import Device
 from gateway.engine.engine import Engine
 from gateway.engine.health import State
 from gateway.engine.unanswered import LONGEST_WAIT
+from gateway.engine.unsolicited import UnsolicitedFrames
 from gateway.line.line import Line
 from gateway.planning.bad_addresses import RETRIES
 from gateway.protocols.frames import FrameDriver
@@ -205,7 +206,8 @@ class Expectations:
         requests = len(schedule.requests.waiting)
         if requests > 4 * len(engine.devices):
             broke(f"{name}: {requests} requests wait")
-        if (replies := len(engine._unsolicited._replies)) > 4:
+        frames = engine._unsolicited
+        if isinstance(frames, UnsolicitedFrames) and (replies := len(frames._replies)) > 4:
             broke(f"{name}: {replies} replies wait")
 
     def _look_at_ages(self) -> None:

@@ -14,6 +14,7 @@ import zenoh
 from gateway.cli.client.arguments import matches, tags_by_key
 from gateway.cli.client.rows import Row, document, raw, reason, without_gateway
 from gateway.cli.client.signing import signature
+from gateway.cli.client.tracing import traced
 from gateway.cli.client.value_pages import paged
 from gateway.config import Config
 from gateway.config.commands import TO_ALL
@@ -121,6 +122,12 @@ class Client:
         key = self._keys.alarm(alarm)
         status = self._keys.status("status")
         return self._request(key, json.dumps({"by": by}).encode(), status)
+
+    def trace(self, line: str, until: float | None) -> Iterator[dict[str, Any]]:
+        """Yields the trace of a line, in parts. Raises `GatewayError` if nobody serves it."""
+        session, keys = self._session, self._keys
+        served = partial(self.status, f"lines/{line}")
+        return traced(session, keys, line, until, served, self._tell)
 
     def write(self, tag: str, value: Value) -> dict[str, object]:
         """Returns the outcome as the gateway sends it: `value ...` or `error ...`.
