@@ -47,16 +47,11 @@ def check(
         lines = app.forecasts(loaded, report)
     few = sum(len(line.blocks) for line in lines) <= 100
     out.print(plan(lines, every_block=few if blocks is None else blocks))
-    for served in (line for line in loaded.lines if line.serve):
-        out.print(served_plan(served))
-    for sentence in _listening(loaded):
+    for sentence in (*_served(loaded), *_listening(loaded)):
         out.print(sentence)
     for note in _notes(loaded):
         err.print(f"note: {note}")
-    for line in lines:
-        if line.overloaded:
-            err.print(f"warning: {line.advice()}")
-    for warning in warnings:
+    for warning in (*(line.advice() for line in lines if line.overloaded), *warnings):
         err.print(f"warning: {warning}")
     if unwritable := list(_unwritable(loaded)):
         for sentence in unwritable:
@@ -65,6 +60,11 @@ def check(
     print(f"{config}: good, {size(loaded)}")
     if strict and any(line.overloaded for line in lines):
         sys.exit(FAILED)
+
+
+def _served(config: Config) -> Iterator[object]:
+    """Yields what masters may read and write on the lines that answer."""
+    yield from (served_plan(line) for line in config.lines if line.serve)
 
 
 def _listening(config: Config) -> Iterator[str]:
