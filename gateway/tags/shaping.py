@@ -1,4 +1,4 @@
-"""What a tag makes of its raw value besides scale and offset, both ways; and names of numbers."""
+"""Shapes a raw value besides scale and offset, in both directions; and names numbers."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
