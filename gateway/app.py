@@ -157,15 +157,17 @@ class Gateway:
 
     def samples(self, samples: Sequence[Sample]) -> None:
         changed = self.mirror.update(samples)
-        if self.serving.remembers:
+        if self.serving.remembering:
             self.serving.remember(samples)
         if self._waiting:
             for sample in samples:
                 if sample.tag in self._waiting:
                     self._answer(sample)
+        if self.mirror.derives and (changed or self.mirror.pending):
+            changed = self.mirror.follow(changed)
+            if self.serving.remembering:
+                self.serving.remember(changed)
         if changed:
-            if self.mirror.dependents:
-                changed = [*changed, *self.mirror.computed_after(changed)]
             self._publish(changed)
 
     def online(self, device: Device | Station, online: bool) -> None:
@@ -234,7 +236,7 @@ class Gateway:
 
         The age is monotonic time: a change of the system clock must not change it.
         """
-        if tag.formula is not None:
+        if tag.inputs:
             return all(self.is_fresh(one, max_age) for one in tag.inputs)
         poll = self._poll(tag)
         if poll is None or not self._places[tag.device][0].engine.is_open:
@@ -249,7 +251,7 @@ class Gateway:
         Several clients share one read. The sample is bad if the device does not answer. Raises
         `Busy` if the line had no time for the read.
         """
-        if tag.formula is not None:
+        if tag.inputs:
             await asyncio.gather(*(self.fresh(one, max_age) for one in tag.inputs))
             return self.mirror[tag]
         poll = self._poll(tag)

@@ -102,6 +102,7 @@ async def _serve(
     state_file = None if config.state_file is None else StateFile(config.state_file)
     if state_file is not None:
         state_file.restore(gateway.enabled_devices)
+        gateway.mirror.restore(state_file.counters)
     gateway.subscribe(northbound)
     if history is not None:  # clients may have missed what was published
         gateway.subscribe(_Recording(history))
@@ -230,14 +231,16 @@ async def _saved(state_file: StateFile, gateway: Gateway) -> AsyncIterator[None]
     try:
         yield
     finally:
-        state_file.save_last(state_file.snapshot(gateway.enabled_devices))
+        counters = gateway.mirror.counters()
+        state_file.save_last(state_file.snapshot(gateway.enabled_devices, counters))
         await _end([saving])
 
 
 async def _save_regularly(state_file: StateFile, gateway: Gateway) -> None:
     while True:
         await asyncio.sleep(SAVE_EVERY)
-        state_file.save_soon(state_file.snapshot(gateway.enabled_devices))
+        counters = gateway.mirror.counters()
+        state_file.save_soon(state_file.snapshot(gateway.enabled_devices, counters))
 
 
 async def _close(

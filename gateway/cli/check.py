@@ -13,12 +13,13 @@ from gateway import app, northbound
 from gateway.cli.progress import progress
 from gateway.cli.served_plan import served_plan
 from gateway.cli.terminal import FAILED, ConfigPath, err, out
-from gateway.config import Config, load, state_folder
+from gateway.config import Config, expanded_text, load, state_folder
 from gateway.engine.forecast import LineForecast
 from gateway.engine.listening import why_not_learned
 from gateway.history.place import trouble
 from gateway.planning.planner import describe
 from gateway.planning.wire_timing import NETWORK_BAUD, WireTiming
+from gateway.tags.tag import CounterRule
 from gateway.web import exposure
 
 
@@ -31,18 +32,23 @@ def check(
     strict: Annotated[
         bool, typer.Option("--strict", help="End with 1 if a line is overloaded.")
     ] = False,
+    expand: Annotated[
+        bool, typer.Option("--expand", help="Print the file with its templates expanded instead.")
+    ] = False,
 ) -> None:
     """Validate the file and print the plan of each line. Sends nothing."""
+    if expand:
+        load(config)
+        print(expanded_text(config), end="")
+        return
     with progress(err) as report:
         loaded = load(config, report)
         warnings = northbound.check(loaded) + exposure.check(loaded)
         lines = app.forecasts(loaded, report)
     few = sum(len(line.blocks) for line in lines) <= 100
     out.print(plan(lines, every_block=few if blocks is None else blocks))
-    for served in (line for line in loaded.lines if line.serve):
-        out.print(served_plan(served))
-    for sentence in _listening(loaded):
-        out.print(sentence)
+    for part in _without_polls(loaded):
+        out.print(part)
     for note in _notes(loaded):
         err.print(f"note: {note}")
     for line in lines:
@@ -59,8 +65,9 @@ def check(
         sys.exit(FAILED)
 
 
-def _listening(config: Config) -> Iterator[str]:
-    """Yields which tags of the listen-only lines can be learned."""
+def _without_polls(config: Config) -> Iterator[RenderableType]:
+    """Yields the served lines, and which tags of the listen-only lines can be learned."""
+    yield from (served_plan(line) for line in config.lines if line.serve)
     for line in config.lines:
         if not line.listen_only:
             continue
@@ -87,12 +94,18 @@ def _notes(config: Config) -> Iterator[str]:
                 "the word back; changes by the PLC in between are lost"
             )
     for tag in tags:
-        if (limit := tag.exact_below) is not None:
+        if tag.kept is None and (limit := tag.exact_below) is not None:
             yield (
                 f"{tag.key} ({tag.text}): a JSON number has 53 bits. Beyond {limit:.4g}"
                 " either way two values of the device can look equal, and a write can be one"
                 " step off"
             )
+    totals = [tag.key for tag in tags if isinstance(tag.kept, CounterRule)]
+    if totals and config.state_file is None:
+        yield (
+            f"{', '.join(totals[:5])}: a total begins again at each start of the gateway: "
+            "write `state: state.json` below `gateway:`"
+        )
     for sheet in config.sheets:
         yield from (f"{sheet.file.name}: {note}" for note in sheet.notes)
 

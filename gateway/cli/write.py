@@ -40,6 +40,8 @@ def write(
     if target is None:
         raise ConfigError(f"there is no tag {tag} in {config}{suggestion(tag, known)}")
     if target.write is None:
+        if target.inputs:
+            raise ConfigError(f"{tag} cannot be written: its value follows from other reads")
         raise ConfigError(f"{tag} cannot be written: it has no `write: true` in {config}")
     parsed = _parsed(value, target)
     try:

@@ -7,7 +7,7 @@ from pathlib import Path as FilePath
 from typing import Any
 
 from gateway.config import parsers
-from gateway.config.computed_tags import with_computed
+from gateway.config.computed_tags import check_totals, with_computed
 from gateway.config.device_tags import DeviceTags, mapping
 from gateway.config.line_rules import check_line, line_wire
 from gateway.config.messages import Mistakes, Path, meant, shown
@@ -29,10 +29,10 @@ from gateway.config.records import (
 from gateway.config.served import (
     ServedDevice,
     ServedView,
+    check_retained,
     check_served_line,
     check_sources,
     only_served,
-    retained,
 )
 from gateway.config.sheet_tags import SheetTags
 from gateway.config.tag_rules import inherit
@@ -87,10 +87,12 @@ class Builder:
             self.mistakes.add(("lines",), "no lines: a gateway has at least one")
         lines = with_computed(lines, self._tags.computed, self.mistakes)
         self._check_ports(lines, raw_lines)
+        if top is not None and top.gateway.standby is not None:
+            check_totals(lines, self.mistakes)
         check_sources(lines, self.mistakes)
         if top is None:
             return None
-        self._check_retain(top, lines)
+        check_retained(lines, self._state_file(top), top.gateway.standby, self.mistakes)
         self._check_history(top)
         return Config(
             name=top.gateway.name,
@@ -259,15 +261,6 @@ class Builder:
                 f"history is kept in {top.history.path}: two files are needed, such as "
                 "history.db and state.json",
             )
-
-    def _check_retain(self, top: FileSection, lines: list[LineConfig]) -> None:
-        why = ""
-        if self._state_file(top) is None:
-            why = "the gateway has no file for it: write `gateway: {state: state.json}`"
-        elif top.gateway.standby is not None:
-            why = "a standby would answer with the values of its own file, which are old"
-        for place in retained(lines) if why else ():
-            self.mistakes.add((*place, "retain"), why)
 
     def _zenoh(self, top: FileSection) -> ZenohConfig:
         found, own = top.zenoh, ("zenoh",)

@@ -1,6 +1,6 @@
 """Makes computed tags: finds the inputs of their formulas, and loops."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -14,6 +14,7 @@ from gateway.errors import ConfigError
 from gateway.protocols.driver import Address, Span, Unit
 from gateway.tags import Tag
 from gateway.tags.formula import Formula
+from gateway.tags.tag import CounterRule
 from gateway.values import Kind, Layout, ValueType
 
 if TYPE_CHECKING:
@@ -131,3 +132,17 @@ class _Maker:
             formula=Formula(own.computed, parsed.term, whole),
             inputs=tuple(inputs),
         )
+
+
+def check_totals(lines: Sequence[LineConfig], mistakes: Mistakes) -> None:
+    """Notes totals in a standby group: each of its gateways would have another one."""
+    for line in lines:
+        for device in line.devices:
+            for tag in device.tags:
+                if isinstance(tag.kept, CounterRule):
+                    place = ("lines", line.name, "devices", device.name, "tags", tag.name)
+                    mistakes.add(
+                        (*place, "counter"),
+                        "a total is kept by one gateway, and this one has a standby: remove "
+                        "counter, and count in the PLC",
+                    )

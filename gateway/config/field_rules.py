@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import replace
 
+from gateway.config.kept_rules import kept_tag
 from gateway.config.messages import Mistakes
 from gateway.config.model import TagDefaults, WriteSection
 from gateway.config.tag_rules import (
@@ -43,7 +44,7 @@ def field_tag(
     if tag.event:
         tag = replace(tag, publish=Publish.ALWAYS, heartbeat=None)
     check_bounds(source, tag, mistakes)
-    return tag
+    return kept_tag(source.own, settings, tag, source.path, mistakes)
 
 
 def _write(

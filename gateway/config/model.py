@@ -341,6 +341,10 @@ class FileSection(Section):
     writers: WritersSection | None = None
     history: HistorySection | None = None
     web: WebSection | None = None
+    templates: dict[str, Any] = {}
+    """Devices with parameters, which devices `use`: docs/templates.md."""
+    templates_from: str | list[str] = []
+    """Files with more templates."""
     defaults: dict[str, Any] = {}
     lines: dict[str, Any]
     """The lines, by name."""

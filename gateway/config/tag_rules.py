@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from gateway.config.kept_rules import kept_tag
 from gateway.config.messages import Mistakes, Path
 from gateway.config.model import ComputedSection, TagDefaults, TagSection, WriteSection
 from gateway.config.shaping_rules import shaping_of
@@ -72,7 +73,7 @@ def build_tag(source: TagSource, driver: AnyDriver, mistakes: Mistakes) -> Tag |
     layout = _layout(source, settings, driver, area, kind)
     tag = assemble(source, settings, address, span, area.unit, layout, write, mistakes)
     check_bounds(source, tag, mistakes)
-    return tag
+    return kept_tag(source.own, settings, tag, source.path, mistakes)
 
 
 def address_of(source: TagSource, driver: AnyDriver, mistakes: Mistakes) -> Address | None:

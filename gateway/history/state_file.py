@@ -2,7 +2,7 @@
 
 It holds the addresses that each device refuses and the places where its requests must be split, so
 that the search for them is made once and not after every start. Without the file, or with a
-damaged one, the search is made again.
+damaged one, the search is made again. It also holds the totals of counters, which then begin again.
 """
 
 import os
@@ -18,16 +18,19 @@ import structlog
 from gateway.engine.device import Device
 from gateway.planning.bad_addresses import KnownBad
 from gateway.protocols.driver import Span
+from gateway.tags.kept import CounterState
 
 log = structlog.get_logger("gateway")
 FORMAT = 1
 LATEST = 2**63 - 1  # ns since 1970: the year 2262
+_Content = tuple[Mapping[str, KnownBad], Mapping[str, CounterState]]
 
 
 class StateFile:
     """One file, and a thread that writes it, so that a stalled disk delays nothing else."""
 
     def __init__(self, path: Path) -> None:
+        self.counters: Mapping[str, CounterState] = {}  # by tag, as `restore` has read them
         self._path = path
         self._saved: bytes | None = None
         self._trouble: str | None = None
@@ -41,19 +44,24 @@ class StateFile:
 
         Moves a file aside that cannot be parsed.
         """
-        learned_by_name = self._load()
+        learned_by_name, self.counters = self._load()
         for device in devices:
             if (learned := learned_by_name.get(device.name)) is not None:
                 device.bad_addresses.restore(learned, device.tags)
                 if device.blocks:
                     device.plan()
 
-    def snapshot(self, devices: Iterable[Device]) -> bytes:
+    def snapshot(
+        self, devices: Iterable[Device], counters: Mapping[str, CounterState] | None = None
+    ) -> bytes:
         """Returns the content of the file for the present state of the devices."""
         return orjson.dumps(
             {
                 "form": FORMAT,
                 "devices": {d.name: _to_json(d.bad_addresses.known()) for d in devices},
+                "counters": {
+                    key: list(state) for key, state in {**self.counters, **(counters or {})}.items()
+                },
             },
             option=orjson.OPT_INDENT_2 | orjson.OPT_SORT_KEYS,
         )
@@ -105,19 +113,19 @@ class StateFile:
 
     # -- loading --
 
-    def _load(self) -> Mapping[str, KnownBad]:
+    def _load(self) -> _Content:
         try:
             data = self._path.read_bytes()
         except FileNotFoundError:
-            return {}
+            return {}, {}
         except OSError as error:
             log.warning("state file not read", file=str(self._path), why=str(error))
-            return {}
+            return {}, {}
         try:
             return _parse(orjson.loads(data))
         except (ValueError, TypeError, KeyError, AttributeError) as error:
             self._move_aside(repr(error))
-            return {}
+            return {}, {}
 
     def _move_aside(self, why: str) -> None:
         aside = self._path.with_name(self._path.name + ".bad")
@@ -129,10 +137,15 @@ class StateFile:
             log.warning("state file damaged", file=str(self._path), why=why, moved_to=str(aside))
 
 
-def _parse(document: Mapping[str, Any]) -> dict[str, KnownBad]:
+def _parse(document: Mapping[str, Any]) -> _Content:
     if document["form"] != FORMAT:
         raise ValueError(f"form {document['form']} is not {FORMAT}")
-    return {name: _from_json(entry) for name, entry in document["devices"].items()}
+    devices = {name: _from_json(entry) for name, entry in document["devices"].items()}
+    counters = {
+        str(key): CounterState(int(last), int(total))
+        for key, (last, total) in document.get("counters", {}).items()
+    }
+    return devices, counters
 
 
 def _to_json(learned: KnownBad) -> dict[str, object]:

@@ -55,6 +55,13 @@ class WriteRule:
     latest: bool = False  # of several waiting writes only the latest is sent
 
 
+class CounterRule(NamedTuple):
+    """A counter has the values below `modulus`; a step of more than `most` is no count."""
+
+    modulus: int
+    most: int
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Tag:
     """One value of one device: its address, type, interval and rules."""
@@ -82,7 +89,12 @@ class Tag:
     shaping: Shaping | None = None
     names: Names | None = None
     formula: Formula | None = None  # of a computed tag: no address, read or write
-    inputs: tuple["Tag", ...] = ()  # of the formula, in its order
+    kept: float | CounterRule | None = (
+        None  # seconds that a bit must stay, or the rule of a counter
+    )
+    # Of the formula, in its order; of a kept value the one tag with its reads. These are the tags
+    # of another tag's value: this tag is not read itself.
+    inputs: tuple["Tag", ...] = ()
     part: Part | None = field(init=False, repr=False)  # of its word; None: whole words
     # From the unit of the span to the value, or from its units if it has several.
     convert: Decode = field(init=False, repr=False)
@@ -95,6 +107,9 @@ class Tag:
     def _decoder(self, shaping: Shaping | None) -> Decode:
         if self.formula is not None:
             return with_shaping(self.formula.value, shaping)
+        if self.kept is not None:
+            counter = isinstance(self.kept, CounterRule)  # the reads of a bit are inverted already
+            return field_decoder(self.layout, self._line, shaping if counter else None)
         if self.shape is not None:
             return field_decoder(self.layout, self._line, shaping)
         bit = self.address.bit
@@ -112,6 +127,9 @@ class Tag:
             object.__setattr__(twin, slot, getattr(self, slot))
         object.__setattr__(twin, "device", device)
         object.__setattr__(twin, "name", name)
+        if self.inputs:
+            inputs = tuple(one.copy(device, name) for one in self.inputs)
+            object.__setattr__(twin, "inputs", inputs)
         return twin
 
     @property

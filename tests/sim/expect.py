@@ -86,6 +86,13 @@ class Expectations:
                 if episode.kind == "stall":
                     continue  # unsolicited frames continue
                 limit = 10 * every + 2 * longest + 1.0
+            if isinstance(bus.wire, SimNet) and any(
+                other.device not in ("", device.name)
+                and other.start < episode.start + limit
+                and episode.start < other.end + LONGEST_WAIT
+                for other in bus.episodes
+            ):
+                limit += LONGEST_WAIT  # a request to that device may hold this one up, in a bridge
             if gone:  # refused twice, then found by halving
                 limit += 3 * load * every + 8 * longest
                 if self._unwell(episode.line, device.name, episode.start - LONGEST_PAUSE, limit):
@@ -147,6 +154,8 @@ class Expectations:
         if (sample.quality is Quality.GOOD) is not station.lacks(tag):
             return
         if not station.lacks(tag) and self._passing(tag, judge.began + episode.end):
+            return
+        if sample.reason is Reason.OVERDUE and self.times(self.judge.buses[tag.device].line)[1] > 1:
             return
         judge.broke(
             f"{tag.key} is {sample.quality.value} ({sample.reason}: {sample.detail}) "
