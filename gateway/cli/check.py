@@ -71,15 +71,11 @@ def _without_polls(config: Config) -> Iterator[RenderableType]:
     for line in config.lines:
         if not line.listen_only:
             continue
-        reasons = {
-            tag.key: why
-            for device in line.devices
-            for tag in device.tags
-            if (why := why_not_learned(device.driver, tag))
-        }
+        tags = [(device.driver, tag) for device in line.devices for tag in device.wire_tags]
+        reasons = {tag.key: why for driver, tag in tags if (why := why_not_learned(driver, tag))}
         yield (
-            f"line {line.name} only listens: {len(line.tags) - len(reasons)} of "
-            f"{_counted(len(line.tags), 'tag')} can be learned, when another master reads them"
+            f"line {line.name} only listens: {len(tags) - len(reasons)} of "
+            f"{_counted(len(tags), 'tag')} can be learned, when another master reads them"
         )
         yield from (f"  {key} cannot: {why}" for key, why in reasons.items())
 
