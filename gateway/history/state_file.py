@@ -30,7 +30,7 @@ class StateFile:
     """One file, and a thread that writes it, so that a stalled disk delays nothing else."""
 
     def __init__(self, path: Path) -> None:
-        self.counters: Mapping[str, CounterState] = {}  # by tag, as `restore` has read them
+        self.counters: Mapping[str, CounterState] = {}  # as `restore` has read them
         self._path = path
         self._saved: bytes | None = None
         self._trouble: str | None = None
