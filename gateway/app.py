@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import NamedTuple, Protocol
 
 from gateway import __version__
+from gateway.alarms import Alarms
+from gateway.alarms.watched import watch
 from gateway.config import Config, LineConfig
 from gateway.config.commands import check_command, every_command, speaker
 from gateway.engine.device import Device, DeviceSettings
@@ -15,13 +17,15 @@ from gateway.engine.requests import WRITE_EXPIRY, CommandResult
 from gateway.errors import Busy, Offline
 from gateway.line.build import OpenPort, line_of, opener
 from gateway.line.duty import Duty
-from gateway.line.line import Line, Watcher
+from gateway.line.line import Line
 from gateway.line.serving import Serving
+from gateway.line.wire_log import WireLog
 from gateway.northbound.served_status import served_documents
 from gateway.northbound.status import Document, device_document, line_document, standing
 from gateway.serving.station import Station
 from gateway.tags import Quality, Reason, Sample, Tag, WriteResult, bad
 from gateway.tags.mirror import Mirror
+from gateway.tags.scan import Scan
 from gateway.tags.timestamps import rfc3339
 from gateway.values import Value
 
@@ -89,9 +93,12 @@ class Gateway:
         self._places: dict[str, tuple[Line, Device]] = {}
         self._forecasts: dict[str, LineForecast] = {}
         self._waiting: dict[Tag, list[_Reader]] = {}
+        self.alarms = Alarms(self._tags.values(), wall)
+        self.add_document("alarms", self.alarms.counts)
         self.serving = Serving(config, self, self._find_sample, wall=wall, duty=self.duty)
         for seed, line in enumerate(config.lines):
             self._add_line(line, open_line(line), seed)
+        watch(self.alarms, self.lines, config.alarms)
         if plan_now:
             for made in self.lines:
                 self.planned(made, self.plan(made))
@@ -144,12 +151,9 @@ class Gateway:
         """Adds a document of another part to the status."""
         self._documents[path] = document
 
-    def watch(self, line: str, watcher: Watcher | None) -> bool:
-        """Sets or removes the watcher of a line. False: there is no such line."""
-        found = [one for one in self.lines if one.engine.name == line]
-        for one in found:
-            one.watcher = watcher
-        return bool(found)
+    def wire_logs(self) -> Mapping[str, WireLog]:
+        polled = {line.engine.name: line.wire_log for line in self.lines}
+        return polled | {line.name: line.wire_log for line in self.serving.lines}
 
     @property
     def enabled_devices(self) -> Sequence[Device]:
@@ -159,6 +163,8 @@ class Gateway:
 
     def samples(self, samples: Sequence[Sample]) -> None:
         changed = self.mirror.update(samples)
+        if self.alarms.of_tags and not (type(samples) is Scan and samples.latest.alarmed == ()):
+            self.alarms.judge(samples)
         if self.serving.remembering:
             self.serving.remember(samples)
         if self._waiting:
@@ -167,6 +173,8 @@ class Gateway:
                     self._answer(sample)
         if self.mirror.derives and (changed or self.mirror.pending):
             changed = self.mirror.follow(changed)
+            if self.alarms.of_tags:
+                self.alarms.judge([sample for sample in changed if sample.tag.inputs])
             if self.serving.remembering:
                 self.serving.remember(changed)
         if changed:

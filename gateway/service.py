@@ -11,6 +11,7 @@ from typing import Any
 
 import structlog
 
+from gateway.alarms.file import AlarmFile
 from gateway.app import Gateway
 from gateway.config import Config
 from gateway.errors import GatewayError
@@ -103,6 +104,8 @@ async def _serve(
     if state_file is not None:
         state_file.restore(gateway.enabled_devices)
         gateway.mirror.restore(state_file.counters)
+    alarm_file = AlarmFile(config.alarms.path, gateway.alarms)
+    gateway.add_document("clock", clock.document)
     gateway.subscribe(northbound)
     if history is not None:  # clients may have missed what was published
         gateway.subscribe(_Recording(history))
@@ -112,7 +115,7 @@ async def _serve(
         cleanup.callback(clock.stop)
         plans = _plan_lines(gateway, cleanup)
         zenoh = asyncio.create_task(northbound.run(), name="zenoh")
-        cleanup.push_async_callback(_close, zenoh, history, state_file)
+        cleanup.push_async_callback(_close, zenoh, history, state_file, alarm_file)
         exclusive, active, opened, replaced, stopping = events = [
             asyncio.create_task(event.wait())
             for event in (
@@ -137,6 +140,7 @@ async def _serve(
             await _first(active, zenoh, stopping, replaced)
             if active.done():
                 supervisor.says(f"serving {len(config.devices)} devices")
+                await cleanup.enter_async_context(alarm_file.kept())
                 lines = await _start_lines(gateway, plans, history, state_file, cleanup)
         await _first(opened, zenoh, stopping, replaced)
         if opened.done():
@@ -244,7 +248,10 @@ async def _save_regularly(state_file: StateFile, gateway: Gateway) -> None:
 
 
 async def _close(
-    zenoh: asyncio.Task[None], history: Historian | None, state_file: StateFile | None
+    zenoh: asyncio.Task[None],
+    history: Historian | None,
+    state_file: StateFile | None,
+    alarm_file: AlarmFile,
 ) -> None:
     """Ends Zenoh, then the files: they keep the last outcomes too.
 
@@ -258,9 +265,10 @@ async def _close(
             left = by - time.monotonic()
             if not await asyncio.to_thread(history.close, left):
                 log.error("history close timed out", so="samples that are not on disk are lost")
-        if state_file is not None:
+        closes = [alarm_file.close] if state_file is None else [alarm_file.close, state_file.close]
+        for close in closes:
             left = min(STATE_FILE_WITHIN, by - time.monotonic())
-            if not await asyncio.to_thread(state_file.close, left):
+            if not await asyncio.to_thread(close, left):
                 log.warning("state file close timed out", so="the last changes are not saved")
 
 

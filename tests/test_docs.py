@@ -136,7 +136,7 @@ def test_every_page_with_files_is_checked() -> None:
     assert set(counted) == {
         *("/README.md", "configuration.md", "vigor.md", "computer-link.md", "modbus.md"),
         *("first-plant.md", "import.md", "peek.md", "serve.md", "shaping.md", "systems.md"),
-        "templates.md",
+        *("templates.md", "trace.md", "alarms.md"),
         *("tutorial-computer-link.md", "tutorial-modbus.md", "tutorial-vigor.md"),
     }
     assert sum(counted.values()) >= 11
@@ -206,6 +206,8 @@ DEFAULTS_OF_PROTOCOLS = table("configuration-protocols.md", "Defaults of the pro
 def settings(heading: str) -> dict[str, str]:
     """The settings of a section with the defaults that its page names."""
     page = "configuration-protocols.md" if heading in PROTOCOLS else "configuration.md"
+    if heading in ("alarm", "alarms"):
+        page = "alarms.md"
     rows = table(page, heading, "setting")
     if heading == "A tag":
         rows += table("shaping.md", "Settings", "setting")
@@ -236,6 +238,7 @@ def properties(*names: str) -> set[str]:
     [
         *(("gateway", "GatewaySection"), ("zenoh", "ZenohSection"), ("tls", "TlsSection")),
         *(("writers", "WritersSection"), ("history", "HistorySection")),
+        *(("alarm", "AlarmSection"), ("alarms", "AlarmsSection")),
         *(("web", "WebSection"), ("A line", "Line"), ("A tag", "Tag"), ("write", "WriteSection")),
     ],
 )
@@ -520,8 +523,16 @@ def _example_keys() -> set[str]:
         *(key for name in devices for key in (keys.device(name), keys.block(name))),
         *(keys.status(f"devices/{name}") for name in devices),
         *(keys.status(f"lines/{line.name}") for line in config.lines),
+        *(keys.trace(line.name) for line in config.lines),
         *(keys.alive(name) for name in devices),
-        *(keys.own, keys.status("status"), keys.writes, keys.page),
+        *(
+            keys.own,
+            keys.status("alarms"),
+            keys.alarm("**"),
+            keys.status("status"),
+            keys.writes,
+            keys.page,
+        ),
         *(
             keys.command(name, command)
             for name, commands in every_command(config).items()

@@ -15,6 +15,7 @@ from gateway.cli.served_plan import served_plan
 from gateway.cli.terminal import FAILED, ConfigPath, err, out
 from gateway.config import Config, expanded_text, load, state_folder
 from gateway.engine.forecast import LineForecast
+from gateway.engine.listening import why_not_learned
 from gateway.history.place import trouble
 from gateway.planning.planner import describe
 from gateway.planning.wire_timing import NETWORK_BAUD, WireTiming
@@ -48,6 +49,8 @@ def check(
     out.print(plan(lines, every_block=few if blocks is None else blocks))
     for served in (line for line in loaded.lines if line.serve):
         out.print(served_plan(served))
+    for sentence in _listening(loaded):
+        out.print(sentence)
     for note in _notes(loaded):
         err.print(f"note: {note}")
     for line in lines:
@@ -62,6 +65,24 @@ def check(
     print(f"{config}: good, {size(loaded)}")
     if strict and any(line.overloaded for line in lines):
         sys.exit(FAILED)
+
+
+def _listening(config: Config) -> Iterator[str]:
+    """Yields which tags of the listen-only lines can be learned."""
+    for line in config.lines:
+        if not line.listen_only:
+            continue
+        reasons = {
+            tag.key: why
+            for device in line.devices
+            for tag in device.tags
+            if (why := why_not_learned(device.driver, tag))
+        }
+        yield (
+            f"line {line.name} only listens: {len(line.tags) - len(reasons)} of "
+            f"{_counted(len(line.tags), 'tag')} can be learned, when another master reads them"
+        )
+        yield from (f"  {key} cannot: {why}" for key, why in reasons.items())
 
 
 def _notes(config: Config) -> Iterator[str]:
@@ -97,6 +118,7 @@ def _unwritable(config: Config) -> Iterator[str]:
     for setting, file in (
         ("history.path", None if kept is None else kept.path),
         ("gateway.state", config.state_file),
+        ("alarms.path", config.alarms.path),
     ):
         if file is not None and (why := trouble(file)) is not None:
             yield (
@@ -116,7 +138,7 @@ def plan(lines: Sequence[LineForecast], *, every_block: bool) -> RenderableType:
     parts: list[RenderableType] = []
     for line in lines:
         parts.append(_line(line))
-        if every_block:
+        if every_block and (line.blocks or line.unsolicited):
             parts.append(_blocks(line))
         parts.append(Text())
     return Group(*parts)

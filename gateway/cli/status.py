@@ -164,6 +164,9 @@ def _services(documents: Documents, outcomes: list[dict[str, Any]] | None) -> Ta
     history = documents.get("history")
     text = "not kept" if history is None else f"{history['state']}, {history['waiting']} waiting"
     table.add_row("history", Text(printable(text)))
+    if alarms := documents.get("alarms"):
+        text = ", ".join(f"{n} {state}" for state, n in alarms.items() if n and state != "normal")
+        table.add_row("alarms", Text(text or "none"))
     if outcomes is not None:
         known = Counter(str(outcome.get("outcome")) for outcome in outcomes)
         text = ", ".join(f"{number} {outcome}" for outcome, number in known.most_common())

@@ -11,6 +11,7 @@ from gateway.config.build import Builder
 from gateway.config.file_rules import check_files
 from gateway.config.messages import ConfigErrors, Mistakes, OptionPlaces
 from gateway.config.records import (
+    AlarmsConfig,
     Config,
     HistoryConfig,
     LineConfig,
@@ -26,6 +27,7 @@ from gateway.config.yaml_dump import dumped
 from gateway.config.yaml_file import read_yaml
 
 __all__ = [
+    "AlarmsConfig",
     "Config",
     "ConfigErrors",
     "HistoryConfig",

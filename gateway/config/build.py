@@ -1,7 +1,7 @@
 """Builds the configuration from the data of the file, and notes every mistake."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from os.path import realpath
 from pathlib import Path as FilePath
 from typing import Any
@@ -18,6 +18,7 @@ from gateway.config.model import (
     TagDefaults,
 )
 from gateway.config.records import (
+    AlarmsConfig,
     Config,
     HistoryConfig,
     LineConfig,
@@ -50,6 +51,7 @@ from gateway.protocols.registry import PROTOCOLS
 from gateway.transport.port import SerialPath
 
 STATE_FILE = FilePath("state.json")  # where there is a folder for it
+ALARM_FILE = FilePath("alarms.json")
 
 
 @dataclass(slots=True)
@@ -104,6 +106,7 @@ class Builder:
             zenoh=self._zenoh(top),
             history=self._history(top),
             web=self._web(top),
+            alarms=self._alarms(top, lines),
             lines=tuple(lines),
             sheets=tuple(self._sheets.used),
         )
@@ -144,8 +147,9 @@ class Builder:
             serial=serial,
             wire=wire,
             echo=line.echo,
+            listen_only=line.listen_only,
             serve=line.serve,
-            devices=tuple(devices),
+            devices=tuple(replace(one, listen_only=line.listen_only) for one in devices),
         )
 
     def _device(
@@ -303,6 +307,13 @@ class Builder:
             name = STATE_FILE
         return None if name is None else self._written(name)
 
+    def _alarms(self, top: FileSection, lines: list[LineConfig]) -> AlarmsConfig:
+        found = top.alarms
+        path = None if found.path is None else self._written(found.path)
+        if path is None and (self.state_folder is not None or _have_alarms(lines)):
+            path = self._written(ALARM_FILE)
+        return AlarmsConfig(path=path, devices=found.devices, lines=found.lines)
+
     def _web(self, top: FileSection) -> WebConfig | None:
         if top.web is None:
             return None
@@ -333,6 +344,10 @@ class Builder:
 
 def _devices_of(raw: object) -> object:
     return raw.get("devices") if isinstance(raw, dict) else None
+
+
+def _have_alarms(lines: list[LineConfig]) -> bool:
+    return any(tag.alarm is not None for line in lines for tag in line.tags)
 
 
 def _either(own: float | None, default: float) -> float:

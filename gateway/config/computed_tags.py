@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+from gateway.config.alarm_rules import alarm_misfits, alarm_rule
 from gateway.config.device_tags import ComputedSource
 from gateway.config.messages import Mistakes, similar
 from gateway.config.records import LineConfig
@@ -112,6 +113,9 @@ class _Maker:
         whole = parsed.whole and not any(one.value_type.startswith("float") for one in inputs)
         wrong: list[tuple[str, str]] = []
         shaping = computed_shaping(own, settings, wrong, whole=whole)
+        kind = ValueType(Kind.INT64 if whole else Kind.FLOAT64)
+        if own.alarm is not None:
+            wrong += alarm_misfits(own.alarm, kind)
         for setting, problem in wrong:
             self.mistakes.add((*source.path, setting), problem)
         return Tag(
@@ -121,13 +125,14 @@ class _Maker:
             address=Address("", 0),
             span=Span("", 0, 0),
             unit_kind=Unit.WORD,
-            layout=Layout(ValueType(Kind.INT64 if whole else Kind.FLOAT64)),
+            layout=Layout(kind),
             every=min(one.every for one in inputs),
             unit=settings.unit,
             description=settings.description,
             deadband=settings.deadband,
             history=settings.history,
             payload=settings.payload,
+            alarm=alarm_rule(own.alarm, settings.description),
             shaping=shaping,
             formula=Formula(own.computed, parsed.term, whole),
             inputs=tuple(inputs),

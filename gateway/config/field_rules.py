@@ -75,6 +75,8 @@ def _misfits(
         yield "every", f"{name} is never polled: it has no interval"
     if not field.polled and not field.unsolicited and write is None:
         yield "write", f"{name} can only be written: it needs write: true"
+    if not field.polled and not field.unsolicited and source.own.alarm is not None:
+        yield "alarm", f"{name} can only be written: it can have no alarm"
     rule = source.own.write
     if isinstance(rule, WriteSection) and rule.verify and not field.polled:
         yield "write", f"{name} cannot be read back, no request reads it: remove verify"

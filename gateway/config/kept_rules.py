@@ -37,7 +37,13 @@ def kept_tag(
 def _raw(tag: Tag) -> Tag:
     """Returns the tag that is read; nothing of it is published."""
     return replace(
-        tag, deadband=None, heartbeat=None, publish=Publish.CHANGE, history=False, names=None
+        tag,
+        deadband=None,
+        heartbeat=None,
+        publish=Publish.CHANGE,
+        history=False,
+        names=None,
+        alarm=None,
     )
 
 

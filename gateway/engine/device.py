@@ -44,6 +44,7 @@ class DeviceSettings:
     verify_reads: int = 1  # reads in a row that must agree
     blocks: bool | Literal["only"] = False  # one put per scan: also, or instead of one per tag
     control: bool = False  # run, stop, ... are allowed
+    listen_only: bool = False  # another master asks it; nothing is ever sent
     enabled: bool = True
     tags: tuple[Tag, ...] = ()
     served: Served | None = None  # it is a station of the gateway, for a master on its line
@@ -82,7 +83,8 @@ class Device:
         self.bad_addresses = BadAddresses(driver.cost)
         self.turnaround = Turnaround(self.settings.turnaround)
         used = [driver.areas[tag.span.area] for tag in self.tags] or driver.areas.values()
-        self.health = Health(answerable=any(area.readable for area in used))
+        answerable = any(area.readable for area in used) and not self.settings.listen_only
+        self.health = Health(answerable=answerable)
         self.window = driver.window if isinstance(driver, Windowed) else 1
         self.shapes = (
             None if self.broadcast else reply_shapes(driver, self.polled_tags, self.bad_addresses)
@@ -181,6 +183,9 @@ class Device:
     def plan(self) -> None:
         """Plans the blocks that read the tags, without the bad addresses."""
         bad = self.bad_addresses
+        if self.settings.listen_only:
+            self.poll_nothing()
+            return
         blocks = plan(self.tags, self.driver, self.transactions, bad.cuts)
         if self.monitor.allowed:
             blocks = with_monitor_list(blocks, self.driver, self.seconds, bad.bad.keys())

@@ -72,7 +72,7 @@ class ServedLine:
         self._open_port = open_port
         self._wall = wall
         self._duty = duty or Duty()
-        self._wire_log = WireLog(config.name)
+        self.wire_log = WireLog()
         self._lost = False
         self._wake = asyncio.Event()  # the port is lost, or a master is there again
 
@@ -197,12 +197,12 @@ class ServedLine:
         return self._duty.why_not(now, now)
 
     def heard(self, data: bytes) -> None:
-        if self._wire_log.active:
-            self._wire_log.heard(data)
+        if self.wire_log.active:
+            self.wire_log.heard(data)
 
     def sent(self, data: bytes) -> None:
-        if self._wire_log.active:
-            self._wire_log.sent(data)
+        if self.wire_log.active:
+            self.wire_log.sent(data)
 
     def take(self, heard: Heard, now: float) -> None:
         """Publishes what the master wrote, all of one request with one time."""

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 from gateway.errors import BadValue, Garbled
 from gateway.protocols.driver import Address, Span, Unit
 from gateway.protocols.typed_fields import Shape
+from gateway.tags.alarm import AlarmRule
 from gateway.tags.decoding import (
     Decode,
     Part,
@@ -84,6 +85,7 @@ class Tag:
     history: bool = False
     payload: Form = Form.JSON
     write: WriteRule | None = None
+    alarm: AlarmRule | None = None
     shape: Shape | None = None  # for a field of a frame: a read gives the value itself
     event: bool = False  # every value is published, also an equal one
     shaping: Shaping | None = None

@@ -144,6 +144,17 @@ def test_what_a_silent_master_wrote_turns_bad_until_it_writes_again() -> None:
     assert ask(made, "03 0064 0001") == "03 02 00 08"
 
 
+def test_a_lost_port_turns_what_the_master_wrote_bad() -> None:
+    made = bench()
+    [station] = made.line.stations.values()
+    ask(made, "06 0064 0007")
+    assert {one.reason for one in station.lost(1, "closed")} == {Reason.LINE_DOWN}
+    assert station.diagnosis() == "The line is down: closed"
+    station.opened(made.now)
+    assert ask(made, "03 0064 0001") == "83 04"
+    assert station.diagnosis() == ""
+
+
 def test_units_of_other_stations_have_no_path_and_a_single_station_has_two_more() -> None:
     made = bench()
     assert ask(made, "03 0000 0001", unit=2) == "83 0a"
