@@ -1,4 +1,4 @@
-"""Shapes a raw value besides scale and offset, in both directions; and names numbers."""
+"""Shaping of a value besides scale and offset, in both directions, and names of numbers."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
