@@ -13,8 +13,8 @@ from gateway.config.commands import check_command, every_command, speaker
 from gateway.engine.device import Device, DeviceSettings
 from gateway.engine.forecast import LineForecast, forecast
 from gateway.engine.jobs import Poll
-from gateway.engine.requests import WRITE_EXPIRY, CommandResult
-from gateway.errors import Busy, Offline
+from gateway.engine.requests import WRITE_EXPIRY, CommandResult, Peeked
+from gateway.errors import BadValue, Busy, ConfigError, Offline
 from gateway.line.build import OpenPort, line_of, opener
 from gateway.line.duty import Duty
 from gateway.line.line import Line
@@ -22,6 +22,8 @@ from gateway.line.serving import Serving
 from gateway.line.wire_log import WireLog
 from gateway.northbound.served_status import served_documents
 from gateway.northbound.status import Document, device_document, line_document, standing
+from gateway.protocols.driver import Address
+from gateway.protocols.ranges import addresses, spans
 from gateway.serving.station import Station
 from gateway.tags import Quality, Reason, Sample, Tag, WriteResult, bad
 from gateway.tags.mirror import Mirror
@@ -29,6 +31,7 @@ from gateway.tags.scan import Scan
 from gateway.tags.timestamps import rfc3339
 from gateway.values import Value
 
+MOST_PEEKED = 256  # addresses of one peek
 FRESH_WITHIN = 5.0  # seconds that a client waits for a read on demand
 
 
@@ -240,6 +243,26 @@ class Gateway:
         started = loop.time()
         answer = await line.command(receiver, command, argument, within)
         return CommandResult(answer, self._wall(), loop.time() - started)
+
+    async def peek(self, device: str, text: str) -> Peeked:
+        """Reads any addresses once, such as `D100..D119`.
+
+        Raises `BadValue` before anything is sent, otherwise a `GatewayError`.
+        """
+        if device not in self._places:
+            raise Offline(f"no device {device} is polled here; nothing was sent")
+        line, receiver = self._places[device]
+        try:
+            area, numbers = addresses(receiver.driver, text, MOST_PEEKED)
+            parts = list(spans(receiver.driver, area, numbers))
+        except ConfigError as error:
+            raise BadValue(str(error)) from None
+        loop = asyncio.get_running_loop()
+        started, units = loop.time(), list[int]()
+        for part in parts:
+            units += map(int, (await line.peek(receiver, part)).split())
+        first = receiver.driver.spell(Address(area, numbers.start))
+        return Peeked(first, units, self._wall(), loop.time() - started)
 
     def is_fresh(self, tag: Tag, max_age: float) -> bool:
         """True if the last read is younger than `max_age` seconds, or no read is possible now.

@@ -1,11 +1,11 @@
 """The `peek` command: addresses of a device in every type, to find out what they mean."""
 
 import asyncio
-import re
 import time
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -14,23 +14,23 @@ from rich.live import Live
 from rich.table import Table
 
 from gateway.cli import direct
+from gateway.cli.client import Client, connected
 from gateway.cli.logs import LogFormat, LogLevel, set_up
 from gateway.cli.peek_table import Cell, change_text, table_of
 from gateway.cli.terminal import FAILED, end, err, out
 from gateway.config import Config, built, load, parsers
 from gateway.config.yaml_scalars import scalar
 from gateway.engine.device import Device, DeviceSettings
-from gateway.errors import ConfigError
+from gateway.errors import ConfigError, GatewayError
 from gateway.protocols.driver import Address, AnyDriver, Span, Unit
+from gateway.protocols.ranges import addresses
 from gateway.protocols.registry import PROTOCOLS
-from gateway.protocols.typed_fields import TypedFields
-from gateway.tags import Quality, Reason, Sample, Tag
+from gateway.tags import Quality, Reason, Sample, Tag, good
 from gateway.values import Kind, Layout, ValueType
 
 MOST = 1000  # addresses
 MARKED = 5.0  # seconds for which a change is marked
 _TYPES = {Unit.BIT: Kind.BOOL, Unit.WORD: Kind.UINT16, Unit.DWORD: Kind.UINT32}
-_NUMBERED = re.compile(r"(.*?)([0-9]+)\Z")
 
 PortOption = Annotated[
     str | None, typer.Option(help="/dev/ttyUSB0, COM3, tcp://host:port, rfc2217://...")
@@ -62,20 +62,22 @@ def peek(
     ] = False,
     every: Annotated[str, typer.Option(help="the interval with --watch")] = "500ms",
 ) -> None:
-    """Read a range of addresses and print it in every type and word order.
+    """Read a range of addresses and print it in every type and word order. Only reads.
 
-    Only reads. No gateway may be running at that port.
+    With a file it asks the running gateway, if there is one. Otherwise it opens the port itself.
     """
     options = {"port": port, "protocol": protocol, "station": station, "baudrate": baud}
     options["format"] = serial_format
     config, text = _target(arguments, options, setting or [])
     view = view_of(config, text, parsers.interval(every))
     set_up(LogFormat.TEXT, LogLevel.ERROR)
-    if watch:
-        with suppress(KeyboardInterrupt):
-            asyncio.run(_follow(view))
-        return
-    samples = asyncio.run(direct.read(view.config, view.tags))
+    with _gateway(Path(arguments[0]) if len(arguments) == 3 else None) as client:
+        ask = None if client is None else partial(_asked, client, view, text)
+        if watch:
+            with suppress(KeyboardInterrupt):
+                asyncio.run(_follow(view, ask))
+            return
+        samples = asyncio.run(direct.read(view.config, view.tags)) if ask is None else ask()
     view.samples(samples)
     some = any(sample.quality is Quality.GOOD for sample in samples)
     if some:
@@ -84,6 +86,30 @@ def peek(
         err.print(failure)
     if not some:
         end(f"nothing of {text} could be read: {samples[0].reason}", FAILED)
+
+
+@contextmanager
+def _gateway(config: Path | None) -> Iterator[Client | None]:
+    """Yields a client of the running gateway; None where there is none, or no file."""
+    with ExitStack() as stack:
+        try:
+            found = (
+                None if config is None else stack.enter_context(connected(load(config), err.print))
+            )
+        except GatewayError:
+            found = None
+        yield found
+
+
+def _asked(client: Client, view: "View", text: str) -> list[Sample]:
+    """Returns what the gateway reads now. Raises `GatewayError`."""
+    device = view.tags[0].device
+    answer = client.peek(device, text)
+    units = answer.get("units")
+    if not isinstance(units, list) or len(units) != len(view.tags):
+        raise GatewayError(f"{device}: {answer.get('reason') or answer.get('error') or answer}")
+    now = time.time_ns()
+    return [good(tag, int(unit), now) for tag, unit in zip(view.tags, units, strict=True)]
 
 
 def _target(
@@ -185,9 +211,7 @@ def view_of(config: Config, text: str, every: float = 1.0) -> View:
     (line,) = config.lines
     (device,) = line.devices
     driver = device.driver
-    if isinstance(driver, TypedFields):
-        raise ConfigError(f"{driver.protocol} has fields with types: use `read`")
-    area, numbers = addresses(driver, text)
+    area, numbers = addresses(driver, text, MOST)
     unit = driver.areas[area].unit
     layout = Layout(ValueType(_TYPES[unit]))
     tags = [_tag(device, Address(area, number), unit, layout, every) for number in numbers]
@@ -215,28 +239,16 @@ def _tag(device: DeviceSettings, address: Address, unit: Unit, layout: Layout, e
     )
 
 
-def addresses(driver: AnyDriver, text: str) -> tuple[str, range]:
-    """Parses `D100..D119`, `D100..119`, `D100`: an area and its numbers. Raises `ConfigError`."""
-    begin, dots, end = (part.strip() for part in text.partition(".."))
-    if dots and end.isdecimal() and (match := _NUMBERED.match(begin)):
-        end = match[1] + end
-    first, last = driver.address(begin), driver.address(end if dots else begin)
-    if first.bit is not None or last.bit is not None:
-        raise ConfigError(f"{text}: name the words, without a bit behind them")
-    if first.area != last.area:
-        raise ConfigError(f"{text}: {begin} and {end} are of two kinds: peek each for itself")
-    if first.number > last.number:
-        raise ConfigError(f"{text} is no range: write the first and the last, such as D100..D119")
-    if not driver.areas[first.area].readable:
-        raise ConfigError(f"{begin} cannot be read at station {driver.station}")
-    if last.number - first.number >= MOST:
-        raise ConfigError(f"{text} has more than {MOST} addresses")
-    return first.area, range(first.number, last.number + 1)
+async def _poll(view: View, ask: Callable[[], list[Sample]]) -> None:
+    while True:
+        view.samples(await asyncio.to_thread(ask))
+        await asyncio.sleep(view.tags[0].every)
 
 
-async def _follow(view: View) -> None:
+async def _follow(view: View, ask: Callable[[], list[Sample]] | None) -> None:
     """Reads until Ctrl-C, and shows the newest values."""
-    reading = asyncio.create_task(direct.follow(view.config, view))
+    following = direct.follow(view.config, view) if ask is None else _poll(view, ask)
+    reading = asyncio.create_task(following)
     try:
         if out.is_terminal:
             with Live(

@@ -208,7 +208,7 @@ class Engine:
         if isinstance(request, Write):
             for older in queue.superseded(request):
                 self._effects.ended(older, Busy("a newer value took its place; not sent"))
-        else:
+        elif request.span is None:
             control = device.settings.control
             if why := why_not_commanded(device.driver, request.name, control=control):
                 self._effects.ended(request, BadValue(why))

@@ -7,12 +7,21 @@ from typing import NamedTuple
 
 from gateway.engine.device import Device
 from gateway.errors import GatewayError
-from gateway.protocols.driver import AnyDriver, Controllable, ScatteredWriter
+from gateway.protocols.driver import AnyDriver, Controllable, ScatteredWriter, Span
 from gateway.tags import Tag, WriteResult
 from gateway.values import Value
 
 WRITE_EXPIRY = 5.0  # seconds after which a waiting request is no longer sent
 MOST_WAITING = 1000  # requests
+
+
+class Peeked(NamedTuple):
+    """Words or bits as they were read; `time` in ns since 1970, `took` in seconds."""
+
+    address: str
+    units: list[int]
+    time: int
+    took: float
 
 
 class CommandResult(NamedTuple):
@@ -87,13 +96,14 @@ class Write:
 
 @dataclass(slots=True, eq=False)
 class Command:
-    """A command to one device: run, stop, loopback, model and others."""
+    """A command to one device: run, stop, loopback, model and others; or a peek at addresses."""
 
     device: Device
     name: str
     argument: str
     submitted: float
     within: float = WRITE_EXPIRY
+    span: Span | None = None  # of a peek: it is read, and nothing changes
     resyncs: Resyncs = NO_RESYNCS
 
     @property

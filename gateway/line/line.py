@@ -25,6 +25,7 @@ from gateway.line.duty import Duty
 from gateway.line.perform import perform
 from gateway.line.transaction import Transaction
 from gateway.line.wire_log import WireLog
+from gateway.protocols.driver import Span
 from gateway.tags import Sample, Tag, WriteResult
 from gateway.transport import Port, Receiver
 
@@ -94,6 +95,10 @@ class Line:
     ) -> asyncio.Future[str]:
         """Sends a command of the driver, such as run or stop. As `write`."""
         return self._submit(Command(device, name, argument, _now(), within))
+
+    def peek(self, device: Device, span: Span, within: float = WRITE_EXPIRY) -> asyncio.Future[str]:
+        """Reads any addresses once. The future has the units, with spaces between. As `write`."""
+        return self._submit(Command(device, "peek", "", _now(), within, span))
 
     def _submit(self, request: Request) -> asyncio.Future[Any]:
         outcome = self._outcomes[request] = asyncio.get_running_loop().create_future()

@@ -33,7 +33,7 @@ from gateway.errors import (
 )
 from gateway.line.transaction import Transaction
 from gateway.planning.planner import Block
-from gateway.protocols.driver import Controllable, Monitor, ScatteredWriter, Span, Talk
+from gateway.protocols.driver import Monitor, ScatteredWriter, Span, Talk
 
 T = TypeVar("T")
 TWO_REPLIES = "two replies arrived, and the first may be that to an earlier write"
@@ -95,19 +95,25 @@ async def _perform(job: Transacted, transaction: Transaction) -> Result:
             return await _read_back(job, transaction)
         case Confirm():
             return await _confirm(job, transaction)
-        case Command(name=name, argument=argument) if isinstance(driver, Controllable):
-            if job.resyncs.before is not None:
-                spans = job.device.probe_spans
-                await job.device.driver.resync(transaction, None, job.resyncs.before, spans)
-            transaction.guard(job.submitted)
-            try:
-                return await driver.control(transaction, name, argument)
-            finally:
-                transaction.guard(None)
+        case Command():
+            return await _command(job, driver, transaction)
         case Answer(frame=frame):
             await transaction.tell(frame)
             return None
     raise TypeError(f"{job.device.name} cannot perform {job!r}")
+
+
+async def _command(job: Command, driver: Any, transaction: Transaction) -> str:
+    if job.resyncs.before is not None:
+        await driver.resync(transaction, None, job.resyncs.before, job.device.probe_spans)
+    if job.span is not None:
+        return " ".join(map(str, await driver.read(transaction, job.span)))
+    transaction.guard(job.submitted)
+    try:
+        answer: str = await driver.control(transaction, job.name, job.argument)
+        return answer
+    finally:
+        transaction.guard(None)
 
 
 def _wanted(units: Sequence[int], longer: Span, wanted: Span) -> Sequence[int]:

@@ -142,6 +142,7 @@ class Declarations:
         `complete`. So a write reaches each of them, and only the gateway of its device takes it.
         """
         keys = [self._keys.values, self._keys.late, self._keys.metas, self._keys.sets]
+        keys.append(self._keys.peek("*"))
         keys += [self._keys.commands(command) for command in self._commands]
         if any(device.blocks for device in self._devices):
             keys.append(self._keys.blocks)

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Literal, Protocol
 
 from gateway.alarms import Alarms
-from gateway.engine.requests import CommandResult
+from gateway.engine.requests import CommandResult, Peeked
 from gateway.history.buckets import Bucket
 from gateway.history.course import Now
 from gateway.history.question import Question
@@ -80,6 +80,10 @@ class Plant(Lines, Protocol):
     ) -> CommandResult:
         """Returns the device's answer. Raises `GatewayError`; `BadValue` before anything is
         sent."""
+
+    async def peek(self, device: str, text: str) -> Peeked:
+        """Reads any addresses once, such as `D100..D119`. Raises `GatewayError`; `BadValue` before
+        anything is sent."""
 
     def is_fresh(self, tag: Tag, max_age: float) -> bool:
         """True if the current sample is younger than `max_age` seconds, or cannot be read now."""

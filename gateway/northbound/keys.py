@@ -43,9 +43,11 @@ class Family(StrEnum):
     STATUS = "status"
     ALARM = "alarm"
     COMMAND = "command"
+    PEEK = "peek"
 
 
 _BY_LAST_CHUNK = {"@set": Family.SET, "@meta": Family.META, "@block": Family.BLOCK}
+_BY_LAST_CHUNK["@peek"] = Family.PEEK
 _BY_LAST_CHUNK |= dict.fromkeys(("@run", "@stop", "@loopback", "@model"), Family.COMMAND)
 
 
@@ -110,6 +112,10 @@ class Keys:
     def commands(self, command: str) -> str:
         """One command to any device of any gateway under the prefix."""
         return f"{self.prefix}/*/@{command}"
+
+    def peek(self, device: str) -> str:
+        """A read of any addresses of a device; `*`: of any gateway under the prefix."""
+        return f"{self.prefix}/{device}/@peek"
 
     @property
     def blocks(self) -> str:

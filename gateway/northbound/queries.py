@@ -12,9 +12,10 @@ from functools import partial
 import structlog
 import zenoh
 
-from gateway.engine.requests import CommandResult
-from gateway.errors import BadValue, Busy
+from gateway.engine.requests import CommandResult, Peeked
+from gateway.errors import BadValue, Busy, GatewayError
 from gateway.history.question import is_of_past
+from gateway.northbound import payload
 from gateway.northbound.acceptance import sender
 from gateway.northbound.alarms import Acknowledgements
 from gateway.northbound.answers import Answer, AnswerPool, QueryCounters
@@ -33,6 +34,7 @@ StatusDocuments = Callable[[], Awaitable[dict[str, bytes]]]  # by full key
 
 FRESH_LIMIT = 256  # tags that one query may have read from the devices
 _BUSY = Failure(Problem.BUSY, "too many queries are waiting; nothing was done")
+_LONGEST_RANGE = 100  # characters
 _ENDING = Failure(Problem.UNCLEAR, "the gateway is ending")
 
 
@@ -79,10 +81,8 @@ class Queries:
         if not self._pool.admit(query):
             return
         match parsed.family:
-            case Family.SET:
-                self._start(self._set(query, at))
-            case Family.COMMAND:
-                self._start(self._command(query, at))
+            case Family.SET | Family.COMMAND | Family.PEEK:
+                self._start(self._request(query, parsed, at))
             case Family.ALARM:
                 self._take_alarm(query, parsed, at)
             case Family.STATUS:
@@ -102,7 +102,7 @@ class Queries:
 
         It gets no answer, not even `busy`: the other gateway may carry it out.
         """
-        is_request = parsed.family in (Family.SET, Family.COMMAND)
+        is_request = parsed.family in (Family.SET, Family.COMMAND, Family.PEEK)
         return is_request and not parsed.has_wildcard and not self._index.owns(parsed.target)
 
     def _take_fresh(self, query: zenoh.Query, parsed: ParsedKey) -> None:
@@ -144,6 +144,15 @@ class Queries:
         """Ends the answering threads, after the session is closed."""
         self._pool.end()
 
+    async def _request(self, query: zenoh.Query, parsed: ParsedKey, at: float) -> None:
+        match parsed.family:
+            case Family.SET:
+                await self._set(query, at)
+            case Family.COMMAND:
+                await self._command(query, at)
+            case _:
+                await self._peek(query, parsed)
+
     async def _set(self, query: zenoh.Query, at: float) -> None:
         result: WriteResult | Failure = _ENDING
         key, by = str(query.key_expr), sender(query, at)
@@ -159,6 +168,21 @@ class Queries:
             result = await self._commands.execute(key, _data(query), by)
         finally:
             self._pool.answer(query, partial(self._commands.reply, result))
+
+    async def _peek(self, query: zenoh.Query, parsed: ParsedKey) -> None:
+        result: Peeked | Failure = _ENDING
+        try:
+            text = (_data(query) or b"").decode(errors="replace")[:_LONGEST_RANGE]
+            async with asyncio.timeout(ANSWER_WITHIN):
+                result = await self._plant.peek(parsed.target.rpartition("/")[2], text)
+        except TimeoutError:
+            result = Failure(Problem.BUSY, f"not read within {ANSWER_WITHIN:g} s")
+        except BadValue as error:
+            result = Failure(Problem.BAD_QUERY, str(error))
+        except GatewayError as error:
+            result = payload.failure(error)
+        finally:
+            self._pool.answer(query, partial(self._replies.peeked, result))
 
     async def _status(self, query: zenoh.Query) -> None:
         documents: dict[str, bytes] = {}

@@ -7,6 +7,7 @@ from itertools import islice
 import orjson
 import zenoh
 
+from gateway.engine.requests import Peeked
 from gateway.errors import BadValue, Busy, Damaged, GatewayError
 from gateway.history.buckets import Bucket
 from gateway.history.course import Now
@@ -22,6 +23,7 @@ from gateway.northbound.tag_index import TagIndex
 from gateway.northbound.turns import Pause, Rank, Turns
 from gateway.tags import Sample, Tag, WriteResult
 from gateway.tags.recorded import Place, Recorded, RecordedQuery
+from gateway.tags.timestamps import rfc3339
 
 ANSWER_WITHIN = 60.0  # seconds for a whole answer of history; its client has gone after that
 PAGE_WITHIN = 5.0  # seconds for a page
@@ -293,6 +295,13 @@ class Replies:
         for key, document in documents.items():
             if query.key_expr.intersects(key):
                 self._reply(query, key, document, self._stamp())
+
+    def peeked(self, result: Peeked | Failure, query: zenoh.Query) -> None:
+        if isinstance(result, Failure):
+            self.outcome(result, query)
+            return
+        data = orjson.dumps({**result._asdict(), "time": rfc3339(result.time)})
+        self._reply(query, str(query.key_expr), data, self._stamp())
 
     def outcome(self, result: WriteResult | Failure, query: zenoh.Query) -> None:
         data = payload.outcome(result)

@@ -6,11 +6,12 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from gateway.cli.peek import addresses, one_device, view_of
+from gateway.cli.peek import one_device, view_of
 from gateway.cli.peek_table import MEDIUM, WIDE, Cell, change_text, number_text, table_of
 from gateway.config import ConfigErrors
 from gateway.errors import ConfigError
 from gateway.protocols.driver import Unit
+from gateway.protocols.ranges import addresses
 from gateway.protocols.vigor import Vigor
 from gateway.tags import Reason, bad, good
 from gateway.values import Order
@@ -117,7 +118,7 @@ def test_a_bad_value_is_never_shown_as_the_last_good_one() -> None:
 def test_a_range_is_written_as_the_maker_writes_addresses(
     text: str, area: str, numbers: range
 ) -> None:
-    assert addresses(Vigor(station=1), text) == (area, numbers)
+    assert addresses(Vigor(station=1), text, 1000) == (area, numbers)
 
 
 @pytest.mark.parametrize(
@@ -133,7 +134,7 @@ def test_a_range_is_written_as_the_maker_writes_addresses(
 )
 def test_a_wrong_range_is_explained(text: str, problem: str) -> None:
     with pytest.raises(ConfigError, match=problem):
-        addresses(Vigor(station=1), text)
+        addresses(Vigor(station=1), text, 1000)
 
 
 def test_options_describe_the_device_as_the_file_would() -> None:

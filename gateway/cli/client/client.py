@@ -146,6 +146,10 @@ class Client:
         key = self._keys.command(device, command)
         return self._request(key, argument.encode(), self._tags_of(device))
 
+    def peek(self, device: str, text: str) -> dict[str, object]:
+        """Returns `address`, `units` and `time`, or `error ...`. Raises as `write`."""
+        return self._request(self._keys.peek(device), text.encode(), self._tags_of(device))
+
     def _tags_of(self, device: str) -> str:
         """One description of a device: only its gateway replies."""
         return self._keys.meta(f"{device}/**") + "?page=1"
