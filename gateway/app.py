@@ -1,28 +1,28 @@
 """Connects the lines of a configuration with the last sample of every tag, without Zenoh."""
 
 import asyncio
+import itertools
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 from gateway import __version__
 from gateway.config import Config, LineConfig
+from gateway.config.changes import DeviceChange
 from gateway.config.commands import check_command, every_command, speaker
 from gateway.engine.device import Device, DeviceSettings
 from gateway.engine.forecast import LineForecast, forecast
-from gateway.engine.jobs import Poll
 from gateway.engine.requests import WRITE_EXPIRY, CommandResult
 from gateway.errors import Busy, Offline
 from gateway.line.build import OpenPort, line_of, opener
 from gateway.line.duty import Duty
 from gateway.line.line import Line, Watcher
+from gateway.line.on_demand import OnDemand
 from gateway.northbound.status import Document, device_document, line_document, standing
-from gateway.tags import Quality, Reason, Sample, Tag, WriteResult, bad
+from gateway.tags import Reason, Sample, Tag, WriteResult, bad
 from gateway.tags.mirror import Mirror
 from gateway.tags.timestamps import rfc3339
 from gateway.values import Value
-
-FRESH_WITHIN = 5.0  # seconds that a client waits for a read on demand
 
 
 def forecasts(
@@ -41,19 +41,15 @@ def forecasts(
     return found
 
 
+REMOVED = "removed from the file"
+
+
 class Subscriber(Protocol):
     """Receives the samples to publish and the device states, on the event loop."""
 
     def publish(self, samples: Sequence[Sample]) -> None: ...
 
     def set_online(self, device: str, online: bool) -> None: ...
-
-
-class _Reader(NamedTuple):
-    """A client that waits for a read that starts after `asked`, by the line's clock."""
-
-    answer: asyncio.Future[Sample]
-    asked: float
 
 
 class Gateway:
@@ -72,7 +68,7 @@ class Gateway:
 
         Without `plan_now` each line needs `plan` and `planned` before it runs.
         """
-        self.config = config
+        self.config, self._devices = config, config.devices
         self.duty = duty or Duty()
         self.mirror = Mirror((tag for device in config.devices for tag in device.tags), wall())
         self.lines: list[Line] = []
@@ -82,10 +78,11 @@ class Gateway:
         self._documents: dict[str, Callable[[], Document]] = {}  # of other parts, in the status
         self._tags = {tag.key: tag for device in config.devices for tag in device.tags}
         self._places: dict[str, tuple[Line, Device]] = {}
+        self._open_line, self._seeds = open_line, itertools.count()
         self._forecasts: dict[str, LineForecast] = {}
-        self._waiting: dict[Tag, list[_Reader]] = {}
-        for seed, line in enumerate(config.lines):
-            self._add_line(line, open_line(line), seed)
+        self._on_demand = OnDemand(self._places.get, self.sample)
+        for line in config.lines:
+            self.add_line(line)
         if plan_now:
             for made in self.lines:
                 self.planned(made, self.plan(made))
@@ -98,21 +95,28 @@ class Gateway:
         if self.config.standby is not None:
             self.mirror.begin(self._wall())
 
-    def _add_line(self, config: LineConfig, open_port: OpenPort, seed: int) -> None:
+    def add_line(self, config: LineConfig) -> Line:
+        """Makes a line, which needs `plan` and `planned` before it runs."""
         devices = [device for device in config.devices if device.enabled]
         line = line_of(
             config,
             devices,
             self,
-            open_port=open_port,
+            open_port=self._open_line(config),
             wall=self._wall,
-            seed=seed,
+            seed=next(self._seeds),
             duty=self.duty,
             plan_now=False,
         )
         self.lines.append(line)
         for device in line.engine.devices:
             self._places[device.name] = (line, device)
+        return line
+
+    def remove_line(self, line: Line) -> None:
+        """Removes a line that has ended, and has no devices any more."""
+        self.lines.remove(line)
+        self._forecasts.pop(line.engine.name, None)
 
     @staticmethod
     def plan(line: Line) -> LineForecast:
@@ -124,9 +128,43 @@ class Gateway:
 
     def planned(self, line: Line, expected: LineForecast) -> None:
         """Takes over the plans of a line: it may run now."""
-        self._forecasts[line.engine.name] = expected
+        self.expect(line, expected)
         for device in line.engine.devices:
             line.engine.schedule.plan(device, 0.0)
+
+    def expect(self, line: Line, expected: LineForecast) -> None:
+        """Takes over the forecast of a line."""
+        self._forecasts[line.engine.name] = expected
+
+    def take_over(self, changes: Iterable[DeviceChange]) -> None:
+        """Takes over the tags of changed devices: their first, next or last samples."""
+        now, gone = self._wall(), list[Tag]()
+        for change in changes:
+            enabled = change.new is not None and change.new.enabled
+            reason = Reason.STARTING if enabled else Reason.DISABLED
+            started = [bad(tag, reason, now) for tag in change.started]
+            self.mirror.add(started, change.renewed)
+            if change.new is not None:
+                self._tags.update((tag.key, tag) for tag in change.new.tags)
+            left = change.gone
+            ended = [tag for tag in left if self._tags[tag.key] is tag]
+            for tag in ended:
+                del self._tags[tag.key]
+            self.mirror.forget(left)  # last: other threads find the new tag instead
+            last = [bad(tag, Reason.DISABLED, now, REMOVED) for tag in ended]
+            self._publish([*started, *last])
+            gone += left
+        self._on_demand.changed(gone)
+
+    def configure(self, config: Config) -> None:
+        """Has this configuration, after its changes are taken over."""
+        self.config, self._devices = config, config.devices
+
+    def move(self, gone: Iterable[str], line: Line, devices: Iterable[Device] = ()) -> None:
+        """Notes the devices that the line has no longer, and those that it has now."""
+        for name in gone:
+            self._places.pop(name, None)
+        self._places |= {device.name: (line, device) for device in devices}
 
     def subscribe(self, subscriber: Subscriber) -> None:
         """Adds a subscriber. It receives each sample after the earlier subscribers."""
@@ -151,10 +189,10 @@ class Gateway:
 
     def samples(self, samples: Sequence[Sample]) -> None:
         changed = self.mirror.update(samples)
-        if self._waiting:
+        if waiting := self._on_demand.waiting:
             for sample in samples:
-                if sample.tag in self._waiting:
-                    self._answer(sample)
+                if sample.tag in waiting:
+                    self._on_demand.answer(sample)
         if changed:
             self._publish(changed)
 
@@ -169,13 +207,19 @@ class Gateway:
     # For the Zenoh side
 
     def devices(self) -> Iterable[DeviceSettings]:
-        return self.config.devices
+        return self._devices  # the same object until a reload
 
     def tag(self, key: str) -> Tag | None:
         return self._tags.get(key)
 
     def sample(self, tag: Tag) -> Sample:
-        return self.mirror[tag]
+        try:
+            return self.mirror[tag]
+        except KeyError:  # a reload removed it, or another tag has its place
+            current = self._tags.get(tag.key)
+            if current is None:
+                return bad(tag, Reason.DISABLED, self._wall(), REMOVED)
+            return self.mirror[current]
 
     def mark_published(self, samples: Sequence[Sample]) -> None:
         if changed := self.mirror.mark_published(samples):
@@ -186,6 +230,8 @@ class Gateway:
 
         Raises `BadValue` before anything is sent, otherwise a `GatewayError`.
         """
+        if self._tags.get(tag.key) is not tag:  # its scale or limits may be others now
+            raise Busy(f"the file was reloaded, and {tag.key} with it; not sent")
         if tag.device not in self._places:
             raise Offline(f"device {tag.device} is disabled; nothing was sent")
         units = tag.encode(value)
@@ -206,6 +252,8 @@ class Gateway:
         Raises `BadValue` before anything is sent, otherwise a `GatewayError`.
         """
         check_command(self.config, device, command)
+        if device not in self._places:
+            raise Offline(f"device {device} is disabled; nothing was sent")
         line, receiver = self._places[device]
         loop = asyncio.get_running_loop()
         started = loop.time()
@@ -213,63 +261,13 @@ class Gateway:
         return CommandResult(answer, self._wall(), loop.time() - started)
 
     def is_fresh(self, tag: Tag, max_age: float) -> bool:
-        """True if the last read is younger than `max_age` seconds, or no read is possible now.
-
-        The age is monotonic time: a change of the system clock must not change it.
-        """
-        poll = self._poll(tag)
-        if poll is None or not self._places[tag.device][0].engine.is_open:
-            return True
-        if poll.last.at is None or self.mirror[tag].quality is Quality.BAD:
-            return False
-        return asyncio.get_running_loop().time() - poll.last.at < max_age
+        """True if the last read is younger than `max_age` seconds, or no read is possible now."""
+        return self._on_demand.is_fresh(tag, max_age)
 
     async def fresh(self, tag: Tag, max_age: float) -> Sample:
-        """Returns the last sample if it `is_fresh`, otherwise that of the next read.
-
-        Several clients share one read. The sample is bad if the device does not answer. Raises
-        `Busy` if the line had no time for the read.
-        """
-        poll = self._poll(tag)
-        if poll is None or self.is_fresh(tag, max_age):
-            return self.mirror[tag]
-        reader = _Reader(asyncio.get_running_loop().create_future(), poll.asked)
-        self._waiting.setdefault(tag, []).append(reader)
-        self._expedite(tag)
-        try:
-            async with asyncio.timeout(FRESH_WITHIN):
-                return await reader.answer
-        except TimeoutError:
-            if self.mirror[tag].quality is Quality.BAD:  # an offline device sends no sample
-                return self.mirror[tag]
-            raise Busy(f"{tag.key} could not be read within {FRESH_WITHIN:g} s") from None
-        finally:
-            self._waiting[tag].remove(reader)
-            if not self._waiting[tag]:
-                del self._waiting[tag]
-
-    def _answer(self, sample: Sample) -> None:
-        """Answers waiting clients. A read that started before the request does not satisfy it."""
-        tag = sample.tag
-        poll = self._poll(tag)
-        for reader in self._waiting[tag]:
-            if reader.answer.done():
-                continue
-            if sample.quality is Quality.BAD or poll is None or poll.asked > reader.asked:
-                reader.answer.set_result(self.mirror[tag])
-            else:
-                self._expedite(tag)
-
-    def _poll(self, tag: Tag) -> Poll | None:
-        """Returns the poll that reads the tag; None if the value is unsolicited."""
-        if tag.device not in self._places:
-            return None
-        line, device = self._places[tag.device]
-        return line.engine.schedule.reader(device, tag)
-
-    def _expedite(self, tag: Tag) -> None:
-        line, device = self._places[tag.device]
-        line.expedite(device, tag)
+        """Returns the last sample if it `is_fresh`, otherwise that of the next read. Raises
+        `Busy`."""
+        return await self._on_demand.fresh(tag, max_age)
 
     def status(self) -> Mapping[str, Document]:
         """Returns documents by path: `status`, `lines/<line>`, `devices/<device>`."""

@@ -91,6 +91,7 @@ class Builder:
             history=self._history(top),
             web=self._web(top),
             lines=tuple(lines),
+            watch=top.gateway.watch_config,
             sheets=tuple(self._sheets.used),
         )
 

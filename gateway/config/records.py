@@ -110,6 +110,7 @@ class Config:
     history: HistoryConfig | None
     web: WebConfig | None
     lines: tuple[LineConfig, ...]
+    watch: bool = False  # a changed file is reloaded by itself
     sheets: tuple[SheetUse, ...] = ()  # files that the tags of some devices come from
 
     @property

@@ -10,11 +10,12 @@ import time
 from collections.abc import Awaitable, Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Any, NoReturn, Protocol
+from typing import Any, NamedTuple, NoReturn, Protocol, runtime_checkable
 
 import structlog
 
-from gateway.engine.device import Device
+from gateway.engine.changes import Changes
+from gateway.engine.device import Device, DeviceSettings
 from gateway.engine.effects import Effect, LogEvent, OnlineChange, Pause, RequestEnded, Samples
 from gateway.engine.engine import Engine
 from gateway.engine.jobs import Idle, Poll, Reopen, Result, Settle, Traffic, Transacted
@@ -40,6 +41,13 @@ class SampleSink(Protocol):
     def online(self, device: Device, online: bool) -> None: ...
 
 
+@runtime_checkable
+class Changeable(Protocol):
+    """A simulated port, whose stations are the devices of the file."""
+
+    def change(self, devices: Sequence[DeviceSettings]) -> None: ...
+
+
 # Called after each job with its result, and the times of its begin and end by the line's clock.
 Watcher = Callable[[Transacted, Result, float, float], None]
 
@@ -50,6 +58,15 @@ class _Expiry:
 
     alarm: Alarm = field(default_factory=Alarm)
     at: float = NEVER  # the deadline when the alarm was set last
+
+
+class _Waiting(NamedTuple):
+    """Changed devices that wait for the end of the current transaction."""
+
+    changes: Changes
+    devices: Sequence[DeviceSettings]
+    applied: Callable[[], None]
+    ended: asyncio.Future[None]
 
 
 class Line:
@@ -79,6 +96,7 @@ class Line:
         self._outcomes: dict[Request, asyncio.Future[Any]] = {}
         self._wake = asyncio.Event()
         self._expiry = _Expiry()
+        self._waiting: _Waiting | None = None
         self.watcher: Watcher | None = None
         self.tried = asyncio.Event()  # set once the port was opened, or could not be
 
@@ -109,6 +127,30 @@ class Line:
         """Polls the tag's block before all other polls."""
         self.engine.expedite(device, tag)
         self._wake.set()
+
+    async def change(
+        self, changes: Changes, devices: Sequence[DeviceSettings], applied: Callable[[], None]
+    ) -> None:
+        """Takes over changed devices when the current transaction has ended. Calls `applied` at
+        once then: no sample comes between. `devices`: all of the line, for its simulated port.
+        Call it again only after it has returned."""
+        ended = asyncio.get_running_loop().create_future()
+        self._waiting = _Waiting(changes, devices, applied, ended)
+        if self.engine.is_open:
+            self._wake.set()
+        else:
+            self._apply()
+        await ended
+
+    def _apply(self) -> None:
+        waiting, self._waiting = self._waiting, None
+        if waiting is not None:
+            self._deliver(self.engine.change(waiting.changes, _now()))
+            if isinstance(self._open_port, Changeable):
+                self._open_port.change(waiting.devices)
+            waiting.applied()
+            if not waiting.ended.done():
+                waiting.ended.set_result(None)
 
     # The receiver of the port
 
@@ -156,6 +198,7 @@ class Line:
                 self.tried.set()
             finally:
                 self._deliver(self.engine.stopped(_now()))
+                self._apply()
                 await self._close()  # last, because closing can be slow
             if served > REOPEN_LONGEST:
                 pause = REOPEN_FIRST
@@ -191,6 +234,8 @@ class Line:
         engine, now = self.engine, channel.now
         while self._lost is None:
             begun = now()
+            if self._waiting is not None and engine.is_idle:
+                self._apply()
             if engine.deadline <= begun:
                 self._expire()
             job = engine.next(begun)

@@ -1,6 +1,6 @@
 """The latest sample of every tag, and the choice of samples to publish."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import compress, count
 from operator import ne
 
@@ -65,6 +65,24 @@ class Mirror:
             if last is not None and last.value != sample.value:
                 changed.append(sample)
         return changed
+
+    def add(self, samples: Iterable[Sample], renewed: Mapping[Tag, Tag]) -> None:
+        """Adds tags with their first samples, which are published. `renewed`: old tags to those
+        that go on with their samples."""
+        for sample in samples:
+            self._current[sample.tag] = self._published[sample.tag] = sample
+        for old, new in renewed.items():
+            self._current[new] = self[old]._replace(tag=new)
+            if (last := self._last_published(old)) is not None:
+                self._published[new] = last._replace(tag=new)
+
+    def forget(self, tags: Iterable[Tag]) -> None:
+        """Removes tags. Other threads must not look them up any more."""
+        for tag in tags:
+            if tag in self._places:
+                self._supersede(self._places[tag][0])
+            self._current.pop(tag, None)
+            self._published.pop(tag, None)
 
     def _last_published(self, tag: Tag) -> Sample | None:
         entry = self._places.get(tag)

@@ -1,0 +1,158 @@
+"""The differences between two configurations: devices that changed, and values that go on."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from typing import Any
+
+from gateway.config.records import Config, LineConfig
+from gateway.engine.device import DeviceSettings
+from gateway.tags import Tag
+
+# Parts of a configuration that a reload takes over. All others need a restart.
+_TAKEN_OVER = {"lines", "sheets", "watch"}
+# Settings of a tag that do not change the meaning of its value. After a change of any other one
+# the value begins again.
+_HARMLESS = {"every", "description", "deadband", "publish", "heartbeat", "history"}
+_HARMLESS |= {"payload", "write"}
+_NAMES = {
+    "host": "listen",
+    "port": "listen",
+    "name": "gateway.name",
+    "state_file": "gateway.state",
+    "standby": "gateway.standby",
+    "standby_alone": "gateway.standby_alone",
+    "secret_file": "gateway.secret_file",
+    "writers_file": "writers.file",
+}
+_SETTINGS = [one.name for one in fields(Tag) if one.init]
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceChange:
+    """A device that changed. Without `old` it is added, without `new` removed."""
+
+    old: DeviceSettings | None
+    new: DeviceSettings | None
+    continues: bool = False  # it is the same station on the same line
+    renewed: Mapping[Tag, Tag] = field(default_factory=dict)  # old to new: the value goes on
+
+    @property
+    def name(self) -> str:
+        known = self.new or self.old
+        return "" if known is None else known.name
+
+    @property
+    def kept(self) -> frozenset[Tag]:
+        """The tags that are the same objects in both."""
+        return frozenset(_tags(self.old)) & frozenset(_tags(self.new))
+
+    @property
+    def gone(self) -> list[Tag]:
+        """The tags of `old` that are not in `new`, also those that have a successor there."""
+        kept = self.kept
+        return [tag for tag in _tags(self.old) if tag not in kept]
+
+    @property
+    def started(self) -> list[Tag]:
+        """The tags of `new` whose values begin now."""
+        others = self.kept | frozenset(self.renewed.values())
+        return [tag for tag in _tags(self.new) if tag not in others]
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """All changes. `config` has the objects of the old one wherever nothing changed."""
+
+    config: Config
+    devices: Mapping[str, DeviceChange]
+    closed: Sequence[str]  # lines whose port is closed; a line in both is opened again
+    opened: Sequence[LineConfig]
+
+    def __bool__(self) -> bool:
+        return bool(self.devices or self.closed or self.opened)
+
+
+def needs_restart(old: Config, new: Config) -> list[str]:
+    """Returns the settings that changed and that only a restart takes over."""
+    return list(dict.fromkeys(_changed(old, new, "", _TAKEN_OVER)))
+
+
+def _changed(old: Any, new: Any, prefix: str, left_out: set[str]) -> Iterator[str]:
+    for one in fields(old):
+        before, after = getattr(old, one.name), getattr(new, one.name)
+        if one.name in left_out or before == after:
+            continue
+        name = prefix + _NAMES.get(one.name, one.name)
+        if is_dataclass(before) and is_dataclass(after):
+            yield from _changed(before, after, f"{name}.", set())
+        else:
+            yield name
+
+
+def compare(old: Config, new: Config) -> Difference:
+    """Compares the lines and devices of two configurations."""
+    lines = {line.name: line for line in old.lines}
+    before = {device.name: device for device in old.devices}
+    after = {device.name for device in new.devices}
+    devices = {
+        name: DeviceChange(device, None) for name, device in before.items() if name not in after
+    }
+    merged, opened = [], []
+    for line in new.lines:
+        known = lines.get(line.name)
+        if known is None or _port(known) != _port(line):
+            opened.append(line)
+            merged.append(line)
+            changes = [DeviceChange(before.get(one.name), one) for one in line.devices]
+        else:
+            here = {device.name for device in known.devices}
+            changes = [_change(before.get(d.name), d, same=d.name in here) for d in line.devices]
+            merged.append(replace(line, devices=tuple(c.new for c in changes if c.new is not None)))
+        devices |= {change.name: change for change in changes if change.new is not change.old}
+    stay = {line.name for line in merged} - {line.name for line in opened}
+    closed = [name for name in lines if name not in stay]
+    return Difference(replace(new, lines=tuple(merged)), devices, closed, opened)
+
+
+def _port(line: LineConfig) -> LineConfig:
+    return replace(line, devices=())
+
+
+def _change(old: DeviceSettings | None, new: DeviceSettings, *, same: bool) -> DeviceChange:
+    """Compares one device. `same`: it was on this line."""
+    if old is None or not same:
+        return DeviceChange(old, new)
+    known = {tag.name: tag for tag in old.tags}
+    tags = tuple(_equal(known.get(tag.name), tag) for tag in new.tags)
+    new = replace(new, tags=tags)
+    # Tags are equal only to themselves.
+    if new == old:
+        return DeviceChange(old, old)
+    if not (old.enabled and new.enabled and _is_one_station(old, new)):
+        # No value goes on, so no tag does.
+        anew = tuple(tag.copy(tag.device, tag.name) for tag in tags)
+        return DeviceChange(old, replace(new, tags=anew))
+    renewed = {
+        before: tag
+        for tag in tags
+        if (before := known.get(tag.name)) is not None
+        and before is not tag
+        and _differ(before, tag) <= _HARMLESS
+    }
+    return DeviceChange(old, new, continues=True, renewed=renewed)
+
+
+def _equal(old: Tag | None, new: Tag) -> Tag:
+    return new if old is None or _differ(old, new) else old
+
+
+def _differ(old: Tag, new: Tag) -> set[str]:
+    return {name for name in _SETTINGS if getattr(old, name) != getattr(new, name)}
+
+
+def _is_one_station(old: DeviceSettings, new: DeviceSettings) -> bool:
+    return old.driver == new.driver and old.answerable == new.answerable
+
+
+def _tags(device: DeviceSettings | None) -> Sequence[Tag]:
+    return () if device is None else device.tags
