@@ -6,17 +6,23 @@ addresses of each station are drawn at random. It prints for each file the time,
 and the largest memory of `check`, then for `run` the time until a query of one tag and of all tags
 is answered, and the processor time and memory then. `--before` names a checkout of another version:
 both are measured in turn, and the last column is the ratio of the processor times.
+
+With `--apart` the stations are in a process of their own, behind TCP ports as slow as the wire, as
+real device servers are. Otherwise the simulated stations use the processor of the gateway.
 """
 
 import argparse
 import json
 import os
 import random
+import socket
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
+from itertools import zip_longest
 from pathlib import Path
 from typing import NamedTuple
 
@@ -25,9 +31,11 @@ import zenoh
 from tests.zenoh_peer import free_endpoint
 
 INTERVALS = ("1s", "5s", "30s")
+KINDS = ("alike", "different")
 STEPS = (1, 1, 1, 2, 5, 20)  # from one address to the next
 HERE = Path(__file__).parents[1]
 PATIENCE = 600.0  # seconds
+ALL_WITHIN = 120.0  # seconds in which a query must bring all tags
 MB = 1e6
 
 
@@ -52,12 +60,13 @@ class Taken(NamedTuple):
     memory: float
 
 
-def rows(sizes: Sizes, endpoint: str, *, alike: bool) -> Iterator[str]:
-    """Yields the rows of the file."""
+def rows(sizes: Sizes, endpoint: str, *, alike: bool, first_port: int = 0) -> Iterator[str]:
+    """Yields the rows of the file. `first_port`: TCP port of the first line; 0: simulated."""
     chance = random.Random(1)
     yield from ("gateway: {name: large}", f"zenoh: {{listen: [{endpoint}]}}", "lines:")
     for line in range(sizes.lines):
-        yield f"  line{line}:\n    port: simulator\n    baudrate: 19200\n    devices:"
+        port = f"tcp://127.0.0.1:{first_port + line}" if first_port else "simulator"
+        yield f"  line{line}:\n    port: {port}\n    baudrate: 19200\n    devices:"
         for device in range(sizes.devices):
             yield f"      d{line}-{device}:\n        protocol: vigor"
             yield f"        station: {device + 1}\n        tags:"
@@ -86,6 +95,38 @@ def checked(tree: Path, path: Path) -> Taken:
     return Taken("check", taken, used.ru_utime + used.ru_stime, used.ru_maxrss * 1024)
 
 
+def free_ports(count: int) -> int:
+    """Returns the first of so many free TCP ports in a row."""
+    for first in range(21000, 31000, count):
+        with ExitStack() as stack, suppress(OSError):
+            for port in range(first, first + count):
+                stack.enter_context(socket.create_server(("127.0.0.1", port)))
+            return first
+    raise SystemExit(f"no {count} free ports in a row")
+
+
+@contextmanager
+def stations(path: Path) -> Iterator[None]:
+    """Serves the lines of the file in another process."""
+    known = {**os.environ, "PYTHONPATH": str(HERE)}
+    program = subprocess.Popen(
+        [sys.executable, "-m", "gateway", "simulate", str(path)],
+        cwd=HERE,
+        env=known,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        assert program.stdout is not None
+        while b"Ctrl-C" not in program.stdout.readline():
+            if program.poll() is not None:
+                raise SystemExit("the stations ended")
+        yield
+    finally:
+        program.terminate()
+        program.wait()
+
+
 def ran(tree: Path, path: Path, endpoint: str, sizes: Sizes) -> list[Taken]:
     begun = time.monotonic()
     program = started(tree, "run", path)
@@ -101,9 +142,15 @@ def ran(tree: Path, path: Path, endpoint: str, sizes: Sizes) -> list[Taken]:
             while not answers(client, "plant/d0-0/t0"):
                 time.sleep(0.05)
             found = [taken("run: one tag answers")]
-            while answers(client, "plant/**") < sizes.all_tags:
-                pass
-            return [*found, taken("run: all tags answer")]
+            until = time.monotonic() + ALL_WITHIN
+            while time.monotonic() < until:
+                asked = time.monotonic()
+                count = answers(client, "plant/**")
+                seconds = time.monotonic() - asked
+                found.append(taken(f"run: {count} tags answer in {seconds:.1f} s"))
+                if count == sizes.all_tags:
+                    break
+            return found
     finally:
         program.terminate()
         program.wait()
@@ -135,6 +182,8 @@ def answers(client: zenoh.Session, key: str) -> int:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--sizes", type=int, nargs=3, default=(64, 32, 100), metavar="N")
+    parser.add_argument("--apart", action="store_true", help="the stations are another process")
+    parser.add_argument("--only", choices=KINDS, help="one kind of file")
     parser.add_argument("--before", type=Path, help="a checkout of another version")
     arguments = parser.parse_args()
     sizes, trees = Sizes(*arguments.sizes), [HERE]
@@ -143,16 +192,22 @@ def main() -> None:
     print("| tags | step | s | s of processor | MB | x processor |")
     print("|---|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as folder:
-        for kind in ("alike", "different"):
+        for kind in KINDS if arguments.only is None else (arguments.only,):
             endpoint, path = free_endpoint(), Path(folder) / f"{kind}.yaml"
-            path.write_text("\n".join(rows(sizes, endpoint, alike=kind == "alike")) + "\n")
-            measured = [[checked(tree, path), *ran(tree, path, endpoint, sizes)] for tree in trees]
+            first = free_ports(sizes.lines) if arguments.apart else 0
+            text = rows(sizes, endpoint, alike=kind == "alike", first_port=first)
+            path.write_text("\n".join(text) + "\n")
+            with stations(path) if first else nullcontext():
+                measured = [
+                    [checked(tree, path), *ran(tree, path, endpoint, sizes)] for tree in trees
+                ]
             for tree, found in zip(trees, measured, strict=True):
                 name = kind if tree == HERE else f"{kind}, before"
-                for one, first in zip(found, measured[0], strict=True):
+                for one, before in zip_longest(found, measured[0][: len(found)]):
+                    ratio = "" if before is None else f"{one.processor / before.processor:.2f}"
                     print(
                         f"| {name} | {one.step} | {one.seconds:.1f} | {one.processor:.1f} | "
-                        f"{one.memory / MB:.0f} | {one.processor / first.processor:.2f} |",
+                        f"{one.memory / MB:.0f} | {ratio} |",
                         flush=True,
                     )
 

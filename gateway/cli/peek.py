@@ -5,7 +5,7 @@ import re
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -22,6 +22,7 @@ from gateway.config.yaml_scalars import scalar
 from gateway.engine.device import Device, DeviceSettings
 from gateway.errors import ConfigError
 from gateway.protocols.driver import Address, AnyDriver, Span, Unit
+from gateway.protocols.registry import PROTOCOLS
 from gateway.protocols.typed_fields import TypedFields
 from gateway.tags import Quality, Reason, Sample, Tag
 from gateway.values import Kind, Layout, ValueType
@@ -107,6 +108,9 @@ def one_device(options: Mapping[str, object], settings: Sequence[str]) -> Config
             raise ConfigError(f"--{name} is missing; or name a file and a device before the range")
     line = {name: options[name] for name in ("port", "baudrate", "format")}
     device = {name: options[name] for name in ("protocol", "station")}
+    known = PROTOCOLS.get(str(options["protocol"]))
+    if known is not None and "format" in {one.name for one in fields(known.settings)}:
+        device["format"] = options["format"]  # a station that is set so: `one_format`
     for text in settings:
         name, equals, value = text.partition("=")
         if not equals:

@@ -1,6 +1,6 @@
 """Looks for the stations on an unknown line: which answer, at which speed, in which format."""
 
-from collections.abc import Awaitable, Callable, Iterator, Sequence
+from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 
@@ -186,10 +186,17 @@ class _Scan:
         for driver, settings in variants(self._plan.protocol, station):
             try:
                 if await self._replies(channel, driver, probe_token):
-                    return Found(self._serial, driver, settings)
+                    return self._found(driver, settings)
             except Refused as error:
-                refused = refused or Found(self._serial, driver, settings, str(error))
+                refused = refused or self._found(driver, settings, str(error))
         return refused
+
+    def _found(self, driver: AnyDriver, settings: Mapping[str, object], refusal: str = "") -> Found:
+        serial, traits = self._serial, driver.traits
+        known = dict(settings)
+        if serial is not None and traits.one_format and serial.format != traits.format:
+            known["format"] = serial.format  # the file must say that this station differs
+        return Found(serial, driver, known, refusal)
 
     async def _replies(self, channel: Channel, driver: AnyDriver, probe_token: int) -> bool:
         """Raises `Refused` and `LineDown`."""

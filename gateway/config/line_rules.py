@@ -18,6 +18,8 @@ def check_line(
     """Notes every conflict between the line and its devices."""
     _check_unsolicited(devices, path, mistakes)
     _check_stations(devices, path, mistakes)
+    if line.format is not None:
+        _check_format(line.format, devices, (*path, "format"), mistakes)
     for device in devices:
         driver, place = device.driver, (*path, "devices", device.name)
         if isinstance(line.port, SimulatorAddress) and not can_simulate(driver):
@@ -30,21 +32,52 @@ def check_line(
             mistakes.add((*place, setting), f"the line has `echo: true`, and {reason}")
         if driver.traits.over_network:
             _check_network(line, devices, device, place, mistakes)
-        elif driver.traits.binary and line.format and line.format[0] == "7":
-            mistakes.add(
-                (*path, "format"),
-                f"{line.format} has 7 data bits, but {device.name} speaks "
-                f"{driver.protocol}, which needs 8, such as 8{line.format[1:]}",
-            )
+
+
+def _check_format(
+    given: str, devices: Sequence[DeviceSettings], path: Path, mistakes: Mistakes
+) -> None:
+    """Refuses a format that the protocol of a device does not have, once for all devices."""
+    binary = [device for device in devices if device.driver.traits.binary]
+    others = [
+        device
+        for device in devices
+        if device.driver.traits.one_format and device.driver.traits.format != given
+    ]
+    if binary and given[0] == "7":
+        first = binary[0]
+        mistakes.add(
+            path,
+            f"{given} has 7 data bits, but {_named(binary)} {first.driver.protocol}, which needs "
+            f"8, such as 8{given[1:]}",
+        )
+    if not others:
+        return
+    traits, protocol = others[0].driver.traits, others[0].driver.protocol
+    advice = f"If the ports are really set to {given}, write `format: {given}` there too"
+    if binary:
+        name, rtu = binary[0].name, binary[0].driver.protocol
+        advice = f"{name} ({rtu}) needs 8 data bits: use two ports, or {protocol} devices in "
+        advice += "their Modbus mode"
+    mistakes.add(
+        path,
+        f"{given}, but {_named(others)} {protocol}, which is {traits.format} by its manual. "
+        f"{advice}",
+    )
+
+
+def _named(devices: Sequence[DeviceSettings]) -> str:
+    first, more = devices[0].name, len(devices) - 1
+    return f"{first} and {more} more speak" if more else f"{first} speaks"
 
 
 def _check_stations(devices: Sequence[DeviceSettings], path: Path, mistakes: Mistakes) -> None:
-    stations: dict[int, str] = {}
+    stations: dict[tuple[str, int], str] = {}
     for device in devices:
         if not device.driver.traits.numbered:
             continue
-        number = device.driver.station
-        other = stations.setdefault(number, device.name)
+        protocol, number = device.driver.protocol, device.driver.station
+        other = stations.setdefault((protocol, number), device.name)
         if other != device.name:
             mistakes.add(
                 (*path, "devices", device.name, "station"),

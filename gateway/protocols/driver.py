@@ -83,6 +83,7 @@ class Traits:
 
     baudrate: int | None = 9600  # default of the line; None: over TCP, without a serial line
     format: str = "8N1"  # default of the line
+    one_format: bool = False  # the manual names no other; the file must say that a device differs
     binary: bool = False  # frames need 8 data bits
     word_type: Kind = Kind.INT16  # default type of a word
     string_order: Order = Order.LOW_FIRST  # default byte order of a text

@@ -26,11 +26,14 @@ class OldLine:
     It is the `Port`, too. `heard` is all that was sent, with how the port was opened.
     """
 
-    def __init__(self, *stations: Station, nonsense: bytes = b"") -> None:
+    def __init__(
+        self, *stations: Station, nonsense: bytes = b"", right: SerialSettings = RIGHT
+    ) -> None:
         self.stations = stations
         self.heard: list[tuple[SerialSettings | None, bytes]] = []
         self.closed = 0
         self._nonsense = nonsense
+        self._right = right
 
     async def open(self, settings: SerialSettings | None, ear: Receiver) -> Port:
         self._settings, self._ear = settings, ear
@@ -40,7 +43,7 @@ class OldLine:
         loop = asyncio.get_running_loop()
         self.heard.append((self._settings, data))
         answers: Sequence[bytes] = [self._nonsense] if self._nonsense else []
-        if self._settings in (RIGHT, None):
+        if self._settings in (self._right, None):
             answers = [
                 each for station in self.stations for each in station.hear(data, loop.time())
             ]
@@ -80,6 +83,14 @@ async def test_the_speed_and_format_at_which_they_answer_is_found() -> None:
         "      station-2: {protocol: vigor, station: 2, tags: {}}",
         "      station-17: {protocol: vigor, station: 17, tags: {}}",
     ]
+
+
+@on_virtual_time
+async def test_a_vigor_in_another_format_than_its_manual_is_listed_with_it() -> None:
+    other = SerialSettings(9600, "8N1")
+    report = await scan(sought(OldLine(VigorStation(3), right=other), "vigor", "3"))
+    [found] = report.found
+    assert (found.serial, found.settings) == (other, {"format": "8N1"})
 
 
 @pytest.mark.parametrize(

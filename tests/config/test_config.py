@@ -352,6 +352,27 @@ LINES = [
         "3: lines.hall.port: port number 70000 is not 1..65535",
     ),
     bad(
+        "a format that the manual does not have",
+        on_line("port: simulator\nformat: 8N1\ndevices:\n"
+                "  mixer: {protocol: vigor, station: 1}\n"
+                "  oven: {protocol: vigor, station: 2}"),
+        "4: lines.hall.format: 8N1, but mixer and 1 more speak vigor, which is 7E1 by its manual. "
+        "If the ports are really set to 8N1, write `format: 8N1` there too",
+    ),
+    bad(
+        "protocols of 7 and of 8 bits",
+        on_line("port: simulator\nbaudrate: 9600\nformat: 8E1\ndevices:\n"
+                "  mixer: {protocol: vigor, station: 1}\n"
+                "  oven: {protocol: modbus-rtu, station: 2}"),
+        "5: lines.hall.format: 8E1, but mixer speaks vigor, which is 7E1 by its manual. oven "
+        "(modbus-rtu) needs 8 data bits: use two ports, or vigor devices in their Modbus mode",
+    ),
+    bad(
+        "a format of a device that is none",
+        on_mixer("protocol: vigor\nformat: 9N1"),
+        f"7: {M}.format: 9N1 is no character format such as 8N1",
+    ),
+    bad(
         "one port twice",
         "lines:\n"
         "  a: {port: /dev/ttyUSB0, devices: {mixer: {protocol: vigor}}}\n"
@@ -422,7 +443,7 @@ DEVICES = [
         "one station number twice",
         on_line("port: simulator\nbaudrate: 9600\nformat: 7E1\ndevices:\n"
                 "  mixer: {protocol: vigor, station: 5}\n"
-                "  oven:\n    protocol: computer-link\n    station: 5"),
+                "  oven:\n    protocol: vigor\n    station: 5"),
         "10: lines.hall.devices.oven.station: mixer on this line is station 5 already: "
         "both would answer at once",
     ),
@@ -470,7 +491,7 @@ DEVICES = [
         "another protocol's setting",
         on_mixer("protocol: vigor\nframe_format: 4"),
         f"7: {M}.frame_format: no setting of a vigor device: use blocks, control, defaults, "
-        "enabled, late_guard, reply_timeout, retries, silence, station, tags, tags_from, "
+        "enabled, format, late_guard, reply_timeout, retries, silence, station, tags, tags_from, "
         "turnaround or verify_reads",
     ),
     bad(
@@ -841,6 +862,26 @@ def test_a_modbus_tcp_line_has_no_serial_line_unless_the_file_has_a_baudrate(
     assert line.devices[0].driver == ModbusTcp(station=1)
     (line,) = file(on_line(rows + "\nbaudrate: 9600\nformat: 8N1")).lines
     assert line.wire.baudrate == 9600
+
+
+def test_a_device_may_be_set_to_another_format_than_its_manual(
+    file: Callable[[str], Config],
+) -> None:
+    rows = "port: /dev/ttyS0\ndevices: {m: {protocol: vigor, format: 8N1}}"
+    for text in (rows, rows + "\nformat: 8N1"):
+        (line,) = file(on_line(text)).lines
+        assert (line.serial.format, line.devices[0].driver) == ("8N1", Vigor(format="8N1"))
+
+
+def test_stations_of_two_protocols_may_have_one_number(file: Callable[[str], Config]) -> None:
+    (line,) = file(
+        on_line(
+            "port: simulator\nbaudrate: 9600\nformat: 7E1\ndevices:\n"
+            "  mixer: {protocol: vigor, station: 5}\n"
+            "  oven: {protocol: modbus-ascii, station: 5}"
+        )
+    ).lines
+    assert [device.driver.station for device in line.devices] == [5, 5]
 
 
 def test_an_rfc2217_port(file: Callable[[str], Config]) -> None:

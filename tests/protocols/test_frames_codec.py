@@ -2,13 +2,15 @@
 
 import random
 import tracemalloc
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gateway.errors import BadValue, Evidence, Garbled
+from gateway.errors import BadValue, ConfigError, Evidence, Garbled
 from gateway.protocols.frames import FrameCodec, FrameReader, Framing
+from gateway.protocols.frames.framing import Check, End
 from gateway.protocols.frames.presets import written_out
 
 SMALL = 8  # a short maximum, so that few bytes reach every branch
@@ -29,15 +31,30 @@ def framings(draw: st.DrawFn) -> Framing:
     exact = draw(st.booleans())
     terminator = draw(marks | nothing)
     keep = bool(terminator) and draw(st.integers(0, 4)) == 0
+    ending = "" if keep else draw(st.sampled_from(["", "CR", "CR LF"]))
+    total = bool(terminator) and not keep and draw(st.booleans())
+    conversion = draw(st.booleans())
+    checks: list[Check | None] = [None]
+    if not total and not keep:
+        checks.append("lrc")
+        if exact or conversion or not (terminator or ending):
+            checks.append("crc16")
+    ends: list[End] = ["terminator"] if terminator or ending else []
+    if not total:
+        if not ends or (terminator, ending) in (("<03>", ""), ("A", ""), ("", "CR")):
+            ends.append("count")
+        ends.append("gap")
     return Framing(
         header=draw(marks | nothing),
         terminator=terminator,
-        ending="" if keep else draw(st.sampled_from(["", "CR", "CR LF"])),
-        sum_check=bool(terminator) and not keep and draw(st.booleans()),
-        conversion=draw(st.booleans()),
+        ending=ending,  # type: ignore[arg-type]  # a str from the strategy
+        sum_check=total,
+        conversion=conversion,
         keep_terminator=keep,
         length=draw(st.integers(1, SMALL)) if exact else None,
         max_length=None if exact else SMALL,
+        check=draw(st.sampled_from(checks)),
+        ends=tuple(ends) if not exact and draw(st.booleans()) else (),
     )
 
 
@@ -299,3 +316,84 @@ def test_hex_digits_may_be_small_letters_for_they_mean_nothing_else() -> None:
 def test_half_a_converted_byte_is_error_3() -> None:
     with pytest.raises(Garbled, match="error 3"):
         FrameCodec(Framing(terminator="<03>", conversion=True)).feed(b"ABC\x03")
+
+
+RS = Framing(terminator="<03>", max_length=4, ends=("terminator", "count", "gap"))
+
+
+def test_count_end_code_or_time_out_whichever_is_first() -> None:
+    """Vigor RS instruction, B-3-9: each of the three completes a reception."""
+    reader = FrameReader(RS)
+    assert reader.feed(b"AB\x03CDEFGH") == [b"AB", b"CDEF"]
+    assert reader.expire() == [b"GH"]
+
+
+def test_an_end_code_directly_after_the_last_counted_byte_belongs_to_that_frame() -> None:
+    reader = FrameReader(RS)
+    assert reader.feed(b"ABCD") == [b"ABCD"]
+    assert reader.feed(b"\x03EF\x03") == [b"EF"]
+
+
+def test_an_end_code_after_a_counted_frame_and_a_gap_is_an_empty_frame() -> None:
+    reader = FrameReader(RS)
+    assert [*reader.feed(b"ABCD"), *reader.expire(), *reader.feed(b"\x03")] == [b"ABCD", b""]
+
+
+def test_an_end_that_is_not_named_does_not_complete_a_frame() -> None:
+    only = FrameReader(Framing(max_length=4, ends=("count",)))
+    assert only.feed(b"AB") == []
+    assert isinstance(only.expire()[0], Garbled)
+    by_gap = FrameReader(Framing(max_length=4, ends=("gap",)))
+    found = by_gap.feed(b"ABCDEFGH")
+    assert frames(found) == []
+    assert isinstance(found[0], Garbled)
+
+
+@pytest.mark.parametrize(
+    ("settings_", "message"),
+    [
+        ({"length": 4, "ends": ("gap",)}, "length is exact"),
+        ({"terminator": "<03>", "ends": ("gap",)}, "must name the terminator"),
+        ({"ends": ("terminator",)}, "needs a terminator or ending"),
+        ({"ends": ("count",)}, "max_length, which is missing"),
+        ({"ends": ("gap", "gap")}, "twice"),
+        ({"terminator": "<03>", "sum_check": True, "ends": ("terminator", "gap")}, "sum_check"),
+        ({"ending": "CR LF", "max_length": 4, "ends": ("terminator", "count")}, "one byte"),
+        ({"ending": "CR", "check": "crc16"}, "two bytes of any value"),
+        ({"terminator": "<03>", "sum_check": True, "check": "lrc"}, "one check"),
+    ],
+)
+def test_ends_and_checks_that_cannot_work_say_why(settings_: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        Framing(**settings_)
+
+
+ASCII = Framing(header=":", ending="CR LF", conversion=True, check="lrc")
+RTU = Framing(length=6, check="crc16")
+
+
+def test_an_lrc_and_a_crc_as_modbus_writes_them() -> None:
+    """The frames of the Modbus specification: address 11h, read 3 registers from 6Bh."""
+    request = bytes.fromhex("1103006B0003")
+    assert FrameCodec(ASCII).encode(request) == b":1103006B00037E\r\n"
+    assert FrameCodec(RTU).encode(request) == request + bytes.fromhex("7687")
+    for framing in (ASCII, RTU):
+        assert FrameCodec(framing).feed(FrameCodec(framing).encode(request)) == [request]
+
+
+@pytest.mark.parametrize("framing", [ASCII, RTU, Framing(terminator="<03>", check="lrc")])
+def test_each_flipped_bit_of_data_or_check_is_found(framing: Framing) -> None:
+    good = FrameCodec(framing).encode(b"ABCDEF")
+    for bit in range(8 * len(good)):
+        damaged = bytearray(good)
+        damaged[bit // 8] ^= 1 << bit % 8
+        reader = FrameReader(framing)
+        found = frames(reader.feed(bytes(damaged)) + reader.expire())
+        assert found in ([], [b"ABCDEF"])  # small letters of a hexadecimal digit mean the same
+
+
+def test_a_wrong_check_is_told_as_a_checksum() -> None:
+    (damage,) = FrameReader(RTU).feed(bytes(8))
+    assert isinstance(damage, Garbled)
+    assert damage.evidence is Evidence.CHECKSUM
+    assert str(damage) == "crc16 0000 is not 001b"

@@ -2,6 +2,7 @@
 
 import struct
 from contextlib import suppress
+from typing import Any, Literal
 
 import pytest
 from hypothesis import given
@@ -238,3 +239,17 @@ def test_any_bytes_give_a_value_or_garbled(kind: str, raw: bytes) -> None:
 def test_a_field_that_cannot_be_is_refused(settings: dict[str, object], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         Field(**settings)  # type: ignore[arg-type]  # mistakes are the point
+
+
+@pytest.mark.parametrize(("half", "value"), [("low", 0x34), ("high", 0x12)])
+def test_a_byte_of_a_word(half: Literal["low", "high"], value: int) -> None:
+    word = Field(type="uint16", byte_order="high_first", byte=half)
+    assert word.take(b"\x12\x34") == value
+    with pytest.raises(BadValue, match="a part of a number"):
+        word.put(1)
+
+
+@pytest.mark.parametrize("settings", [{"type": "int16"}, {"type": "uint16", "bit": 3}])
+def test_a_byte_is_half_of_a_whole_uint16(settings: dict[str, Any]) -> None:
+    with pytest.raises(ConfigError, match="low or high half of a uint16"):
+        Field(byte_order="low_first", byte="low", **settings)

@@ -1910,4 +1910,11 @@ MUTANTS = (
         "            place: bad(",
         "tests/tags/test_scan.py",
     ),
+    Mutant(
+        "a wrong LRC or CRC of a frame is taken",
+        "protocols/frames/codec.py",
+        "        if got != wanted:\n            why",
+        "        if False:\n            why",
+        "tests/protocols/test_frames_codec.py",
+    ),
 )

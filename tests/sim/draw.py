@@ -76,6 +76,7 @@ def draw(seed: int, seconds: float, pace: str = "busy") -> Drawn:
     while at < seconds:
         jumps.append((at, chance.choice((-7200.0, -3600.0, -1.0, 1.0, 3600.0, 1e6, -1e6))))
         at += chance.expovariate(1 / 1800)
+    _force_formats(lines)
     document = {
         "gateway": {"name": "demo"},
         "defaults": {"publish": chance.choice(("always", "always", "change"))},
@@ -84,6 +85,14 @@ def draw(seed: int, seconds: float, pace: str = "busy") -> Drawn:
     manners, between = hostile_manners(lines, seed, pace), bridges(lines, seed, pace)
     in_order = tuple(sorted(episodes, key=_order))
     return Drawn(document, missing, in_order, tuple(jumps), chunks, zeros, manners, between)
+
+
+def _force_formats(lines: dict[str, Any]) -> None:
+    """Says of each Vigor station that it has the format of its line."""
+    for line in lines.values():
+        for device in line["devices"].values():
+            if device["protocol"] == "vigor" and line.get("format", "7E1") != "7E1":
+                device["format"] = line["format"]
 
 
 def _order(episode: Episode) -> tuple[float, str, str, str]:

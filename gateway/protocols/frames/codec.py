@@ -27,7 +27,8 @@ class FrameReader:
         self._framing = framing = written_out(framing)
         self._header = octets(framing.header)
         self._mark = framing.mark
-        self._unit = 2 if framing.conversion else 1
+        self._longest = framing.longest_on_line
+        self._counted = False  # the last frame ended by its count: its terminator may follow
         self._after = (2 if framing.sum_check else 0) + len(framing.tail)
         self._buffer = bytearray()
         self._aligned = quiet or bool(self._header)
@@ -62,7 +63,7 @@ class FrameReader:
             while (cut := self._cut()) is not None:  # a whole frame behind a false header
                 _append(found, cut)
         self._buffer.clear()
-        self._aligned = True
+        self._aligned, self._counted = True, False
         return found
 
     def settle(self) -> None:
@@ -73,7 +74,7 @@ class FrameReader:
 
     def _ended_by_gap(self) -> bytes | Garbled:
         framing, body = self._framing, len(self._header)
-        if not self._mark and framing.length is None:
+        if framing.ends_by_gap and (not self._mark or self._end_of_data(len(self._buffer)) is None):
             data = bytes(self._buffer[body:])
             self._buffer.clear()
             return self._data(data)
@@ -85,8 +86,9 @@ class FrameReader:
 
     def _missing(self) -> str:
         framing, body = self._framing, len(self._header)
-        if framing.length is not None and len(self._buffer) - body < framing.length * self._unit:
-            return f"fewer than {framing.length} bytes of data"
+        is_counted = framing.ends_by_count or framing.length is not None
+        if is_counted and len(self._buffer) - body < self._longest:
+            return f"fewer than {framing.longest} bytes of data"
         at = self._end_of_data(len(self._buffer))
         if at is None:
             return self._no_mark()
@@ -96,19 +98,21 @@ class FrameReader:
         return "error 8, LF missing" if missing == 1 and framing.ending == "CR LF" else _NO_CR
 
     def _no_mark(self) -> str:
+        if not self._mark:
+            return "no gap"
         return "error 10, terminator missing" if self._framing.terminator else _NO_CR
 
     def _cut(self) -> bytes | Garbled | None:
         """Takes one frame, or one piece of damage, off the buffer; None while it is incomplete."""
         if not self._hunt():
             return None
-        framing, body = self._framing, len(self._header)
-        most = body + framing.longest * self._unit
-        if not self._mark:
-            return self._finish(most) if len(self._buffer) >= most else None
-        at = self._end_of_data(most)
+        framing, most = self._framing, len(self._header) + self._longest
+        by_count = framing.ends_by_count
+        at = self._end_of_data(most - 1 if by_count else most) if self._mark else None
         if at is None:
-            if len(self._buffer) < most + len(self._mark):
+            if by_count:
+                return self._finish(most, counted=True) if len(self._buffer) >= most else None
+            if len(self._buffer) < most + max(1, len(self._mark)):
                 return None
             return self._endless(most)
         if framing.length is None and self._header:
@@ -133,16 +137,19 @@ class FrameReader:
     def _end_of_data(self, most: int) -> int | None:
         """Returns the place of the mark, with data up to `most`; None: not received (yet)."""
         if self._framing.length is not None:
-            at = len(self._header) + self._framing.length * self._unit
+            at = len(self._header) + self._longest
             return at if self._buffer.startswith(self._mark, at) else None
         at = self._buffer.find(self._mark, len(self._header), most + len(self._mark))
         return at if at >= 0 else None
 
-    def _finish(self, at: int) -> bytes | Garbled | None:
-        """Checks the bytes behind the data, which ends at `at`, and takes the frame."""
+    def _finish(self, at: int, *, counted: bool = False) -> bytes | Garbled | None:
+        """Checks the bytes behind the data, which ends at `at`, and takes the frame.
+
+        `counted`: its count ended it, before a terminator came.
+        """
         framing, body = self._framing, len(self._header)
         data = bytes(self._buffer[body:at])
-        end = at + len(self._mark)
+        end = at if counted else at + len(self._mark)
         if framing.sum_check:
             end += 2
             if len(self._buffer) < end:
@@ -159,16 +166,30 @@ class FrameReader:
             end += 1
         result = self._data(data)
         if isinstance(result, Garbled):
-            return self._damage(str(result), end, aligned=bool(self._mark))
+            return self._damage(
+                str(result), end, evidence=result.evidence, aligned=bool(self._mark)
+            )
         self._drop(end)
-        return result + self._mark if framing.keep_terminator else result
+        self._counted = counted
+        return result + self._mark if framing.keep_terminator and not counted else result
 
     def _data(self, data: bytes) -> bytes | Garbled:
-        if not self._framing.conversion:
-            return data
-        if len(data) % 2 or not _HEX.issuperset(data):
-            return Garbled("error 3, a character that is no hex digit", data)
-        return bytes.fromhex(data.decode("ascii"))
+        """Returns the data without conversion and check."""
+        framing, plain = self._framing, data
+        if framing.conversion:
+            if len(data) % 2 or not _HEX.issuperset(data):
+                return Garbled("error 3, a character that is no hex digit", data)
+            plain = bytes.fromhex(data.decode("ascii"))
+        if framing.check is None:
+            return plain
+        payload = plain[: len(plain) - framing.check_size]
+        got, wanted = plain[len(payload) :], framing.check_of(payload)
+        if framing.check == "lrc" and not framing.conversion:
+            got = got.upper()
+        if got != wanted:
+            why = f"{framing.check} {got.hex()} is not {wanted.hex()}"
+            return Garbled(why, data, evidence=Evidence.CHECKSUM)
+        return payload
 
     def _damage(
         self,
@@ -194,6 +215,10 @@ class FrameReader:
             return self._buffer.startswith(self._header)
         if not self._aligned:
             self._align()
+        if self._counted and self._buffer:
+            self._counted = False
+            if self._mark and self._buffer.startswith(self._mark):
+                self._drop(len(self._mark))
         return self._aligned and bool(self._buffer)
 
     def _align(self) -> None:

@@ -53,11 +53,11 @@ class Frames:
     def timing(self) -> Timing:
         """Default times; the silence lets an unsolicited frame end.
 
-        Where only a gap ends a reply, each request takes this gap longer.
+        Where a gap may end a reply, each request takes this gap longer.
         """
         framing = written_out(self.framing)
         gap = 0.0
-        if not framing.mark and framing.length is None:
+        if framing.ends_by_gap:
             gap = framing.gap_timeout or 0.0
         return Timing(reply_timeout=0.5 + gap, turnaround=0.02 + gap, silence=0.01)
 

@@ -64,8 +64,8 @@ class Field:
     Its place: `offset` (bytes, the first is 0), `columns` (characters, the first is 1: `7-14`),
     or, with neither, the group of its name in `match`. Its type: `uint8` to `float64` and BCD as
     raw bytes, with `hex` as two hex characters each; `text`, `integer`, `decimal` as characters.
-    `bit` picks one bit of an unsigned number. `format` is the format of a number to write, as in
-    Python: `06.2f`, `+8.1f`, `04d`.
+    `bit` picks one bit of an unsigned number, `byte` one half of a `uint16`. `format` is the
+    format of a number to write, as in Python: `06.2f`, `+8.1f`, `04d`.
     """
 
     type: FieldType
@@ -74,6 +74,7 @@ class Field:
     byte_order: Literal["low_first", "high_first"] | None = None
     hex: bool = False
     bit: int | None = None
+    byte: Literal["low", "high"] | None = None
     decimal_point: Literal[".", ","] = "."
     encoding: Literal["ascii", "latin-1", "utf-8"] = "ascii"
     format: str | None = None
@@ -98,7 +99,7 @@ class Field:
 
     def _check_number(self) -> None:
         if self.size is None:
-            for name in ("byte_order", "bit"):
+            for name in ("byte_order", "bit", "byte"):
                 if getattr(self, name) is not None:
                     raise ConfigError(f"{self.type} has no {name}")
             if self.hex:
@@ -114,6 +115,8 @@ class Field:
             raise ConfigError(
                 f"{self.type} has no bit {self.bit}: use an unsigned type and its bits"
             )
+        if self.byte is not None and (self.type != "uint16" or self.bit is not None):
+            raise ConfigError("byte is the low or high half of a uint16, without bit")
 
     def _check_text(self) -> None:
         if self.decimal_point != "." and self.type != "decimal":
@@ -229,12 +232,14 @@ class Field:
             number = shortest(number)
         if number is None or not math.isfinite(number):
             raise _garbled("not a number", raw)
+        if self.byte is not None:
+            return int(number) >> 8 if self.byte == "high" else int(number) & 0xFF
         return number if self.bit is None else bool(int(number) >> self.bit & 1)
 
     def put(self, value: Value) -> bytes:
         """Returns the bytes of a value. Raises `BadValue`."""
-        if self.bit is not None:
-            raise BadValue("one bit of a number cannot be written")
+        if self.bit is not None or self.byte is not None:
+            raise BadValue("a part of a number cannot be written")
         if self.type == "text":
             return self._put_text(value)
         number = real(value) if self.kind == "number" else whole(value)
@@ -282,8 +287,8 @@ def check_writable(field: Field) -> None:
         raise ConfigError(
             "the place of a value that is sent is {value} in send: no offset, columns"
         )
-    if field.bit is not None:
-        raise ConfigError("one bit of a number cannot be written")
+    if field.bit is not None or field.byte is not None:
+        raise ConfigError("a part of a number cannot be written: leave out bit and byte")
     if field.type == "decimal" and field.format is None:
         raise ConfigError("decimal needs a format, such as 06.2f")
 

@@ -4,19 +4,27 @@ The framing of the Vigor VB-1COM (manual B-4: BFM#0 and #2 to #11, error numbers
 which is general enough for scales, barcode readers and inverters of any make:
 
     [header 0..4] data [terminator 0..4] [sum 2] [CR] [LF]
+
+An LRC or CRC stands behind the data, before the terminator:
+
+    [header 0..4] data [LRC or CRC] [terminator 0..4] [CR] [LF]
 """
 
 from dataclasses import dataclass
 from typing import Literal
 
 from gateway.errors import BadValue, ConfigError
-from gateway.protocols.checksums import byte_sum
+from gateway.protocols.checksums import byte_sum, crc16, lrc
 from gateway.protocols.frames.bytetext import octets
 
 Preset = Literal["vb-1com", "vigor-rs", "ex485lnk-user", "k120s-drcv", "k120s-dsnd"]
 
 DEFAULT_GAP = 0.1  # s; ends a frame that neither a terminator nor its length can end
 
+
+End = Literal["terminator", "count", "gap"]
+# Behind the data: the LRC of Modbus ASCII, or the CRC of Modbus RTU.
+Check = Literal["lrc", "crc16"]
 
 # The header bytes that the sum leaves out: the first, by the manuals; no recording confirms it.
 SumHeaderRule = Literal["first_byte_only", "whole_header"]
@@ -27,7 +35,9 @@ class Framing:
     """One framing as in the file. With a `preset`, `presets.written_out` completes it.
 
     `length` is the exact number of data bytes, of any value; `max_length` ends a frame without
-    another end. Both count data before conversion. `gap` in seconds, in steps of 10 ms.
+    another end. Both count data before conversion. `gap` in seconds, in steps of 10 ms. `ends`
+    names all that may complete a frame, whichever is first; empty: the terminator or `length`
+    where there is one, otherwise `max_length` or the gap.
     """
 
     preset: Preset | None = None
@@ -43,6 +53,8 @@ class Framing:
     length: int | None = None
     max_length: int | None = None
     gap: float | None = None
+    ends: tuple[End, ...] = ()
+    check: Check | None = None
 
     def __post_init__(self) -> None:
         for name, text in (("header", self.header), ("terminator", self.terminator)):
@@ -50,16 +62,45 @@ class Framing:
                 raise ConfigError(f"{name} {text!r} is longer than 4 bytes")
         if self.preset is None:
             self._check_by_hand()
-        if self.keep_terminator and not self.terminator:
-            raise ConfigError("keep_terminator needs a terminator")
-        if self.keep_terminator and (self.sum_check or self.ending):
-            raise ConfigError("keep_terminator: a sum, CR or LF cannot follow")
+        self._check_sums()
         for name, count in (("length", self.length), ("max_length", self.max_length)):
             if count is not None and not 1 <= count <= self.capacity:
                 raise ConfigError(f"{name} {count} is not 1..{self.capacity}")
         if self.length is not None and self.max_length is not None:
             raise ConfigError("length is exact, max_length is not: write one of them")
         self._check_gap()
+        self._check_ends()
+
+    def _check_sums(self) -> None:
+        if self.keep_terminator and not self.terminator:
+            raise ConfigError("keep_terminator needs a terminator")
+        if self.keep_terminator and (self.sum_check or self.ending):
+            raise ConfigError("keep_terminator: a sum, CR or LF cannot follow")
+        if self.check == "crc16" and self.mark and self.length is None and not self.conversion:
+            raise ConfigError(
+                "crc16 is two bytes of any value: end the frame by length or gap, or set conversion"
+            )
+        if self.check is not None and (self.sum_check or self.keep_terminator):
+            raise ConfigError("a frame has one check: sum_check (or keep_terminator), or check")
+
+    def _check_ends(self) -> None:
+        ends = self.ends
+        if not ends:
+            return
+        if self.length is not None:
+            raise ConfigError("length is exact and ends the frame: ends belongs to max_length")
+        if len(set(ends)) < len(ends):
+            raise ConfigError(f"ends names one of {', '.join(ends)} twice")
+        if "count" in ends and self.max_length is None:
+            raise ConfigError("ends: count is the number in max_length, which is missing")
+        marked = bool(self.mark)
+        if ("terminator" in ends) != marked and self.preset is None:
+            missing = "needs a terminator or ending" if not marked else "must name the terminator"
+            raise ConfigError(f"ends {missing}")
+        if "count" in ends and marked and len(self.mark + self.tail) > 1:
+            raise ConfigError("ends: count and a terminator: it has one byte, and no LF behind it")
+        if self.sum_check and ends != ("terminator",):
+            raise ConfigError("ends: with sum_check only the terminator ends a frame")
 
     def _check_by_hand(self) -> None:
         if self.format is not None:
@@ -100,14 +141,50 @@ class Framing:
 
     @property
     def gap_timeout(self) -> float | None:
-        """Seconds of silence that end a frame; None where a silence ends no frame."""
-        if self.gap is None and not self.mark:
+        """Seconds of silence that end a frame, or cut it short; None where it does neither."""
+        if self.gap is None and (not self.mark or self.ends_by_gap):
             return DEFAULT_GAP
         return self.gap
 
+    @property
+    def ends_by_gap(self) -> bool:
+        """True when a frame is complete after a silence, not cut short."""
+        if self.ends:
+            return "gap" in self.ends
+        return not self.mark and self.length is None
+
+    @property
+    def ends_by_count(self) -> bool:
+        """True when a frame is complete with its longest data."""
+        return "count" in self.ends if self.ends else not self.mark
+
+    @property
+    def longest_on_line(self) -> int:
+        """The most characters between the header and the terminator."""
+        return (self.longest + self.check_size) * (2 if self.conversion else 1)
+
+    @property
+    def check_size(self) -> int:
+        """The bytes of the LRC or CRC, before conversion."""
+        if self.check is None:
+            return 0
+        return 1 if self.check == "lrc" and self.conversion else 2
+
+    def check_of(self, data: bytes) -> bytes:
+        """Returns the LRC or CRC of data before conversion; the LRC as two hexadecimal
+        characters, unless conversion makes these of it."""
+        match self.check:
+            case "lrc":
+                value = lrc(data)
+                return bytes([value]) if self.conversion else b"%02X" % value
+            case "crc16":
+                return crc16(data)
+            case None:
+                return b""
+
     def on_line(self, count: int) -> int:
         """Returns the characters of a frame with `count` data bytes, everything included."""
-        data = count * (2 if self.conversion else 1)
+        data = (count + self.check_size) * (2 if self.conversion else 1)
         around = octets(self.header) + self.mark + self.tail
         return data + len(around) + (2 if self.sum_check else 0)
 
@@ -123,7 +200,8 @@ class Framing:
         if self.keep_terminator:
             return payload
         header, terminator = octets(self.header), octets(self.terminator)
-        data = payload.hex().upper().encode() if self.conversion else payload
+        checked = payload + self.check_of(payload)
+        data = checked.hex().upper().encode() if self.conversion else checked
         if self.length is None:
             self._refuse_marks(data)
         total = self.sum_of(header, data) if self.sum_check else b""

@@ -58,7 +58,7 @@ def _vb_1com(framing: Framing) -> Framing:
     _takes(
         framing,
         *("format", "header", "terminator", "sum_header_rule", "conversion"),
-        *("buffer", "length", "max_length", "gap"),
+        *("buffer", "length", "max_length", "gap", "ends"),
     )
     number = framing.format
     if number not in _VB_1COM:
@@ -77,7 +77,7 @@ def _vb_1com(framing: Framing) -> Framing:
 
 
 def _vigor_rs(framing: Framing) -> Framing:
-    _takes(framing, "header", "terminator", "buffer", "length", "max_length", "gap")
+    _takes(framing, "header", "terminator", "buffer", "length", "max_length", "gap", "ends")
     for name, text in (("header", framing.header), ("terminator", framing.terminator)):
         if len(octets(text)) > 1:
             raise ConfigError(f"vigor-rs has a {name} of one byte, not {text!r}")
@@ -86,7 +86,7 @@ def _vigor_rs(framing: Framing) -> Framing:
 
 
 def _ex485lnk(framing: Framing) -> Framing:
-    _takes(framing, "header", "terminator", "buffer", "length", "max_length", "gap")
+    _takes(framing, "header", "terminator", "buffer", "length", "max_length", "gap", "ends")
     _check_first_byte(framing)
     return _limited(framing, 128 if framing.buffer == 16 else 64)
 

@@ -1,8 +1,9 @@
 """Reads and writes the devices of Vigor M, VB and VH PLCs over the computer link (manual B-5)."""
 
+import re
 import struct
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import ClassVar, Literal
 
@@ -53,23 +54,30 @@ _REFUSALS = {
     "14": (Refusal.DAMAGED, "stop bit, parity, frame or overrun error: line settings or noise"),
     "28": (Refusal.ADDRESS, "data address out of range"),
 }
-_TRAITS = Traits(baudrate=19200, format="7E1")
+_TRAITS = Traits(baudrate=19200, format="7E1", one_format=True)
+_FORMAT = re.compile(r"[78][NEO][12]\Z")
 _TIMING = Timing(reply_timeout=0.5, turnaround=0.005, silence=0.005, retries=2, learn_silence=True)
 _PROBE_SIZES = (1, 3, 5, 7, 9, 11, 13, 15)  # odd byte counts: no read of words has these
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Vigor:
-    """One Vigor PLC. `station` is 0 on port CP1, 0..255 on CP2, 0..99 on CP3."""
+    """One Vigor PLC. `station` is 0 on port CP1, 0..255 on CP2, 0..99 on CP3.
+
+    `format`: only for a device that is set to another format than the manual's.
+    """
 
     protocol: Literal["vigor"] = "vigor"
     station: int = 0
+    format: str = _TRAITS.format
 
     scan_hints: ClassVar = ScanHints(formats=("7E1", "8N1"), stations=range(32))
 
     def __post_init__(self) -> None:
         if not 0 <= self.station <= 255:
             raise ConfigError(f"station {self.station} is not 0..255")
+        if not _FORMAT.match(self.format):
+            raise ConfigError(f"format: {self.format} is no character format such as 8N1")
 
     @property
     def areas(self) -> Mapping[str, Area]:
@@ -77,7 +85,8 @@ class Vigor:
 
     @property
     def traits(self) -> Traits:
-        return _TRAITS
+        usual = self.format == _TRAITS.format
+        return _TRAITS if usual else replace(_TRAITS, format=self.format)
 
     @property
     def timing(self) -> Timing:
