@@ -87,6 +87,12 @@ class Incoming:
         """Call it when the gateway becomes active, before it takes queries for the plant."""
         self._acceptance.begin()
 
+    def become(self, index: TagIndex) -> frozenset[str]:
+        """Serves other devices from now on. Returns the names of those that have gone."""
+        gone = self._index.names - index.names
+        self._index.become(index)
+        return gone
+
     def changed(self) -> None:
         """Declares the keys of changed devices. Blocks."""
         if self._declarations is not None:

@@ -85,7 +85,7 @@ class Northbound:
             log.warning("Zenoh session exposed", why=exposure)
         self._plant = plant
         self._links = LinkMonitor(is_peer=settings.mode is ZenohMode.PEER)
-        self._index = index = TagIndex(self.keys, plant.devices())
+        index = TagIndex(self.keys, plant.devices())
         self._admission = Admission(group, self.keys, self._config, index.names, plant.duty)
         losses = Losses(drop_limit(self._config))
         self._publisher = Publisher(self.keys, losses)
@@ -177,9 +177,7 @@ class Northbound:
 
     async def change(self, index: TagIndex, gone: Iterable[Tag]) -> None:
         """Serves the devices of the plant as they are now. `gone`: tags that it had before."""
-        left = self._index.names - index.names
-        self._index.become(index)
-        self._publisher.forget(left, gone)
+        self._publisher.forget(self._incoming.become(index), gone)
         if self.opened.is_set():
             await off_loop(self._incoming.changed)
             self._status.publish()
