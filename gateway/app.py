@@ -18,7 +18,10 @@ from gateway.line.build import OpenPort, line_of, opener
 from gateway.line.duty import Duty
 from gateway.line.line import Line, Watcher
 from gateway.line.on_demand import OnDemand
+from gateway.line.serving import Serving
+from gateway.northbound.served_status import served_documents
 from gateway.northbound.status import Document, device_document, line_document, standing
+from gateway.serving.station import Station
 from gateway.tags import Reason, Sample, Tag, WriteResult, bad
 from gateway.tags.mirror import Mirror
 from gateway.tags.timestamps import rfc3339
@@ -34,6 +37,8 @@ def forecasts(
     """
     found = []
     for line in config.lines:
+        if line.serve:
+            continue
         devices = [Device(device, line.wire) for device in line.devices if device.enabled]
         found.append(forecast(line.name, devices, line.wire))
         if report is not None:
@@ -81,8 +86,10 @@ class Gateway:
         self._open_line, self._seeds = open_line, itertools.count()
         self._forecasts: dict[str, LineForecast] = {}
         self._on_demand = OnDemand(self._places.get, self.sample)
+        self.serving = Serving(config, self, self._find_sample, wall=wall, duty=self.duty)
         for line in config.lines:
-            self.add_line(line)
+            if not line.serve:
+                self.add_line(line)
         if plan_now:
             for made in self.lines:
                 self.planned(made, self.plan(made))
@@ -145,7 +152,7 @@ class Gateway:
             started = [bad(tag, reason, now) for tag in change.started]
             self.mirror.add(started, change.renewed)
             if change.new is not None:
-                self._tags.update((tag.key, tag) for tag in change.new.tags)
+                self._tags.update((tag.key, tag) for tag in change.new.wire_tags)
             left = change.gone
             ended = [tag for tag in left if self._tags[tag.key] is tag]
             for tag in ended:
@@ -155,6 +162,23 @@ class Gateway:
             self._publish([*started, *last])
             gone += left
         self._on_demand.changed(gone)
+
+    def compute(self, new: Sequence[Tag], gone: Sequence[Tag]) -> None:
+        """Takes over the computed tags, when all their inputs are taken over."""
+        if not (gone or new):
+            return
+        now = self._wall()
+        enabled = {device.name for device in self._devices if device.enabled}
+        self._tags.update((tag.key, tag) for tag in new)
+        first = [
+            bad(tag, Reason.STARTING if tag.device in enabled else Reason.DISABLED, now)
+            for tag in new
+        ]
+        found = self.mirror.compute(first, gone)
+        ended = [tag for tag in gone if self._tags.get(tag.key) is tag]
+        for tag in ended:
+            del self._tags[tag.key]
+        self._publish([*found, *(bad(tag, Reason.DISABLED, now, REMOVED) for tag in ended)])
 
     def configure(self, config: Config) -> None:
         """Has this configuration, after its changes are taken over."""
@@ -189,14 +213,18 @@ class Gateway:
 
     def samples(self, samples: Sequence[Sample]) -> None:
         changed = self.mirror.update(samples)
+        if self.serving.remembers:
+            self.serving.remember(samples)
         if waiting := self._on_demand.waiting:
             for sample in samples:
                 if sample.tag in waiting:
                     self._on_demand.answer(sample)
         if changed:
+            if self.mirror.dependents:
+                changed = [*changed, *self.mirror.computed_after(changed)]
             self._publish(changed)
 
-    def online(self, device: Device, online: bool) -> None:
+    def online(self, device: Device | Station, online: bool) -> None:
         for subscriber in self._subscribers:
             subscriber.set_online(device.name, online)
 
@@ -221,6 +249,11 @@ class Gateway:
                 return bad(tag, Reason.DISABLED, self._wall(), REMOVED)
             return self.mirror[current]
 
+    def _find_sample(self, key: str) -> Sample | None:
+        """Returns the sample of `device/tag`; None: no such tag in this process."""
+        tag = self._tags.get(key)
+        return None if tag is None else self.sample(tag)
+
     def mark_published(self, samples: Sequence[Sample]) -> None:
         if changed := self.mirror.mark_published(samples):
             self._publish(changed)  # history keeps it too
@@ -232,6 +265,8 @@ class Gateway:
         """
         if self._tags.get(tag.key) is not tag:  # its scale or limits may be others now
             raise Busy(f"the file was reloaded, and {tag.key} with it; not sent")
+        if self.serving.holds(tag):
+            return await self.serving.write(tag, value)
         if tag.device not in self._places:
             raise Offline(f"device {tag.device} is disabled; nothing was sent")
         units = tag.encode(value)
@@ -279,8 +314,10 @@ class Gateway:
                 "time": rfc3339(self._wall()),
                 "up": round(time.monotonic() - self._started, 1),
                 "tags": len(self._tags),
-                "lines": {line.engine.name: line.engine.is_open for line in self.lines},
-                "devices": {name: standing(d) for name, (_, d) in self._places.items()},
+                "lines": {line.engine.name: line.engine.is_open for line in self.lines}
+                | {line.name: line.is_open for line in self.serving.lines},
+                "devices": {name: standing(d) for name, (_, d) in self._places.items()}
+                | {station.name: station.presence.value for station in self.serving.stations},
             }
         }
         for line in self.lines:
@@ -291,4 +328,5 @@ class Gateway:
         for name, (line, device) in self._places.items():
             polls = line.engine.schedule.polls(device)
             documents[f"devices/{name}"] = device_document(device, polls, now)
+        documents |= served_documents(self.serving.lines, now)
         return documents | {path: document() for path, document in self._documents.items()}

@@ -231,7 +231,10 @@ async def _start_lines(
     if state_file is not None:
         await cleanup.enter_async_context(_saved(state_file, gateway))
     for line, plan in zip(gateway.lines, plans, strict=True):
-        running.start(line, _run_planned(line, plan))
+        running.start(line, line.engine.name, _run_planned(line, plan))
+    gateway.serving.restore()
+    for one in gateway.serving.lines:
+        running.start(one, one.name, one.run())
     cleanup.push_async_callback(running.end_all)  # first, so that the last outcomes are published
 
 

@@ -9,11 +9,11 @@ import re
 import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from decimal import Decimal
 from enum import StrEnum
 from operator import index
 
 from gateway.errors import BadValue, ConfigError
+from gateway.numerals import real, shortest, whole
 
 Value = bool | int | float | str
 Words = Sequence[int]
@@ -24,6 +24,8 @@ ToWords = Callable[[Value], list[int]]
 
 class Kind(StrEnum):
     BOOL = "bool"
+    INT8 = "int8"
+    UINT8 = "uint8"
     INT16 = "int16"
     UINT16 = "uint16"
     INT32 = "int32"
@@ -44,8 +46,17 @@ class Order(StrEnum):
     HIGH_FIRST = "high_first"
 
 
+class Byte(StrEnum):
+    """The byte of a word that holds a value of 8 bits."""
+
+    LOW = "low"
+    HIGH = "high"
+
+
 _WORDS = {
     Kind.BOOL: 1,
+    Kind.INT8: 1,
+    Kind.UINT8: 1,
     Kind.INT16: 1,
     Kind.UINT16: 1,
     Kind.BCD16: 1,
@@ -58,6 +69,8 @@ _WORDS = {
     Kind.FLOAT64: 4,
 }
 _STRUCT = {
+    Kind.INT8: ">b",
+    Kind.UINT8: ">B",
     Kind.INT16: ">h",
     Kind.UINT16: ">H",
     Kind.INT32: ">i",
@@ -69,9 +82,7 @@ _STRUCT = {
 }
 _FLOATS = (Kind.FLOAT32, Kind.FLOAT64)
 _BCD = (Kind.BCD16, Kind.BCD32)
-_SINGLE = struct.Struct(">f")
-_LARGEST_SINGLE = 3.4028234663852886e38
-_WHOLE_FLOATS = 2.0**53  # from here on floats skip whole numbers
+BYTES = (Kind.INT8, Kind.UINT8)
 LONGEST_STRING = 250
 
 
@@ -88,8 +99,25 @@ class ValueType:
         return (self.length + 1) // 2 if self.kind is Kind.STRING else _WORDS[self.kind]
 
     @property
+    def bits(self) -> int:
+        """The number of bits of a number."""
+        return 8 if self.kind in BYTES else 16 * self.words
+
+    def holds(self, number: int) -> bool:
+        """Returns True if a number of this type can be `number`."""
+        try:
+            to_words(Layout(self))(number)
+        except BadValue:
+            return False
+        return True
+
+    @property
     def is_number(self) -> bool:
         return self.kind not in (Kind.BOOL, Kind.STRING)
+
+    @property
+    def is_float(self) -> bool:
+        return self.kind in _FLOATS
 
     def __str__(self) -> str:
         return f"string[{self.length}]" if self.kind is Kind.STRING else self.kind.value
@@ -121,6 +149,7 @@ class Layout:
     type: ValueType
     word_order: Order = Order.LOW_FIRST
     byte_order: Order = Order.HIGH_FIRST
+    byte: Byte = Byte.LOW  # for 8 bits
 
 
 def from_words(layout: Layout) -> FromWords:
@@ -135,6 +164,9 @@ def from_words(layout: Layout) -> FromWords:
         return lambda words: _text(_octets(words, layout.byte_order)[:length])
     if kind is Kind.BOOL:
         return lambda words: bool(words[0])
+    if kind in BYTES:
+        shift, sign = (8 if layout.byte is Byte.HIGH else 0), 0x80 if kind is Kind.INT8 else 0
+        return lambda words: ((words[0] >> shift & 0xFF) ^ sign) - sign
     if kind in _BCD:
         return lambda words: _from_bcd(_ordered(words, layout))
     unpack = struct.Struct(_STRUCT[kind]).unpack
@@ -162,12 +194,17 @@ def from_word(layout: Layout) -> FromWord:
 
 
 def to_words(layout: Layout) -> ToWords:
-    """Returns the inverse of `from_words`. It raises `BadValue` for a value that does not fit."""
+    """Returns the inverse of `from_words`. It raises `BadValue` for a value that does not fit.
+
+    A value of 8 bits gives the byte alone.
+    """
     kind = layout.type.kind
     if kind is Kind.STRING:
         return lambda value: _string_words(value, layout)
     if kind is Kind.BOOL:
         return lambda value: [int(_boolean(value))]
+    if kind in BYTES:
+        return lambda value: [_byte(whole(value), kind)]
     if kind in _BCD:
         digits = 4 * layout.type.words
         return lambda value: _ordered(_to_bcd(whole(value), digits), layout)
@@ -183,6 +220,14 @@ def to_words(layout: Layout) -> ToWords:
         return _ordered(struct.unpack(f">{len(raw) // 2}H", raw), layout)
 
     return encode
+
+
+def _byte(value: int, kind: Kind) -> int:
+    try:
+        (byte,) = struct.pack(_STRUCT[kind], value)
+    except struct.error:
+        raise BadValue(f"{value} does not fit {kind.value} ({_bounds(kind)})") from None
+    return int(byte)
 
 
 def _ordered(words: Words, layout: Layout) -> list[int]:
@@ -202,20 +247,6 @@ def _octets(words: Words, order: Order = Order.HIGH_FIRST) -> bytes:
 
 def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
-
-
-def shortest(value: float) -> float | None:
-    """Returns the shortest decimal of a 32-bit float: 0.1, not 0.10000000149011612."""
-    if not math.isfinite(value):
-        return None
-    if value.is_integer():
-        return value
-    packed = _SINGLE.pack(value)
-    for digits in (6, 7, 8):
-        short = float(f"{value:.{digits}g}")
-        if abs(short) <= _LARGEST_SINGLE and _SINGLE.pack(short) == packed:
-            return short
-    return float(f"{value:.9g}")
 
 
 def _text(octets: bytes) -> str:
@@ -245,44 +276,10 @@ def _boolean(value: Value) -> bool:
     return bool(value)
 
 
-def whole(value: Value) -> int:
-    """Returns the value as an integer. Raises `BadValue` for other values."""
-    if isinstance(value, (bool, str)):
-        raise BadValue(f"{value!r} is not a number")
-    if isinstance(value, float) and not value.is_integer():
-        raise BadValue(f"{value} is not a whole number")
-    return int(value)
-
-
-def parse_decimal(text: str) -> int | float:
-    """Returns the number of a JSON text with a point or an exponent, infinite if too large.
-
-    It is an integer where a float would change a whole number of 64 bits: 9007199254740993.0.
-    """
-    number = float(text)
-    if not _WHOLE_FLOATS <= abs(number) < 2.0**64:
-        return number
-    exact = Decimal(text)
-    return int(exact) if exact == exact.to_integral_value() else number
-
-
-def real(value: Value) -> float:
-    """Returns the value as a finite float. Raises `BadValue` for other values."""
-    if isinstance(value, (bool, str)):
-        raise BadValue(f"{value!r} is not a number")
-    try:
-        number = float(value)
-    except OverflowError:
-        number = math.inf
-    if not math.isfinite(number):
-        raise BadValue(f"{value} is not a finite number")
-    return number
-
-
 def _bounds(kind: Kind) -> str:
     if kind in _FLOATS:
         return "up to 3.4e38 either way" if kind is Kind.FLOAT32 else "up to 1.8e308 either way"
-    bits = 16 * _WORDS[kind]
+    bits = ValueType(kind).bits
     if kind.value.startswith("u"):
         return f"0 to {2**bits - 1}"
     return f"{-(2 ** (bits - 1))} to {2 ** (bits - 1) - 1}"

@@ -35,6 +35,8 @@ _KNOWN = frozenset(
         "minimum",
         "maximum",
         "minProperties",
+        "minItems",
+        "maxItems",
         "propertyNames",
         "not",
     ]
@@ -62,6 +64,8 @@ class _Check:
         if isinstance(value, dict):
             yield from self._mapping(value, rule, at)
         if isinstance(value, list):
+            if not rule.get("minItems", 0) <= len(value) <= rule.get("maxItems", len(value)):
+                yield at
             for i, inner in enumerate(value):
                 yield from self.broken(inner, rule.get("items", {}), f"{at}/{i}")
         yield from self._choices(value, rule, at)

@@ -36,6 +36,7 @@ from gateway.history import Historian
 from gateway.line.duty import Duty
 from gateway.northbound import GroupSettings, payload
 from gateway.northbound.keys import Keys
+from gateway.northbound.meta import meta
 from gateway.northbound.payload import Problem
 from gateway.northbound.secrets import exposures
 from gateway.northbound.standby import Standby
@@ -116,7 +117,7 @@ def endpoint(running: Path) -> str:
 
 def shape(line: str) -> str:
     """Replaces everything that differs from one run to the next."""
-    line = re.sub(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d+Z", "TIME", line)
+    line = re.sub(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d+(Z|[+-]\d\d:\d\d)", "TIME", line)
     line = re.sub(r"\b(True|False|true|false)\b", "BOOL", line)
     return re.sub(r"(?<![\w.])-?\d+(\.\d+)?(?![\w.])", "N", line)
 
@@ -134,7 +135,8 @@ def test_every_page_with_files_is_checked() -> None:
     counted = Counter(block.page for block in FILES)
     assert set(counted) == {
         *("/README.md", "configuration.md", "vigor.md", "computer-link.md", "modbus.md"),
-        *("first-plant.md", "import.md", "peek.md", "systems.md"),
+        *("first-plant.md", "import.md", "peek.md", "serve.md", "systems.md"),
+        *("tutorial-computer-link.md", "tutorial-modbus.md", "tutorial-vigor.md"),
     }
     assert sum(counted.values()) >= 11
     assert {block.page for block in DEVICES} == {OF_DEVICES}
@@ -204,7 +206,23 @@ def settings(heading: str) -> dict[str, str]:
     """The settings of a section with the defaults that its page names."""
     page = "configuration-protocols.md" if heading in PROTOCOLS else "configuration.md"
     rows = table(page, heading, "setting")
+    if heading == "A tag":
+        rows += table("shaping.md", "Settings", "setting")
     return {bare(name): bare(default) for name, _, default, _ in rows}
+
+
+# The settings of served lines are on the page about them.
+SERVED = {
+    "A line": "Settings of a served line",
+    "A device": "Settings of a station",
+    "A tag": "Settings of its tags",
+}
+
+
+def documented(heading: str) -> set[str]:
+    """The settings of a section on its page, and those of served lines."""
+    served = table("serve.md", SERVED[heading], "setting") if heading in SERVED else []
+    return {*settings(heading), *(bare(name) for name, *_ in served)}
 
 
 def properties(*names: str) -> set[str]:
@@ -221,12 +239,12 @@ def properties(*names: str) -> set[str]:
     ],
 )
 def test_every_setting_of_a_section_is_on_the_page_and_no_other(heading: str, shape: str) -> None:
-    assert set(settings(heading)) == properties(shape)
+    assert documented(heading) == properties(shape)
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 def test_every_setting_of_a_protocol_is_on_the_page_and_no_other(protocol: str) -> None:
-    common = set(settings("A device"))
+    common = documented("A device")
     own = set(settings({"modbus-ascii": "modbus-rtu"}.get(protocol, protocol)))
     if protocol == "modbus-tcp":
         own |= set(settings("modbus-rtu"))
@@ -420,9 +438,12 @@ def test_the_reference_lists_every_command_and_every_option() -> None:
     group: Any = typer.main.get_command(cli)
     listed = [name.split()[0] for name in names("commands.md", "Commands", "command")]
     assert listed == list(group.commands)
+    single = {name: one for name, one in group.commands.items() if not hasattr(one, "commands")}
+    for name, group_of in group.commands.items() - single.items():
+        single |= {f"{name} {sub}": command for sub, command in group_of.commands.items()}
     options = {
         (name, option)
-        for name, command in group.commands.items()
+        for name, command in single.items()
         for param in command.params
         if param.param_type_name == "option"
         for option in (*param.opts, *param.secondary_opts)
@@ -617,7 +638,7 @@ def test_a_value_has_the_fields_of_the_page() -> None:
 def test_a_description_has_the_fields_of_the_page() -> None:
     tag = load(EXAMPLE).devices[0].tags[0]
     sentence = TEXT["zenoh.md"].partition("A description holds ")[2].partition(": `null`")[0]
-    assert set(re.findall(r"`(\w+)`", sentence)) == set(json.loads(payload.meta(tag)))
+    assert set(re.findall(r"`(\w+)`", sentence)) == set(json.loads(meta(tag)))
 
 
 def test_the_status_documents_have_the_fields_of_the_page(endpoint: str, tmp_path: Path) -> None:

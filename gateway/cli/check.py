@@ -11,6 +11,7 @@ from rich.text import Text
 
 from gateway import app, northbound
 from gateway.cli.progress import progress
+from gateway.cli.served_plan import served_plan
 from gateway.cli.terminal import FAILED, ConfigPath, err, out
 from gateway.config import Config, load, state_folder
 from gateway.engine.forecast import LineForecast
@@ -37,6 +38,8 @@ def check(
         lines = app.forecasts(loaded, report)
     few = sum(len(line.blocks) for line in lines) <= 100
     out.print(plan(lines, every_block=few if blocks is None else blocks))
+    for served in (line for line in loaded.lines if line.serve):
+        out.print(served_plan(served))
     for note in _notes(loaded):
         err.print(f"note: {note}")
     for line in lines:
@@ -54,11 +57,12 @@ def check(
 
 
 def _notes(config: Config) -> Iterator[str]:
-    tags = [tag for device in config.devices for tag in device.tags]
+    tags = [tag for one in config.devices if one.served is None for tag in one.tags]
     for tag in tags:
-        if tag.write is not None and tag.address.bit is not None:
+        if tag.write is not None and tag.part is not None:
+            part = "one bit" if tag.address.bit is not None else "one byte"
             yield (
-                f"writing {tag.key} ({tag.text}) reads the word, changes one bit and writes "
+                f"writing {tag.key} ({tag.text}) reads the word, changes {part} and writes "
                 "the word back; changes by the PLC in between are lost"
             )
     for tag in tags:

@@ -14,13 +14,14 @@ from gateway.cli.client import matches, wanted_keys
 from gateway.cli.terminal import ConfigPath, TagNames
 from gateway.config import load
 from gateway.errors import ConfigError
-from gateway.northbound import payload
+from gateway.northbound.meta import meta_fields
 from gateway.protocols.driver import Unit
 from gateway.tags import Tag
-from gateway.values import Kind
+from gateway.values import BYTES, Kind
 
 _FIRST = ("Device", "Name", "Address", "Type", "Unit", "Scale", "Offset", "Every", "R/W")
-_OWN = {"type", "address", "unit", "scale", "offset", "every", "write", "deadband"}
+_OWN = {"type", "raw_type", "address", "unit", "scale", "offset", "every", "write", "deadband"}
+_OWN |= {"clamp", "enum"}
 _TIMES = {"every", "heartbeat"}
 
 
@@ -67,7 +68,7 @@ def table(rows: list[dict[str, object]], *, decimal_comma: bool) -> str:
 
 
 def _row(prefix: str, tag: Tag) -> dict[str, object]:
-    meta: dict[str, object] = orjson.loads(payload.meta(tag))
+    meta = meta_fields(tag)
     rule, band = meta["write"], meta["deadband"]
     limits = rule if isinstance(rule, dict) else {}
     row: dict[str, object] = {
@@ -88,6 +89,10 @@ def _row(prefix: str, tag: Tag) -> dict[str, object]:
         else "",
     }
     row |= _order(tag)
+    if tag.shaping is not None and tag.shaping.clamp is not None:
+        row["Clamp"] = orjson.dumps(tag.shaping.clamp).decode()
+    if tag.names is not None:
+        row["Enum"] = ";".join(f"{number}={name}" for number, name in tag.names.by_number.items())
     for name, value in meta.items():
         if name not in _OWN:
             row[name.replace("_", " ").capitalize()] = _other(name, value)
@@ -102,6 +107,8 @@ def _order(tag: Tag) -> Mapping[str, object]:
     kind = tag.layout.type
     if tag.shape is not None or tag.unit_kind is not Unit.WORD or kind.kind is Kind.BOOL:
         return {}
+    if kind.kind in BYTES:
+        return {"Byte": tag.layout.byte.value}
     found = {"Byte order": tag.layout.byte_order.value}
     if kind.is_number and kind.words > 1:
         found["Word order"] = tag.layout.word_order.value
@@ -114,7 +121,7 @@ def _other(name: str, value: object) -> object:
         return ""
     if name in _TIMES and isinstance(value, float):
         return _time(value)
-    return orjson.dumps(value).decode() if isinstance(value, (dict, list)) else value
+    return orjson.dumps(value).decode() if isinstance(value, (dict, list, tuple)) else value
 
 
 def _time(seconds: float) -> str:

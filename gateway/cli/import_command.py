@@ -9,10 +9,11 @@ import typer
 
 from gateway.cli.terminal import err
 from gateway.config import Config, ConfigErrors, SheetUse, load
+from gateway.config.messages import one_of
 from gateway.config.sheet_tags import preview
 from gateway.config.yaml_insert import entry, with_tags
 from gateway.errors import ConfigError
-from gateway.sheets import devices_in, read_grid
+from gateway.sheets import devices_in, link_table, read_grid
 from gateway.tags import Tag
 
 _DERIVED = ("decode", "shape")
@@ -34,7 +35,7 @@ def import_(
 ) -> None:
     """Import the tags of a sheet into the configuration. With a mistake nothing is written."""
     grid = read_grid(read_file(sheet))
-    named = devices_in(grid)
+    named = [] if link_table.is_table(grid) else devices_in(grid)
     if into is None:
         tags, notes = preview(sheet, grid, device or (named[0] if len(named) == 1 else ""))
         print_notes(sheet, notes)
@@ -60,7 +61,7 @@ def add_tags(sheet: Path, into: Path, devices: list[str], *, backup: bool = True
 
     Raises `ConfigErrors` with every mistake; then the file is as before.
     """
-    devices = devices or _only_device(into)
+    devices = devices or _devices_of_table(sheet, into) or _only_device(into)
     before = read_file(into)
     try:
         wanted = load(into, imports={device: sheet.absolute() for device in devices})
@@ -92,6 +93,19 @@ def _said(sheet: Path, into: Path, use: SheetUse) -> str:
 def print_notes(sheet: Path, notes: tuple[str, ...] | list[str]) -> None:
     for note in notes:
         err.print(f"note: {sheet.name}: {note}")
+
+
+def _devices_of_table(sheet: Path, into: Path) -> list[str]:
+    """Returns the devices whose stations a communication table has; none for another sheet."""
+    stations = link_table.stations_in(read_grid(read_file(sheet)))
+    devices = load(into).devices if stations else ()
+    known = {device.driver.station: device.name for device in devices}
+    if missing := [station for station in stations if station not in known]:
+        raise ConfigError(
+            f"{into.name} has no device with station {one_of(map(str, missing))}, which "
+            f"{sheet.name} names: add it, or name one device with --device"
+        )
+    return [known[station] for station in stations]
 
 
 def _only_device(into: Path) -> list[str]:

@@ -16,6 +16,7 @@ from gateway.cli import (
     check,
     control,
     export,
+    history,
     import_command,
     new,
     peek,
@@ -109,6 +110,7 @@ cli.command()(simulate.simulate)
 cli.command()(status.status)
 cli.command()(status.health)
 cli.command()(backup.backup)
+cli.add_typer(history.cli, name="history")
 
 
 @cli.command()

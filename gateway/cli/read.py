@@ -10,7 +10,7 @@ from gateway.cli import direct
 from gateway.cli.client import connected, matches, tags_by_key, wanted_keys
 from gateway.cli.logs import LogFormat, LogLevel, set_up
 from gateway.cli.tables import is_good, print_rows, row_of
-from gateway.cli.terminal import FAILED, AsJson, ConfigPath, Direct, TagNames, err
+from gateway.cli.terminal import FAILED, AsJson, ConfigPath, Direct, TagNames, Utc, err
 from gateway.config import load
 from gateway.errors import GatewayError
 from gateway.northbound.keys import max_age as parse_max_age
@@ -24,6 +24,7 @@ def read(
         str | None, typer.Option(help="Read the PLC if the sample is older, e.g. 0s")
     ] = None,
     as_json: AsJson = False,
+    utc: Utc = False,
 ) -> None:
     """Print the current values, through the running gateway or --direct from the PLC."""
     loaded = load(config)
@@ -44,6 +45,6 @@ def read(
             if not rows:
                 raise GatewayError(client.no_reply)
             complete = client.report_missing(wanted, rows)
-    print_rows(rows, by_key, as_json=as_json)
+    print_rows(rows, by_key, as_json=as_json, utc=utc)
     if not (complete and all(map(is_good, rows))):
         sys.exit(FAILED)

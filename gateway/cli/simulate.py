@@ -63,7 +63,7 @@ async def serve(
 
 
 async def _serve(line: LineConfig, place: tuple[str, int] | None, links: Path | None) -> Served:
-    stations = [station_for(device.driver, device.tags) for device in line.devices]
+    stations = [station_for(device.driver, device.wire_tags) for device in line.devices]
     if place is None and isinstance(line.port, TcpAddress):
         place = ("127.0.0.1", line.port.port)
     if place is not None:

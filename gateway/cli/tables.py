@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterable, Sequence
+from datetime import datetime
 
 from rich.table import Table
 from rich.text import Text
@@ -19,6 +20,8 @@ def row_of(sample: Sample) -> Row:
         "quality": sample.quality.value,
         "time": rfc3339(sample.time),
     }
+    if sample.tag.names is not None and (text := sample.tag.names.text(sample.value)):
+        document["text"] = text
     if sample.reason is not None:
         document["reason"] = sample.reason.value
     return Row(sample.tag.key, document)
@@ -28,15 +31,18 @@ def is_good(row: Row) -> bool:
     return bool(row.document.get("quality") == Quality.GOOD)
 
 
-def print_rows(rows: Sequence[Row], tags: dict[str, Tag], *, as_json: bool) -> None:
+def print_rows(
+    rows: Sequence[Row], tags: dict[str, Tag], *, as_json: bool, utc: bool = False
+) -> None:
+    """Prints a table with times of this machine's zone unless `utc`. JSON has UTC always."""
     if as_json:
         for row in rows:
             print(json.dumps({"tag": row.tag, **row.document}), flush=True)
     else:
-        out.print(table_of(rows, tags))
+        out.print(table_of(rows, tags, utc=utc))
 
 
-def table_of(rows: Iterable[Row], tags: dict[str, Tag]) -> Table:
+def table_of(rows: Iterable[Row], tags: dict[str, Tag], *, utc: bool = False) -> Table:
     """Returns a table of values, with one line for each row."""
     table = Table(box=None, pad_edge=False)
     for column in ("tag", "value", "unit", "quality", "time"):
@@ -48,12 +54,31 @@ def table_of(rows: Iterable[Row], tags: dict[str, Tag]) -> Table:
         tag = tags.get(row.tag)
         table.add_row(
             Text(row.tag),
-            Text("-" if document.get("value") is None else value_text(document["value"])),
+            Text("-" if document.get("value") is None else _named(document)),
             Text(tag.unit if tag else ""),
             Text(printable(quality), style="" if good else "red"),
-            Text(printable(str(document.get("time", "")))),
+            Text(time_text(str(document.get("time", "")), utc=utc)),
         )
     return table
+
+
+def time_text(text: str, *, utc: bool = False) -> str:
+    """Returns a time of a payload in this machine's zone: `2026-11-20T13:00:00.123+01:00`.
+
+    With `utc` as it is in the payload. A text that is no time stays as it is.
+    """
+    if utc:
+        return printable(text)
+    try:
+        return datetime.fromisoformat(text).astimezone().isoformat(timespec="milliseconds")
+    except (ValueError, OverflowError):
+        return printable(text)
+
+
+def _named(document: dict[str, object]) -> str:
+    """Returns the value, behind its name if it has one: `auto (1)`."""
+    value = value_text(document["value"])
+    return printable(f"{document['text']} ({value})") if document.get("text") else value
 
 
 def value_text(value: object) -> str:

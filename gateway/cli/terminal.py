@@ -25,6 +25,8 @@ Direct = Annotated[
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="One JSON document per line.")]
 
+Utc = Annotated[bool, typer.Option("--utc", help="Times in UTC instead of this machine's zone.")]
+
 
 def printable(text: str, keep: str = "") -> str:
     """Escapes characters that move the cursor, forge a line or control the terminal otherwise.

@@ -10,12 +10,14 @@ from rich.text import Text
 
 from gateway.cli.client import Row, connected, tags_by_key, wanted_keys
 from gateway.cli.tables import print_rows, table_of
-from gateway.cli.terminal import AsJson, ConfigPath, TagNames, err, out
+from gateway.cli.terminal import AsJson, ConfigPath, TagNames, Utc, err, out
 from gateway.config import load
 from gateway.tags import Tag
 
 
-def watch(config: ConfigPath, tags: TagNames = None, as_json: AsJson = False) -> None:
+def watch(
+    config: ConfigPath, tags: TagNames = None, as_json: AsJson = False, utc: Utc = False
+) -> None:
     """Print a live table of values. Ctrl-C ends it."""
     loaded = load(config)
     wanted, by_key = wanted_keys(loaded, tags), tags_by_key(loaded)
@@ -23,32 +25,38 @@ def watch(config: ConfigPath, tags: TagNames = None, as_json: AsJson = False) ->
     tell = out.print if live else err.print  # above the table
     with connected(loaded, tell) as client, suppress(KeyboardInterrupt):
         if live:
-            show_live(out, client.follow(wanted), by_key)
+            show_live(out, client.follow(wanted), by_key, utc=utc)
         else:
             for row in client.follow(wanted):
-                print_rows([row], by_key, as_json=as_json)
+                print_rows([row], by_key, as_json=as_json, utc=utc)
 
 
-def show_live(screen: Console, news: Iterable[Row], tags: dict[str, Tag]) -> None:
+def show_live(
+    screen: Console, news: Iterable[Row], tags: dict[str, Tag], *, utc: bool = False
+) -> None:
     """Shows a table with the latest row of each tag until `news` ends."""
     rows: dict[str, Row] = {}
 
     def table() -> RenderableType:
-        return fitted(screen, [rows[tag] for tag in sorted(rows)], tags)
+        return fitted(screen, [rows[tag] for tag in sorted(rows)], tags, utc=utc)
 
     with Live(console=screen, refresh_per_second=5, get_renderable=table):
         for row in news:
             rows[row.tag] = row
 
 
-def fitted(screen: Console, rows: Sequence[Row], tags: dict[str, Tag]) -> RenderableType:
+def fitted(
+    screen: Console, rows: Sequence[Row], tags: dict[str, Tag], *, utc: bool = False
+) -> RenderableType:
     """Returns the table, cut to the height of the screen with the number of hidden rows."""
     room = len(rows) if len(rows) < screen.height else max(screen.height - 2, 0)
     while (
-        room and _height(screen, table_of(rows[:room], tags)) + (room < len(rows)) > screen.height
+        room
+        and _height(screen, table_of(rows[:room], tags, utc=utc)) + (room < len(rows))
+        > screen.height
     ):
         room -= 1  # a long text takes several lines
-    table = table_of(rows[:room], tags)
+    table = table_of(rows[:room], tags, utc=utc)
     if room == len(rows):
         return table
     note = f"{len(rows) - room} more: name the tags you want to see, or enlarge the window"

@@ -41,12 +41,7 @@ def write(
         raise ConfigError(f"there is no tag {tag} in {config}{suggestion(tag, known)}")
     if target.write is None:
         raise ConfigError(f"{tag} cannot be written: it has no `write: true` in {config}")
-    parsed = parse_value(value)
-    kind = target.layout.type.kind
-    if kind is Kind.BOOL and value.lower() in _SWITCH:
-        parsed = _SWITCH[value.lower()]
-    if kind is Kind.STRING and not isinstance(parsed, str):
-        parsed = value  # 12 is a text for this tag
+    parsed = _parsed(value, target)
     try:
         target.encode(parsed)
     except BadValue as error:
@@ -65,6 +60,18 @@ def write(
         print(outcome(tag, answer))
     if "error" in answer:
         sys.exit(error_code(answer))
+
+
+def _parsed(text: str, tag: Tag) -> Value:
+    """Returns the value that the text means for this tag."""
+    if tag.names is not None and text in tag.names.by_number.values():
+        return text  # `on` is a name here
+    kind, parsed = tag.layout.type.kind, parse_value(text)
+    if kind is Kind.BOOL and text.lower() in _SWITCH:
+        return _SWITCH[text.lower()]
+    if kind is Kind.STRING and not isinstance(parsed, str):
+        return text  # 12 is a text for this tag
+    return parsed
 
 
 def _write_directly(config: Config, tag: Tag, value: Value) -> dict[str, object]:

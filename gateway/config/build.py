@@ -7,6 +7,7 @@ from pathlib import Path as FilePath
 from typing import Any
 
 from gateway.config import parsers
+from gateway.config.computed_tags import with_computed
 from gateway.config.device_tags import DeviceTags, mapping
 from gateway.config.line_rules import check_line, line_wire
 from gateway.config.messages import Mistakes, Path, meant, shown
@@ -24,6 +25,14 @@ from gateway.config.records import (
     WebConfig,
     ZenohConfig,
     ZenohMode,
+)
+from gateway.config.served import (
+    ServedDevice,
+    ServedView,
+    check_served_line,
+    check_sources,
+    only_served,
+    retained,
 )
 from gateway.config.sheet_tags import SheetTags
 from gateway.config.tag_rules import inherit
@@ -76,9 +85,12 @@ class Builder:
                 lines.append(line)
         if raw_lines == {}:
             self.mistakes.add(("lines",), "no lines: a gateway has at least one")
+        lines = with_computed(lines, self._tags.computed, self.mistakes)
         self._check_ports(lines, raw_lines)
+        check_sources(lines, self.mistakes)
         if top is None:
             return None
+        self._check_retain(top, lines)
         self._check_history(top)
         return Config(
             name=top.gateway.name,
@@ -111,7 +123,8 @@ class Builder:
                     "a name is used once in the file, it is the key of the values",
                 )
             self._devices.setdefault(checked, name)
-            device = self._device(checked, raw_device, place, defaults)
+            serve = line is not None and line.serve
+            device = self._device(checked, raw_device, place, defaults, serve=serve)
             if device is not None:
                 devices.append(device)
             if self.report is not None:
@@ -121,6 +134,8 @@ class Builder:
         if line is None:
             return None
         check_line(line, devices, path, self.mistakes)
+        if line.serve:
+            check_served_line(line, devices, path, self.mistakes)
         serial, wire = line_wire(line, devices, path, self.mistakes)
         return LineConfig(
             name=name,
@@ -128,11 +143,12 @@ class Builder:
             serial=serial,
             wire=wire,
             echo=line.echo,
+            serve=line.serve,
             devices=tuple(devices),
         )
 
     def _device(
-        self, name: str, raw: object, path: Path, outer: TagDefaults
+        self, name: str, raw: object, path: Path, outer: TagDefaults, *, serve: bool
     ) -> DeviceSettings | None:
         if not isinstance(raw, dict):
             section(DeviceSection, raw, path, self.mistakes, "a device")
@@ -142,13 +158,22 @@ class Builder:
         settings = section(DeviceSection, common, path, self.mistakes, "a device")
         driver = self._driver(raw.get("protocol"), own, path)
         defaults = self._defaults(raw, path, outer)
+        real, driver = driver, ServedView(driver) if serve and driver is not None else driver
         tags = self._tags.build(name, raw.get("tags"), (*path, "tags"), defaults, driver)
+        sheets = len(self._sheets.used)
         own_sheet = None if settings is None else settings.tags_from
         for sheet in filter(None, (own_sheet, self.imports.get(name))):
             place, taken = (*path, "tags_from"), {tag.name for tag in tags}
             tags += self._sheets.build(name, sheet, place, defaults, driver, taken)
-        if settings is None or driver is None:
+        if settings is None or real is None:
             return None
+        driver, served = real, None
+        if serve:
+            rest = [sheet.raw for sheet in self._sheets.used[sheets:]]
+            device = ServedDevice(driver, settings, raw, rest, defaults, path, self.mistakes)
+            served, tags = device.build(tags)
+        else:
+            only_served(raw, path, self.mistakes)
         default = driver.timing
         timing = Timing(
             reply_timeout=_either(settings.reply_timeout, default.reply_timeout),
@@ -169,6 +194,7 @@ class Builder:
             control=settings.control,
             enabled=settings.enabled,
             tags=tags,
+            served=served,
         )
 
     def _driver(self, protocol: object, own: dict[str, Any], path: Path) -> AnyDriver | None:
@@ -233,6 +259,15 @@ class Builder:
                 f"history is kept in {top.history.path}: two files are needed, such as "
                 "history.db and state.json",
             )
+
+    def _check_retain(self, top: FileSection, lines: list[LineConfig]) -> None:
+        why = ""
+        if self._state_file(top) is None:
+            why = "the gateway has no file for it: write `gateway: {state: state.json}`"
+        elif top.gateway.standby is not None:
+            why = "a standby would answer with the values of its own file, which are old"
+        for place in retained(lines) if why else ():
+            self.mistakes.add((*place, "retain"), why)
 
     def _zenoh(self, top: FileSection) -> ZenohConfig:
         found, own = top.zenoh, ("zenoh",)

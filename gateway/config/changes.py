@@ -29,7 +29,10 @@ _SETTINGS = [one.name for one in fields(Tag) if one.init]
 
 @dataclass(frozen=True, slots=True)
 class DeviceChange:
-    """A device that changed. Without `old` it is added, without `new` removed."""
+    """A device that changed. Without `old` it is added, without `new` removed.
+
+    Its computed tags are in `Computed`: they follow when all inputs are taken over.
+    """
 
     old: DeviceSettings | None
     new: DeviceSettings | None
@@ -60,6 +63,14 @@ class DeviceChange:
 
 
 @dataclass(frozen=True, slots=True)
+class Computed:
+    """Computed tags that begin, and those that have gone, also with a successor."""
+
+    started: Sequence[Tag] = ()
+    gone: Sequence[Tag] = ()
+
+
+@dataclass(frozen=True, slots=True)
 class Difference:
     """All changes. `config` has the objects of the old one wherever nothing changed."""
 
@@ -67,14 +78,35 @@ class Difference:
     devices: Mapping[str, DeviceChange]
     closed: Sequence[str]  # lines whose port is closed; a line in both is opened again
     opened: Sequence[LineConfig]
+    computed: Computed
 
     def __bool__(self) -> bool:
-        return bool(self.devices or self.closed or self.opened)
+        computed = self.computed.started or self.computed.gone
+        return bool(self.devices or self.closed or self.opened or computed)
 
 
 def needs_restart(old: Config, new: Config) -> list[str]:
     """Returns the settings that changed and that only a restart takes over."""
-    return list(dict.fromkeys(_changed(old, new, "", _TAKEN_OVER)))
+    return list(dict.fromkeys([*_changed(old, new, "", _TAKEN_OVER), *_served(old, new)]))
+
+
+def _served(old: Config, new: Config) -> Iterator[str]:
+    """Yields the lines that answer and changed: their masters would see a half of it."""
+    before = {line.name: line for line in old.lines if line.serve}
+    after = {line.name: line for line in new.lines if line.serve}
+    for name in before | after:
+        if not _alike(before.get(name), after.get(name)):
+            yield f"lines.{name}"
+
+
+def _alike(one: Any, other: Any) -> bool:
+    """Compares plain data. Tags are equal to themselves only, so their settings count."""
+    if isinstance(one, tuple) and isinstance(other, tuple):
+        return len(one) == len(other) and all(map(_alike, one, other))
+    if is_dataclass(one) and type(one) is type(other):
+        names = [a.name for a in fields(one) if a.init]
+        return all(_alike(getattr(one, name), getattr(other, name)) for name in names)
+    return bool(one == other)
 
 
 def _changed(old: Any, new: Any, prefix: str, left_out: set[str]) -> Iterator[str]:
@@ -104,6 +136,9 @@ def compare(old: Config, new: Config) -> Difference:
             opened.append(line)
             merged.append(line)
             changes = [DeviceChange(before.get(one.name), one) for one in line.devices]
+        elif line.serve:  # it needs a restart, unless nothing changed
+            merged.append(known)
+            continue
         else:
             here = {device.name for device in known.devices}
             changes = [_change(before.get(d.name), d, same=d.name in here) for d in line.devices]
@@ -111,7 +146,8 @@ def compare(old: Config, new: Config) -> Difference:
         devices |= {change.name: change for change in changes if change.new is not change.old}
     stay = {line.name for line in merged} - {line.name for line in opened}
     closed = [name for name in lines if name not in stay]
-    return Difference(replace(new, lines=tuple(merged)), devices, closed, opened)
+    config, computed = _with_computed(old, new, replace(new, lines=tuple(merged)))
+    return Difference(config, devices, closed, opened, computed)
 
 
 def _port(line: LineConfig) -> LineConfig:
@@ -119,19 +155,18 @@ def _port(line: LineConfig) -> LineConfig:
 
 
 def _change(old: DeviceSettings | None, new: DeviceSettings, *, same: bool) -> DeviceChange:
-    """Compares one device. `same`: it was on this line."""
+    """Compares one device, without its computed tags. `same`: it was on this line."""
     if old is None or not same:
         return DeviceChange(old, new)
-    known = {tag.name: tag for tag in old.tags}
-    tags = tuple(_equal(known.get(tag.name), tag) for tag in new.tags)
-    new = replace(new, tags=tags)
-    # Tags are equal only to themselves.
-    if new == old:
+    known = {tag.name: tag for tag in old.wire_tags}
+    tags = tuple(_equal(known.get(tag.name), tag) for tag in new.wire_tags)
+    others = tuple(tag for tag in new.tags if tag.formula is not None)
+    if tags == old.wire_tags and replace(new, tags=()) == replace(old, tags=()):
         return DeviceChange(old, old)
     if not (old.enabled and new.enabled and _is_one_station(old, new)):
         # No value goes on, so no tag does.
-        anew = tuple(tag.copy(tag.device, tag.name) for tag in tags)
-        return DeviceChange(old, replace(new, tags=anew))
+        tags = tuple(tag.copy(tag.device, tag.name) for tag in tags)
+        return DeviceChange(old, replace(new, tags=(*tags, *others)))
     renewed = {
         before: tag
         for tag in tags
@@ -139,7 +174,42 @@ def _change(old: DeviceSettings | None, new: DeviceSettings, *, same: bool) -> D
         and before is not tag
         and _differ(before, tag) <= _HARMLESS
     }
+    new = replace(new, tags=(*tags, *others))
     return DeviceChange(old, new, continues=True, renewed=renewed)
+
+
+def _with_computed(old: Config, file: Config, merged: Config) -> tuple[Config, Computed]:
+    """Gives the computed tags of `file` the inputs that they have in `merged` from now on."""
+    known = {tag.key: tag for device in old.devices for tag in _computed(device)}
+    wanted = {tag.key: tag for device in file.devices for tag in _computed(device)}
+    if not (known or wanted):
+        return merged, Computed()
+    before = {device.name: device.enabled for device in old.devices}
+    stay = {device.name for device in file.devices if before.get(device.name) is device.enabled}
+    made = {tag.key: tag for device in merged.devices for tag in device.wire_tags}
+
+    def make(tag: Tag) -> Tag:
+        if tag.key in made:
+            return made[tag.key]
+        inputs, same = tuple(make(one) for one in tag.inputs), known.get(tag.key)
+        goes_on = same is not None and same.inputs == inputs and tag.device in stay
+        if same is not None and goes_on and _differ(same, tag) <= {"inputs"}:
+            made[tag.key] = same
+        else:
+            made[tag.key] = replace(tag, inputs=inputs)
+        return made[tag.key]
+
+    final = {key: make(tag) for key, tag in wanted.items()}
+    started = [tag for key, tag in final.items() if tag is not known.get(key)]
+    gone = [tag for key, tag in known.items() if final.get(key) is not tag]
+
+    def resolved(device: DeviceSettings) -> DeviceSettings:
+        own = tuple(tag for tag in final.values() if tag.device == device.name)
+        tags = (*device.wire_tags, *own)
+        return device if tags == device.tags else replace(device, tags=tags)
+
+    lines = (replace(line, devices=tuple(map(resolved, line.devices))) for line in merged.lines)
+    return replace(merged, lines=tuple(lines)), Computed(started, gone)
 
 
 def _equal(old: Tag | None, new: Tag) -> Tag:
@@ -155,4 +225,8 @@ def _is_one_station(old: DeviceSettings, new: DeviceSettings) -> bool:
 
 
 def _tags(device: DeviceSettings | None) -> Sequence[Tag]:
-    return () if device is None else device.tags
+    return () if device is None else device.wire_tags
+
+
+def _computed(device: DeviceSettings) -> Iterator[Tag]:
+    return (tag for tag in device.tags if tag.formula is not None)

@@ -17,6 +17,8 @@ class NotControlled(BadValue):
 
 def commands_of(device: DeviceSettings) -> frozenset[str]:
     """Returns the commands of the protocol, permitted or not."""
+    if device.served is not None:  # the gateway is this PLC
+        return frozenset()
     return device.driver.controls if isinstance(device.driver, Controllable) else frozenset()
 
 
@@ -52,6 +54,8 @@ def check_command(config: Config, device: str, command: str) -> None:
     """
     line = line_of(config, device)
     (asked,) = (one for one in line.devices if one.name == device)
+    if asked.served is not None:
+        raise BadValue(f"{device} is a station of this gateway: it takes no commands")
     if why := why_not_commanded(asked.driver, command, control=True):
         raise BadValue(f"{device}: {why}")
     if not asked.enabled:

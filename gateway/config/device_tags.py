@@ -1,12 +1,14 @@
 """Builds the tags of devices. Tags that are written alike are built once and copied."""
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from gateway.config import parsers
+from gateway.config.bit_tags import with_bits
 from gateway.config.field_rules import field_tag
 from gateway.config.messages import Mistakes, Path
-from gateway.config.model import TagDefaults, TagSection
-from gateway.config.tag_rules import TagSource, build_tag
+from gateway.config.model import ComputedSection, TagDefaults, TagSection
+from gateway.config.tag_rules import TagSource, build_tag, inherit
 from gateway.config.validate import section
 from gateway.errors import ConfigError
 from gateway.protocols.driver import AnyDriver
@@ -18,12 +20,27 @@ from gateway.tags import Tag
 _Alike = dict[str, Tag]
 
 
+class ComputedSource(NamedTuple):
+    """A computed tag in the file. Its inputs may be tags of other devices."""
+
+    device: str
+    name: str
+    own: ComputedSection
+    inherited: TagDefaults
+    path: Path
+
+    @property
+    def key(self) -> str:
+        return f"{self.device}/{self.name}"
+
+
 @dataclass(slots=True)
 class DeviceTags:
     """Builds the tags of all devices of a file, and notes every mistake."""
 
     mistakes: Mistakes
     recorded: Path | None = None  # the first tag with `history: true`
+    computed: list[ComputedSource] = field(default_factory=list)
     _names: dict[str, str] = field(default_factory=dict)  # correct ones, as typed
     _built: dict[tuple[Model, str], _Alike] = field(default_factory=dict)
 
@@ -41,23 +58,27 @@ class DeviceTags:
             alike = self._built.setdefault((model_of(driver), repr(defaults)), alike)
         tags: list[Tag] = []
         seen: set[str] = set()
-        for raw_name, raw in mapping(raw_tags):
-            name = self._names.get(raw_name) or self._name(raw_name, (*path, raw_name))
+        rows = with_bits(dict(mapping(raw_tags)), path, driver, self.mistakes)
+        for raw_name, raw, place in rows:
+            name = self._names.get(raw_name) or self._name(raw_name, place)
             if name in seen:
-                self.mistakes.add((*path, raw_name), f"{name} is there twice, typed in two ways")
+                self.mistakes.add(place, f"{name} is there twice, typed in two ways")
             seen.add(name)
+            if isinstance(raw, dict) and "computed" in raw:
+                self._note_computed(device, name, raw, place, defaults)
+                continue
             text = repr(raw)
             known = alike.get(text)
             if known is not None:
                 tag: Tag | None = known.copy(device, name)
             else:
                 before = len(self.mistakes)
-                tag = self._tag(device, name, raw, (*path, raw_name), defaults, driver)
+                tag = self._tag(device, name, raw, place, defaults, driver)
                 if tag is not None and len(self.mistakes) == before:
                     alike[text] = tag
             if tag is not None:
                 if tag.history and self.recorded is None:
-                    self.recorded = (*path, raw_name)
+                    self.recorded = place
                 tags.append(tag)
         return tuple(tags)
 
@@ -78,6 +99,16 @@ class DeviceTags:
         if isinstance(driver, TypedFields):
             return field_tag(source, driver, driver, self.mistakes)
         return build_tag(source, driver, self.mistakes)
+
+    def _note_computed(
+        self, device: str, name: str, raw: object, place: Path, defaults: TagDefaults
+    ) -> None:
+        own = section(ComputedSection, raw, place, self.mistakes, "a computed tag")
+        if own is None:
+            return
+        self.computed.append(ComputedSource(device, name, own, defaults, place))
+        if inherit(defaults, own).history and self.recorded is None:
+            self.recorded = place
 
     def _name(self, text: str, path: Path) -> str:
         try:

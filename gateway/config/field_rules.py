@@ -19,7 +19,7 @@ from gateway.protocols.typed_fields import TypedField, TypedFields
 from gateway.tags import Publish, Tag, WriteRule
 from gateway.values import Layout
 
-_OF_WORDS = ("type", "word_order", "byte_order")
+_OF_WORDS = ("type", "word_order", "byte_order", "byte", "bits")
 
 
 def field_tag(
@@ -38,7 +38,7 @@ def field_tag(
     if len(mistakes) > before:
         return None
     span = Span(address.area, address.number, 1)
-    tag = assemble(source, settings, address, span, Unit.WORD, Layout(field.type), write)
+    tag = assemble(source, settings, address, span, Unit.WORD, Layout(field.type), write, mistakes)
     tag = replace(tag, shape=field.shape, event=source.own.event)
     if tag.event:
         tag = replace(tag, publish=Publish.ALWAYS, heartbeat=None)

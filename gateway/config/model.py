@@ -41,6 +41,7 @@ from gateway.config.setting_types import (
     Text,
     WebAddress,
 )
+from gateway.config.shaping_settings import Clamp, Decimals, ShapingDefaults, ShapingSettings
 from gateway.tags import Deadband, Form, Publish
 from gateway.values import Order, ValueType
 
@@ -186,11 +187,19 @@ class WriteSection(Section):
         return self
 
 
+Band = Annotated[Deadband | None, PlainValidator(parsers.deadband), WithJsonSchema(DEADBAND_SCHEMA)]
+Payload = Annotated[
+    Form,
+    PlainValidator(parsers.form),
+    WithJsonSchema({"type": "string", "enum": ["json", "raw"]}),
+]
+
+
 def _write_shape(value: object) -> str:
     return "rule" if isinstance(value, (dict, WriteSection)) else "flag"
 
 
-class TagDefaults(Section):
+class TagDefaults(Section, ShapingDefaults):
     """Tag settings for a whole file, line or device."""
 
     type: Annotated[
@@ -207,9 +216,7 @@ class TagDefaults(Section):
     """The unit of the value, for people: rpm, °C."""
     description: Text = ""
     """A description, for people."""
-    deadband: Annotated[
-        Deadband | None, PlainValidator(parsers.deadband), WithJsonSchema(DEADBAND_SCHEMA)
-    ] = None
+    deadband: Band = None
     """A smaller change is not published: 0.5 (in the tag's unit) or 2%."""
     word_order: OrderName = Order.LOW_FIRST
     """The word of a 32- or 64-bit value at the lower address."""
@@ -225,26 +232,49 @@ class TagDefaults(Section):
     """Publish at least this often, changed or not."""
     history: bool = False
     """Store the values on disk."""
-    payload: Annotated[
-        Form,
-        PlainValidator(parsers.form),
-        WithJsonSchema({"type": "string", "enum": ["json", "raw"]}),
-    ] = Form.JSON
+    payload: Payload = Form.JSON
     """json: value, quality and time; raw: the bare value as text."""
     write: Annotated[
         Annotated[bool, Choice("flag")] | Annotated[WriteSection, Choice("rule")],
         Discriminator(_write_shape),
     ] = False
     """Permission to write the tag, with its rules."""
+    hold_last: bool = False
+    """On a served line: answer the master with the last good value instead of an error."""
 
 
-class TagSection(TagDefaults):
+class ComputedSection(Section):
+    """A value that is calculated from the values of other tags."""
+
+    computed: Text
+    """Arithmetic with the names of tags, such as flow_a + flow_b."""
+    unit: Text = ""
+    """The unit of the value, for people."""
+    description: Text = ""
+    """A description, for people."""
+    decimals: Decimals = None
+    """The value is rounded to so many decimals."""
+    clamp: Clamp = None
+    """A value outside is shown as the nearest end."""
+    deadband: Band = None
+    """A smaller change is not published."""
+    history: bool = False
+    """Store the values on disk."""
+    payload: Payload = Form.JSON
+    """json: value, quality and time; raw: the bare value as text."""
+
+
+class TagSection(TagDefaults, ShapingSettings):
     """One value of a device."""
 
     address: Text
     """As the maker writes it: D100, X17, D7.3, holding:100; for frames the name of a field."""
     event: bool = False
     """Publish every frame, even with the same value as the last: a bar code."""
+    source: Text | None = None
+    """On a served line: the tag, as device/tag, whose value the master reads here."""
+    retain: bool = False
+    """On a served line: keep the value that clients wrote across restarts."""
 
 
 class DeviceSection(Section):
@@ -272,6 +302,10 @@ class DeviceSection(Section):
     """Permission for commands to the device, such as run and stop."""
     enabled: bool = True
     """false: the device stays in the file and gets no requests."""
+    accept: list[Text] = []
+    """On a served line: the addresses that the master may write, such as D100..D119."""
+    stale_after: Interval | None = None
+    """On a served line: what the master wrote turns bad when it sends no request for so long."""
     defaults: dict[str, Any] = {}
     tags: dict[str, Any] = {}
     """The values of the device, by name."""
@@ -292,6 +326,8 @@ class LineSection(Section):
     """Data bits, parity, stop bits: 7E1, 8N1; left out: the default of the protocol."""
     echo: bool | None = None
     """true: the port receives its own requests, as with some two-wire RS-485 converters."""
+    serve: bool = False
+    """true: the devices are stations of this gateway, and a master on the line asks them."""
     defaults: dict[str, Any] = {}
     devices: dict[str, Any]
     """The devices on this line, by name."""

@@ -85,6 +85,7 @@ class LineConfig:
     serial: SerialSettings
     wire: WireTiming
     echo: bool | None  # the port receives its own requests; None: unknown
+    serve: bool = False  # a master on the line asks, and the devices are stations of the gateway
     devices: tuple[DeviceSettings, ...]
 
     @property
@@ -116,6 +117,11 @@ class Config:
     @property
     def devices(self) -> tuple[DeviceSettings, ...]:
         return tuple(device for line in self.lines for device in line.devices)
+
+    @property
+    def held_file(self) -> Path | None:
+        """The file of the values with `retain: true`."""
+        return None if self.state_file is None else self.state_file.with_suffix(".held.json")
 
     def without(self, devices: Container[str]) -> "Config":
         """Returns the file without some devices, and without lines that have no others."""

@@ -34,6 +34,8 @@ def schema() -> dict[str, Any]:
     shared: dict[str, Any] = root.setdefault("$defs", {})
     for name, part in _PARTS.items():
         shared[name] = _hoisted(part.model_json_schema(), shared)
+    shared["Tag"]["anyOf"] = [{"required": [name]} for name in ("address", "computed")]
+    del shared["Tag"]["required"]
     for protocol in PROTOCOLS:
         shared[protocol] = _device(protocol, shared)
     shared["Device"] = {

@@ -8,10 +8,11 @@ from typing import NamedTuple
 from gateway.config.device_tags import DeviceTags
 from gateway.config.messages import Mistakes, Path, dotted, one_of
 from gateway.config.model import TagDefaults, TagSection
+from gateway.config.validate import settings_of
 from gateway.config.yaml_events import plain_data
 from gateway.errors import ConfigError
 from gateway.protocols.driver import AnyDriver
-from gateway.sheets import Grid, Sheet, read_grid, read_sheet
+from gateway.sheets import Grid, Sheet, link_table, read_grid, read_sheet
 from gateway.tags import Tag
 
 
@@ -65,6 +66,8 @@ class SheetTags:
         if grid is None:
             return ()
         try:
+            if driver is not None and link_table.is_table(grid):
+                grid = link_table.of_station(grid, driver.station)
             sheet = read_sheet(grid, device, other_settings(), parsed)
         except ConfigError as error:
             self.mistakes.add(path, f"{file}: {error}")
@@ -99,6 +102,11 @@ def preview(
 
     Raises `ConfigErrors` with the mistakes that need no device.
     """
+    if link_table.is_table(grid):
+        raise ConfigError(
+            f"{file} is a communication table: name the file with --into, whose devices tell which "
+            "station is which"
+        )
     sheet = read_sheet(grid, device, other_settings(), parsed)
     mistakes = _mistakes(file, sheet)
     DeviceTags(mistakes).build(device, sheet.tags, (), TagDefaults(), None)
@@ -117,8 +125,9 @@ def _mistakes(file: FilePath, sheet: Sheet) -> Mistakes:
 def other_settings() -> list[str]:
     """Returns the settings of a tag that a column may have under their own names."""
     own = {"address", "type", "unit", "description", "scale", "offset", "every", "deadband"}
-    own |= {"word_order", "byte_order", "history", "write"}
-    return [name for name in TagSection.model_fields if name not in own]
+    own |= {"word_order", "byte_order", "history", "write", "enum", "invert"}
+    own.add("computed")
+    return [name for name in settings_of(TagSection) if name not in own]
 
 
 def parsed(text: str) -> object:

@@ -4,11 +4,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from gateway.config.messages import Mistakes, Path
-from gateway.config.model import TagDefaults, TagSection, WriteSection
+from gateway.config.model import ComputedSection, TagDefaults, TagSection, WriteSection
+from gateway.config.shaping_rules import shaping_of
 from gateway.errors import BadValue, ConfigError
 from gateway.protocols.driver import Address, AnyDriver, Area, Span, Unit
 from gateway.tags import Tag, WriteRule
-from gateway.values import Kind, Layout, Order, ValueType
+from gateway.values import BYTES, Byte, Kind, Layout, Order, ValueType
 
 _WIDE = (Kind.INT32, Kind.UINT32, Kind.FLOAT32, Kind.BCD32)
 
@@ -32,11 +33,18 @@ class TagSource:
         return setting in self.own.model_fields_set
 
 
-def inherit(outer: TagDefaults, inner: TagDefaults) -> TagDefaults:
+def inherit(outer: TagDefaults, inner: TagDefaults | ComputedSection) -> TagDefaults:
     """Returns the settings of `outer`, replaced by those that `inner` sets itself."""
     if not inner.model_fields_set:
         return outer
-    return outer.model_copy(update={name: getattr(inner, name) for name in inner.model_fields_set})
+    replaced = {name: getattr(inner, name) for name in inner.model_fields_set}
+    if (
+        isinstance(inner, TagDefaults) and inner.from_ is not None
+    ):  # one of the two ways to scale replaces the other
+        replaced |= {"scale": 1.0, "offset": 0.0}
+    elif inner.model_fields_set & {"scale", "offset"}:
+        replaced |= {"from_": None, "to": None}
+    return outer.model_copy(update=replaced)
 
 
 def build_tag(source: TagSource, driver: AnyDriver, mistakes: Mistakes) -> Tag | None:
@@ -61,8 +69,8 @@ def build_tag(source: TagSource, driver: AnyDriver, mistakes: Mistakes) -> Tag |
         mistakes.add((*source.path, place), problem)
     if len(mistakes) > before:
         return None
-    layout = _layout(settings, driver, area, kind)
-    tag = assemble(source, settings, address, span, area.unit, layout, write)
+    layout = _layout(source, settings, driver, area, kind)
+    tag = assemble(source, settings, address, span, area.unit, layout, write, mistakes)
     check_bounds(source, tag, mistakes)
     return tag
 
@@ -84,9 +92,14 @@ def assemble(
     unit_kind: Unit,
     layout: Layout,
     write: WriteRule | None,
+    mistakes: Mistakes,
 ) -> Tag:
     """Returns the tag, without settings of numbers where its type is no number."""
     number = layout.type.is_number
+    wrong: list[tuple[str, str]] = []
+    shaping, names = shaping_of(source.own, settings, layout.type, wrong)
+    for setting, problem in wrong:
+        mistakes.add((*source.path, setting.rstrip("_")), problem)
     return Tag(
         device=source.device,
         name=source.name,
@@ -100,12 +113,14 @@ def assemble(
         offset=settings.offset if number else 0.0,
         unit=settings.unit,
         description=settings.description,
-        deadband=settings.deadband if number else None,
+        deadband=settings.deadband if number and names is None else None,
         publish=settings.publish,
         heartbeat=settings.heartbeat,
         history=settings.history,
         payload=settings.payload,
         write=write,
+        shaping=shaping,
+        names=names,
     )
 
 
@@ -138,9 +153,13 @@ def _default_type(driver: AnyDriver, unit: Unit) -> ValueType:
             return ValueType(Kind.INT32)
 
 
-def _layout(settings: TagDefaults, driver: AnyDriver, area: Area, kind: ValueType) -> Layout:
+def _layout(
+    source: TagSource, settings: TagDefaults, driver: AnyDriver, area: Area, kind: ValueType
+) -> Layout:
     if area.unit is Unit.DWORD:  # the driver puts it together, whatever its order on the wire
         return Layout(kind)
+    if kind.kind in BYTES:
+        return Layout(kind, byte=source.own.byte or Byte.LOW)
     usual = driver.traits.string_order if kind.kind is Kind.STRING else Order.HIGH_FIRST
     return Layout(kind, settings.word_order, settings.byte_order or usual)
 
@@ -178,7 +197,7 @@ def _misfits(
         yield "type", f"a {kind} is {span.size} words, more than one request can carry"
     if not area.readable and write is None:
         yield "write", f"{first} is never read at station {driver.station}: it needs write: true"
-    if not area.readable and address.bit is not None:
+    if not area.readable and (address.bit is not None or kind.kind in BYTES):
         yield "address", f"{first} is never read at station {driver.station}: write the whole word"
     if not area.readable and write is not None and write.verify:
         yield "write", f"{first} is never read at station {driver.station}: verify cannot work"
@@ -197,7 +216,9 @@ def _unsuited(
             yield setting, f"{first} has 32 bits by nature: it needs no {setting}"
     elif source.sets("word_order") and not (kind.is_number and kind.words > 1):
         yield "word_order", f"{spelt} is {kind}: only numbers of 32 or 64 bits have a word_order"
-    if kind.kind is Kind.BOOL and source.sets("byte_order"):
+    if kind.kind in BYTES and source.sets("byte_order"):
+        yield "byte_order", f"{spelt} is one byte: write byte: low or byte: high"
+    elif kind.kind is Kind.BOOL and source.sets("byte_order"):
         yield "byte_order", f"{spelt} is {kind}: only words have a byte_order"
     yield from only_for_numbers(source, kind)
 

@@ -103,7 +103,12 @@ def _known(kind: type[Section], place: Path) -> Collection[str]:
         if inner is None:
             return ()
         kind = inner
-    return kind.model_fields
+    return settings_of(kind)
+
+
+def settings_of(kind: type[Section]) -> list[str]:
+    """Returns the names of the settings as the file writes them."""
+    return [field.alias or name for name, field in kind.model_fields.items()]
 
 
 def _inner(annotation: Any) -> type[Section] | None:

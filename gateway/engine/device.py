@@ -17,6 +17,7 @@ from gateway.planning.monitor_lists import with_monitor_list
 from gateway.planning.planner import Block, around, plan, runs_of
 from gateway.planning.wire_timing import Transactions, WireTiming
 from gateway.protocols.driver import AnyDriver, Cost, Monitor, NoReplyCauses, Span, Timing, Windowed
+from gateway.serving.registers import Served
 from gateway.tags import Tag
 
 MOST_PLANNED = 1000  # tags times intervals: planning them takes some tenths of a second
@@ -45,12 +46,18 @@ class DeviceSettings:
     control: bool = False  # run, stop, ... are allowed
     enabled: bool = True
     tags: tuple[Tag, ...] = ()
+    served: Served | None = None  # it is a station of the gateway, for a master on its line
+    wire_tags: tuple[Tag, ...] = field(init=False, repr=False)  # those with an address
+
+    def __post_init__(self) -> None:
+        found = tuple(tag for tag in self.tags if tag.formula is None)
+        object.__setattr__(self, "wire_tags", found)
 
     @property
     def answerable(self) -> bool:
         """False for a device that is only written to, or only sends unsolicited frames."""
         areas = self.driver.areas
-        used = [areas[tag.span.area] for tag in self.tags] or areas.values()
+        used = [areas[tag.span.area] for tag in self.wire_tags] or areas.values()
         return any(area.readable for area in used)
 
 
@@ -105,7 +112,7 @@ class Device:
 
     @property
     def tags(self) -> tuple[Tag, ...]:
-        return self.settings.tags
+        return self.settings.wire_tags
 
     @property
     def broadcast(self) -> bool:
@@ -152,7 +159,7 @@ class Device:
         """Returns the same station with other settings of the file, without a plan yet. A thread
         may do it; `take_over` gives it everything else that was learned. `bad`: addresses."""
         new = Device(settings, self.wire, plan_now=False)
-        new.bad_addresses.restore(bad, settings.tags)
+        new.bad_addresses.restore(bad, settings.wire_tags)
         if settings.turnaround == self.settings.turnaround:
             new.turnaround = self.turnaround
         return new

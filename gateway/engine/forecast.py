@@ -121,6 +121,6 @@ def _write_seconds(device: Device, tag: Tag) -> float:
     cost, back = device.driver.write_cost(tag.span), device.driver.cost(tag.span)
     seconds = 0.0 if cost is None else device.seconds(cost)
     if back is not None:
-        reads = (tag.address.bit is not None) + (tag.write is not None and tag.write.verify)
+        reads = (tag.part is not None) + (tag.write is not None and tag.write.verify)
         seconds += reads * device.seconds(back)
     return seconds

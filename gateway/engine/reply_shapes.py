@@ -97,7 +97,7 @@ class ReplyShapes:
         where the acknowledgement may be an extra one.
         """
         replies = self._driver.write_shapes(tag.span, units)
-        if tag.address.bit is not None:  # the word is read first
+        if tag.part is not None:  # the word is read first
             replies = (self._driver.reply_shape(tag.span), None)
         before, after = False, self.may_be_extra(replies[-1], now)
         for shape in replies[:-1]:

@@ -63,7 +63,7 @@ class Write:
         """True if one request is enough, which it can share with other writes."""
         rule = self.tag.write
         needs_more = rule is not None and (rule.verify or rule.repeat)
-        return not (self.alone or needs_more) and self.tag.address.bit is None
+        return not (self.alone or needs_more) and self.tag.part is None
 
     @property
     def latest(self) -> bool:
@@ -74,9 +74,8 @@ class Write:
         """Returns True if `units`, as read back, are the written value."""
         if self.tag.shape is not None:  # bytes are written, a value is read
             return self.tag.decode(units) == self.tag.from_units(self.units)
-        bit = self.tag.address.bit
-        if bit is not None:
-            return (units[0] >> bit & 1) == self.units[0]
+        if self.tag.part is not None:
+            return self.tag.part.of(units[0]) == self.units[0]
         return list(units) == list(self.units)
 
     def result(

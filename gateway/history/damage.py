@@ -16,7 +16,8 @@ _MOST_LOGGED = 20  # runs; the status has all
 class Damage:
     """Called by any thread."""
 
-    def __init__(self) -> None:
+    def __init__(self, most_logged: int = _MOST_LOGGED) -> None:
+        self._most_logged = most_logged
         self._lock = threading.Lock()
         self._runs: dict[tuple[Identity | None, SortedRun], str] = {}
 
@@ -26,7 +27,7 @@ class Damage:
                 return
             self._runs[file, run] = why
             known = len(self._runs)
-        if known <= _MOST_LOGGED:
+        if known <= self._most_logged:
             log.error("history damaged", first=rfc3339(run.first), last=rfc3339(run.last), why=why)
 
     def sentence(self, file: Identity | None, runs: Iterable[SortedRun]) -> str | None:

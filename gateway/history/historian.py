@@ -10,8 +10,12 @@ from pathlib import Path
 from typing import TypeVar
 
 from gateway.errors import BadValue, Busy
+from gateway.history.buckets import Bucket
 from gateway.history.checker import Checker
+from gateway.history.course import Course, Now
+from gateway.history.newest import Newest
 from gateway.history.outcomes import Outcome, Outcomes, Ring
+from gateway.history.question import Question
 from gateway.history.reader import Reader
 from gateway.history.recent import Recent
 from gateway.history.retention import Retention
@@ -47,6 +51,8 @@ class Historian:
         self._written, self._refused = rings = Outcomes(Ring.WRITTEN), Outcomes(Ring.REFUSED)
         self._reader = Reader(path)
         self._search = Search(self._recent, self._reader)
+        self._course = Course(self._recent, self._reader, self._search.damage)
+        self._newest = Newest(self._recent, self._reader, self._search.damage)
         self._retention = Retention(keep, max_size, self._recent, wall)
         self._transfer = Transfer(self._recent, rings, self._retention, wall)
         self._writer = Writer(path, max_size, self._transfer, self._reader)
@@ -112,6 +118,28 @@ class Historian:
         """
         period = self._range(time_range, limit, now)
         return islice(_readable(self._search.by_time(tag, period)), limit)
+
+    def buckets(
+        self, tag: Tag, question: Question, now: Now, pause: Callable[[], None]
+    ) -> Iterator[Bucket]:
+        """Yields the buckets of a tag in the order of time; nothing for a tag without samples.
+
+        Calls `pause` often. Raises like `samples`; `BadValue` for too many buckets, too.
+        """
+        width = question.bucket
+        if width is None:
+            raise BadValue("a bucket is missing, such as bucket=1min")
+        period = self._range(question.time_range, None, now.time)
+        return _readable(self._course.buckets(tag, period, width, now, pause))
+
+    def newest(
+        self, tag: Tag, question: Question, now: int, pause: Callable[[], None]
+    ) -> Iterator[Sample]:
+        """Yields the newest samples of the range in the order of time. Raises like `samples`."""
+        period = self._range(question.time_range, question.last, now)
+        count = question.last or HIGHEST_LIMIT
+        found = self._newest.of(tag, period, count, pause, only_good=question.only_good)
+        return _readable(found)
 
     def as_recorded(self, query: RecordedQuery, pause: Callable[[], None]) -> Recorded:
         """Yields samples as `Search.as_recorded` does. Raises `BadValue`, `Busy`."""

@@ -114,6 +114,14 @@ class Reader:
             )
             return sections.rows(database, run.number, group) if is_same.fetchall() else None
 
+    def neighbour(
+        self, file: Identity | None, last_run: int, tag: int, time: int, *, later: bool
+    ) -> tuple[int, int] | None:
+        """Returns the run and the time of the last sample of a tag before `time`, or of the first
+        one after it, in the runs up to `last_run`. Raises `Damaged`."""
+        with self._connection(file) as database:
+            return sections.neighbour(database, last_run, tag, time, later=later)
+
     def writes(
         self, ring: Ring, file: Identity | None, last: int, period: TimeRange
     ) -> Iterator[Outcome]:

@@ -92,6 +92,7 @@ class Recent:
         """A run has at most `longest` samples and stays open for `oldest` seconds."""
         self.recorded = 0
         self.lost = 0
+        self.latest = 0  # the time of the last sample, of any tag
         self.file: Identity | None = None  # the file with the sorted runs
         self.sorted_runs: tuple[SortedRun, ...] = ()  # in the order of recording
         self._longest = longest
@@ -116,6 +117,7 @@ class Recent:
                 run.samples.append(sample)
                 run.by_tag.setdefault(tag.key, []).append(sample)
                 self.recorded += 1
+                self.latest = sample.time
 
     # -- any thread --
 

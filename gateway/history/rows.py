@@ -45,6 +45,24 @@ def from_row(tag: Tag, time: int, stored: Stored, kind: int | None, bad: str | N
     return Sample(tag, value, Quality.BAD, time, _REASONS.get(bad))
 
 
+def step(
+    time: int, stored: Stored, kind: int | None, bad: str | None
+) -> tuple[int, Value | None, str | None]:
+    """Returns the time, the value, and the reason why there is none."""
+    if bad is not None:
+        return time, None, bad
+    value = stored if kind is None and not isinstance(stored, bytes) else _value(stored, kind)
+    if value is None or (isinstance(value, float) and not math.isfinite(value)):
+        return time, None, Reason.NOT_A_NUMBER.value
+    return time, value, None
+
+
+def has_value(sample: Sample) -> bool:
+    """True if the sample is good, and a number that JSON has."""
+    reason = None if sample.quality is Quality.GOOD else ""
+    return step(sample.time, sample.value, None, reason)[1] is not None
+
+
 _REASONS = {reason.value: reason for reason in Reason}
 
 

@@ -23,8 +23,8 @@ _Placed = tuple[int, Tag, int, Stored, int | None, str | None]  # a row with its
 class Search:
     """Used by the answering threads. What a damaged file still has is answered first."""
 
-    def __init__(self, recent: Recent, reader: Reader) -> None:
-        self.damage = Damage()
+    def __init__(self, recent: Recent, reader: Reader, damage: Damage | None = None) -> None:
+        self.damage = damage or Damage()
         self._recent = recent
         self._reader = reader
 
@@ -32,7 +32,7 @@ class Search:
         """Yields the samples of a tag in the order of time. Raises `Busy`, and at the end
         `Damaged`."""
         file, sorted_runs, newest = self._recent.find(tag.key)
-        stored = _Stored(self._reader, self.damage, file, period)
+        stored = StoredRuns(self._reader, self.damage, file, period)
         runs = stored.of(sorted_runs)
         numbers = stored.numbers({tag.key: tag}, runs)
         begun = False
@@ -69,7 +69,7 @@ class Search:
         file, sorted_runs, newest = self._recent.content()
         mark = _mark(file)
         (_, begin, first), period = _start(query.after, mark, period)
-        stored = _Stored(self._reader, self.damage, file, period)
+        stored = StoredRuns(self._reader, self.damage, file, period)
         runs = [run for run in sorted_runs if run.number >= begin]
         numbers = stored.numbers(tags, stored.of(runs))
         place, found, of_last_run = (mark, begin, max(first - 1, 0)), 0, 0
@@ -113,7 +113,7 @@ class Search:
                 self.damage.found(file, run, str(error))
 
 
-class _Stored:
+class StoredRuns:
     """The sorted runs, for one answer."""
 
     def __init__(
@@ -122,12 +122,12 @@ class _Stored:
         self._reader = reader
         self._damage = damage
         self._file = file
-        self._period = period
-        self._damaged: list[SortedRun] = []
+        self.period = period
+        self.damaged: list[SortedRun] = []  # since the last call of `lost`
 
     def of(self, runs: Iterable[SortedRun]) -> list[SortedRun]:
         """Returns the runs with samples in the period."""
-        first, last = self._period
+        first, last = self.period
         return [run for run in runs if run.first <= last and run.last >= first]
 
     def numbers(self, tags: Mapping[str, Tag], runs: Sequence[SortedRun]) -> dict[int, Tag]:
@@ -147,7 +147,7 @@ class _Stored:
         """Yields rows of the run in the order of tag and time, at least those of the tags; None if
         it was dropped. Leaves out damaged sections."""
         try:
-            groups = sections.groups(self._reader.sections(self._file, run), numbers, self._period)
+            groups = sections.groups(self._reader.sections(self._file, run), numbers, self.period)
         except Damaged as error:
             self._note(run, error)
             return
@@ -170,7 +170,7 @@ class _Stored:
     ) -> list[_Placed | None] | None:
         """Returns the found rows of a run, each at its number: sorting would take longer. None if
         it was dropped."""
-        first, last = self._period
+        first, last = self.period
         placed: list[_Placed | None] = [None] * run.samples
         for rows in self.rows(run, numbers):
             if rows is None:
@@ -184,7 +184,7 @@ class _Stored:
 
     def lost(self) -> Damaged | None:
         """Returns an error if parts were left out since the last call."""
-        damaged, self._damaged = self._damaged, []
+        damaged, self.damaged = self.damaged, []
         if not damaged:
             return None
         first = rfc3339(min(run.first for run in damaged))
@@ -193,7 +193,7 @@ class _Stored:
 
     def _note(self, run: SortedRun, error: Damaged) -> None:
         self._damage.found(self._file, run, str(error))
-        self._damaged.append(run)
+        self.damaged.append(run)
 
 
 def _found(

@@ -152,6 +152,25 @@ def rows(database: sqlite3.Connection, run: int, sections: Sequence[Section]) ->
     return found
 
 
+def neighbour(
+    database: sqlite3.Connection, last_run: int, tag: int, time: int, *, later: bool
+) -> tuple[int, int] | None:
+    """Returns the run and the time of the last sample of a tag before `time`, or of the first one
+    after it; one search in the index for each run. Raises `Damaged`."""
+    nearest, beyond = ("min", ">") if later else ("max", "<")
+    run, order = ("last", "ASC") if later else ("first", "DESC")
+    try:
+        found = database.execute(
+            f"SELECT run, (SELECT {nearest}(time) FROM sample WHERE sample.run = run.run"  # noqa: S608
+            f" AND tag = ?1 AND time {beyond} ?2) AS nearest FROM run WHERE {run} {beyond} ?2"
+            f" AND run <= ?3 AND nearest IS NOT NULL ORDER BY nearest {order}, run {order} LIMIT 1",
+            (tag, time, last_run),
+        ).fetchall()
+    except _ERRORS as error:
+        raise _damaged(error) from error
+    return (int(found[0][0]), int(found[0][1])) if found else None
+
+
 def write_tag(database: sqlite3.Connection, number: int, key: str) -> None:
     """Writes the checksum of a tag's name."""
     database.execute(

@@ -54,10 +54,10 @@ def time_range(text: str, now: int) -> TimeRange:
 
 def _bound(text: str, now: int) -> int:
     if match := _NOW.match(text):
-        sign, duration = match[1], match[2]
-        if not sign and not duration:
+        sign, length = match[1], match[2]
+        if not sign and not length:
             return now
-        return now - _duration(duration) if sign == "-" else now + _duration(duration)
+        return now - duration(length) if sign == "-" else now + duration(length)
     if match := _RFC3339.match(text):
         date, clock, fraction, zone = match.groups()
         zone = "+00:00" if zone in (None, "Z") else zone
@@ -71,7 +71,8 @@ def _bound(text: str, now: int) -> int:
     raise BadValue(f"{_short(text)} is no time such as 2026-11-20T12:00:00Z or now(-1h)")
 
 
-def _duration(text: str) -> int:
+def duration(text: str) -> int:
+    """Returns ns. Raises `BadValue`."""
     match = _DURATION.match(text)
     if match is None or not (match[1] or match[2]):
         raise BadValue(f"{_short(text)} is no duration such as 500ms, 30m or 1.5h")

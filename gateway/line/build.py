@@ -43,10 +43,10 @@ class SimulatedLine:
         for device in devices:
             before, station = known.get(device.name, (None, None))
             if before is None or station is None or before.driver != device.driver:
-                station = station_for(device.driver, device.tags)
+                station = station_for(device.driver, device.wire_tags)
             elif before is not device:
-                spans = {tag.span for tag in before.tags}
-                animate(station, [tag for tag in device.tags if tag.span not in spans])
+                spans = {tag.span for tag in before.wire_tags}
+                animate(station, [tag for tag in device.wire_tags if tag.span not in spans])
             stations.append(station)
         self._devices, self._stations[:] = devices, stations
 

@@ -38,6 +38,8 @@ class OnDemand:
 
         The age is monotonic time: a change of the system clock must not change it.
         """
+        if tag.formula is not None:
+            return all(self.is_fresh(one, max_age) for one in tag.inputs)
         place = self._place(tag.device)
         poll = self._poll(tag)
         if place is None or poll is None or not place[0].engine.is_open:
@@ -52,6 +54,9 @@ class OnDemand:
         The sample is bad if the device does not answer. Raises `Busy` if the line had no time for
         the read.
         """
+        if tag.formula is not None:
+            await asyncio.gather(*(self.fresh(one, max_age) for one in tag.inputs))
+            return self._latest(tag)
         poll = self._poll(tag)
         if poll is None or self.is_fresh(tag, max_age):
             return self._latest(tag)

@@ -143,15 +143,14 @@ async def _read_once(talk: Talk[Any], device: Device, block: Block, span: Span) 
 
 
 async def _write(write: Write, talk: Transaction) -> Sent:
-    """Writes one value, and reads it back if its tag has `verify`. A bit is changed in its word."""
+    """Writes one value, and reads it back if its tag has `verify`. A part changes in its word."""
     driver, tag = write.device.settings.driver, write.tag
     units = write.units
     if write.resyncs.before is not None:
         await driver.resync(talk, tag.span, write.resyncs.before, write.device.probe_spans)
-    if tag.address.bit is not None:
+    if tag.part is not None:
         (word,) = await driver.read(talk, tag.span)
-        bit = 1 << tag.address.bit
-        units = [word | bit if write.units[0] else word & ~bit]
+        units = [tag.part.into(word, write.units[0])]
     acknowledged = await _only_reply(driver.write(talk, tag.span, units), write, talk)
     if not acknowledged or tag.write is None or not tag.write.verify:
         return Sent(acknowledged)

@@ -4,6 +4,9 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Literal, Protocol
 
 from gateway.engine.requests import CommandResult
+from gateway.history.buckets import Bucket
+from gateway.history.course import Now
+from gateway.history.question import Question
 from gateway.line.duty import Duty
 from gateway.tags import Sample, Tag, WriteResult
 from gateway.tags.recorded import Recorded, RecordedQuery
@@ -86,6 +89,16 @@ class History(Protocol):
         Raises `BadValue` for a range that cannot be parsed, and `Busy`, also in the middle, when
         the file cannot be read now, and `Damaged` at the end when a part of it was left out.
         """
+
+    def buckets(
+        self, tag: Tag, question: Question, now: Now, pause: Callable[[], None]
+    ) -> Iterator[Bucket]:
+        """The buckets of a tag in the order of time. Calls `pause` often. Raises like `samples`."""
+
+    def newest(
+        self, tag: Tag, question: Question, now: int, pause: Callable[[], None]
+    ) -> Iterator[Sample]:
+        """The last samples of a tag in the order of time. Raises like `samples`."""
 
     def as_recorded(self, query: RecordedQuery, pause: Callable[[], None]) -> Recorded:
         """Calls `pause` at least every few milliseconds. Raises `BadValue`, `Busy`."""

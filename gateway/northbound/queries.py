@@ -14,6 +14,7 @@ import zenoh
 
 from gateway.engine.requests import CommandResult
 from gateway.errors import BadValue, Busy
+from gateway.history.question import is_of_past
 from gateway.northbound.acceptance import sender
 from gateway.northbound.answers import Answer, AnswerPool, QueryCounters
 from gateway.northbound.commands import Commands
@@ -83,7 +84,7 @@ class Queries:
                 self._pool.answer_history(query, partial(self._replies.writes, time.time_ns()))
             case Family.STATUS:
                 self._start(self._status(query))
-            case Family.VALUE if query.parameters.get("_time") is not None:
+            case Family.VALUE if is_of_past(query.parameters):
                 history = partial(self._replies.history, parsed, time.time_ns())
                 self._pool.answer_history(query, history)
             case Family.VALUE if query.parameters.get("max_age") is not None:

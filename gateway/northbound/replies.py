@@ -1,15 +1,19 @@
 """Replies to queries, made on an answering thread: values, descriptions, status, outcomes."""
 
 import time
-from collections.abc import Callable, Iterable, Sequence
-from itertools import chain
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import zenoh
 
 from gateway.errors import BadValue, Busy, Damaged, GatewayError
-from gateway.northbound import encoding, pages, payload
+from gateway.history.buckets import Bucket
+from gateway.history.course import Now
+from gateway.history.question import Question, question
+from gateway.history.rows import has_value
+from gateway.northbound import buckets, encoding, pages, past, payload
 from gateway.northbound.interfaces import History, Plant
 from gateway.northbound.keys import Family, Keys, ParsedKey
+from gateway.northbound.meta import meta
 from gateway.northbound.payload import Failure, Problem
 from gateway.northbound.tag_index import TagIndex
 from gateway.northbound.turns import Pause, Rank, Turns
@@ -82,7 +86,7 @@ class Replies:
 
     def _current(self, family: Family, query: zenoh.Query, tag: Tag) -> None:
         if family is Family.META:
-            self._reply(query, self._keys.meta(tag.key), payload.meta(tag), self._stamp())
+            self._reply(query, self._keys.meta(tag.key), meta(tag), self._stamp())
         elif family is not Family.LAST or tag.device not in self._index.only_blocks:
             # An AdvancedSubscriber would keep a value whose key is never put.
             self._value(query, tag)
@@ -106,27 +110,57 @@ class Replies:
     def history(self, parsed: ParsedKey, now: int, query: zenoh.Query) -> None:
         """`now`: ns since 1970, when the query was taken."""
         tags = self._index.tags_at(parsed.target)
-        if self._history is None:
+        history = self._history
+        if history is None:
             if tags:  # otherwise they are another gateway's, which may have a history
                 self.outcome(_NO_HISTORY, query)
             return
         try:
             page = pages.page(query, self._keys.gateway)
             limit = _limit(query.parameters.get("limit"))
-            time_range = query.parameters.get("_time") or ""
+            asked = question(past.parameters(query))
             with self._turns.turn(Rank.HISTORY) as pause:
-                if page is None and (limit is not None or len(tags) == 1):
-                    by_tag = (self._history.samples(tag, time_range, limit, now) for tag in tags)
-                    self._samples(query, chain.from_iterable(by_tag), pause)
+                if asked.bucket is not None:
+                    self._buckets(query, history, tags, asked, now, pause)
+                elif page is None and (asked.last or limit is not None or len(tags) == 1):
+                    by_tag = (past.samples(history, tag, asked, limit, now, pause) for tag in tags)
+                    self._samples(query, past.one_by_one(by_tag), pause)
                 elif tags:
                     wanted = {tag.key: tag for tag in tags}
                     size, after = page or (None, None)
                     place = pages.recorded_place(after)
-                    asked = RecordedQuery(wanted, time_range, place, size, now)
-                    found = self._history.as_recorded(asked, pause)
-                    self._as_recorded(query, found, page, pause)
+                    recorded = RecordedQuery(wanted, asked.time_range, place, size, now)
+                    found = history.as_recorded(recorded, pause)
+                    self._as_recorded(query, found, page, pause, only_good=asked.only_good)
         except GatewayError as error:
             self._failed(error, query)
+
+    def _buckets(
+        self,
+        query: zenoh.Query,
+        history: History,
+        tags: Sequence[Tag],
+        asked: Question,
+        now: int,
+        pause: Pause,
+    ) -> None:
+        until = self._clock() + ANSWER_WITHIN
+
+        def go_on() -> None:
+            self._go_on(until)
+            pause()
+
+        def of(tag: Tag) -> Iterator[tuple[Tag, Bucket]]:
+            # A tag that is not read now has no valid value until now.
+            moment = Now(now, is_valid=has_value(self._plant.sample(tag)))
+            for bucket in history.buckets(tag, asked, moment, go_on):
+                yield tag, bucket
+
+        for tag, bucket in past.one_by_one(of(tag) for tag in tags):
+            if bucket.quality == "good" or not asked.only_good:
+                document = buckets.document(bucket, asked.aggregates)
+                self._reply(query, self._keys.value(tag.key), document, self._stamp())
+            go_on()
 
     def _samples(self, query: zenoh.Query, found: Iterable[Sample], pause: Pause) -> None:
         until = self._clock() + ANSWER_WITHIN
@@ -141,6 +175,8 @@ class Replies:
         found: Recorded,
         page: pages.Page | None,
         pause: Pause,
+        *,
+        only_good: bool,
     ) -> None:
         until = self._clock() + (ANSWER_WITHIN if page is None else PAGE_WITHIN)
         last: Place = ("", 0, 0)
@@ -150,7 +186,7 @@ class Replies:
                 lost = sample
             elif isinstance(sample, bool):
                 complete = sample
-            else:
+            elif has_value(sample) or not only_good:
                 self._recorded(query, sample)
                 count += 1
             last = place or last
@@ -229,4 +265,6 @@ def _limit(text: str | None) -> int | None:
         return None
     if not (text.isascii() and text.isdigit() and len(text) <= 9):
         raise BadValue(f"limit={text[:40]} is no count such as 100")
+    if not int(text):
+        raise BadValue("limit is not between 1 and 1000000000")
     return int(text)

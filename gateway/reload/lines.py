@@ -3,8 +3,6 @@
 import asyncio
 from collections.abc import Coroutine
 
-from gateway.line.line import Line
-
 
 class RunningLines:
     """One task for each line. `failed` is set when one ends by itself."""
@@ -12,16 +10,16 @@ class RunningLines:
     def __init__(self) -> None:
         self.failed = asyncio.Event()
         self.started = False
-        self._tasks: dict[Line, asyncio.Task[None]] = {}
+        self._tasks: dict[object, asyncio.Task[None]] = {}  # by line
 
-    def start(self, line: Line, work: Coroutine[None, None, None] | None = None) -> None:
-        """Runs the line. `work` runs it after it is planned."""
+    def start(self, line: object, name: str, work: Coroutine[None, None, None]) -> None:
+        """Starts the task `work` of a line, which may plan it first."""
         self.started = True
-        task = asyncio.create_task(work or line.run(), name=line.engine.name)
+        task = asyncio.create_task(work, name=name)
         self._tasks[line] = task
         task.add_done_callback(lambda ended: self._ended(line, ended))
 
-    async def end(self, line: Line) -> None:
+    async def end(self, line: object) -> None:
         """Ends the line. Returns when its port is closed."""
         task = self._tasks.pop(line)
         task.cancel()
@@ -36,6 +34,6 @@ class RunningLines:
             if isinstance(outcome, Exception):
                 raise outcome
 
-    def _ended(self, line: Line, task: asyncio.Task[None]) -> None:
+    def _ended(self, line: object, task: asyncio.Task[None]) -> None:
         if self._tasks.get(line) is task:
             self.failed.set()

@@ -61,6 +61,7 @@ class Renewal:
         await asyncio.gather(
             *(self._arrive(line) for line in stay), *(self._open(one) for one in difference.opened)
         )
+        gateway.compute(difference.computed.started, difference.computed.gone)
 
     def _make(self, known: Mapping[str, tuple[Device, KnownBad]]) -> Mapping[str, Device]:
         """Makes and plans the devices of lines that stay open. On a thread."""
@@ -116,7 +117,7 @@ class Renewal:
         gateway.take_over(self._new(self._on(config.name)))
         line = gateway.add_line(config)
         gateway.planned(line, await off_loop(gateway.plan, line))
-        self._lines.start(line, line.run())
+        self._lines.start(line, config.name, line.run())
 
     async def _change(self, line: Line, tags: list[DeviceChange], changes: Changes) -> None:
         gateway, engine = self._gateway, line.engine

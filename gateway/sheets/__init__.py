@@ -4,7 +4,8 @@ A sheet is a CSV or text file of any spreadsheet or PLC program, or an .xlsx fil
 by their titles. Nothing here knows addresses or limits: the configuration checks those.
 """
 
+from gateway.sheets import link_table
 from gateway.sheets.grid import Grid, read_grid
 from gateway.sheets.sheet import Sheet, SheetMistake, devices_in, read_sheet
 
-__all__ = ["Grid", "Sheet", "SheetMistake", "devices_in", "read_grid", "read_sheet"]
+__all__ = ["Grid", "Sheet", "SheetMistake", "devices_in", "link_table", "read_grid", "read_sheet"]

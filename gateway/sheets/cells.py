@@ -66,6 +66,7 @@ _ORDERS = {
     **dict.fromkeys(("low first", "low", "little", "little endian"), "low_first"),
     **dict.fromkeys(("high first", "high", "big", "big endian"), "high_first"),
 }
+_NAMED = re.compile(r"(-?[0-9]+)\s*[=:]\s*(['\"]?)(\S.*?)\2\Z")
 _SPREADSHEET_ERROR = re.compile(
     r"#(REF|BEZUG|N/A|NV|NAME|VALUE|WERT|DIV/0|NUM|ZAHL|NULL)[!?]?\Z", re.IGNORECASE
 )
@@ -151,6 +152,17 @@ def deadband(text: str, decimal: str | None) -> str | int | float:
     if text.endswith("%"):
         return f"{number(text[:-1].strip(), decimal)}%"
     return number(text, decimal)
+
+
+def names(text: str) -> dict[str, str]:
+    """Returns the names of numbers: `0=off;1=auto`, `0: off, 1: auto`."""
+    found: dict[str, str] = {}
+    for part in re.split(r"[;,|]", text.strip("{}")):
+        match = _NAMED.match(part.strip())
+        if match is None or match[1] in found:
+            raise ConfigError(f"{text!r} does not name numbers: write 0=off;1=auto")
+        found[match[1]] = match[3]
+    return found
 
 
 def order(text: str) -> str:

@@ -52,17 +52,20 @@ _TITLES = {
     "scaled_low": "scaled low, scaled min, eng low, eng min, eu min, eu low, messbereich von",
     "scaled_high": "scaled high, scaled max, eng high, eng max, eu max, eu high, messbereich bis",
     "scaling": "scaling",
+    "enum": "enum, states, state names, value names, zustände, zustandsnamen, 狀態名稱, 状态名称",
+    "invert": "invert, inverted, invertiert",
+    "computed": "computed",
     "bit": "bit, bit no, bit number, bitnummer, bit nr, 位元, 位號, 位号",
     # Columns that change a value or its source, in a way that no setting has: see `UNUSABLE`.
     "divisor": "divisor, divide, divide by, divider, teiler, 除數, 除数",
     "places": "decimal places, decimal point, decimal position, kommastellen, nachkommastellen, "
     "dezimalstellen, 小數位數, 小数位数, 小數點, 小数点",
-    "negate": "negate value, negate, invert, inverted, invertiert, negiert",
+    "negate": "negate value, negate, negiert",
     "sign": "signed, unsigned, sign, vorzeichen",
     "station": "station, station no, station number, slave, slave id, unit id, node, node id, "
     "stationsnummer, 站號, 站号",
     # Columns of an export of the gateway that only inform.
-    "": "key, write key, value type",
+    "": "key, write key, value type, raw type",
 }
 # Left out, these would give wrong values that look right.
 UNUSABLE = {

@@ -105,7 +105,7 @@ def _delimited(text: str) -> Grid:
     if match := _SEP.match(first):  # Excel does not show this line
         delimiter, text = match[1], rest
     else:
-        delimiter = max(DELIMITERS, key=lambda one: _score(text, one))
+        delimiter = max(DELIMITERS, key=lambda one: (_score(text, one), first.count(one)))
     rows = list(_records(text, delimiter))
     return Grid(rows, "." if delimiter == "," else None)
 

@@ -17,6 +17,8 @@ _READERS: dict[str, Callable[[str], object]] = {
     "history": cells.flag,
     "word_order": cells.order,
     "byte_order": cells.order,
+    "invert": cells.flag,
+    "enum": cells.names,
 }
 _SCALINGS = ("", "none", "no", "keine", "linear")
 _KEPT = 3  # examples in a note
@@ -101,6 +103,7 @@ class _Reader:
     parse: Callable[[str], object]
     sheet: Sheet = field(default_factory=Sheet)
     renamed: list[str] = field(default_factory=list)
+    computed: int = 0  # rows of tags without an address
     devices: set[str] = field(default_factory=set)
 
     def check_columns(self) -> None:
@@ -141,6 +144,9 @@ class _Reader:
             self._mistake(row.number, "no device, but other rows have one", self._place("device"))
         if whose and cells.name(whose) != device:
             return
+        if self._cell(row, "computed"):
+            self.computed += 1
+            return
         row = self._without_errors(row)
         settings = dict(self._settings(row))
         name = self._name(row, settings)
@@ -168,6 +174,9 @@ class _Reader:
         return Row(row.number, found)
 
     def finish(self, device: str) -> None:
+        if self.computed:
+            left = f"{self.computed} computed tags left out"
+            self.sheet.notes.append(f"{left}: write them into the file")
         if self.renamed:
             examples = ", ".join(self.renamed[:_KEPT])
             more = f" and {len(self.renamed) - _KEPT} more" if len(self.renamed) > _KEPT else ""

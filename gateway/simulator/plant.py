@@ -30,7 +30,7 @@ def _animate(memory: Memory, tag: Tag, number: int) -> None:
     area, start, size = tag.span
     if not memory.holds(area, start, size):
         return
-    if tag.address.bit is not None:
+    if tag.part is not None:
         if tag.write is None:
             memory.animate(area, start, lambda now: int(now) & 0xFFFF)
         return

@@ -13,7 +13,7 @@ from gateway.protocols.vigor.codec import HEX_DIGITS, Reply, RequestReader, enco
 from gateway.stations.station import Memory
 
 
-class _Stretch(NamedTuple):
+class Stretch(NamedTuple):
     """Byte addresses `first` .. `last` and the devices they hold, from number `number` on."""
 
     first: int
@@ -37,22 +37,22 @@ class _Stretch(NamedTuple):
 
 
 _STRETCHES = (
-    _Stretch(0x0000, 0x003F, "X", 0, 0),
-    _Stretch(0x0040, 0x007F, "Y", 0, 0),
-    _Stretch(0x0080, 0x02FF, "M", 0, 0),
-    _Stretch(0x0300, 0x037C, "S", 0, 0),
-    _Stretch(0x0380, 0x039F, "TS", 0, 0),
-    _Stretch(0x03A0, 0x03BF, "CS", 0, 0),
-    _Stretch(0x03E0, 0x03FF, "M9", 9000, 0),
-    _Stretch(0x0780, 0x079F, "TC", 0, 0),
-    _Stretch(0x07A0, 0x07BF, "CC", 0, 0),
-    _Stretch(0x1400, 0x15FF, "T", 0, 2),
-    _Stretch(0x1600, 0x17FF, "D9", 9000, 2),
-    _Stretch(0x1800, 0x198F, "C", 0, 2),
-    _Stretch(0x1A00, 0x1ADF, "C32", 200, 4),
-    _Stretch(0x1C00, 0x5BFF, "D", 0, 2),
+    Stretch(0x0000, 0x003F, "X", 0, 0),
+    Stretch(0x0040, 0x007F, "Y", 0, 0),
+    Stretch(0x0080, 0x02FF, "M", 0, 0),
+    Stretch(0x0300, 0x037C, "S", 0, 0),
+    Stretch(0x0380, 0x039F, "TS", 0, 0),
+    Stretch(0x03A0, 0x03BF, "CS", 0, 0),
+    Stretch(0x03E0, 0x03FF, "M9", 9000, 0),
+    Stretch(0x0780, 0x079F, "TC", 0, 0),
+    Stretch(0x07A0, 0x07BF, "CC", 0, 0),
+    Stretch(0x1400, 0x15FF, "T", 0, 2),
+    Stretch(0x1600, 0x17FF, "D9", 9000, 2),
+    Stretch(0x1800, 0x198F, "C", 0, 2),
+    Stretch(0x1A00, 0x1ADF, "C32", 200, 4),
+    Stretch(0x1C00, 0x5BFF, "D", 0, 2),
 )
-_FORCED = ("X", "Y", "M", "S", "M9")
+FORCED = ("X", "Y", "M", "S", "M9")
 _ANY_CASE = b"0123456789ABCDEFabcdef"
 
 _DONE, _ASCII_ERROR, _BAD_SUM, _NO_COMMAND, _OUT_OF_RANGE = "00", "10", "11", "12", "28"
@@ -140,8 +140,8 @@ class VigorStation:
         if len(body) != 4:
             return _ASCII_ERROR
         byte, bit = divmod(int(body, 16), 8)
-        place = _stretch(byte)
-        if place is None or place.area not in _FORCED:
+        place = stretch(byte)
+        if place is None or place.area not in FORCED:
             return _OUT_OF_RANGE
         number = place.devices(byte)[bit]
         if (place.area, number) in self.holes:
@@ -149,14 +149,14 @@ class VigorStation:
         self._memory.write(place.area, number, [value])
         return _DONE
 
-    def _places(self, body: bytes) -> list[tuple[_Stretch, int]] | None:
+    def _places(self, body: bytes) -> list[tuple[Stretch, int]] | None:
         """Returns the bytes of a 51 or 61; None for zero, too many, or some that do not exist."""
         address, count = int(body[:4], 16), int(body[4:6], 16)
         if not 1 <= count <= 128:
             return None
         places = []
         for byte in range(address, address + count):
-            place = _stretch(byte)
+            place = stretch(byte)
             if place is None:
                 return None
             if self.holes and any((place.area, n) in self.holes for n in place.devices(byte)):
@@ -164,14 +164,14 @@ class VigorStation:
             places.append((place, byte))
         return places
 
-    def _peek(self, place: _Stretch, byte: int, now: float) -> int:
+    def _peek(self, place: Stretch, byte: int, now: float) -> int:
         devices = place.devices(byte)
         values = self._memory.read(place.area, devices[0], len(devices), now)
         if place.width:
             return values[0] >> place.shift(byte) & 0xFF
         return sum((value & 1) << bit for bit, value in enumerate(values))
 
-    def _poke(self, place: _Stretch, byte: int, value: int, now: float) -> None:
+    def _poke(self, place: Stretch, byte: int, value: int, now: float) -> None:
         devices = place.devices(byte)
         if not place.width:
             self._memory.write(place.area, devices[0], [value >> bit & 1 for bit in range(8)])
@@ -188,6 +188,6 @@ def vigor_station(driver: Vigor) -> VigorStation:
 
 
 @cache
-def _stretch(byte: int) -> _Stretch | None:
+def stretch(byte: int) -> Stretch | None:
     """Returns the stretch of a byte address; None between two stretches."""
     return next((place for place in _STRETCHES if place.first <= byte <= place.last), None)

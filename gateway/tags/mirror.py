@@ -5,6 +5,7 @@ from itertools import compress, count
 from operator import ne
 
 from gateway.tags import Publish, Quality, Reason, Sample, Tag, bad
+from gateway.tags.computed import Dependents, computed
 from gateway.tags.scan import Latest, Samples, Scan
 
 
@@ -19,6 +20,7 @@ class Mirror:
     def __init__(self, tags: Iterable[Tag], now: int) -> None:
         """`now`: nanoseconds since 1970."""
         self._current = {tag: bad(tag, Reason.STARTING, now) for tag in tags}
+        self.dependents = Dependents(self._current)
         self._published: dict[Tag, Sample] = {}
         self._begun = False
         # Tags whose latest sample is in a scan, with their place there.
@@ -37,7 +39,8 @@ class Mirror:
     def __getitem__(self, tag: Tag) -> Sample:
         entry = self._places.get(tag)
         if entry is None:
-            return self._current[tag]
+            current = self._current[tag]
+            return current if tag.formula is None else self._computed(tag, current)
         latest, place = entry
         return latest.scan[place]
 
@@ -52,6 +55,21 @@ class Mirror:
         if type(samples) is Scan and not samples.latest.superseded:
             self._adopt(samples.latest, samples)
         return to_publish
+
+    def computed_after(self, samples: Iterable[Sample]) -> list[Sample]:
+        """Calculates the tags that follow from samples to publish. Returns those to publish."""
+        tags = self.dependents.after(sample.tag for sample in samples)
+        due = [self._store([self[tag]]) for tag in tags]
+        return [sample for one in due for sample in one]
+
+    def _computed(self, tag: Tag, current: Sample) -> Sample:
+        """Returns the present sample of a computed tag: a read of equal inputs moves its time."""
+        try:
+            sample = computed(tag, self.__getitem__)
+        except KeyError:  # a reload is replacing an input: this tag follows at its end
+            return bad(tag, Reason.STARTING, current.time)
+        bad_before = sample.quality is Quality.BAD and _same_failure(current, sample)
+        return current if bad_before or current.reason is Reason.DISABLED else sample
 
     def mark_published(self, samples: Iterable[Sample]) -> list[Sample]:
         """Records samples that are published again: deadband and heartbeat count from them.
@@ -75,6 +93,22 @@ class Mirror:
             self._current[new] = self[old]._replace(tag=new)
             if (last := self._last_published(old)) is not None:
                 self._published[new] = last._replace(tag=new)
+
+    def compute(self, first: Iterable[Sample], gone: Iterable[Tag]) -> list[Sample]:
+        """Has other computed tags. `first`: the samples of those that are new. Returns all that
+        are to be published; a tag of a disabled device is disabled too."""
+        due = []
+        for sample in first:
+            self._current[sample.tag] = sample
+            if sample.reason is Reason.DISABLED:
+                self._published[sample.tag] = sample
+                due.append(sample)
+        self.forget(gone)
+        self.dependents = Dependents(self._current)
+        begun = {sample.tag for sample in first} - {sample.tag for sample in due}
+        for tag in self.dependents.in_order(begun):
+            due += self._store([computed(tag, self.__getitem__)])
+        return due
 
     def forget(self, tags: Iterable[Tag]) -> None:
         """Removes tags. Other threads must not look them up any more."""

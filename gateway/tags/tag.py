@@ -1,17 +1,25 @@
 """Tags: their addresses and rules, and the conversion between units and values."""
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 from gateway.errors import BadValue, Garbled
 from gateway.protocols.driver import Address, Span, Unit
 from gateway.protocols.typed_fields import Shape
-from gateway.tags.scaling import exact_below, scaled, unscaled
-from gateway.values import Kind, Layout, Value, from_word, from_words, to_words
+from gateway.tags.decoding import (
+    Decode,
+    Part,
+    decoder,
+    field_decoder,
+    part_of,
+    with_shaping,
+)
+from gateway.tags.formula import Formula
+from gateway.tags.scaling import Linear, exact_below, linear, type_of, unscaled, unscaled_float
+from gateway.tags.shaping import Names, Shaping
+from gateway.values import Layout, Value, to_words
 
 # Larger whole numbers are refused at once: as many bits as the largest float has.
 _MOST_BITS = 1024
@@ -71,18 +79,31 @@ class Tag:
     write: WriteRule | None = None
     shape: Shape | None = None  # for a field of a frame: a read gives the value itself
     event: bool = False  # every value is published, also an equal one
+    shaping: Shaping | None = None
+    names: Names | None = None
+    formula: Formula | None = None  # of a computed tag: no address, read or write
+    inputs: tuple["Tag", ...] = ()  # of the formula, in its order
+    part: Part | None = field(init=False, repr=False)  # of its word; None: whole words
     # From the unit of the span to the value, or from its units if it has several.
-    convert: Callable[[Any], Value | None] = field(init=False, repr=False)
+    convert: Decode = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        scale, offset = self.scale, self.offset
-        convert: Callable[[Any], Value | None]
-        if self.shape is None:
-            unit = self.unit_kind
-            convert = _decoder(self.layout, unit, self.single, self.address.bit, scale, offset)
-        else:
-            convert = _field_decoder(self.layout, scale, offset)
-        object.__setattr__(self, "convert", convert)
+        part = None if self.shape is not None else part_of(self.layout, self.address.bit)
+        object.__setattr__(self, "part", part)
+        object.__setattr__(self, "convert", self._decoder(self.shaping))
+
+    def _decoder(self, shaping: Shaping | None) -> Decode:
+        if self.formula is not None:
+            return with_shaping(self.formula.value, shaping)
+        if self.shape is not None:
+            return field_decoder(self.layout, self._line, shaping)
+        bit = self.address.bit
+        return decoder(self.layout, self.unit_kind, self.single, bit, self._line, shaping)
+
+    @property
+    def _line(self) -> Linear | None:
+        ends = None if self.shaping is None else self.shaping.ends
+        return linear(self.scale, self.offset, ends) if self.layout.type.is_number else None
 
     def copy(self, device: str, name: str) -> "Tag":
         """Returns the same tag under another name. Ten times faster than `replace`."""
@@ -110,18 +131,28 @@ class Tag:
     @property
     def exact_below(self) -> float | None:
         """The amount below which a JSON number tells all values apart; None: it always does."""
-        if not self._rounds:
+        line = self._line
+        if line is None or self.layout.type.is_float:
             return None
-        return exact_below(self.layout.type, self.scale, self.offset)
+        return exact_below(self.layout.type, line)
+
+    @property
+    def value_type(self) -> str:
+        """The type of the value, which a scale can make another one than that of the device."""
+        return type_of(self.layout.type, self._line)
 
     def encode(self, value: Value) -> list[int]:
         """Returns the units to write for `value`. Raises `BadValue`.
 
-        A tag that is one bit of a word gives the bit alone: [0] or [1].
+        A tag that is a part of a word gives that part alone: [0] or [1] for a bit.
         """
         if isinstance(value, int) and value.bit_length() > _MOST_BITS:
             raise BadValue("the number is too large")
+        if self.names is not None:
+            value = self.names.number(value)
         self._check_limits(value, str(value))
+        if self.shaping is not None:
+            value = self._shaped(self.shaping, value)
         if self.shape is not None:
             return self._octets(self.shape, value)
         words = to_words(self.layout)(self._unscaled(value))
@@ -129,14 +160,23 @@ class Tag:
             units = [low | high << 16 for low, high in zip(words[::2], words[1::2], strict=True)]
         else:
             units = words
-        if self._rounds and (real := self.from_units(units)) is not None:
+        if self._rounds and (real := self.held(units)) is not None:
             self._check_limits(real, f"{value} (the device holds {real})")
         return units
+
+    def _shaped(self, shaping: Shaping, value: Value) -> Value:
+        """Returns the value before scaling, as a read would show it. Checks the limits again."""
+        rounded = shaping.rounded(value)
+        self._check_limits(rounded, f"{value} (rounded to {rounded})")
+        shaping.check(rounded)
+        if shaping.invert and isinstance(rounded, (bool, int)) and rounded in (0, 1):
+            return not rounded
+        return rounded
 
     def _octets(self, shape: Shape, value: Value) -> list[int]:
         """Returns the bytes of the value. Checks the limits again, as digits may round it."""
         octets = list(shape.put(self._unscaled(value)))
-        real = self.from_units(octets)
+        real = self.held(octets)
         if real is None:
             raise BadValue(f"{value!r} cannot be read back after the write")
         self._check_limits(real, f"{value} (sent as {real})")
@@ -145,8 +185,7 @@ class Tag:
     @property
     def _rounds(self) -> bool:
         """True when a write rounds the value to a step of the device."""
-        scaled = self.scale != 1 or self.offset != 0
-        return scaled and self.layout.type.is_number and not _is_float(self.layout)
+        return self._line is not None and not self.layout.type.is_float
 
     def _check_limits(self, value: Value, description: str) -> None:
         if self.write is None or isinstance(value, (bool, str)):
@@ -163,92 +202,27 @@ class Tag:
                 return self.decode([self.shape.take(bytes(units))])
             except Garbled:
                 return None
-        if self.address.bit is not None:
-            return bool(units[0])
-        return self.decode(units)
+        return self.decode(self._whole(units))
+
+    def held(self, units: Sequence[int]) -> Value | None:
+        """Returns `from_units` without rounding to decimals and without clamp."""
+        if self.shaping is None:
+            return self.from_units(units)
+        convert, whole = self._decoder(self.shaping.exact), self._whole(units)
+        return convert(whole[0] if self.single else whole)
+
+    def _whole(self, units: Sequence[int]) -> Sequence[int]:
+        """Returns whole units for those of `encode`, which has only a part of a word."""
+        return units if self.part is None else [self.part.into(0, units[0])]
 
     def _unscaled(self, value: Value) -> Value:
-        if not self.layout.type.is_number or isinstance(value, (bool, str)):
+        line = self._line
+        if line is None or isinstance(value, (bool, str)):
             return value
-        if self.scale == 1 and self.offset == 0:
-            return value
-        if not _is_float(self.layout):
-            return unscaled(value, self.scale, self.offset)
-        try:
-            return (value - self.offset) / self.scale
-        except OverflowError:
-            raise BadValue(f"{value} is too large") from None
+        if self.layout.type.is_float:
+            return unscaled_float(value, line)
+        return unscaled(value, line)
 
 
 def _short(number: float) -> str:
     return str(number) if isinstance(number, int) else f"{number:.15g}"
-
-
-def _is_float(layout: Layout) -> bool:
-    return layout.type.kind in (Kind.FLOAT32, Kind.FLOAT64)
-
-
-@lru_cache(maxsize=4096)
-def _decoder(
-    layout: Layout, unit: Unit, single: bool, bit: int | None, scale: float, offset: float
-) -> Callable[[Any], Value | None]:
-    """Returns the function from units to value, shared by all tags of the same kind.
-
-    `single`: it takes one unit, otherwise a sequence.
-    """
-    if bit is not None:
-        if single:
-            return lambda unit: bool(unit >> bit & 1)
-        return lambda units: bool(units[0] >> bit & 1)
-    plain = from_word(layout) if single else from_words(layout)
-    if unit is Unit.DWORD:
-        narrow = from_words(layout)
-
-        def plain(units: Any) -> Value | None:
-            dwords = (units,) if single else units
-            return narrow([half for word in dwords for half in (word & 0xFFFF, word >> 16)])
-
-    if (scale == 1 and offset == 0) or not layout.type.is_number:
-        return plain
-    if _is_float(layout):
-        return _scaled_float(plain, scale, offset)
-    value_of = scaled(scale, offset)
-
-    def integer(units: Any) -> Value | None:
-        raw = plain(units)
-        return value_of(raw) if isinstance(raw, int) else None
-
-    return integer
-
-
-def _scaled_float(
-    plain: Callable[[Any], Value | None], scale: float, offset: float
-) -> Callable[[Any], Value | None]:
-    def value(units: Any) -> Value | None:
-        raw = plain(units)
-        if raw is None or isinstance(raw, str):
-            return raw
-        scaled = raw * scale + offset
-        return scaled if math.isfinite(scaled) else None
-
-    return value
-
-
-@lru_cache(maxsize=4096)
-def _field_decoder(layout: Layout, scale: float, offset: float) -> Callable[[Any], Value | None]:
-    """Returns the decoder for a field of a frame: its value or a `Garbled`."""
-    scales = layout.type.is_number and not (scale == 1 and offset == 0)
-    value_of = None if _is_float(layout) or not scales else scaled(scale, offset)
-
-    def value(raw: Value | Garbled) -> Value | None:
-        if isinstance(raw, Garbled):
-            return None
-        if not scales or isinstance(raw, str):
-            return raw
-        if value_of is not None and isinstance(raw, int):
-            return value_of(raw)
-        number = raw * scale + offset
-        # The device sends decimal digits: 600.0 x 0.1 is 60, not 60.00000000000001.
-        return float(f"{number:.15g}") if math.isfinite(number) else None
-
-    return value

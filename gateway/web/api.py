@@ -7,15 +7,21 @@ are made on threads, because those of a large plant take long.
 import asyncio
 import time
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from itertools import islice
 from typing import Any
 
 import orjson
 from aiohttp import web
 
-from gateway.errors import BadValue, GatewayError
-from gateway.northbound import payload
+from gateway.errors import BadValue, Busy, GatewayError
+from gateway.history.course import Now
+from gateway.history.question import question
+from gateway.history.rows import has_value
+from gateway.northbound import buckets, past, payload
 from gateway.northbound.faults import below, faults, warnings
+from gateway.northbound.interfaces import History
+from gateway.northbound.meta import meta_fields
 from gateway.northbound.payload import Failure, Problem
 from gateway.northbound.session import off_loop
 from gateway.tags import Tag
@@ -28,6 +34,7 @@ MOST_SAMPLES = 10_000
 _ITEMS = 200
 _SAMPLES = 1000
 BODY_WITHIN = 5.0  # seconds
+HISTORY_WITHIN = 20.0  # seconds for one query
 HISTORY_AT_ONCE = 4  # queries; they read the disk
 # 200 only for an acknowledged write. 502 and above: it was sent, or the device cannot be reached.
 _STATUS = {
@@ -129,7 +136,7 @@ class Api:
         return list(islice(matching if find else tags, limit))
 
     def _fields(self, tag: Tag) -> Mapping[str, object]:
-        return {**payload.sample_fields(self._plant.sample(tag)), **payload.meta_fields(tag)}
+        return {**payload.sample_fields(self._plant.sample(tag)), **meta_fields(tag)}
 
     async def _samples(self, request: web.Request) -> web.Response:
         key = request.query.get("tag", "")
@@ -139,15 +146,14 @@ class Api:
         if history is None or not tag.history:
             return answer(404, f"no history is kept of {tag.key}: it needs `history: true`")
         limit = _limit(request, _SAMPLES, MOST_SAMPLES)
-        period = request.query.get("time", "[now(-1h)..]")
+        find = partial(_found, history, tag, dict(request.query), limit)
+        is_valid = has_value(self._plant.sample(tag))
 
         def read() -> object:
             try:
-                found = [*history.samples(tag, period, limit, time.time_ns())]
+                return find(Now(time.time_ns(), is_valid=is_valid))
             except GatewayError as error:
                 return error
-            samples = [payload.sample_fields(sample) for sample in found]
-            return {"tag": tag.key, "samples": samples, "complete": len(samples) < limit}
 
         async with self._history_turns:
             found = await off_loop(read)
@@ -168,6 +174,35 @@ class Api:
         result = await self._north.write(key, data, f"web {request[BY]}", arrived)
         status = _STATUS.get(result.problem, 500) if isinstance(result, Failure) else 200
         return _raw(payload.outcome(result), status)
+
+
+def _found(
+    history: History, tag: Tag, parameters: Mapping[str, str], limit: int, now: Now
+) -> dict[str, object]:
+    """Returns the samples or buckets of one tag. Raises `GatewayError`."""
+    asked = question({"time": "[now(-1h)..]", **parameters}, time="time")
+    until = time.monotonic() + HISTORY_WITHIN
+
+    def pause() -> None:
+        if time.monotonic() > until:
+            raise Busy(f"this takes more than {HISTORY_WITHIN:g} s: ask for a shorter time")
+
+    if asked.bucket is not None:
+        whole = [
+            buckets.fields(bucket, asked.aggregates)
+            for bucket in history.buckets(tag, asked, now, pause)
+            if bucket.quality == "good" or not asked.only_good
+        ]
+        return {"tag": tag.key, "buckets": whole, "complete": True}
+    most = asked.last or limit
+    if most > MOST_SAMPLES:
+        raise BadValue(f"last={asked.last} is no count from 1 to {MOST_SAMPLES}")
+    samples = list[object]()
+    for sample in past.samples(history, tag, asked, limit, now.time, pause):
+        samples.append(payload.sample_fields(sample))
+        pause()
+    complete = asked.last is not None or len(samples) < limit
+    return {"tag": tag.key, "samples": samples, "complete": complete}
 
 
 def overview(documents: Documents) -> dict[str, Any]:

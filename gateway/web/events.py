@@ -186,6 +186,8 @@ class Page:
             fields = payload.sample_fields(sample)
             known = fields["value"]
             text = known if isinstance(known, str) else orjson.dumps(known).decode()
+            if name := fields.get("text"):
+                text = f"{name} ({text})"
             good = fields["quality"] == Quality.GOOD
             why = "" if good else f"{fields['reason'] or ''} {fields.get('detail') or ''}".strip()
             found.append([tag.name, text if good else "", good, sample.time // 10**6, why])

@@ -1,12 +1,14 @@
 """Tables of values."""
 
+import time
 from pathlib import Path
 from typing import Any
 
+import pytest
 from rich.console import Console
 
 from gateway.cli.client import Row
-from gateway.cli.tables import row_of, table_of
+from gateway.cli.tables import row_of, table_of, time_text
 from gateway.tags import Reason, bad, good
 from tests.cli.conftest import tags_of
 
@@ -29,12 +31,29 @@ def test_a_table_of_good_and_bad_samples(tmp_path: Path) -> None:
         row_of(good(run, False, NOW)),
         Row("other/tag", {"value": "[red]:boom:", "quality": "good", "time": "now"}),
     ]
-    header, *lines = [line.split() for line in printed(table_of(rows, tags))]
-    time = "2026-11-21T04:36:03.007430Z"
+    header, *lines = [line.split() for line in printed(table_of(rows, tags, utc=True))]
+    at = "2026-11-21T04:36:03.007430Z"
     assert header == ["tag", "value", "unit", "quality", "time"]
     assert lines == [
-        ["mixer/speed", "-7", "rpm", "good", time],
-        ["mixer/speed", "-", "rpm", "bad:", "no-reply", time],
-        ["mixer/run", "false", "good", time],
+        ["mixer/speed", "-7", "rpm", "good", at],
+        ["mixer/speed", "-", "rpm", "bad:", "no-reply", at],
+        ["mixer/run", "false", "good", at],
         ["other/tag", "[red]:boom:", "good", "now"],
     ]
+
+
+def test_times_are_shown_in_the_zone_of_this_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TZ", "CET-1CEST,M3.5.0,M10.5.0/3")
+    time.tzset()
+    try:
+        assert time_text("2026-11-21T04:36:03.007430Z") == "2026-11-21T05:36:03.007+01:00"
+        assert time_text("2026-07-21T04:36:03.007430Z") == "2026-07-21T06:36:03.007+02:00"
+        assert time_text("2026-11-21T04:36:03Z", utc=True) == "2026-11-21T04:36:03Z"
+    finally:
+        monkeypatch.undo()
+        time.tzset()
+
+
+@pytest.mark.parametrize("text", ["", "now", "0001-01-01T00:00:00Z\x1b[2J"])
+def test_a_time_that_is_none_is_shown_without_control_characters(text: str) -> None:
+    assert time_text(text) == text.replace("\x1b", "\\x1b")

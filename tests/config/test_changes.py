@@ -22,6 +22,39 @@ def test_a_file_that_is_read_twice_has_no_difference(path: Path) -> None:
     assert needs_restart(first, second) == []
 
 
+SHAPED: dict[str, Data] = {
+    "a": {"address": "D10", "decimals": 1, "clamp": [0, 100], "from": [0, 4000], "to": [0, 100]},
+    "b": {"address": "D11", "enum": {"0": "off", "1": "auto"}},
+    "c": {"computed": "a * 2"},
+}
+
+
+def test_shaped_and_computed_tags_are_equal_when_read_twice() -> None:
+    first, second = (built(file(hall={"mixer": vigor(1, **SHAPED)})) for _ in range(2))
+    difference = compare(first, second)
+    assert not difference
+    assert difference.config.devices == first.devices
+
+
+def test_a_line_that_answers_needs_a_restart() -> None:
+    def answering(address: str) -> Data:
+        changed = data()
+        tags = {"speed": {"address": address, "source": "mixer/speed"}}
+        station = {"protocol": "modbus-tcp", "station": 1, "tags": tags}
+        changed["lines"]["panel"] = {
+            "port": "tcp://127.0.0.1:1502",
+            "serve": True,
+            "devices": {"panel": station},
+        }
+        return changed
+
+    old, same, new = (built(answering(f"holding:{n}")) for n in (1, 1, 2))
+    assert needs_restart(old, same) == []
+    assert not compare(old, same)
+    assert needs_restart(old, new) == ["lines.panel"]
+    assert needs_restart(old, built(data())) == ["lines.panel"]
+
+
 def data(**tag: object) -> Data:
     mixer = vigor(1, level={"address": "D10"}, speed={"address": "D11", **tag})
     return file(hall={"mixer": mixer, "oven": vigor(2)})

@@ -111,7 +111,9 @@ def only_tag(config: Config) -> Tag:
 
 
 M = "lines.hall.devices.mixer"
-TYPES = "bool, int16, uint16, int32, uint32, int64, uint64, float32, float64, bcd16, bcd32"
+TYPES = (
+    "bool, int8, uint8, int16, uint16, int32, uint32, int64, uint64, float32, float64, bcd16, bcd32"
+)
 
 
 @dataclass(frozen=True)
@@ -339,7 +341,7 @@ LINES = [
         "(N, E or O) and stop bits (1 or 2), such as 7E1",
         "6: lines.hall.echo: 'maybe' is neither true nor false",
         "7: lines.hall.parity: no setting of a line: "
-        "use port, baudrate, format, echo, defaults or devices",
+        "use port, baudrate, format, echo, serve, defaults or devices",
     ),
     bad(
         "negative baud rate",
@@ -490,9 +492,9 @@ DEVICES = [
     bad(
         "another protocol's setting",
         on_mixer("protocol: vigor\nframe_format: 4"),
-        f"7: {M}.frame_format: no setting of a vigor device: use blocks, control, defaults, "
-        "enabled, format, late_guard, reply_timeout, retries, silence, station, tags, tags_from, "
-        "turnaround or verify_reads",
+        f"7: {M}.frame_format: no setting of a vigor device: use accept, blocks, control, "
+        "defaults, enabled, format, late_guard, reply_timeout, retries, silence, stale_after, "
+        "station, tags, tags_from, turnaround or verify_reads",
     ),
     bad(
         "a protocol's own settings",

@@ -14,6 +14,9 @@ from typing import Any, TypeVar
 from gateway.config import ZenohConfig, ZenohMode
 from gateway.engine.requests import CommandResult
 from gateway.history import Historian
+from gateway.history.buckets import Bucket
+from gateway.history.course import Now
+from gateway.history.question import Question
 from gateway.northbound import Northbound, payload
 from gateway.northbound.answers import HISTORY_LIMIT
 from gateway.northbound.interfaces import History
@@ -117,6 +120,16 @@ class SlowHistory:
 
     def samples(self, tag: Tag, time_range: str, limit: int | None, now: int) -> Iterator[Sample]:
         return self._answer(time_range, now, [good(tag, 1, PAST)])
+
+    def buckets(
+        self, tag: Tag, question: Question, now: Now, pause: Callable[[], None]
+    ) -> Iterator[Bucket]:
+        raise NotImplementedError
+
+    def newest(
+        self, tag: Tag, question: Question, now: int, pause: Callable[[], None]
+    ) -> Iterator[Sample]:
+        return self._answer(question.time_range, now, [good(tag, 1, PAST)])
 
     def as_recorded(self, query: RecordedQuery, pause: Callable[[], None]) -> Recorded:
         return self._answer(query.time_range, query.now, [(True, ("0", 0, 0))])

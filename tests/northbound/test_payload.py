@@ -19,6 +19,7 @@ from gateway.errors import (
     Unclear,
 )
 from gateway.northbound import payload
+from gateway.northbound.meta import meta
 from gateway.northbound.payload import Failure, Problem, WriteOutcome
 from gateway.protocols.driver import Address, Span, Unit
 from gateway.tags import Deadband, Reason, Tag, WriteResult, WriteRule, bad, good
@@ -88,14 +89,14 @@ def test_a_block_holds_every_tag_by_name() -> None:
 def test_meta_holds_type_address_interval_and_limits() -> None:
     rule = WriteRule(min=1, max=40, verify=True)
     of = tag(kind="float32", unit="rpm", write=rule, deadband=Deadband(0.5), every=0.5)
-    document = json.loads(payload.meta(of))
+    document = json.loads(meta(of))
     assert document["type"] == "float32"
     assert document["address"] == "D100"
     assert document["unit"] == "rpm"
     assert document["every"] == 0.5
     assert document["write"] == {"min": 1, "max": 40, "verify": True}
     assert document["deadband"] == {"amount": 0.5, "percent": False}
-    assert json.loads(payload.meta(tag()))["write"] is None
+    assert json.loads(meta(tag()))["write"] is None
 
 
 @pytest.mark.parametrize(

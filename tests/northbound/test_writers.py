@@ -13,6 +13,9 @@ import pytest
 
 from gateway.config import ZenohConfig
 from gateway.errors import ConfigError
+from gateway.history.buckets import Bucket
+from gateway.history.course import Now
+from gateway.history.question import Question
 from gateway.northbound import Northbound
 from gateway.northbound.signatures import sign
 from gateway.northbound.writers import EARLIEST, LATEST, NotAllowed, Repeated, Writers
@@ -35,6 +38,16 @@ class RecordedWrites:
         self.recorded: list[Any] = []
 
     def samples(self, tag: Tag, time_range: str, limit: int | None, now: int) -> Iterator[Sample]:
+        raise NotImplementedError
+
+    def buckets(
+        self, tag: Tag, question: Question, now: Now, pause: Callable[[], None]
+    ) -> Iterator[Bucket]:
+        raise NotImplementedError
+
+    def newest(
+        self, tag: Tag, question: Question, now: int, pause: Callable[[], None]
+    ) -> Iterator[Sample]:
         raise NotImplementedError
 
     def as_recorded(self, query: RecordedQuery, pause: Callable[[], None]) -> Recorded:

@@ -92,7 +92,7 @@ class Plant:
 async def running(data: Data) -> AsyncIterator[Plant]:
     plant = Plant(data)
     for line in plant.gateway.lines:
-        plant.lines.start(line, line.run())
+        plant.lines.start(line, line.engine.name, line.run())
     try:
         yield plant
     finally:

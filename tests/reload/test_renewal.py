@@ -186,6 +186,40 @@ async def test_devices_move_and_lines_open_and_close() -> None:
 
 
 @on_virtual_time
+async def test_computed_tags_follow_their_inputs() -> None:
+    def computed(data: Data, formula: str) -> None:
+        device(data, "oven")["tags"]["sum"] = {"computed": formula}
+
+    devices = {"mixer": vigor(1), "oven": vigor(2)}
+    data = file(hall=devices, yard={"pump": vigor(3)})
+    computed(data, "level + 'mixer/level'")
+    async with running(data) as plant:
+        await plant.until_good("mixer/level", "oven/level", "oven/sum")
+        before = plant.sample("oven/sum").tag
+        await plant.reload(lambda data: device(data, "pump").update(defaults={"every": "300ms"}))
+        assert plant.sample("oven/sum").tag is before
+        # An input goes on as another tag, and the sum with it.
+        await plant.reload(lambda data: device(data, "mixer").update(defaults={"every": "300ms"}))
+        assert plant.sample("oven/sum").quality is Quality.GOOD
+        assert all(sample.quality is Quality.GOOD for sample in plant.published)
+        # The input is read from another station.
+        await plant.reload(lambda data: device(data, "mixer").update(station=7))
+        assert plant.sample("oven/sum").reason is Reason.STARTING
+        await plant.until_good("oven/sum")
+        values = [plant.sample(key).value for key in ("oven/sum", "oven/level", "mixer/level")]
+        assert values[0] == values[1] + values[2]  # type: ignore[operator]  # numbers
+        await plant.reload(lambda data: computed(data, "2 * level"))
+        assert plant.sample("oven/sum").value == 2 * plant.sample("oven/level").value  # type: ignore[operator]
+        await plant.reload(lambda data: device(data, "oven").update(enabled=False))
+        assert plant.sample("oven/sum").reason is Reason.DISABLED
+        await plant.reload(lambda data: device(data, "oven").pop("enabled"))
+        await plant.until_good("oven/sum")
+        await plant.reload(lambda data: device(data, "oven")["tags"].pop("sum"))
+        assert plant.gateway.tag("oven/sum") is None
+        assert plant.of("oven/sum")[-1].reason is Reason.DISABLED
+
+
+@on_virtual_time
 async def test_a_client_that_waits_for_a_read_gets_its_answer() -> None:
     async with running(file(hall=MIXER)) as plant:
         await plant.until_good("mixer/level", "mixer/recipe")

@@ -328,7 +328,6 @@ def test_limits_count_for_tags_that_can_be_written() -> None:
         ("Negate Value", "", "x"),
         ("Signed", "", "no"),
         ("Decimal places", "0", "1"),
-        ("Inverted", "no", "1"),
         ("Slave ID", "1", "2"),
     ],
 )

@@ -12,7 +12,7 @@ from gateway.config.parsers import every_digit
 from gateway.errors import BadValue, ConfigError
 from gateway.protocols.driver import Unit
 from gateway.tags import Tag
-from gateway.tags.scaling import exact_below
+from gateway.tags.scaling import Linear, exact_below, linear
 from gateway.values import parse_type
 from tests.tags.test_tags import tag
 
@@ -90,7 +90,8 @@ def test_a_written_value_is_the_integer_that_was_read(
 def test_the_limit_of_a_json_number(
     kind: str, scale: float, offset: float, limit: float | None
 ) -> None:
-    assert exact_below(parse_type(kind), scale, offset) == limit
+    line = linear(scale, offset) or Linear(Fraction(1), Fraction(0))
+    assert exact_below(parse_type(kind), line) == limit
 
 
 def test_a_whole_scale_and_offset_keep_an_integer() -> None:

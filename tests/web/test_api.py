@@ -90,6 +90,28 @@ async def test_history_is_answered_as_described(tmp_path: Path) -> None:
             assert whole.json["complete"] is True
             wrong = await client.ask(f"/api/history?tag={SPEED.key}&time=yesterday")
             assert (wrong.status, "no range" in wrong.json["error"]) == (400, True)
+            last = await client.ask(f"/api/history?tag={SPEED.key}&last=2")
+            assert [one["value"] for one in last.json["samples"]] == [3, 4]
+
+
+async def test_buckets_are_answered_as_described(tmp_path: Path) -> None:
+    now = time.time_ns()
+    plant = PlainPlant(PlainDevice(SPEED.device, (SPEED,)))
+    with history(tmp_path / "history.db") as historian:
+        historian.record([good(SPEED, 4, now - 20 * 10**9), good(SPEED, 8, now - 15 * 10**9)])
+        async with serving(history=historian, plant=plant) as client:
+            chart = f"/api/history?tag={SPEED.key}&time=[now(-1h)..now(-10s)]&bucket=1d"
+            answer = (await client.ask(chart)).json
+            assert violations(answer, schema("/api/history", 200)) == []
+            first, last = answer["buckets"][0], answer["buckets"][-1]  # two around midnight
+            assert (first["quality"], last["last"]) == ("partial", 8)
+            found = (await client.ask(f"{chart}&agg=last&quality=good")).json["buckets"]
+            assert all(one["quality"] == "good" for one in found)
+            wrong = await client.ask(f"{chart}&agg=average")
+            assert (wrong.status, "is none of min, max" in wrong.json["error"]) == (400, True)
+            # The plant has read nothing yet, so no value is valid until now.
+            until_now = await client.ask(f"/api/history?tag={SPEED.key}&bucket=1d")
+            assert until_now.json["buckets"][-1]["known"] <= 5.1
 
 
 ENDINGS = [

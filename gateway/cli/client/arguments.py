@@ -9,8 +9,9 @@ import zenoh
 from gateway.config import Config
 from gateway.config.messages import similar
 from gateway.errors import ConfigError
+from gateway.numerals import parse_decimal
 from gateway.tags import Tag
-from gateway.values import Value, parse_decimal
+from gateway.values import Value
 
 
 def tags_by_key(config: Config) -> dict[str, Tag]:

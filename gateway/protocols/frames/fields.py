@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 from gateway.errors import BadValue, ConfigError, Evidence, Garbled
-from gateway.values import LONGEST_STRING, Kind, Value, ValueType, real, shortest, whole
+from gateway.numerals import real, shortest, whole
+from gateway.values import LONGEST_STRING, Kind, Value, ValueType
 
 FieldType = Literal[
     "uint8",

@@ -120,6 +120,11 @@ class RequestReader:
     def __init__(self) -> None:
         self._buffer = b""
 
+    @property
+    def begun(self) -> int:
+        """The bytes of a request that is still arriving."""
+        return len(self._buffer)
+
     def feed(self, data: bytes) -> list[bytes]:
         """Returns the requests completed by `data`. A new STX begins another request."""
         self._buffer += data

@@ -25,6 +25,11 @@ class RequestReader:
         self._block: bytearray | None = None
         self._heard = 0.0
 
+    @property
+    def begun(self) -> int:
+        """The characters of a request that is still arriving."""
+        return 0 if self._block is None else 1 + len(self._block)
+
     def feed(self, data: bytes, now: float) -> list[str]:
         """Returns the requests completed by `data`, from station to sum."""
         self._heard = now

@@ -79,6 +79,20 @@ _SERVED: dict[str, dict[int, Runs]] = {
 _WRITES = {5: 1, 15: 1, 6: 3, 16: 3}  # the writing function, and the one that reads the same
 
 
+def runs_by_function(dialect: str) -> dict[int, Runs]:
+    """Returns the data of each function that a slave of the dialect serves."""
+    served = _SERVED[dialect]
+    return served | {write: served[read] for write, read in _WRITES.items() if read in served}
+
+
+def parts_of(runs: Runs, wire: int, count: int) -> Iterator[Part]:
+    """Yields the pieces of the addresses that exist, in order."""
+    for run in sorted(runs):
+        start, end = max(wire, run.wire), min(wire + count, run.wire + run.size)
+        if start < end:
+            yield Part(run, start - run.wire, end - start)
+
+
 class Store:
     """A slave's memory, reached by function code and wire address."""
 
@@ -87,9 +101,7 @@ class Store:
     ) -> None:
         """`holes`: (area, first, last) that this device lacks."""
         served = _SERVED[dialect]
-        self._runs = served | {
-            write: served[read] for write, read in _WRITES.items() if read in served
-        }
+        self._runs = runs_by_function(dialect)
         self._holes = holes
         self._low_first = low_first
         self._agreed: dict[tuple[str, int], int] = {}  # relay words, as both views last had them
@@ -140,10 +152,7 @@ class Store:
 
     def _parts(self, function: int, wire: int, count: int) -> Iterator[Part]:
         """Yields the pieces of the range that exist, in order."""
-        for run in sorted(self._runs[function]):
-            start, end = max(wire, run.wire), min(wire + count, run.wire + run.size)
-            if start < end:
-                yield Part(run, start - run.wire, end - start)
+        yield from parts_of(self._runs[function], wire, count)
 
     def _in_hole(self, part: Part) -> bool:
         first, size = _units(part)

@@ -1,0 +1,273 @@
+"""MQTT: values of the gateway to a broker, and writes back.
+
+    pip install eclipse-zenoh aiomqtt
+    python examples/bridges/mqtt.py --connect tcp/127.0.0.1:7447 --broker mqtt://127.0.0.1:1883
+
+| topic | retained | payload |
+|---|---|---|
+| `plant/mixer/speed` | yes | `{"value": 12.5, "quality": "good", "time": "…"}`, as on Zenoh |
+| `plant/@meta/mixer/speed` | yes | type, unit, limits |
+| `plant/@bridge` | yes | `online`, or `offline` (the last will) |
+| `plant/@set/mixer/recipe` | no | a command: `7`, or `{"value": 7, "id": "a1", "time": "…"}` |
+| `plant/@outcome/mixer/recipe` | no | `{"id": "a1", "outcome": "written", "value": 7, …}` |
+
+Use a value only while its quality is `good` and `plant/@bridge` is `online`. When a gateway or the
+way to it is gone, all its values are `bad` (`no-gateway`). When the bridge is gone, the broker
+publishes the last will, and forgets the retained values after `--expire` seconds (MQTT 5).
+
+Commands are accepted with `--writes`. Everyone who may publish to `plant/@set/#` may then write, so
+restrict this topic in the broker. A command has one outcome: `written` only when the device has
+acknowledged, an error of docs/zenoh.md, or `unclear`: it may or may not have been done. No outcome
+within twenty seconds means the same. The bridge never repeats a command.
+
+MQTT may deliver a command of QoS 1 or 2 twice. So it needs an `id`, a new one for each command. A
+known id is not written again, also after a restart (`--commands`); the bridge publishes its outcome
+again. With `time` the gateway refuses a command that is older than five seconds.
+"""
+
+import asyncio
+import json
+import os
+import sqlite3
+import ssl
+import time
+from collections import deque
+from contextlib import suppress
+from urllib.parse import urlsplit
+from weakref import WeakValueDictionary
+
+import aiomqtt
+from gateway_values import Known, Plant, arguments, bad, opened, run, say
+from paho.mqtt.packettypes import PacketTypes
+from paho.mqtt.properties import Properties
+from paho.mqtt.subscribeoptions import SubscribeOptions
+
+RECONNECT_AFTER = 1.0  # seconds
+MOST_COMMANDS = 100  # that wait; the next one is dropped, without an outcome
+LATEST = 5.0  # seconds: a command that waited longer is not sent
+
+
+class Commands:
+    """The ids of commands and their outcomes, on disk before the command is sent."""
+
+    KEPT = 100_000
+
+    def __init__(self, path: str) -> None:
+        self._db = sqlite3.connect(path, isolation_level=None)
+        self._db.execute(
+            "CREATE TABLE IF NOT EXISTS commands"
+            " (key TEXT, id TEXT, value TEXT, outcome TEXT, PRIMARY KEY (key, id))"
+        )
+
+    def begin(self, key: str, number: str, value: str) -> Known | None:
+        """Returns the outcome of a known id, None for a new one."""
+        select = "SELECT value, outcome FROM commands WHERE key = ? AND id = ?"
+        if (row := self._db.execute(select, (key, number)).fetchone()) is None:
+            insert = "INSERT INTO commands VALUES (?, ?, ?, NULL)"
+            new = self._db.execute(insert, (key, number, value)).lastrowid or 0
+            self._db.execute("DELETE FROM commands WHERE rowid <= ?", (new - self.KEPT,))
+            return None
+        if row[0] != value:
+            return {"outcome": "bad-value", "reason": "this id belongs to another value"}
+        if row[1] is None:
+            return {"outcome": "unclear", "reason": "the bridge ended while it was written"}
+        known: Known = json.loads(row[1])
+        return known
+
+    def end(self, key: str, number: str, outcome: Known) -> None:
+        update = "UPDATE commands SET outcome = ? WHERE key = ? AND id = ?"
+        self._db.execute(update, (json.dumps(outcome), key, number))
+
+
+def parsed(message: aiomqtt.Message) -> Known:
+    """Returns `value` and perhaps `id` and `time` of a command. Raises ValueError."""
+    command = json.loads(message.payload)
+    if not isinstance(command, dict):
+        command = {"value": command}
+    if "value" not in command or not command.keys() <= {"value", "id", "time"}:
+        raise ValueError('a command is a value, or {"value": …, "id": "…", "time": "…"}')
+    if not all(isinstance(command.get(name, ""), str) for name in ("id", "time")):
+        raise ValueError("`id` and `time` are texts")
+    if message.retain:
+        raise ValueError("a retained command would be done again after every restart")
+    if message.qos and not command.get("id"):
+        raise ValueError("MQTT may deliver it twice: give it an id, or publish it with QoS 0")
+    return command
+
+
+class Bridge:
+    def __init__(self, root: str, expire: int, writes: bool, commands: str) -> None:
+        self.plant: Plant
+        self._root, self._expire, self._writes = root, expire, writes
+        self._commands = Commands(commands if writes else ":memory:")
+        self._retained: dict[str, bytes] = {}  # by topic
+        self._pending: dict[str, None] = {}  # topics to publish, in order
+        self._outcomes: deque[tuple[str, bytes]] = deque(maxlen=1000)
+        self._news = asyncio.Event()
+        self._open: set[asyncio.Task[None]] = set()
+        self._turns: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
+
+    def described(self, key: str, meta: Known) -> None:
+        self._keep(f"{self._root}/@meta/{key}", meta)
+
+    def changed(self, key: str, known: Known) -> None:
+        self._keep(f"{self._root}/{key}", known)
+
+    def _keep(self, topic: str, document: Known) -> None:
+        self._retained[topic] = json.dumps(document, ensure_ascii=False).encode()
+        self._pending[topic] = None
+        self._news.set()
+
+    async def serve(self, address: str) -> None:
+        """Connects to the broker again and again."""
+        where = urlsplit(address)
+        secure = where.scheme == "mqtts"
+        while True:
+            client = aiomqtt.Client(
+                where.hostname or "127.0.0.1",
+                where.port or (8883 if secure else 1883),
+                username=where.username,
+                password=os.environ.get("MQTT_PASSWORD"),
+                tls_context=ssl.create_default_context() if secure else None,
+                # The same name again: the broker ends an old connection, with its last will, first.
+                identifier=f"gateway-{self._root.replace('/', '-')}",
+                protocol=aiomqtt.ProtocolVersion.V5,
+                clean_start=True,  # no command waits at the broker
+                keepalive=10,
+                will=aiomqtt.Will(f"{self._root}/@bridge", "offline", qos=1, retain=True),
+            )
+            try:
+                async with client as broker:
+                    await self._session(broker)
+            except* aiomqtt.MqttError as errors:
+                say(f"broker: {errors.exceptions[0]}")
+            await asyncio.sleep(RECONNECT_AFTER)
+
+    async def _session(self, broker: aiomqtt.Client) -> None:
+        """Publishes everything, then every change. `online` comes after the first values."""
+        state = f"{self._root}/@bridge"
+        try:
+            await self._clear(broker)
+            self._pending |= dict.fromkeys(self._retained)
+            await self._publish(broker)
+            if self._writes:
+                options = SubscribeOptions(qos=1, retainAsPublished=True, retainHandling=2)
+                await broker.subscribe(f"{self._root}/@set/#", options=options)
+            await broker.publish(state, "online", qos=1, retain=True)
+            say("connected to the broker")
+            async with asyncio.TaskGroup() as group:
+                group.create_task(self._publish_changes(broker))
+                group.create_task(self._receive(broker))
+        finally:
+            with suppress(aiomqtt.MqttError):  # then the broker publishes the last will
+                await broker.publish(state, "offline", qos=1, retain=True, timeout=1.0)
+                for topic, known in self._retained.items():
+                    if b'"quality": "good"' in known:
+                        empty = json.dumps(bad("no-bridge"))
+                        await broker.publish(topic, empty, retain=True, properties=self._expiring())
+
+    async def _clear(self, broker: aiomqtt.Client) -> None:
+        """Replaces what an earlier run left at the broker and this one does not have."""
+        everything, mark = f"{self._root}/#", f"{self._root}/@bridge/{os.urandom(8).hex()}"
+        await broker.subscribe(everything)
+        await broker.publish(mark)  # arrives after all that is retained
+        async for message in broker.messages:
+            topic = str(message.topic)
+            if topic == mark:
+                break
+            if message.retain and topic not in self._retained and topic != f"{self._root}/@bridge":
+                empty = b"" if "/@" in topic else json.dumps(bad("no-gateway"))
+                await broker.publish(topic, empty, retain=True, properties=self._expiring())
+        await broker.unsubscribe(everything)
+        while len(broker.messages):  # own ones
+            await anext(broker.messages)
+
+    def _expiring(self) -> Properties:
+        properties = Properties(PacketTypes.PUBLISH)
+        properties.MessageExpiryInterval = self._expire
+        return properties
+
+    async def _publish(self, broker: aiomqtt.Client) -> None:
+        while self._pending or self._outcomes:
+            if self._outcomes:
+                await broker.publish(*self._outcomes[0], qos=1)
+                self._outcomes.popleft()
+                continue
+            topic = next(iter(self._pending))
+            del self._pending[topic]
+            await broker.publish(
+                topic, self._retained[topic], retain=True, properties=self._expiring()
+            )
+
+    async def _publish_changes(self, broker: aiomqtt.Client) -> None:
+        while True:
+            again = time.monotonic() + self._expire / 3
+            while (left := again - time.monotonic()) > 0:
+                with suppress(TimeoutError):
+                    await asyncio.wait_for(self._news.wait(), left)
+                self._news.clear()
+                await self._publish(broker)
+            self._pending |= dict.fromkeys(self._retained)
+
+    async def _receive(self, broker: aiomqtt.Client) -> None:
+        async for message in broker.messages:
+            if len(self._open) >= MOST_COMMANDS:
+                say(f"too many commands wait: {message.topic} is dropped")
+                continue
+            task = asyncio.create_task(self._command(message, time.monotonic()))
+            self._open.add(task)
+            task.add_done_callback(self._open.discard)
+
+    async def _command(self, message: aiomqtt.Message, arrived: float) -> None:
+        key = str(message.topic).removeprefix(f"{self._root}/@set/")
+        command: Known = {}
+        try:
+            command = parsed(message)
+            outcome = await self._outcome(key, command, arrived)
+        except ValueError as error:
+            outcome = {"outcome": "bad-value", "reason": str(error)}
+        except sqlite3.Error as error:
+            outcome = {"outcome": "busy", "reason": f"cannot record commands: {error}"}
+        say(f"{key} = {command.get('value')}: {outcome['outcome']}")
+        document = json.dumps({"id": command.get("id")} | outcome)
+        self._outcomes.append((f"{self._root}/@outcome/{key}", document.encode()))
+        self._news.set()
+
+    async def _outcome(self, key: str, command: Known, arrived: float) -> Known:
+        number, value = command.get("id"), command["value"]
+        turn = self._turns.setdefault(key, asyncio.Lock())
+        async with turn:  # commands to a tag in their order
+            known = number and self._commands.begin(key, number, json.dumps(value))
+            if known:
+                return known
+            if key not in self.plant.tags:
+                outcome = {"outcome": "unknown-tag", "reason": "no gateway has described this tag"}
+            elif time.monotonic() - arrived > LATEST:
+                outcome = {"outcome": "busy", "reason": "it waited longer than five seconds"}
+            else:
+                outcome = await self.plant.write(key, value, command.get("time"))
+            if number:
+                with suppress(sqlite3.Error):  # then a second delivery is `unclear`
+                    self._commands.end(key, number, outcome)
+            return outcome
+
+
+async def main() -> None:
+    parser = arguments(__doc__)
+    parser.add_argument("--broker", default="mqtt://127.0.0.1:1883", help="or mqtts://user@host")
+    parser.add_argument("--root", help="the first levels of all topics; left out: the prefix")
+    parser.add_argument("--expire", type=int, default=60, help="seconds (default: 60)")
+    parser.add_argument("--writes", action="store_true", help="accept commands")
+    parser.add_argument("--commands", default="mqtt-commands.db", help="file with their ids")
+    given = parser.parse_args()
+    with await opened(given) as session:
+        root = given.root or given.prefix
+        bridge = Bridge(root, given.expire, given.writes, given.commands)
+        bridge.plant = Plant(session, given.prefix, bridge.described, bridge.changed)
+        async with asyncio.TaskGroup() as group:
+            group.create_task(bridge.plant.follow())
+            group.create_task(bridge.serve(given.broker))
+
+
+if __name__ == "__main__":
+    run(main())

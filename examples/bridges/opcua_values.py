@@ -1,0 +1,163 @@
+"""Values and history of the gateway as OPC UA has them: used by opcua.py."""
+
+import json
+import struct
+from datetime import UTC, datetime, timedelta
+
+import zenoh
+from asyncua import ua
+from asyncua.server.history import HistoryManager
+from asyncua.server.internal_server import InternalServer
+from asyncua.ua.ua_binary import variant_to_binary
+from gateway_values import Known, Plant, copied
+
+Code, Type = ua.StatusCodes, ua.VariantType
+
+STATUS = {  # by the reason of a bad value
+    "starting": Code.BadWaitingForInitialData,
+    "no-gateway": Code.BadNoCommunication,
+    "no-reply": Code.BadDeviceFailure,
+    "garbled": Code.BadCommunicationError,
+    "line-down": Code.BadNotConnected,
+    "refused": Code.BadConfigurationError,
+    "overdue": Code.BadResourceUnavailable,
+    "disabled": Code.BadOutOfService,
+    "not-a-number": Code.BadSensorFailure,
+}
+TYPES = {  # by the type of a tag; the others are texts
+    "bool": Type.Boolean,
+    "int8": Type.SByte,
+    "uint8": Type.Byte,
+    "int16": Type.Int16,
+    "uint16": Type.UInt16,
+    "int32": Type.Int32,
+    "uint32": Type.UInt32,
+    "int64": Type.Int64,
+    "uint64": Type.UInt64,
+    "float32": Type.Float,
+    "float64": Type.Double,
+    "bcd16": Type.UInt16,
+    "bcd32": Type.UInt32,
+}
+STEP = timedelta(microseconds=1)
+MOST_SAMPLES = 10_000  # in one answer; the client gets the rest with the continuation point
+
+
+def type_of(meta: Known) -> ua.VariantType:
+    """Returns the type of the value, which `scale` and `offset` can change."""
+    raw = TYPES.get(meta["type"], Type.String)
+    scale, offset = meta.get("scale") or 1, meta.get("offset") or 0
+    if raw in (Type.Boolean, Type.String) or (scale, offset) == (1, 0):
+        return raw
+    is_whole = raw not in (Type.Float, Type.Double) and scale % 1 == offset % 1 == 0
+    return Type.Int64 if is_whole else Type.Double
+
+
+def data_value(known: Known, kind: ua.VariantType) -> ua.DataValue:
+    time = datetime.fromisoformat(known["time"]).astimezone(UTC)
+    now = datetime.now(UTC)
+    code = Code.Good
+    if known["quality"] != "good":
+        code = STATUS.get(known.get("reason", ""), Code.Bad)
+    elif (variant := variant_of(known["value"], kind)) is not None:
+        return ua.DataValue(variant, ua.StatusCode(code), time, now)
+    else:
+        code = Code.BadTypeMismatch
+    return ua.DataValue(ua.Variant(), ua.StatusCode(code), time, now)
+
+
+def variant_of(value: object, kind: ua.VariantType) -> ua.Variant | None:
+    """Returns None if the type cannot hold the value."""
+    if kind in (Type.Float, Type.Double) and type(value) is int:
+        value = float(value)
+    expected = {Type.Boolean: bool, Type.String: str, Type.Float: float, Type.Double: float}
+    if type(value) is not expected.get(kind, int):
+        return None
+    variant = ua.Variant(value, kind)
+    try:
+        variant_to_binary(variant)
+    except (ua.UaError, struct.error, OverflowError):
+        return None
+    return variant
+
+
+def _text(time: datetime | None) -> str:
+    return "" if time is None else f"{time:%Y-%m-%dT%H:%M:%S.%fZ}"
+
+
+class History(HistoryManager):
+    """Answers HistoryRead of raw values from the history of the gateway."""
+
+    def __init__(self, iserver: InternalServer, plant: Plant) -> None:
+        super().__init__(iserver)
+        self._plant = plant
+
+    async def read_history(self, params: ua.HistoryReadParameters) -> list[ua.HistoryReadResult]:
+        results = []
+        for item in params.NodesToRead:
+            result = ua.HistoryReadResult(HistoryData=ua.HistoryData())
+            try:
+                values, rest = await self._history(params.HistoryReadDetails, item)
+                result.HistoryData.DataValues, result.ContinuationPoint = values, rest
+            except ua.UaStatusCodeError as error:
+                result.StatusCode = ua.StatusCode(error.code)
+            results.append(result)
+        return results
+
+    async def _history(
+        self, details: object, item: ua.HistoryReadValueId
+    ) -> tuple[list[ua.DataValue], bytes | None]:
+        """Returns samples and a continuation point: the time of the next one."""
+        key = item.NodeId.Identifier
+        if not isinstance(details, ua.ReadRawModifiedDetails) or details.IsReadModified:
+            raise ua.uaerrors.BadHistoryOperationUnsupported
+        if not self._plant.tags.get(key, {}).get("history"):
+            raise ua.uaerrors.BadHistoryOperationUnsupported
+        start, end = (
+            None if time is None or time <= ua.get_win_epoch() else time.astimezone(UTC)
+            for time in (details.StartTime, details.EndTime)
+        )
+        if start is None:  # the last ones before a time
+            raise ua.uaerrors.BadHistoryOperationUnsupported
+        backwards = end is not None and end < start
+        if item.ContinuationPoint:
+            try:
+                start = datetime.fromisoformat(item.ContinuationPoint.decode())
+            except ValueError:
+                raise ua.uaerrors.BadContinuationPointInvalid from None
+        # The bound where it starts is included. The gateway keeps nanoseconds, and shows less.
+        bounds = f"[{_text(start)}..{_text(end)}["
+        if backwards:
+            bounds = f"]{_text(end)}..{_text(start + STEP)}["
+        wanted = min(details.NumValuesPerNode or MOST_SAMPLES, MOST_SAMPLES)
+        samples = await self._samples(key, bounds, None if backwards else wanted + 1)
+        samples.sort(key=lambda known: known["time"], reverse=backwards)
+        rest = samples[wanted]["time"].encode() if len(samples) > wanted else None
+        kind = type_of(self._plant.tags[key])
+        return [data_value(known, kind) for known in samples[:wanted]], rest
+
+    async def _samples(self, key: str, bounds: str, wanted: int | None) -> list[Known]:
+        """Queries page by page: only the end of a page tells whether all of it has arrived."""
+        samples: list[Known] = []
+        after = ""
+        while wanted is None or len(samples) < wanted:
+            replies = await self._plant.ask(
+                f"{key}?_time={bounds};page={wanted or MOST_SAMPLES}{after}",
+                accept_replies=zenoh.ReplyKeyExpr.ANY,
+            )
+            if not replies:
+                raise ua.uaerrors.BadNoCommunication
+            *found, last = [reply.ok for reply in replies]
+            if last is None or not str(last.key_expr).endswith("/page"):
+                raise ua.uaerrors.BadCommunicationError
+            page = json.loads(last.payload.to_bytes())
+            if page["samples"] != len(found) or None in found:
+                raise ua.uaerrors.BadCommunicationError
+            if "damaged" in page:
+                raise ua.uaerrors.BadDataLost
+            read = [self._plant.read(key, *copied(sample)[1:]) for sample in found]
+            samples += [known for known in read if known]
+            if page["complete"]:
+                break
+            after = f";after={page['next']}"
+        return samples

@@ -1,0 +1,51 @@
+"""Bits of a word as tags of their own: `bits: {0: pump, 3: fault}`."""
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from gateway.config import shaping_parsers
+from gateway.config.messages import Mistakes, Path
+from gateway.errors import ConfigError
+from gateway.protocols.driver import AnyDriver, Unit
+from gateway.protocols.typed_fields import TypedFields
+
+Rows = Iterator[tuple[str, object, Path]]
+
+
+def with_bits(
+    rows: Mapping[str, object], path: Path, driver: AnyDriver | None, mistakes: Mistakes
+) -> Rows:
+    """Yields name, settings and place of each tag; for a tag with bits, of each of its bits."""
+    for name, raw in rows.items():
+        if isinstance(raw, dict) and "bits" in raw and driver is not None:
+            yield from _bits(name, raw, (*path, name), driver, mistakes)
+        else:
+            yield name, raw, (*path, name)
+
+
+def _bits(
+    name: str, raw: Mapping[str, Any], place: Path, driver: AnyDriver, mistakes: Mistakes
+) -> Rows:
+    try:
+        bits = shaping_parsers.bits(raw["bits"])
+    except ConfigError as error:
+        mistakes.add((*place, "bits"), str(error))
+        return
+    rest = {setting: value for setting, value in raw.items() if setting != "bits"}
+    try:
+        address = driver.address(str(raw.get("address", "")))
+    except ConfigError:
+        yield name, rest, place  # its mistake is found there
+        return
+    if isinstance(driver, TypedFields):
+        mistakes.add((*place, "bits"), "a field of a frame has no bits: declare fields of one bit")
+        return
+    if address.bit is not None or driver.areas[address.area].unit is not Unit.WORD:
+        spelt = driver.spell(address)
+        mistakes.add((*place, "bits"), f"{spelt} is no word of 16 bits: remove bits")
+        return
+    for bit, entry in bits.items():
+        own = {"name": entry} if isinstance(entry, str) else dict(entry)
+        inner = place if isinstance(entry, str) else (*place, "bits", str(bit))
+        spelt = driver.spell(address._replace(bit=bit))
+        yield f"{name}/{own.pop('name')}", {**rest, **own, "address": spelt}, inner

@@ -1,0 +1,46 @@
+"""The description of a tag for clients: `@meta`, the JSON API, and the sheet of `export`."""
+
+import orjson
+
+from gateway.tags import Tag
+from gateway.tags.shaping import PLAIN, Bounds
+
+
+def meta(tag: Tag) -> bytes:
+    """The description of a tag: type, address, unit, interval, limits."""
+    return orjson.dumps(meta_fields(tag))
+
+
+def meta_fields(tag: Tag) -> dict[str, object]:
+    rule, deadband, shaping = tag.write, tag.deadband, tag.shaping or PLAIN
+    low, high = shaping.clamp or Bounds()
+    return {
+        "type": tag.value_type,
+        "raw_type": str(tag.layout.type),
+        "address": tag.text,
+        "unit": tag.unit,
+        "description": tag.description,
+        "every": tag.every,
+        "scale": tag.scale,
+        "offset": tag.offset,
+        "from": None if shaping.ends is None else shaping.ends.raw,
+        "to": None if shaping.ends is None else shaping.ends.value,
+        "decimals": shaping.decimals,
+        "clamp": None if shaping.clamp is None else {"min": low, "max": high},
+        "invert": shaping.invert,
+        "computed": None if tag.formula is None else tag.formula.text,
+        "enum": None
+        if tag.names is None
+        else {str(number): name for number, name in tag.names.by_number.items()},
+        "publish": tag.publish.value,
+        "deadband": None
+        if deadband is None
+        else {"amount": deadband.amount, "percent": deadband.percent},
+        "heartbeat": tag.heartbeat,
+        "history": tag.history,
+        "payload": tag.payload.value,
+        "event": tag.event,
+        "write": None
+        if rule is None
+        else {"min": rule.min, "max": rule.max, "verify": rule.verify},
+    }

@@ -1,0 +1,48 @@
+"""The samples that a query of the past asks for, for Zenoh and HTTP alike."""
+
+from collections.abc import Callable, Iterable, Iterator
+from itertools import islice
+from typing import TypeVar
+
+import zenoh
+
+from gateway.errors import Damaged
+from gateway.history.question import Question
+from gateway.history.rows import has_value
+from gateway.northbound.interfaces import History
+from gateway.tags import Sample, Tag
+
+T = TypeVar("T")
+
+
+def parameters(query: zenoh.Query) -> dict[str, str]:
+    return dict(part.partition("=")[::2] for part in str(query.parameters).split(";") if part)
+
+
+def samples(
+    history: History,
+    tag: Tag,
+    asked: Question,
+    limit: int | None,
+    now: int,
+    pause: Callable[[], None],
+) -> Iterator[Sample]:
+    """Yields the newest samples, or the first `limit`. Raises as `History.samples`."""
+    if asked.last is not None:
+        return history.newest(tag, asked, now, pause)
+    if not asked.only_good:
+        return history.samples(tag, asked.time_range, limit, now)
+    found = history.samples(tag, asked.time_range, None, now)
+    return islice(filter(has_value, found), limit)
+
+
+def one_by_one(answers: Iterable[Iterator[T]]) -> Iterator[T]:
+    """Yields all of each answer; raises `Damaged` at the end, if one did."""
+    lost: Damaged | None = None
+    for answer in answers:
+        try:
+            yield from answer
+        except Damaged as error:
+            lost = error
+    if lost is not None:
+        raise lost

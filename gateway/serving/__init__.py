@@ -1,0 +1,1 @@
+"""Served stations: the gateway answers a master, and takes what the master writes."""

@@ -1,0 +1,177 @@
+"""Communication tables of a Vigor PLC that was the master of a line, as sheets of tags.
+
+The PLC copied with the instruction LINK (Vigor VB/VH manual, B-3-3) or MBUS (B-3-6). Its table says
+which data of which station it read and wrote: the gateway in its place needs the same tags. Two
+forms are known: the table of Ladder Master (Command, Master Data, Slave ID, Slave Data, Length),
+and the registers themselves (Register, Value), 7 for each row from the second on.
+"""
+
+import re
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+from gateway.errors import ConfigError
+from gateway.sheets.grid import HEADER_ROWS, Grid, Row
+
+_MOST = 64  # words or bits of a row
+_ROW = 7  # registers
+_DEVICE = re.compile(r"([A-Z]+)([0-9]+)\Z")
+_OCTAL = ("X", "Y")
+# Device types of LINK, and of the master in MBUS.
+_LINK = dict(enumerate(("X", "Y", "M", "S", "TS", "CS"), 1))
+_LINK |= dict(enumerate(("T", "C", "C", "D"), 10))
+_MBUS = {0: "coil:", 1: "discrete:", 3: "input:", 4: "holding:"}
+_COMMANDS = {"read": "r", "write": "rw", "single write": "rw", "1": "r", "2": "rw", "3": "rw"}
+_TITLES = ["Name", "Address", "R/W", "Comment"]
+
+
+class _Copy(NamedTuple):
+    """One row: `slave` is the first address at the station."""
+
+    row: int  # of the sheet
+    command: str  # as in `_COMMANDS`
+    station: int
+    slave: str
+    length: int
+    master: str
+
+
+def is_table(grid: Grid) -> bool:
+    """Returns True for a communication table."""
+    return _layout(grid.rows) is not None
+
+
+def stations_in(grid: Grid) -> list[int]:
+    """Returns the stations of a table, in their order; none for another sheet.
+
+    Raises `ConfigError`.
+    """
+    return list(dict.fromkeys(copy.station for copy in _copies(grid.rows)))
+
+
+def of_station(grid: Grid, station: int) -> Grid:
+    """Returns the data of one station as a sheet of tags. Raises `ConfigError`."""
+    copies = [copy for copy in _copies(grid.rows) if copy.station == station]
+    if not copies:
+        known = ", ".join(map(str, stations_in(grid)))
+        raise ConfigError(f"the table has no row for station {station}: it has {known}")
+    rows = [Row(1, _TITLES)]
+    seen: dict[str, str] = {}
+    for copy in sorted(copies, key=lambda copy: copy.command, reverse=True):  # written ones first
+        for address in _addresses(copy):
+            if address not in seen:
+                seen[address] = copy.command
+                name = address.replace(":", "-").lower()
+                comment = f"{copy.master} of the master PLC, row {copy.row} of its table"
+                rows.append(Row(copy.row, [name, address, copy.command, comment]))
+    return Grid(rows, ".")
+
+
+def _layout(rows: Sequence[Row]) -> tuple[int, dict[str, int]] | None:
+    """Returns the index of the titles, and the column of each; None for another sheet."""
+    for index, row in enumerate(rows[:HEADER_ROWS]):
+        columns = {" ".join(cell.casefold().split()): at for at, cell in enumerate(row.cells)}
+        if columns.keys() >= {"command", "master data", "slave id", "length"}:
+            return index, columns
+        if set(columns) == {"register", "value"}:
+            return index, columns
+    return None
+
+
+def _copies(rows: Sequence[Row]) -> Iterator[_Copy]:
+    layout = _layout(rows)
+    if layout is None:
+        return
+    index, columns = layout
+    rest = [row for row in rows[index + 1 :] if row.cells]
+    if "register" in columns:
+        yield from _registers(rest, columns)
+        return
+    for row in rest:
+        cells = {
+            title: row.cells[at] if at < len(row.cells) else "" for title, at in columns.items()
+        }
+        command = _COMMANDS.get(cells["command"].casefold())
+        if command is None:
+            raise ConfigError(f"row {row.number}: {cells['command']!r} is neither Read nor Write")
+        slave = cells.get("slave data", "")
+        if not slave:  # MBUS has a type and a number
+            kind = _number(row, cells.get("slave data type", ""))
+            slave = f"{_named(row, kind, _MBUS)}{_number(row, cells.get('slave data #', ''))}"
+        station, length = _number(row, cells["slave id"]), _number(row, cells["length"])
+        yield _checked(_Copy(row.number, command, station, slave, length, cells["master data"]))
+
+
+def _registers(rows: Sequence[Row], columns: dict[str, int]) -> Iterator[_Copy]:
+    """The first register is the number of rows, then come 7 registers for each."""
+    registers = [row.cells[columns["register"]] for row in rows]
+    values = [_number(row, row.cells[columns["value"]]) for row in rows]
+    first = _DEVICE.match(registers[0].upper()) if registers else None
+    if first is None or first[1] != "D":
+        raise ConfigError("the registers of a table are D1000, D1001 ... in a row")
+    wanted = [f"D{int(first[2]) + place}" for place in range(len(rows))]
+    for row, have, want in zip(rows, registers, wanted, strict=True):
+        if have.upper() != want:
+            raise ConfigError(f"row {row.number}: {want} is missing, there is {have}")
+    if len(values) < 1 + _ROW * values[0]:
+        raise ConfigError(
+            f"{registers[0]} says {values[0]} rows of {_ROW} registers; there are {len(values) - 1}"
+        )
+    slaves = [values[1 + _ROW * number + 5] for number in range(values[0])]
+    kinds = _MBUS if set(slaves) <= set(_MBUS) and set(slaves) & {0, 4} else _LINK
+    for number in range(values[0]):
+        start = 1 + _ROW * number
+        row = rows[start]
+        station, code, length, kind, own, slave_kind, slave = values[start : start + _ROW]
+        command = _COMMANDS.get(str(code))
+        if command is None:
+            raise ConfigError(f"row {row.number}: {code} is no command: 1, 2 or 3")
+        target, master = (
+            f"{_named(row, slave_kind, kinds)}{slave}",
+            f"{_named(row, kind, _LINK)}{own}",
+        )
+        if target.startswith(_OCTAL):
+            raise ConfigError(
+                f"row {row.number}: the manual does not say if {target[0]} is counted in octal "
+                "here: use the table of Ladder Master"
+            )
+        length = 1 if code == 3 else length
+        yield _checked(_Copy(row.number, command, station, target, length, master))
+
+
+def _checked(copy: _Copy) -> _Copy:
+    if not 1 <= copy.length <= _MOST:
+        raise ConfigError(f"row {copy.row}: length {copy.length} is not 1 to {_MOST}")
+    return copy
+
+
+def _addresses(copy: _Copy) -> Iterator[str]:
+    """Yields each address of a row. X and Y are counted in octal."""
+    kind, colon, number = copy.slave.partition(":")
+    if colon:
+        first = int(number)
+        yield from (f"{kind}:{address}" for address in range(first, first + copy.length))
+        return
+    match = _DEVICE.match(copy.slave.upper())
+    if match is None:
+        raise ConfigError(f"row {copy.row}: {copy.slave!r} is no address such as D10")
+    octal = match[1] in _OCTAL
+    if octal and set(match[2]) & {"8", "9"}:
+        raise ConfigError(f"row {copy.row}: {copy.slave} has no octal number")
+    first = int(match[2], 8 if octal else 10)
+    for address in range(first, first + copy.length):
+        yield f"{match[1]}{address:o}" if octal else f"{match[1]}{address}"
+
+
+def _named(row: Row, kind: int, kinds: dict[int, str]) -> str:
+    if kind not in kinds:
+        known = ", ".join(map(str, kinds))
+        raise ConfigError(f"row {row.number}: {kind} is no device type: {known}")
+    return kinds[kind]
+
+
+def _number(row: Row, text: str) -> int:
+    digits = text.upper().removeprefix("K")
+    if not digits.isascii() or not digits.isdigit() or len(digits) > 5:
+        raise ConfigError(f"row {row.number}: {text!r} is no number")
+    return int(digits)

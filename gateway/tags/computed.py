@@ -1,0 +1,64 @@
+"""Samples of computed tags, made of the samples of their inputs."""
+
+from collections.abc import Callable, Iterable, Sequence
+
+from gateway.tags.sample import Quality, Reason, Sample, bad, good
+from gateway.tags.tag import Tag
+
+
+def computed(tag: Tag, sample_of: Callable[[Tag], Sample]) -> Sample:
+    """Returns the sample of a computed tag. It is bad if an input is bad.
+
+    Its time is that of the newest input: a value that follows from another is never older.
+    """
+    inputs = [sample_of(one) for one in tag.inputs]
+    for sample in inputs:
+        if sample.quality is Quality.BAD:
+            name = sample.tag.name if sample.tag.device == tag.device else sample.tag.key
+            why = f"input {name} is bad"
+            detail = f"{why}: {sample.detail}" if sample.detail else why
+            return bad(tag, sample.reason or Reason.NOT_A_NUMBER, sample.time, detail)
+    time = max(sample.time for sample in inputs)
+    try:
+        value = tag.convert([sample.value for sample in inputs])
+    except ArithmeticError as error:
+        return bad(tag, Reason.NOT_A_NUMBER, time, str(error))
+    return bad(tag, Reason.NOT_A_NUMBER, time) if value is None else good(tag, value, time)
+
+
+class Dependents:
+    """The computed tags that follow from each tag."""
+
+    def __init__(self, tags: Iterable[Tag]) -> None:
+        """`tags`: in any order; inputs that are computed too come first in `after`."""
+        self._order: dict[Tag, int] = {}  # a tag comes after its inputs
+        self._of: dict[Tag, set[Tag]] = {}  # directly
+        for tag in tags:
+            if tag.formula is not None:
+                self._add(tag)
+
+    def _add(self, tag: Tag) -> None:
+        if tag in self._order:
+            return
+        for one in tag.inputs:
+            if one.formula is not None:
+                self._add(one)
+            self._of.setdefault(one, set()).add(tag)
+        self._order[tag] = len(self._order)
+
+    def __bool__(self) -> bool:
+        return bool(self._order)
+
+    def after(self, changed: Iterable[Tag]) -> Sequence[Tag]:
+        """Returns the computed tags that follow from changed ones, each after its inputs."""
+        found: set[Tag] = set()
+        waiting = list(changed)
+        while waiting:
+            new = self._of.get(waiting.pop(), set()) - found
+            found |= new
+            waiting += new
+        return self.in_order(found)
+
+    def in_order(self, tags: Iterable[Tag]) -> Sequence[Tag]:
+        """Returns computed tags, each after its inputs."""
+        return sorted(tags, key=self._order.__getitem__)

@@ -1,0 +1,102 @@
+"""What a tag makes of its raw value besides scale and offset, both ways; and names of numbers."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+from gateway.errors import BadValue
+from gateway.tags.scaling import Ends
+from gateway.values import Value
+
+
+class Bounds(NamedTuple):
+    """The least and the greatest value; None: there is none."""
+
+    low: float | None = None
+    high: float | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Shaping:
+    """Settings of a value. It is scaled, then rounded, then clamped."""
+
+    ends: Ends | None = None  # instead of scale and offset
+    decimals: int | None = None
+    clamp: Bounds | None = None
+    invert: bool = False  # of a bit
+
+    @property
+    def exact(self) -> "Shaping":
+        """The same without rounding and limits: the value that the device really holds."""
+        return replace(self, decimals=None, clamp=None)
+
+    def rounded(self, value: Value) -> Value:
+        """Returns a value to write with as many decimals as a read shows."""
+        if self.decimals is None or not isinstance(value, float):
+            return value
+        return round(value, self.decimals)
+
+    def check(self, value: Value) -> None:
+        """Raises `BadValue` for a value that no read would show, because of the clamp."""
+        if self.clamp is None or isinstance(value, (bool, str)):
+            return
+        low, high = self.clamp
+        if (low is not None and value < low) or (high is not None and value > high):
+            raise BadValue(f"{value} is outside the clamp: {low} to {high}")
+
+
+PLAIN = Shaping()
+Convert = Callable[[Value], Value | None]
+
+
+def shaped(shaping: Shaping) -> Convert | None:
+    """Returns the function from the scaled to the shaped value; None: they are equal."""
+    if shaping.invert:
+        return lambda value: not value
+    decimals, clamp = shaping.decimals, shaping.clamp
+    if clamp is None:
+        return None if decimals is None else lambda value: _rounded(value, decimals)
+    low = -float("inf") if clamp.low is None else clamp.low
+    high = float("inf") if clamp.high is None else clamp.high
+
+    def limited(value: Value) -> Value:
+        if decimals is not None:
+            value = _rounded(value, decimals)
+        if isinstance(value, str):
+            return value
+        if low <= value <= high:
+            return value
+        limit = low if value < low else high
+        return float(limit) if isinstance(value, float) else int(limit)
+
+    return limited
+
+
+def _rounded(value: Value, decimals: int) -> Value:
+    # `+ 0.0`: -0.04 is shown as 0.0, not as -0.0.
+    return round(value, decimals) + 0.0 if isinstance(value, float) else value
+
+
+@dataclass(frozen=True, slots=True)
+class Names:
+    """The names of the values of a tag: `enum` in the file. A read gives the number."""
+
+    by_number: Mapping[int, str]
+
+    def number(self, value: Value) -> Value:
+        """Returns the number of a value to write, or of its name. Raises `BadValue`."""
+        if isinstance(value, str):
+            for number, name in self.by_number.items():
+                if name == value:
+                    return number
+            raise BadValue(f"{value!r} is no name of a value: use {self}")
+        if value not in self.by_number:
+            raise BadValue(f"{value} has no name: use {self}")
+        return value
+
+    def text(self, value: Value | None) -> str | None:
+        """Returns the name of a value that was read; None: it has no name."""
+        return self.by_number.get(value) if isinstance(value, int) else None
+
+    def __str__(self) -> str:
+        return ", ".join(f"{number} ({name})" for number, name in self.by_number.items())

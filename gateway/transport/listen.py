@@ -1,0 +1,106 @@
+"""Accepts TCP connections on a port of this machine."""
+
+import asyncio
+import socket
+from collections.abc import Callable
+from typing import Protocol
+
+import structlog
+
+from gateway.errors import LineDown
+from gateway.transport.os_errors import line_down
+from gateway.transport.port import Port, Receiver, TcpAddress
+from gateway.transport.stream import StreamPort
+from gateway.transport.tcp import configure
+
+log = structlog.get_logger("gateway.line")
+MOST_CONNECTIONS = 32
+_WAITING = 8  # connections that the system accepts before this process does
+
+
+class Connected(Receiver, Protocol):
+    """One connection, on this side."""
+
+    def opened(self, port: Port) -> None:
+        """Called before the first bytes."""
+
+
+class Listener:
+    """A port of this machine that other programs connect to."""
+
+    def __init__(self, where: TcpAddress) -> None:
+        self._name = f"{where.host}:{where.port}"
+        self._where = where
+        self._socket: socket.socket | None = None
+        self._ports: set[StreamPort] = set()
+
+    async def open(self) -> None:
+        """Raises `LineDown`."""
+        loop = asyncio.get_running_loop()
+        try:
+            found = await loop.getaddrinfo(
+                self._where.host, self._where.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+            )
+            family, _, _, _, address = found[0]
+            self._socket = socket.create_server(address[:2], family=family, backlog=_WAITING)
+            self._socket.setblocking(False)
+        except (OSError, UnicodeError, OverflowError) as error:
+            raise line_down(self._name, error) from error
+
+    async def serve(self, connect: Callable[[], Connected]) -> None:
+        """Accepts connections until cancelled. `connect` makes the receiver of each."""
+        if self._socket is None:
+            raise LineDown(f"{self._name}: not open")
+        loop = asyncio.get_running_loop()
+        while True:
+            try:
+                connection, _ = await loop.sock_accept(self._socket)
+            except OSError as error:
+                raise line_down(self._name, error) from error
+            await self._accept(connection, connect)
+
+    async def _accept(self, connection: socket.socket, connect: Callable[[], Connected]) -> None:
+        loop = asyncio.get_running_loop()
+        if len(self._ports) >= MOST_CONNECTIONS:
+            log.warning("connection refused", port=self._name, why="too many masters")
+            connection.close()
+            return
+        receiver = _Registered(connect(), self._ports)
+        port = StreamPort(self._name, receiver)
+        try:
+            configure(connection)
+            receiver.port = port
+            self._ports.add(port)
+            receiver.receiver.opened(port)
+            port.ready()
+            await loop.connect_accepted_socket(lambda: port, connection)
+        except OSError as error:  # the master is gone already
+            log.debug("connection lost", port=self._name, why=str(error))
+            self._ports.discard(port)
+            connection.close()
+
+    async def close(self) -> None:
+        """Closes the port and its connections; never raises."""
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+        for port in list(self._ports):
+            await port.close()
+        self._ports.clear()
+
+
+class _Registered:
+    """Takes a lost connection out of the list."""
+
+    def __init__(self, receiver: Connected, ports: set[StreamPort]) -> None:
+        self.receiver = receiver
+        self.port: StreamPort | None = None
+        self._ports = ports
+
+    def received(self, data: bytes) -> None:
+        self.receiver.received(data)
+
+    def lost(self, error: Exception) -> None:
+        if self.port is not None:
+            self._ports.discard(self.port)
+        self.receiver.lost(error)

@@ -1,0 +1,140 @@
+// npm's OPC UA client, controlled by commands: `node opcua_client.js ENDPOINT FOLDER`. It prints
+// `ready`, then executes commands from its standard input and prints `ok` and JSON after each:
+//
+//     browse i=85                 the nodes below: their ids
+//     read ns=2;s=mixer/speed     value, type, status, source time
+//     meta ns=2;s=mixer/speed     data type, access level, description, unit and range
+//     write ns=2;s=mixer/recipe Int16 7      the status code
+//     start …  /  written         the same write in the background; waits for its status code
+//     history ns=2;s=mixer/speed SECONDS COUNT [back]     of the last seconds; counts and values
+//     watch ns=2;s=mixer/speed    prints `changed ns=2;s=mixer/speed STATUS VALUE` from now on
+"use strict";
+
+const readline = require("node:readline");
+const ua = require("node-opcua-client");
+const { OPCUACertificateManager } = require("node-opcua-certificate-manager");
+
+const [endpointUrl, folder] = process.argv.slice(2);
+
+function shown(value) {
+    return {
+        value: value.value ? value.value.value : null,
+        type: value.value ? ua.DataType[value.value.dataType] : null,
+        status: value.statusCode.name,
+        time: value.sourceTimestamp,
+    };
+}
+
+async function browse(session, nodeId) {
+    const { references } = await session.browse(nodeId);
+    return references.map((reference) => reference.nodeId.toString());
+}
+
+async function meta(session, nodeId) {
+    const ask = (attributeId) => session.read({ nodeId, attributeId });
+    const type = await ask(ua.AttributeIds.DataType);
+    const access = await ask(ua.AttributeIds.AccessLevel);
+    const description = await ask(ua.AttributeIds.Description);
+    const about = { type: ua.DataType[type.value.value.value], access: access.value.value };
+    about.description = description.value.value.text;
+    for (const id of await browse(session, nodeId)) {
+        const property = (await session.read({ nodeId: id })).value.value;
+        if (property.displayName) about.unit = property.displayName.text;
+        if ("high" in property) about.range = [property.low, property.high];
+    }
+    return about;
+}
+
+async function write(session, nodeId, type, text) {
+    const dataType = ua.DataType[type];
+    const value = type === "String" ? text : JSON.parse(text);
+    const code = await session.write({
+        nodeId,
+        attributeId: ua.AttributeIds.Value,
+        value: { value: { dataType, value } },
+    });
+    return code.name;
+}
+
+async function history(session, nodeId, seconds, count, back) {
+    const now = new Date();
+    const begin = new Date(now - seconds * 1000);
+    const [startTime, endTime] = back ? [now, begin] : [begin, now];
+    const historyReadDetails = new ua.ReadRawModifiedDetails({
+        isReadModified: false,
+        startTime,
+        endTime,
+        numValuesPerNode: Number(count),
+        returnBounds: false,
+    });
+    const values = [];
+    let parts = 0;
+    let continuationPoint;
+    do {
+        const { results } = await session.historyRead(
+            new ua.HistoryReadRequest({
+                historyReadDetails,
+                nodesToRead: [{ nodeId, continuationPoint }],
+                timestampsToReturn: ua.TimestampsToReturn.Both,
+            })
+        );
+        const [result] = results;
+        if (result.statusCode.isNot(ua.StatusCodes.Good)) return { status: result.statusCode.name };
+        values.push(...result.historyData.dataValues.map(shown));
+        continuationPoint = result.continuationPoint;
+        parts += 1;
+    } while (continuationPoint && continuationPoint.length);
+    return { status: "Good", parts, values };
+}
+
+async function watch(session, nodeId) {
+    const subscription = await session.createSubscription2({
+        requestedPublishingInterval: 50,
+        requestedLifetimeCount: 1000,
+        requestedMaxKeepAliveCount: 100,
+        publishingEnabled: true,
+    });
+    const item = await subscription.monitor(
+        { nodeId, attributeId: ua.AttributeIds.Value },
+        { samplingInterval: 0, queueSize: 100 },
+        ua.TimestampsToReturn.Both
+    );
+    item.on("changed", (value) => {
+        const { status, value: known } = shown(value);
+        console.log("changed", nodeId, status, JSON.stringify(known));
+    });
+}
+
+async function main() {
+    const clientCertificateManager = new OPCUACertificateManager({ rootFolder: folder });
+    const client = ua.OPCUAClient.create({
+        clientCertificateManager,
+        endpointMustExist: false,
+        connectionStrategy: { initialDelay: 100, maxDelay: 200, maxRetry: 100 },
+    });
+    await client.connect(endpointUrl);
+    const session = await client.createSession();
+    let started;
+    const commands = {
+        browse,
+        meta,
+        write,
+        history,
+        watch,
+        read: async (_, nodeId) => shown(await session.read({ nodeId })),
+        start: async (...given) => {
+            started = write(...given);
+        },
+        written: () => started,
+    };
+    console.log("ready");
+    for await (const line of readline.createInterface({ input: process.stdin })) {
+        const [name, ...given] = line.split(" ");
+        const answer = await commands[name](session, ...given);
+        console.log("ok", JSON.stringify(answer ?? null));
+    }
+    await session.close();
+    await client.disconnect();
+}
+
+main();

@@ -1,0 +1,67 @@
+"""Values that clients write and a master reads."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gateway.app import Gateway
+from gateway.config import built
+from gateway.errors import BadValue, Busy
+from gateway.tags import Quality, Tag
+
+TAGS = {
+    "limit": {"address": "holding:1", "write": {"max": 50}, "retain": True},
+    "name": {"address": "holding:10", "type": "string[4]", "write": True},
+    "order": {"address": "holding:100"},
+}
+
+
+def gateway(folder: Path) -> Gateway:
+    hmi = {"protocol": "modbus-tcp", "accept": ["holding:100"], "tags": TAGS}
+    panel = {"port": "tcp://127.0.0.1:502", "serve": True, "devices": {"hmi": hmi}}
+    data: dict[str, Any] = {"gateway": {"state": "state.json"}, "lines": {"panel": panel}}
+    return Gateway(built(data, folder))
+
+
+def tag(of: Gateway, name: str) -> Tag:
+    found = of.tag(f"hmi/{name}")
+    assert found is not None
+    return found
+
+
+async def test_a_held_value_is_on_the_disk_before_it_is_acknowledged(tmp_path: Path) -> None:
+    first = gateway(tmp_path)
+    assert (await first.write(tag(first, "limit"), 42)).value == 42
+    assert (await first.write(tag(first, "name"), "AB")).value == "AB"
+    again = gateway(tmp_path)
+    again.serving.restore()
+    assert again.sample(tag(again, "limit")).value == 42
+    assert again.sample(tag(again, "name")).quality is Quality.BAD  # without `retain`
+
+
+async def test_a_value_that_cannot_be_kept_is_refused_and_not_shown(tmp_path: Path) -> None:
+    one = gateway(tmp_path)
+    await one.write(tag(one, "limit"), 42)
+    (tmp_path / "state.held.json").unlink()
+    tmp_path.rmdir()
+    with pytest.raises(Busy, match="No such file or directory; not done"):
+        await one.write(tag(one, "limit"), 43)
+    assert one.sample(tag(one, "limit")).value == 42
+    with pytest.raises(BadValue):
+        await one.write(tag(one, "limit"), 51)
+
+
+async def test_a_damaged_file_of_held_values_is_moved_aside(tmp_path: Path) -> None:
+    (tmp_path / "state.held.json").write_text('{"form": 1, "held": [')
+    one = gateway(tmp_path)
+    one.serving.restore()
+    assert one.sample(tag(one, "limit")).quality is Quality.BAD
+    assert (tmp_path / "state.held.json.bad").exists()
+
+
+async def test_a_held_value_outside_new_limits_is_dropped(tmp_path: Path) -> None:
+    (tmp_path / "state.held.json").write_text('{"form": 1, "held": {"hmi/limit": 51}}')
+    one = gateway(tmp_path)
+    one.serving.restore()
+    assert one.sample(tag(one, "limit")).quality is Quality.BAD

@@ -1,0 +1,131 @@
+"""Communication tables of LINK and MBUS: the manual's examples as tags (VB/VH, B-3-3 and B-3-6)."""
+
+from pathlib import Path
+
+import pytest
+
+from gateway.cli.import_command import add_tags
+from gateway.config import load
+from gateway.errors import ConfigError
+from gateway.sheets import link_table, read_grid
+
+LINK = """\
+Number,Command,Master Data,,Slave ID,Slave Data,Length,Word / Bit
+1,Read,D0,<--,5,D10,10,W
+2,Write,M0,-->,2,M100,30,B
+"""
+MBUS = """\
+Number;Command;Master Data;;Slave ID;Slave Data Type;Slave Data #;Length;Word/Bit
+1;Read;D2000;<--;5;4;0;10;W
+2;Write;D2010;-->;2;4;1000;5;W
+3;Single Write;D2015;-->;3;4;2000;1;W
+"""
+LINK_REGISTERS = (2, 5, 1, 10, 13, 0, 13, 10, 2, 2, 30, 3, 0, 3, 100)
+MBUS_REGISTERS = (
+    3,
+    5,
+    1,
+    10,
+    13,
+    2000,
+    4,
+    0,
+    2,
+    2,
+    5,
+    13,
+    2010,
+    4,
+    1000,
+    3,
+    3,
+    1,
+    13,
+    2015,
+    4,
+    2000,
+)
+
+
+def registers(values: tuple[int, ...]) -> str:
+    rows = [f"D{1000 + place},{value}" for place, value in enumerate(values)]
+    return "\n".join(["Register,Value", *rows])
+
+
+def tags(text: str, station: int) -> dict[str, str]:
+    """Access by address."""
+    rows = link_table.of_station(read_grid(text.encode()), station).rows[1:]
+    return {row.cells[1]: row.cells[2] for row in rows}
+
+
+@pytest.mark.parametrize("text", [LINK, registers(LINK_REGISTERS)])
+def test_the_manuals_easy_link_example(text: str) -> None:
+    assert link_table.stations_in(read_grid(text.encode())) == [5, 2]
+    assert tags(text, 5) == {f"D{number}": "r" for number in range(10, 20)}
+    assert tags(text, 2) == {f"M{number}": "rw" for number in range(100, 130)}
+
+
+@pytest.mark.parametrize("text", [MBUS, registers(MBUS_REGISTERS)])
+def test_the_manuals_mbus_example(text: str) -> None:
+    assert tags(text, 5) == {f"holding:{number}": "r" for number in range(10)}
+    assert tags(text, 2) == {f"holding:{number}": "rw" for number in range(1000, 1005)}
+    assert tags(text, 3) == {"holding:2000": "rw"}
+
+
+def test_x_and_y_are_counted_in_octal() -> None:
+    text = "Command,Master Data,Slave ID,Slave Data,Length\nRead,M0,1,X6,4\n"
+    assert list(tags(text, 1)) == ["X6", "X7", "X10", "X11"]
+
+
+def test_data_that_are_read_and_written_are_one_writable_tag() -> None:
+    text = "Command,Master Data,Slave ID,Slave Data,Length\nRead,D0,1,D5,2\nWrite,D9,1,D6,1\n"
+    assert tags(text, 1) == {"D6": "rw", "D5": "r"}
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (LINK.replace("Read", "Copy"), "row 2: 'Copy' is neither Read nor Write"),
+        (LINK.replace(",10,W", ",65,W"), "row 2: length 65 is not 1 to 64"),
+        (LINK.replace("D10,", "D1x,"), "row 2: 'D1x' is no address such as D10"),
+        (LINK.replace("M100", "X8"), "row 3: X8 has no octal number"),
+        (LINK.replace(",5,D10", ",five,D10"), "row 2: 'five' is no number"),
+        (MBUS.replace("5;4;0", "5;2;0"), "row 2: 2 is no device type: 0, 1, 3, 4"),
+        (registers(LINK_REGISTERS[:-1]), "D1000 says 2 rows of 7 registers; there are 13"),
+        (registers((1, 5, 9, 10, 13, 0, 13, 10)), "row 3: 9 is no command"),
+        (registers((1, 5, 1, 8, 3, 0, 1, 8)), "use the table of Ladder Master"),
+        ("Register,Value\nD1000,1\nD1002,5\n", "row 3: D1001 is missing"),
+    ],
+)
+def test_a_mistake_is_told_with_its_row(text: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        tags(text, 2 if "X8" in text else 5)
+
+
+def test_a_station_that_the_table_does_not_have() -> None:
+    with pytest.raises(ConfigError, match="no row for station 7: it has 5, 2"):
+        tags(LINK, 7)
+
+
+PLANT = """\
+lines:
+  hall:
+    port: simulator
+    devices:
+      mixer: {protocol: vigor, station: 5, tags: {}}
+      oven: {protocol: vigor, station: 2, tags: {}}
+"""
+
+
+def test_each_device_gets_the_rows_of_its_station(tmp_path: Path) -> None:
+    plant, table = tmp_path / "plant.yaml", tmp_path / "link.csv"
+    plant.write_text(PLANT)
+    table.write_text(LINK)
+    add_tags(table, plant, [], backup=False)
+    mixer, oven = load(plant).devices
+    assert [tag.name for tag in mixer.tags] == [f"d{number}" for number in range(10, 20)]
+    assert len(oven.tags) == 30
+    assert all(tag.write is not None for tag in oven.tags)
+    table.write_text(LINK.replace(",2,M100", ",9,M100"))
+    with pytest.raises(ConfigError, match=r"no device with station 9, which link\.csv names"):
+        add_tags(table, plant, [], backup=False)
