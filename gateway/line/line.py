@@ -10,7 +10,7 @@ import time
 from collections.abc import Awaitable, Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, NoReturn, Protocol, runtime_checkable
+from typing import Any, NoReturn, Protocol
 
 import structlog
 
@@ -21,6 +21,7 @@ from gateway.engine.engine import Engine
 from gateway.engine.jobs import Idle, Poll, Reopen, Result, Settle, Traffic, Transacted
 from gateway.engine.requests import WRITE_EXPIRY, Command, Outcome, Request, Write
 from gateway.errors import GatewayError, LineDown
+from gateway.line.changing import Changeable, WaitingChange
 from gateway.line.channel import NEVER, Alarm, Channel, Echo
 from gateway.line.duty import Duty
 from gateway.line.perform import perform
@@ -41,13 +42,6 @@ class SampleSink(Protocol):
     def online(self, device: Device, online: bool) -> None: ...
 
 
-@runtime_checkable
-class Changeable(Protocol):
-    """A simulated port, whose stations are the devices of the file."""
-
-    def change(self, devices: Sequence[DeviceSettings]) -> None: ...
-
-
 # Called after each job with its result, and the times of its begin and end by the line's clock.
 Watcher = Callable[[Transacted, Result, float, float], None]
 
@@ -58,15 +52,6 @@ class _Expiry:
 
     alarm: Alarm = field(default_factory=Alarm)
     at: float = NEVER  # the deadline when the alarm was set last
-
-
-class _Waiting(NamedTuple):
-    """Changed devices that wait for the end of the current transaction."""
-
-    changes: Changes
-    devices: Sequence[DeviceSettings]
-    applied: Callable[[], None]
-    ended: asyncio.Future[None]
 
 
 class Line:
@@ -96,7 +81,7 @@ class Line:
         self._outcomes: dict[Request, asyncio.Future[Any]] = {}
         self._wake = asyncio.Event()
         self._expiry = _Expiry()
-        self._waiting: _Waiting | None = None
+        self._waiting: WaitingChange | None = None
         self.watcher: Watcher | None = None
         self.tried = asyncio.Event()  # set once the port was opened, or could not be
 
@@ -135,7 +120,7 @@ class Line:
         once then: no sample comes between. `devices`: all of the line, for its simulated port.
         Call it again only after it has returned."""
         ended = asyncio.get_running_loop().create_future()
-        self._waiting = _Waiting(changes, devices, applied, ended)
+        self._waiting = WaitingChange(changes, devices, applied, ended)
         if self.engine.is_open:
             self._wake.set()
         else:
