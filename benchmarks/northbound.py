@@ -34,9 +34,11 @@ from typing import Literal, NamedTuple
 import structlog
 import zenoh
 
+from gateway.alarms import Alarms
 from gateway.config import ZenohConfig, ZenohMode
 from gateway.engine.requests import CommandResult
 from gateway.line.duty import Duty
+from gateway.line.wire_log import WireLog
 from gateway.northbound import Northbound
 from gateway.northbound.session import configure
 from gateway.protocols.driver import Address, Span, Unit
@@ -62,14 +64,19 @@ class Plant:
 
     made: list[Device]
     mirror: Mirror = field(init=False)
+    alarms: Alarms = field(init=False)
     duty: Duty = field(default_factory=Duty)
 
     def __post_init__(self) -> None:
         self.tags = [tag for device in self.made for tag in device.tags]
         self.mirror = Mirror(self.tags, time.time_ns())
+        self.alarms = Alarms(self.tags)
 
     def devices(self) -> list[Device]:
         return self.made
+
+    def wire_logs(self) -> dict[str, WireLog]:
+        return {}
 
     def begin(self) -> None:
         pass

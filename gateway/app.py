@@ -7,6 +7,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Protocol
 
 from gateway import __version__
+from gateway.alarms import Alarms
+from gateway.alarms.watched import watch
 from gateway.config import Config, LineConfig
 from gateway.config.changes import DeviceChange
 from gateway.config.commands import check_command, every_command, speaker
@@ -16,14 +18,16 @@ from gateway.engine.requests import WRITE_EXPIRY, CommandResult
 from gateway.errors import Busy, Offline
 from gateway.line.build import OpenPort, line_of, opener
 from gateway.line.duty import Duty
-from gateway.line.line import Line, Watcher
+from gateway.line.line import Line
 from gateway.line.on_demand import OnDemand
 from gateway.line.serving import Serving
+from gateway.line.wire_log import WireLog
 from gateway.northbound.served_status import served_documents
 from gateway.northbound.status import Document, device_document, line_document, standing
 from gateway.serving.station import Station
 from gateway.tags import Reason, Sample, Tag, WriteResult, bad
 from gateway.tags.mirror import Mirror
+from gateway.tags.scan import Scan
 from gateway.tags.timestamps import rfc3339
 from gateway.values import Value
 
@@ -86,10 +90,13 @@ class Gateway:
         self._open_line, self._seeds = open_line, itertools.count()
         self._forecasts: dict[str, LineForecast] = {}
         self._on_demand = OnDemand(self._places.get, self.sample)
+        self.alarms = Alarms(self._tags.values(), wall)
+        self.add_document("alarms", self.alarms.counts)
         self.serving = Serving(config, self, self._find_sample, wall=wall, duty=self.duty)
         for line in config.lines:
             if not line.serve:
                 self.add_line(line)
+        watch(self.alarms, self.lines, config.alarms)
         if plan_now:
             for made in self.lines:
                 self.planned(made, self.plan(made))
@@ -158,6 +165,8 @@ class Gateway:
             for tag in ended:
                 del self._tags[tag.key]
             self.mirror.forget(left)  # last: other threads find the new tag instead
+            self.alarms.take_over([*change.started, *change.renewed.values()], left)
+            self.alarms.judge(started)
             last = [bad(tag, Reason.DISABLED, now, REMOVED) for tag in ended]
             self._publish([*started, *last])
             gone += left
@@ -174,7 +183,9 @@ class Gateway:
             bad(tag, Reason.STARTING if tag.device in enabled else Reason.DISABLED, now)
             for tag in new
         ]
+        self.alarms.take_over(new, gone)
         found = self.mirror.compute(first, gone)
+        self.alarms.judge(found)
         ended = [tag for tag in gone if self._tags.get(tag.key) is tag]
         for tag in ended:
             del self._tags[tag.key]
@@ -183,6 +194,7 @@ class Gateway:
     def configure(self, config: Config) -> None:
         """Has this configuration, after its changes are taken over."""
         self.config, self._devices = config, config.devices
+        watch(self.alarms, self.lines, config.alarms)
 
     def move(self, gone: Iterable[str], line: Line, devices: Iterable[Device] = ()) -> None:
         """Notes the devices that the line has no longer, and those that it has now."""
@@ -198,12 +210,9 @@ class Gateway:
         """Adds a document of another part to the status."""
         self._documents[path] = document
 
-    def watch(self, line: str, watcher: Watcher | None) -> bool:
-        """Sets or removes the watcher of a line. False: there is no such line."""
-        found = [one for one in self.lines if one.engine.name == line]
-        for one in found:
-            one.watcher = watcher
-        return bool(found)
+    def wire_logs(self) -> Mapping[str, WireLog]:
+        polled = {line.engine.name: line.wire_log for line in self.lines}
+        return polled | {line.name: line.wire_log for line in self.serving.lines}
 
     @property
     def enabled_devices(self) -> Sequence[Device]:
@@ -213,15 +222,21 @@ class Gateway:
 
     def samples(self, samples: Sequence[Sample]) -> None:
         changed = self.mirror.update(samples)
-        if self.serving.remembers:
+        if self.alarms.of_tags and not (type(samples) is Scan and samples.latest.alarmed == ()):
+            self.alarms.judge(samples)
+        if self.serving.remembering:
             self.serving.remember(samples)
         if waiting := self._on_demand.waiting:
             for sample in samples:
                 if sample.tag in waiting:
                     self._on_demand.answer(sample)
+        if self.mirror.derives and (changed or self.mirror.pending):
+            changed = self.mirror.follow(changed)
+            if self.alarms.of_tags:
+                self.alarms.judge([sample for sample in changed if sample.tag.inputs])
+            if self.serving.remembering:
+                self.serving.remember(changed)
         if changed:
-            if self.mirror.dependents:
-                changed = [*changed, *self.mirror.computed_after(changed)]
             self._publish(changed)
 
     def online(self, device: Device | Station, online: bool) -> None:

@@ -12,6 +12,7 @@ from typing import Any
 
 import structlog
 
+from gateway.alarms.file import AlarmFile
 from gateway.app import Gateway
 from gateway.config import Config
 from gateway.errors import GatewayError
@@ -111,6 +112,9 @@ async def _serve(
     state_file = None if config.state_file is None else StateFile(config.state_file)
     if state_file is not None:
         state_file.restore(gateway.enabled_devices)
+        gateway.mirror.restore(state_file.counters)
+    alarm_file = AlarmFile(config.alarms.path, gateway.alarms)
+    gateway.add_document("clock", clock.document)
     gateway.subscribe(northbound)
     if history is not None:  # clients may have missed what was published
         gateway.subscribe(_Recording(history))
@@ -122,7 +126,7 @@ async def _serve(
         cleanup.callback(clock.stop)
         plans = _plan_lines(gateway, cleanup)
         zenoh = asyncio.create_task(northbound.run(), name="zenoh")
-        cleanup.push_async_callback(_close, zenoh, history, state_file)
+        cleanup.push_async_callback(_close, zenoh, history, state_file, alarm_file)
         exclusive, active, opened, replaced, stopping, failed = events = [
             asyncio.create_task(event.wait())
             for event in (
@@ -152,6 +156,7 @@ async def _serve(
             await _first(active, *ends)
             if active.done():
                 supervisor.says(reloader.says)
+                await cleanup.enter_async_context(alarm_file.kept())
                 await _start_lines(gateway, plans, running, history, state_file, cleanup)
                 cleanup.push_async_callback(_end, [reload])  # before the lines: it starts some
         await _first(opened, *ends)
@@ -246,18 +251,23 @@ async def _saved(state_file: StateFile, gateway: Gateway) -> AsyncIterator[None]
     try:
         yield
     finally:
-        state_file.save_last(state_file.snapshot(gateway.enabled_devices))
+        counters = gateway.mirror.counters()
+        state_file.save_last(state_file.snapshot(gateway.enabled_devices, counters))
         await _end([saving])
 
 
 async def _save_regularly(state_file: StateFile, gateway: Gateway) -> None:
     while True:
         await asyncio.sleep(SAVE_EVERY)
-        state_file.save_soon(state_file.snapshot(gateway.enabled_devices))
+        counters = gateway.mirror.counters()
+        state_file.save_soon(state_file.snapshot(gateway.enabled_devices, counters))
 
 
 async def _close(
-    zenoh: asyncio.Task[None], history: Historian | None, state_file: StateFile | None
+    zenoh: asyncio.Task[None],
+    history: Historian | None,
+    state_file: StateFile | None,
+    alarm_file: AlarmFile,
 ) -> None:
     """Ends Zenoh, then the files: they keep the last outcomes too.
 
@@ -271,9 +281,10 @@ async def _close(
             left = by - time.monotonic()
             if not await asyncio.to_thread(history.close, left):
                 log.error("history close timed out", so="samples that are not on disk are lost")
-        if state_file is not None:
+        closes = [alarm_file.close] if state_file is None else [alarm_file.close, state_file.close]
+        for close in closes:
             left = min(STATE_FILE_WITHIN, by - time.monotonic())
-            if not await asyncio.to_thread(state_file.close, left):
+            if not await asyncio.to_thread(close, left):
                 log.warning("state file close timed out", so="the last changes are not saved")
 
 

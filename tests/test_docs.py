@@ -135,7 +135,8 @@ def test_every_page_with_files_is_checked() -> None:
     counted = Counter(block.page for block in FILES)
     assert set(counted) == {
         *("/README.md", "configuration.md", "vigor.md", "computer-link.md", "modbus.md"),
-        *("first-plant.md", "import.md", "peek.md", "serve.md", "systems.md"),
+        *("first-plant.md", "import.md", "peek.md", "serve.md", "shaping.md", "systems.md"),
+        *("templates.md", "trace.md", "alarms.md"),
         *("tutorial-computer-link.md", "tutorial-modbus.md", "tutorial-vigor.md"),
     }
     assert sum(counted.values()) >= 11
@@ -205,6 +206,8 @@ DEFAULTS_OF_PROTOCOLS = table("configuration-protocols.md", "Defaults of the pro
 def settings(heading: str) -> dict[str, str]:
     """The settings of a section with the defaults that its page names."""
     page = "configuration-protocols.md" if heading in PROTOCOLS else "configuration.md"
+    if heading in ("alarm", "alarms"):
+        page = "alarms.md"
     rows = table(page, heading, "setting")
     if heading == "A tag":
         rows += table("shaping.md", "Settings", "setting")
@@ -235,6 +238,7 @@ def properties(*names: str) -> set[str]:
     [
         *(("gateway", "GatewaySection"), ("zenoh", "ZenohSection"), ("tls", "TlsSection")),
         *(("writers", "WritersSection"), ("history", "HistorySection")),
+        *(("alarm", "AlarmSection"), ("alarms", "AlarmsSection")),
         *(("web", "WebSection"), ("A line", "Line"), ("A tag", "Tag"), ("write", "WriteSection")),
     ],
 )
@@ -253,7 +257,8 @@ def test_every_setting_of_a_protocol_is_on_the_page_and_no_other(protocol: str) 
 
 
 def test_every_section_of_the_file_is_on_the_page() -> None:
-    headings = set(re.findall(r"^## (\w+)$", CONFIGURATION, re.MULTILINE))
+    pages = CONFIGURATION + TEXT["templates.md"]
+    headings = set(re.findall(r"^## (\w+)$", pages, re.MULTILINE))
     assert set(schema()["properties"]) - {"defaults", "lines"} <= headings
 
 
@@ -518,8 +523,16 @@ def _example_keys() -> set[str]:
         *(key for name in devices for key in (keys.device(name), keys.block(name))),
         *(keys.status(f"devices/{name}") for name in devices),
         *(keys.status(f"lines/{line.name}") for line in config.lines),
+        *(keys.trace(line.name) for line in config.lines),
         *(keys.alive(name) for name in devices),
-        *(keys.own, keys.status("status"), keys.writes, keys.page),
+        *(
+            keys.own,
+            keys.status("alarms"),
+            keys.alarm("**"),
+            keys.status("status"),
+            keys.writes,
+            keys.page,
+        ),
         *(
             keys.command(name, command)
             for name, commands in every_command(config).items()
@@ -535,6 +548,7 @@ def test_every_key_in_the_pages_is_one_of_the_examples() -> None:
     shown = {
         (page, key)
         for page, text in TEXT.items()
+        if page != "integrate.md"  # topics of MQTT
         for key in re.findall(r"(?<![\w/.-])plant/[^\s`\"'?,)}]+", text)
     }
     assert len(shown) >= 30

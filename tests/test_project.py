@@ -44,7 +44,8 @@ def test_the_changelog_begins_with_the_version() -> None:
 
 def test_the_package_is_typed() -> None:
     assert "Typing :: Typed" in PROJECT["project"]["classifiers"]
-    assert PROJECT["tool"]["setuptools"]["package-data"]["gateway"] == ["py.typed", "web/assets/*"]
+    data = PROJECT["tool"]["setuptools"]["package-data"]["gateway"]
+    assert data == ["py.typed", "config/shipped/*.yaml", "web/assets/*"]
     assert resources.files("gateway").joinpath("py.typed").is_file()
 
 

@@ -5,26 +5,25 @@ token goes, the values of the device turn bad here, because no gateway can say i
 turn good again by values that arrive after the token has returned, never by older ones.
 """
 
-import argparse
 import asyncio
 import hashlib
 import hmac
 import json
 import os
 import secrets
-import signal
 import sys
 from collections import deque
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable
 from contextlib import suppress
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import Any
 
 import zenoh
+from program import say
 
 QUERY_EVERY = 60.0  # seconds between two queries of all values without a known reason
 RETRY_AFTER = 0.5  # seconds, doubled up to QUERY_EVERY while values are missing
+SETTLE = 0.1  # seconds
 ANSWER_WITHIN = 10.0  # seconds: a gateway answers within eight, also a write
 MOST_WAITING = 200_000  # samples between Zenoh's threads and the event loop
 
@@ -39,8 +38,15 @@ def bad(reason: str) -> Known:
     return {"value": None, "quality": "bad", "reason": reason, "time": utc_now()}
 
 
-def say(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
+def is_value(known: Any) -> bool:
+    """Checks a document. Raises KeyError, TypeError or ValueError where a field lacks."""
+    value, reason = known["value"], known.get("reason")
+    if datetime.fromisoformat(known["time"]).tzinfo is None:
+        return False
+    if known["quality"] == "bad":
+        return value is None and isinstance(reason, str)
+    is_number = isinstance(value, int | float) and abs(value) <= sys.float_info.max  # no NaN
+    return known["quality"] == "good" and (is_number or isinstance(value, str))
 
 
 class Plant:
@@ -64,8 +70,8 @@ class Plant:
         self._described, self._changed = described, changed
         self._loop = asyncio.get_running_loop()
         self._waiting: deque[tuple[Callable[..., None], Any]] = deque()
-        self._woken = False
-        self._query_due = asyncio.Event()
+        self._woken = self._overrun = False
+        self._query_due, self._arrived = asyncio.Event(), asyncio.Event()
         self._gateways: set[str] = set()
         self._alive: dict[str, set[str]] = {}  # device: the gateways that report it as answering
         self._served_by: dict[str, str] = {}  # device: the last of them
@@ -87,7 +93,7 @@ class Plant:
 
         def callback(sample: zenoh.Sample) -> None:
             if len(self._waiting) >= MOST_WAITING and receive != self._token:
-                self._call(self._query_due.set)  # instead of this value
+                self._overrun = True  # a query follows instead of this value
                 return
             self._waiting.append((receive, copied(sample)))
             if not self._woken:
@@ -107,11 +113,14 @@ class Plant:
         while self._waiting:
             receive, sample = self._waiting.popleft()
             receive(*sample)
+        if self._overrun:
+            self._overrun = False
+            self._query_due.set()
 
     def key(self, key: str) -> str:
         return key.removeprefix(f"{self._prefix}/")
 
-    def _token(self, key: str, there: bool, *_: object) -> None:
+    def _token(self, key: str, there: bool, *_rest: object) -> None:
         gateway, _, device = self.key(key).removeprefix("@gateway/").partition("/alive/")
         if device and there:
             self._alive.setdefault(device, set()).add(gateway)
@@ -129,6 +138,8 @@ class Plant:
                 if self._served_by.get(lost, gateway) == gateway:
                     self._gone(gateway, lost, "no-gateway")
         self._query_due.set()
+        if there:
+            self._arrived.set()
 
     def _gone(self, gateway: str, device: str, reason: str) -> None:
         alive = self._alive.get(device, set())
@@ -139,7 +150,7 @@ class Plant:
         self._trusted.discard(device)
         for key, known in list(self.values.items()):
             of_device = key.startswith(f"{device}/")
-            if of_device and (known["quality"] == "good" or reason == "no-gateway"):
+            if of_device and (known["quality"] != "bad" or reason == "no-gateway"):
                 self._store(key, bad(reason))
 
     def _sample(self, key: str, is_put: bool, payload: bytes, about: bytes) -> None:
@@ -151,10 +162,8 @@ class Plant:
     def _block(self, key: str, is_put: bool, payload: bytes, _about: bytes) -> None:
         device = self.key(key).removesuffix("/@block")
         with suppress(ValueError, AttributeError):
-            for tag, known in json.loads(payload).items():
-                if f"{device}/{tag}" in self.tags:
-                    self._live.add(f"{device}/{tag}")
-                    self._take(f"{device}/{tag}", known)
+            for tag, document in json.loads(payload).items():
+                self._sample(f"{device}/{tag}", is_put, json.dumps(document).encode(), b"")
 
     def read(self, key: str, is_put: bool, payload: bytes, about: bytes) -> Known | None:
         """Reads a payload, also of a tag with `payload: raw`. None: no gateway has the tag."""
@@ -167,8 +176,8 @@ class Plant:
                 text = payload.decode()
                 value = text if tag["type"].startswith("string") else json.loads(text or "null")
                 known = {"value": value if is_put else None, **json.loads(about)}
-            return known if known["quality"] and known["time"] else None
-        except (ValueError, KeyError, TypeError):
+            return known if is_value(known) else bad("garbled")
+        except (KeyError, TypeError, ValueError):
             return bad("garbled")  # from another program
 
     def _take(self, key: str, known: Known) -> None:
@@ -183,10 +192,22 @@ class Plant:
 
     async def follow(self) -> None:
         """Queries all tags and values after every change of gateways or devices, and regularly."""
-        pause = RETRY_AFTER
+        pause, may_hang = RETRY_AFTER, True
         while True:
             self._query_due.clear()
-            pause = QUERY_EVERY if await self._query() else min(2 * pause, QUERY_EVERY)
+            self._arrived.clear()
+            query = asyncio.create_task(self._query())
+            arrived = asyncio.create_task(self._arrived.wait())
+            # A query that was sent when the link went would wait for its time-out.
+            waited = {query, arrived} if may_hang else {query}
+            await asyncio.wait(waited, return_when=asyncio.FIRST_COMPLETED)
+            arrived.cancel()
+            may_hang = query.done()
+            if not query.done():
+                query.cancel()
+                await asyncio.sleep(SETTLE)  # gateways and devices arrive together
+                continue
+            pause = QUERY_EVERY if query.result() else min(2 * pause, QUERY_EVERY)
             with suppress(TimeoutError):
                 await asyncio.wait_for(self._query_due.wait(), pause)
                 pause = RETRY_AFTER
@@ -203,29 +224,35 @@ class Plant:
                 if self.tags.get(key) != meta:
                     self.tags[key] = meta
                     self._described(key, meta)
-                    self.values.get(key) or self._store(key, bad("starting"))
+                    if key not in self.values:
+                        self._store(key, bad("starting"))
         self._trusted |= self._asked & described
         self._live.clear()
-        answered, failed = set(), False
-        for reply in await self.ask("**"):
-            if (sample := reply.ok) is None:
-                failed = True
-                continue
-            key, *rest = copied(sample)
-            key = self.key(key)
-            answered.add(key)
+        replies = [reply.ok for reply in await self.ask("**")]
+        answered = {self.key(str(sample.key_expr)) for sample in replies if sample is not None}
+        for sample in replies:
+            key = "" if sample is None else self.key(str(sample.key_expr))
             # A value that arrived by itself meanwhile may be newer.
-            if key not in self._live and (known := self.read(key, *rest)):
-                self._take(key, known)
-        if failed or not answered:
+            if sample and key not in self._live and (known := self.read(key, *copied(sample)[1:])):
+                self._take(key, self._not_again(key, known))
+        if None in replies or not answered:
             return not self._gateways
-        for key, known in list(self.values.items()):
-            if known["quality"] == "good" and key not in answered | self._live:
+        gone = self.values.keys() - answered - self._live
+        for key in gone:
+            if self.values[key]["quality"] != "bad":
                 self._store(key, bad("no-gateway"))
         alive = {device for device, gateways in self._alive.items() if gateways}
         return alive <= self._trusted and all(
             key in answered for key in self.tags if key.partition("/")[0] in alive
         )
+
+    def _not_again(self, key: str, known: Known) -> Known:
+        """An event (a bar code) is passed on when it happens, and never from a query."""
+        before = self.values[key]
+        if known["quality"] == "bad" or not self.tags[key].get("event"):
+            return known
+        is_waiting = before["quality"] != "bad" or before["reason"] == "starting"
+        return before if is_waiting else bad("starting")
 
     async def ask(self, selector: str, **options: Any) -> list[zenoh.Reply]:
         """Returns all replies to a query."""
@@ -247,7 +274,8 @@ class Plant:
 
         `time`: when the write was ordered; the gateway refuses it five seconds later.
         """
-        if key not in self.tags or not await self.ask(f"{key}/@meta"):
+        described = key in self.tags and await self.ask(f"{key}/@meta")
+        if not described or all(reply.ok is None for reply in described):
             why = "no gateway serves this tag now: nothing was sent"
             return {"outcome": "no-gateway", "reason": why}
         payload = json.dumps(value)
@@ -282,46 +310,3 @@ def copied(sample: zenoh.Sample) -> tuple[str, bool, bytes, bytes]:
         sample.payload.to_bytes(),
         b"" if about is None else about.to_bytes(),
     )
-
-
-def arguments(about: str | None) -> argparse.ArgumentParser:
-    """The options of every bridge."""
-    parser = argparse.ArgumentParser(
-        description=about, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--connect", nargs="+", default=["tcp/127.0.0.1:7447"], metavar="ENDPOINT")
-    parser.add_argument("--zenoh", type=Path, metavar="FILE", help="a Zenoh file: user, TLS, …")
-    parser.add_argument("--prefix", default="plant")
-    return parser
-
-
-async def opened(given: argparse.Namespace) -> zenoh.Session:
-    """Opens a session, and waits for a router. Zenoh reconnects an open session by itself."""
-    if given.zenoh:
-        config = zenoh.Config.from_file(given.zenoh)
-    else:
-        config = zenoh.Config()
-        config.insert_json5("connect/endpoints", json.dumps(given.connect))
-        config.insert_json5("scouting/multicast/enabled", "false")
-    config.insert_json5("mode", '"client"')
-    config.insert_json5("connect/retry", '{"period_init_ms": 500, "period_max_ms": 2000}')
-    config.insert_json5("connect/timeout_ms", "1000")
-    while True:
-        try:
-            return await asyncio.to_thread(zenoh.open, config)
-        except zenoh.ZError as error:
-            say(f"waiting for Zenoh: {error}")
-            await asyncio.sleep(1.0)
-
-
-def run(bridge: Coroutine[Any, Any, None]) -> None:
-    """Runs it until Ctrl-C or SIGTERM, which cancel it."""
-
-    async def until_signal() -> None:
-        task = asyncio.ensure_future(bridge)
-        with suppress(NotImplementedError):  # Windows
-            asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, task.cancel)
-        await task
-
-    with suppress(KeyboardInterrupt, asyncio.CancelledError):
-        asyncio.run(until_signal())

@@ -12,8 +12,8 @@ go to the standard output, for Telegraf's `inputs.execd`.
     plc,device=mixer,name=speed good=false,reason="no-reply" 1763640003500000000
     plc_bridge lost=120i,refused=0i 1763640010000000000
 
-* Numbers and bits (0, 1) are in `value`, texts in `text`. Beyond 2^53 a number is exact in `text`
-  only.
+* Numbers and bits (0, 1) are in `value`, texts and the names of an `enum` in `text`. Beyond 2^53 a
+  number is exact in `text` only.
 * The time is that of the sample. A value that becomes good again without a new sample has the time
   of its return.
 * A bad sample has no value. A chart of the last value must look at the last `good` too.
@@ -33,7 +33,8 @@ import urllib.request
 from collections import deque
 from datetime import datetime
 
-from gateway_values import Known, Plant, arguments, opened, run, say, utc_now
+from gateway_values import Known, Plant, utc_now
+from program import arguments, opened, run, say
 
 BATCH = 5000  # lines of one request
 ANSWER_WITHIN = 10.0  # seconds
@@ -52,6 +53,8 @@ def line_of(key: str, known: Known) -> str:
         fields = f"value={float(value)!r},good=true"
         if isinstance(value, int) and abs(value) > 2**53:
             fields += f",text={quoted(str(value))}"
+        elif "text" in known:
+            fields += f",text={quoted(str(known['text']))}"
     nanoseconds = round(datetime.fromisoformat(known["time"]).timestamp() * 1_000_000) * 1000
     return f"plc,device={device},name={tag} {fields} {nanoseconds}"
 

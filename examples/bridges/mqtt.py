@@ -6,14 +6,16 @@
 | topic | retained | payload |
 |---|---|---|
 | `plant/mixer/speed` | yes | `{"value": 12.5, "quality": "good", "time": "…"}`, as on Zenoh |
+| `plant/scanner/code` | no | a tag with `event: true`: each event once, if the bridge is there |
 | `plant/@meta/mixer/speed` | yes | type, unit, limits |
 | `plant/@bridge` | yes | `online`, or `offline` (the last will) |
 | `plant/@set/mixer/recipe` | no | a command: `7`, or `{"value": 7, "id": "a1", "time": "…"}` |
 | `plant/@outcome/mixer/recipe` | no | `{"id": "a1", "outcome": "written", "value": 7, …}` |
 
-Use a value only while its quality is `good` and `plant/@bridge` is `online`. When a gateway or the
-way to it is gone, all its values are `bad` (`no-gateway`). When the bridge is gone, the broker
-publishes the last will, and forgets the retained values after `--expire` seconds (MQTT 5).
+Use a value only while its quality is `good` and `plant/@bridge` is `online`. It is `offline` also
+while a change has waited for more than a second. When a gateway or the way to it is gone, all its
+values are `bad` (`no-gateway`). When the bridge is gone, the broker publishes the last will, and
+forgets the retained values after `--expire` seconds (MQTT 5).
 
 Commands are accepted with `--writes`. Everyone who may publish to `plant/@set/#` may then write, so
 restrict this topic in the broker. A command has one outcome: `written` only when the device has
@@ -27,72 +29,31 @@ again. With `time` the gateway refuses a command that is older than five seconds
 
 import asyncio
 import json
+import math
 import os
 import sqlite3
 import ssl
 import time
 from collections import deque
 from contextlib import suppress
+from itertools import islice
 from urllib.parse import urlsplit
 from weakref import WeakValueDictionary
 
 import aiomqtt
-from gateway_values import Known, Plant, arguments, bad, opened, run, say
+from gateway_values import Known, Plant, bad
+from mqtt_commands import Commands, parsed
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 from paho.mqtt.subscribeoptions import SubscribeOptions
+from program import arguments, opened, run, say
 
 RECONNECT_AFTER = 1.0  # seconds
+BATCH = 100  # messages on their way to the broker
+LATE = 1.0  # seconds: longer than that no change waits while the bridge is `online`
 MOST_COMMANDS = 100  # that wait; the next one is dropped, without an outcome
+MOST_MESSAGES = 10_000  # outcomes and events that wait for the broker; then the oldest are lost
 LATEST = 5.0  # seconds: a command that waited longer is not sent
-
-
-class Commands:
-    """The ids of commands and their outcomes, on disk before the command is sent."""
-
-    KEPT = 100_000
-
-    def __init__(self, path: str) -> None:
-        self._db = sqlite3.connect(path, isolation_level=None)
-        self._db.execute(
-            "CREATE TABLE IF NOT EXISTS commands"
-            " (key TEXT, id TEXT, value TEXT, outcome TEXT, PRIMARY KEY (key, id))"
-        )
-
-    def begin(self, key: str, number: str, value: str) -> Known | None:
-        """Returns the outcome of a known id, None for a new one."""
-        select = "SELECT value, outcome FROM commands WHERE key = ? AND id = ?"
-        if (row := self._db.execute(select, (key, number)).fetchone()) is None:
-            insert = "INSERT INTO commands VALUES (?, ?, ?, NULL)"
-            new = self._db.execute(insert, (key, number, value)).lastrowid or 0
-            self._db.execute("DELETE FROM commands WHERE rowid <= ?", (new - self.KEPT,))
-            return None
-        if row[0] != value:
-            return {"outcome": "bad-value", "reason": "this id belongs to another value"}
-        if row[1] is None:
-            return {"outcome": "unclear", "reason": "the bridge ended while it was written"}
-        known: Known = json.loads(row[1])
-        return known
-
-    def end(self, key: str, number: str, outcome: Known) -> None:
-        update = "UPDATE commands SET outcome = ? WHERE key = ? AND id = ?"
-        self._db.execute(update, (json.dumps(outcome), key, number))
-
-
-def parsed(message: aiomqtt.Message) -> Known:
-    """Returns `value` and perhaps `id` and `time` of a command. Raises ValueError."""
-    command = json.loads(message.payload)
-    if not isinstance(command, dict):
-        command = {"value": command}
-    if "value" not in command or not command.keys() <= {"value", "id", "time"}:
-        raise ValueError('a command is a value, or {"value": …, "id": "…", "time": "…"}')
-    if not all(isinstance(command.get(name, ""), str) for name in ("id", "time")):
-        raise ValueError("`id` and `time` are texts")
-    if message.retain:
-        raise ValueError("a retained command would be done again after every restart")
-    if message.qos and not command.get("id"):
-        raise ValueError("MQTT may deliver it twice: give it an id, or publish it with QoS 0")
-    return command
 
 
 class Bridge:
@@ -101,8 +62,10 @@ class Bridge:
         self._root, self._expire, self._writes = root, expire, writes
         self._commands = Commands(commands if writes else ":memory:")
         self._retained: dict[str, bytes] = {}  # by topic
-        self._pending: dict[str, None] = {}  # topics to publish, in order
-        self._outcomes: deque[tuple[str, bytes]] = deque(maxlen=1000)
+        self._pending: dict[str, float] = {}  # changed topics, in order; since when
+        self._repeats: dict[str, float] = {}  # topics to publish again before they expire
+        self._is_online = False
+        self._messages: deque[tuple[str, bytes]] = deque(maxlen=MOST_MESSAGES)
         self._news = asyncio.Event()
         self._open: set[asyncio.Task[None]] = set()
         self._turns: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
@@ -111,11 +74,19 @@ class Bridge:
         self._keep(f"{self._root}/@meta/{key}", meta)
 
     def changed(self, key: str, known: Known) -> None:
-        self._keep(f"{self._root}/{key}", known)
+        if self.plant.tags[key].get("event"):
+            self._send(f"{self._root}/{key}", known)
+        else:
+            self._keep(f"{self._root}/{key}", known)
+
+    def _send(self, topic: str, document: Known) -> None:
+        """Publishes a message that counts by itself: once, in order, not retained."""
+        self._messages.append((topic, json.dumps(document, ensure_ascii=False).encode()))
+        self._news.set()
 
     def _keep(self, topic: str, document: Known) -> None:
         self._retained[topic] = json.dumps(document, ensure_ascii=False).encode()
-        self._pending[topic] = None
+        self._pending.setdefault(topic, time.monotonic())
         self._news.set()
 
     async def serve(self, address: str) -> None:
@@ -144,27 +115,31 @@ class Bridge:
             await asyncio.sleep(RECONNECT_AFTER)
 
     async def _session(self, broker: aiomqtt.Client) -> None:
-        """Publishes everything, then every change. `online` comes after the first values."""
-        state = f"{self._root}/@bridge"
+        """Publishes everything, then every change; `online` comes after the first values."""
+        self._is_online = False
+        broker.pending_calls_threshold = 2 * BATCH
         try:
             await self._clear(broker)
-            self._pending |= dict.fromkeys(self._retained)
-            await self._publish(broker)
+            self._pending |= dict.fromkeys(self._retained, time.monotonic())
             if self._writes:
                 options = SubscribeOptions(qos=1, retainAsPublished=True, retainHandling=2)
                 await broker.subscribe(f"{self._root}/@set/#", options=options)
-            await broker.publish(state, "online", qos=1, retain=True)
+            await self._publish(broker)
             say("connected to the broker")
             async with asyncio.TaskGroup() as group:
                 group.create_task(self._publish_changes(broker))
                 group.create_task(self._receive(broker))
         finally:
             with suppress(aiomqtt.MqttError):  # then the broker publishes the last will
-                await broker.publish(state, "offline", qos=1, retain=True, timeout=1.0)
+                await self._tell(broker, False)
                 for topic, known in self._retained.items():
                     if b'"quality": "good"' in known:
-                        empty = json.dumps(bad("no-bridge"))
-                        await broker.publish(topic, empty, retain=True, properties=self._expiring())
+                        await self._retain(broker, topic, json.dumps(bad("no-bridge")).encode())
+
+    async def _tell(self, broker: aiomqtt.Client, online: bool) -> None:
+        self._is_online = online
+        state = "online" if online else "offline"
+        await broker.publish(f"{self._root}/@bridge", state, qos=1, retain=True)
 
     async def _clear(self, broker: aiomqtt.Client) -> None:
         """Replaces what an earlier run left at the broker and this one does not have."""
@@ -176,28 +151,34 @@ class Bridge:
             if topic == mark:
                 break
             if message.retain and topic not in self._retained and topic != f"{self._root}/@bridge":
-                empty = b"" if "/@" in topic else json.dumps(bad("no-gateway"))
-                await broker.publish(topic, empty, retain=True, properties=self._expiring())
+                empty = b"" if "/@" in topic else json.dumps(bad("no-gateway")).encode()
+                await self._retain(broker, topic, empty)
         await broker.unsubscribe(everything)
         while len(broker.messages):  # own ones
             await anext(broker.messages)
 
-    def _expiring(self) -> Properties:
-        properties = Properties(PacketTypes.PUBLISH)
-        properties.MessageExpiryInterval = self._expire
-        return properties
+    async def _retain(self, broker: aiomqtt.Client, topic: str, payload: bytes = b"") -> None:
+        expiring = Properties(PacketTypes.PUBLISH)
+        expiring.MessageExpiryInterval = self._expire
+        payload = payload or self._retained.get(topic, b"")
+        await broker.publish(topic, payload, retain=True, properties=expiring)
 
     async def _publish(self, broker: aiomqtt.Client) -> None:
-        while self._pending or self._outcomes:
-            if self._outcomes:
-                await broker.publish(*self._outcomes[0], qos=1)
-                self._outcomes.popleft()
-                continue
-            topic = next(iter(self._pending))
-            del self._pending[topic]
-            await broker.publish(
-                topic, self._retained[topic], retain=True, properties=self._expiring()
-            )
+        """Publishes all that waits. The bridge is `offline` while a change waits for long."""
+        while self._messages or self._pending or self._repeats:
+            while self._messages:
+                await broker.publish(*self._messages[0], qos=1)
+                self._messages.popleft()
+            waiting = self._pending or self._repeats
+            topics = list(islice(waiting, BATCH))
+            oldest = min((self._pending.get(topic, math.inf) for topic in topics), default=math.inf)
+            if self._is_online and time.monotonic() - oldest > LATE:
+                await self._tell(broker, False)
+            for topic in topics:
+                del waiting[topic]
+            await asyncio.gather(*(self._retain(broker, topic) for topic in topics))
+        if not self._is_online:
+            await self._tell(broker, True)
 
     async def _publish_changes(self, broker: aiomqtt.Client) -> None:
         while True:
@@ -207,7 +188,7 @@ class Bridge:
                     await asyncio.wait_for(self._news.wait(), left)
                 self._news.clear()
                 await self._publish(broker)
-            self._pending |= dict.fromkeys(self._retained)
+            self._repeats = dict.fromkeys(self._retained, 0.0)
 
     async def _receive(self, broker: aiomqtt.Client) -> None:
         async for message in broker.messages:
@@ -229,9 +210,7 @@ class Bridge:
         except sqlite3.Error as error:
             outcome = {"outcome": "busy", "reason": f"cannot record commands: {error}"}
         say(f"{key} = {command.get('value')}: {outcome['outcome']}")
-        document = json.dumps({"id": command.get("id")} | outcome)
-        self._outcomes.append((f"{self._root}/@outcome/{key}", document.encode()))
-        self._news.set()
+        self._send(f"{self._root}/@outcome/{key}", {"id": command.get("id")} | outcome)
 
     async def _outcome(self, key: str, command: Known, arrived: float) -> Known:
         number, value = command.get("id"), command["value"]

@@ -27,8 +27,9 @@ from asyncua.server import binary_server_asyncio
 from asyncua.server.address_space import AttributeService
 from asyncua.server.uaprocessor import UaProcessor
 from asyncua.ua.ua_binary import nodeid_from_binary
-from gateway_values import Known, Plant, arguments, opened, run, say
+from gateway_values import Known, Plant
 from opcua_values import History, data_value, type_of
+from program import arguments, opened, run, say
 
 Code = ua.StatusCodes
 NOT_DONE = {  # by the outcome of a write
@@ -139,10 +140,11 @@ class Bridge(AttributeService):
             shown = ua.LocalizedText(unit)
             about = ua.EUInformation("urn:zenoh-plc-gateway", -1, shown, shown)
             await node.add_property(self._node(f"{key}@unit"), "0:EngineeringUnits", about)
-        low, high = ((meta["write"] or {}).get(end) for end in ("min", "max"))
+        limits = meta["write"] or meta.get("clamp") or {}
+        low, high = limits.get("min"), limits.get("max")
         if low is not None and high is not None:
-            limits = ua.Range(Low=low, High=high)
-            await node.add_property(self._node(f"{key}@range"), "0:EURange", limits)
+            about = ua.Range(Low=low, High=high)
+            await node.add_property(self._node(f"{key}@range"), "0:EURange", about)
 
     async def write(self, params: ua.WriteParameters, user: User) -> list[ua.StatusCode]:
         if user.role == UserRole.Admin:  # this program itself

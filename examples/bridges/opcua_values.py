@@ -44,13 +44,7 @@ MOST_SAMPLES = 10_000  # in one answer; the client gets the rest with the contin
 
 
 def type_of(meta: Known) -> ua.VariantType:
-    """Returns the type of the value, which `scale` and `offset` can change."""
-    raw = TYPES.get(meta["type"], Type.String)
-    scale, offset = meta.get("scale") or 1, meta.get("offset") or 0
-    if raw in (Type.Boolean, Type.String) or (scale, offset) == (1, 0):
-        return raw
-    is_whole = raw not in (Type.Float, Type.Double) and scale % 1 == offset % 1 == 0
-    return Type.Int64 if is_whole else Type.Double
+    return TYPES.get(meta["type"], Type.String)
 
 
 def data_value(known: Known, kind: ua.VariantType) -> ua.DataValue:
@@ -117,24 +111,36 @@ class History(HistoryManager):
             None if time is None or time <= ua.get_win_epoch() else time.astimezone(UTC)
             for time in (details.StartTime, details.EndTime)
         )
+        backwards = start is None or (end is not None and end < start)
         if start is None:  # the last ones before a time
-            raise ua.uaerrors.BadHistoryOperationUnsupported
-        backwards = end is not None and end < start
+            start, end = end, None
         if item.ContinuationPoint:
             try:
                 start = datetime.fromisoformat(item.ContinuationPoint.decode())
             except ValueError:
                 raise ua.uaerrors.BadContinuationPointInvalid from None
-        # The bound where it starts is included. The gateway keeps nanoseconds, and shows less.
-        bounds = f"[{_text(start)}..{_text(end)}["
-        if backwards:
-            bounds = f"]{_text(end)}..{_text(start + STEP)}["
+        if start is None:
+            raise ua.uaerrors.BadInvalidTimestampArgument
         wanted = min(details.NumValuesPerNode or MOST_SAMPLES, MOST_SAMPLES)
-        samples = await self._samples(key, bounds, None if backwards else wanted + 1)
+        # The bound where it starts is included. The gateway keeps nanoseconds, and shows less.
+        if backwards:
+            until = f"{_text(start + STEP)}["
+            begin = await self._oldest_of_last(key, f"]{_text(end)}..{until}", wanted + 1)
+            samples = await self._samples(key, f"{begin or f']{_text(end)}'}..{until}", None)
+        else:
+            samples = await self._samples(key, f"[{_text(start)}..{_text(end)}[", wanted + 1)
         samples.sort(key=lambda known: known["time"], reverse=backwards)
         rest = samples[wanted]["time"].encode() if len(samples) > wanted else None
         kind = type_of(self._plant.tags[key])
         return [data_value(known, kind) for known in samples[:wanted]], rest
+
+    async def _oldest_of_last(self, key: str, bounds: str, count: int) -> str:
+        """Returns the bound at the oldest of the last samples: the first reply, also of a broken
+        answer."""
+        for reply in await self._plant.ask(f"{key}?_time={bounds};last={count}"):
+            if reply.ok and (known := self._plant.read(key, *copied(reply.ok)[1:])):
+                return f"[{known['time']}"
+        return ""
 
     async def _samples(self, key: str, bounds: str, wanted: int | None) -> list[Known]:
         """Queries page by page: only the end of a page tells whether all of it has arrived."""

@@ -13,11 +13,13 @@ from gateway import app, northbound
 from gateway.cli.progress import progress
 from gateway.cli.served_plan import served_plan
 from gateway.cli.terminal import FAILED, ConfigPath, err, out
-from gateway.config import Config, load, state_folder
+from gateway.config import Config, expanded_text, load, state_folder
 from gateway.engine.forecast import LineForecast
+from gateway.engine.listening import why_not_learned
 from gateway.history.place import trouble
 from gateway.planning.planner import describe
 from gateway.planning.wire_timing import NETWORK_BAUD, WireTiming
+from gateway.tags.tag import CounterRule
 from gateway.web import exposure
 
 
@@ -30,8 +32,15 @@ def check(
     strict: Annotated[
         bool, typer.Option("--strict", help="End with 1 if a line is overloaded.")
     ] = False,
+    expand: Annotated[
+        bool, typer.Option("--expand", help="Print the file with its templates expanded instead.")
+    ] = False,
 ) -> None:
     """Validate the file and print the plan of each line. Sends nothing."""
+    if expand:
+        load(config)
+        print(expanded_text(config), end="")
+        return
     with progress(err) as report:
         loaded = load(config, report)
         warnings = northbound.check(loaded) + exposure.check(loaded)
@@ -40,6 +49,8 @@ def check(
     out.print(plan(lines, every_block=few if blocks is None else blocks))
     for served in (line for line in loaded.lines if line.serve):
         out.print(served_plan(served))
+    for sentence in _listening(loaded):
+        out.print(sentence)
     for note in _notes(loaded):
         err.print(f"note: {note}")
     for line in lines:
@@ -56,6 +67,24 @@ def check(
         sys.exit(FAILED)
 
 
+def _listening(config: Config) -> Iterator[str]:
+    """Yields which tags of the listen-only lines can be learned."""
+    for line in config.lines:
+        if not line.listen_only:
+            continue
+        reasons = {
+            tag.key: why
+            for device in line.devices
+            for tag in device.tags
+            if (why := why_not_learned(device.driver, tag))
+        }
+        yield (
+            f"line {line.name} only listens: {len(line.tags) - len(reasons)} of "
+            f"{_counted(len(line.tags), 'tag')} can be learned, when another master reads them"
+        )
+        yield from (f"  {key} cannot: {why}" for key, why in reasons.items())
+
+
 def _notes(config: Config) -> Iterator[str]:
     tags = [tag for one in config.devices if one.served is None for tag in one.tags]
     for tag in tags:
@@ -66,12 +95,18 @@ def _notes(config: Config) -> Iterator[str]:
                 "the word back; changes by the PLC in between are lost"
             )
     for tag in tags:
-        if (limit := tag.exact_below) is not None:
+        if tag.kept is None and (limit := tag.exact_below) is not None:
             yield (
                 f"{tag.key} ({tag.text}): a JSON number has 53 bits. Beyond {limit:.4g}"
                 " either way two values of the device can look equal, and a write can be one"
                 " step off"
             )
+    totals = [tag.key for tag in tags if isinstance(tag.kept, CounterRule)]
+    if totals and config.state_file is None:
+        yield (
+            f"{', '.join(totals[:5])}: a total begins again at each start of the gateway: "
+            "write `state: state.json` below `gateway:`"
+        )
     for sheet in config.sheets:
         yield from (f"{sheet.file.name}: {note}" for note in sheet.notes)
 
@@ -83,6 +118,7 @@ def _unwritable(config: Config) -> Iterator[str]:
     for setting, file in (
         ("history.path", None if kept is None else kept.path),
         ("gateway.state", config.state_file),
+        ("alarms.path", config.alarms.path),
     ):
         if file is not None and (why := trouble(file)) is not None:
             yield (
@@ -102,7 +138,7 @@ def plan(lines: Sequence[LineForecast], *, every_block: bool) -> RenderableType:
     parts: list[RenderableType] = []
     for line in lines:
         parts.append(_line(line))
-        if every_block:
+        if every_block and (line.blocks or line.unsolicited):
             parts.append(_blocks(line))
         parts.append(Text())
     return Group(*parts)

@@ -2,7 +2,7 @@
 
 import asyncio
 import time
-from collections.abc import AsyncIterator, Collection, Sequence
+from collections.abc import AsyncIterator, Collection, Iterable, Sequence
 from collections.abc import Set as AbstractSet
 from contextlib import asynccontextmanager, suppress
 from dataclasses import replace
@@ -16,8 +16,10 @@ from gateway.errors import BadValue, LineDown
 from gateway.line import build
 from gateway.line.line import Line, SampleSink
 from gateway.tags import Reason, Sample, Tag, WriteResult, bad
+from gateway.tags.mirror import Mirror
 from gateway.values import Value
 
+SERVED = "is on a served line: only the running gateway has it, without --direct"
 LISTEN_FOR = 5.0  # seconds, for unsolicited frames
 
 
@@ -42,15 +44,30 @@ class _Once:
 
 async def read(config: Config, tags: Sequence[Tag]) -> list[Sample]:
     """Returns one sample of each tag, good or bad, in the order of `tags`."""
+    known = _with_inputs(tags)
     found: dict[Tag, Sample] = {}
     for line_config in config.lines:
         enabled = {device.name for device in line_config.devices if device.enabled}
-        mine = [tag for tag in tags if tag in line_config.tags]
+        own = set(line_config.tags)
+        mine = [tag for tag in known if tag in own and not tag.inputs]
+        if line_config.serve:  # a request on the wire of a master would disturb it
+            found |= {tag: bad(tag, Reason.LINE_DOWN, time.time_ns(), SERVED) for tag in mine}
+            continue
         wanted = [tag for tag in mine if tag.device in enabled]
         found |= {tag: bad(tag, Reason.DISABLED, time.time_ns()) for tag in mine}
         found |= {tag: bad(tag, Reason.STARTING, time.time_ns()) for tag in wanted}
         found |= await _read(line_config, wanted)
-    return [found[tag] for tag in tags]
+    mirror = Mirror(known, time.time_ns())
+    mirror.follow(mirror.update(found.values()))
+    return [mirror[tag] for tag in tags]
+
+
+def _with_inputs(tags: Iterable[Tag]) -> list[Tag]:
+    """Returns the tags, and those that their values are made of, each once."""
+    known: dict[Tag, None] = {}
+    for tag in tags:
+        known |= dict.fromkeys((*_with_inputs(tag.inputs), tag))
+    return list(known)
 
 
 async def _read(config: LineConfig, tags: Sequence[Tag]) -> dict[Tag, Sample]:
@@ -81,7 +98,7 @@ async def _listen(once: _Once, unsolicited: AbstractSet[Tag]) -> None:
 
 async def follow(config: Config, sink: SampleSink) -> None:
     """Reads all tags at their intervals until it is cancelled."""
-    lines = [build.line_of(line, line.devices, sink) for line in config.lines]
+    lines = [build.line_of(line, line.devices, sink) for line in config.lines if not line.serve]
     await asyncio.gather(*(line.run() for line in lines))
 
 
@@ -89,6 +106,8 @@ async def write(config: Config, tag: Tag, value: Value) -> WriteResult:
     """Writes one tag. Raises `GatewayError`; `BadValue` only before anything is sent."""
     units = tag.encode(value)
     (line_config,) = (line for line in config.lines if tag in line.tags)
+    if line_config.serve:
+        raise BadValue(f"{tag.key} {SERVED}")
     if not any(device.enabled for device in line_config.devices if device.name == tag.device):
         raise BadValue(f"device {tag.device} is disabled")
     line = _line(line_config, {tag.device}, [tag], _Once())

@@ -17,12 +17,13 @@ from gateway.errors import ConfigError
 from gateway.northbound.meta import meta_fields
 from gateway.protocols.driver import Unit
 from gateway.tags import Tag
+from gateway.tags.tag import CounterRule
 from gateway.values import BYTES, Kind
 
 _FIRST = ("Device", "Name", "Address", "Type", "Unit", "Scale", "Offset", "Every", "R/W")
 _OWN = {"type", "raw_type", "address", "unit", "scale", "offset", "every", "write", "deadband"}
-_OWN |= {"clamp", "enum"}
-_TIMES = {"every", "heartbeat"}
+_OWN |= {"clamp", "enum", "counter"}
+_TIMES = {"every", "heartbeat", "debounce"}
 
 
 def export(
@@ -75,7 +76,7 @@ def _row(prefix: str, tag: Tag) -> dict[str, object]:
         "Device": tag.device,
         "Name": tag.name,
         "Address": tag.text,
-        "Type": "" if tag.shape is not None else str(tag.layout.type),
+        "Type": _type(tag),
         "Unit": tag.unit,
         "Scale": "" if tag.scale == 1 else tag.scale,
         "Offset": "" if tag.offset == 0 else tag.offset,
@@ -90,7 +91,9 @@ def _row(prefix: str, tag: Tag) -> dict[str, object]:
     }
     row |= _order(tag)
     if tag.shaping is not None and tag.shaping.clamp is not None:
-        row["Clamp"] = orjson.dumps(tag.shaping.clamp).decode()
+        row["Clamp"] = orjson.dumps([*tag.shaping.clamp]).decode()
+    if isinstance(tag.kept, CounterRule):
+        row["Counter"] = _counter(tag.kept)
     if tag.names is not None:
         row["Enum"] = ";".join(f"{number}={name}" for number, name in tag.names.by_number.items())
     for name, value in meta.items():
@@ -102,10 +105,31 @@ def _row(prefix: str, tag: Tag) -> dict[str, object]:
     return row
 
 
+def _type(tag: Tag) -> str:
+    """Returns the type in the device; nothing where the file has none."""
+    if tag.formula is not None or tag.shape is not None:
+        return ""
+    return str(meta_fields(tag)["raw_type"])
+
+
+def _counter(rule: CounterRule) -> str:
+    """Returns a counter as `import` takes it."""
+    bits = rule.modulus.bit_length() - 1
+    width = f"bits: {bits}" if rule.modulus == 1 << bits else f"top: {rule.modulus - 1}"
+    return f"{{{width}, most: {rule.most}}}"
+
+
 def _order(tag: Tag) -> Mapping[str, object]:
     """Returns the order of words and bytes, where the type has one."""
+    if tag.kept is not None:
+        return _order(tag.inputs[0])
     kind = tag.layout.type
-    if tag.shape is not None or tag.unit_kind is not Unit.WORD or kind.kind is Kind.BOOL:
+    if (
+        tag.formula is not None
+        or tag.shape is not None
+        or tag.unit_kind is not Unit.WORD
+        or kind.kind is Kind.BOOL
+    ):
         return {}
     if kind.kind in BYTES:
         return {"Byte": tag.layout.byte.value}

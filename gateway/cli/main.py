@@ -12,6 +12,7 @@ import typer
 
 from gateway import __version__
 from gateway.cli import (
+    alarms,
     backup,
     check,
     control,
@@ -21,10 +22,12 @@ from gateway.cli import (
     new,
     peek,
     read,
+    replay,
     run,
     scan_command,
     simulate,
     status,
+    trace,
     watch,
     write,
 )
@@ -109,6 +112,9 @@ cli.command()(export.export)
 cli.command()(simulate.simulate)
 cli.command()(status.status)
 cli.command()(status.health)
+cli.command()(alarms.alarms)
+cli.command()(trace.trace)
+cli.command()(replay.replay)
 cli.command()(backup.backup)
 cli.add_typer(history.cli, name="history")
 

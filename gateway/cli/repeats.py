@@ -24,7 +24,10 @@ BURST = 20  # changes of one state at once; different entries of one topic that 
 _ALL = frozenset({"tag written", "write failed", "command executed", "command failed"})
 # Changes of these are logged at once, up to `BURST` of them: a cable is plugged again soon.
 _STATES = frozenset(
-    {"device", "file", "gateway", "history", "line", "standby state", "Zenoh link", "Zenoh session"}
+    {
+        *("alarm", "device", "file", "gateway", "history", "line", "standby state"),
+        *("Zenoh link", "Zenoh session"),
+    }
 )
 _SOURCE = "line", "device", "logger"
 _UNIQUE = frozenset({"address", "bytes", "id"})  # different in each entry of one kind

@@ -33,7 +33,7 @@ def run(
     log_format: Annotated[LogFormat, typer.Option(help="text for people, json for programs")] = (
         LogFormat.TEXT
     ),
-    log_level: Annotated[LogLevel, typer.Option(help="debug shows every byte")] = LogLevel.INFO,
+    log_level: Annotated[LogLevel, typer.Option(help="debug leaves nothing out")] = LogLevel.INFO,
 ) -> None:
     """Run the service: poll, publish on Zenoh, accept writes. SIGTERM or Ctrl-C ends it."""
     if log_format is LogFormat.TEXT:

@@ -172,7 +172,7 @@ class _Scan:
 
     async def ask(self) -> None:
         port = await self._plan.open_port(self._serial, self)
-        channel = Channel(port, self._wire, WireLog("scan"), echo=Echo("scan", None))
+        channel = Channel(port, self._wire, WireLog(), echo=Echo("scan", None))
         try:
             for probe_token, station in enumerate(self._plan.stations):
                 if (found := await self._seek(channel, station, probe_token)) is not None:

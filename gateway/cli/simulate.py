@@ -52,7 +52,7 @@ async def serve(
         loop.add_signal_handler(number, stop.set)
     host, port = (None, 0) if tcp is None else _address(tcp)
     async with AsyncExitStack() as stack:
-        for offset, line in enumerate(config.lines):
+        for offset, line in enumerate(line for line in config.lines if not line.serve):
             place = None if host is None else (host, port + offset)
             served = await _serve(line, place, links)
             stack.push_async_callback(served.close)

@@ -40,6 +40,8 @@ def write(
     if target is None:
         raise ConfigError(f"there is no tag {tag} in {config}{suggestion(tag, known)}")
     if target.write is None:
+        if target.inputs:
+            raise ConfigError(f"{tag} cannot be written: its value follows from other reads")
         raise ConfigError(f"{tag} cannot be written: it has no `write: true` in {config}")
     parsed = _parsed(value, target)
     try:
@@ -57,7 +59,8 @@ def write(
     elif "error" in answer:
         err.print(outcome(tag, answer), style="red")
     else:
-        print(outcome(tag, answer))
+        held = any(one.served for one in loaded.devices if one.name == target.device)
+        print(outcome(tag, answer, held=held))
     if "error" in answer:
         sys.exit(error_code(answer))
 
@@ -89,14 +92,19 @@ def error_code(answer: dict[str, object]) -> int:
     return USER_MISTAKE if answer["error"] in _USER_MISTAKES else FAILED
 
 
-def outcome(target: str, answer: dict[str, object]) -> str:
-    """Describes the outcome of a write or command in one line."""
+def outcome(target: str, answer: dict[str, object], *, held: bool = False) -> str:
+    """Describes the outcome of a write or command in one line.
+
+    `held`: the gateway keeps the value for the master of a served line.
+    """
     if "error" in answer:
         code = f" {answer['code']}" if answer.get("code") else ""
         return printable(f"{target}: {answer['error']}{code}: {answer.get('reason')}")
     took = f"{float(str(answer['took'])) * 1000:.0f} ms"
     how = "acknowledged by the PLC"
-    if answer.get("verified"):
+    if held:
+        how = "held for the master of the line"
+    elif answer.get("verified"):
         how = "acknowledged and read back"
     elif answer.get("acknowledged") is False:
         how = "broadcast, without acknowledgement"

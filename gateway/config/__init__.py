@@ -11,6 +11,7 @@ from gateway.config.build import Builder
 from gateway.config.file_rules import check_files
 from gateway.config.messages import ConfigErrors, Mistakes, OptionPlaces
 from gateway.config.records import (
+    AlarmsConfig,
     Config,
     HistoryConfig,
     LineConfig,
@@ -21,9 +22,12 @@ from gateway.config.records import (
 )
 from gateway.config.schema import schema
 from gateway.config.sheet_tags import SheetUse
+from gateway.config.templates import expanded
+from gateway.config.yaml_dump import dumped
 from gateway.config.yaml_file import read_yaml
 
 __all__ = [
+    "AlarmsConfig",
     "Config",
     "ConfigErrors",
     "HistoryConfig",
@@ -34,6 +38,7 @@ __all__ = [
     "ZenohConfig",
     "ZenohMode",
     "built",
+    "expanded_text",
     "load",
     "state_folder",
     "schema",
@@ -60,13 +65,22 @@ def load(
     with _without_gc():
         file, mistakes = read_yaml(Path(path), _TEXTS, read)
         builder = Builder(mistakes, Path(path).parent, state_folder(), checked, imports or {})
-        config = builder.config(file.data)
+        config = builder.config(expanded(file, mistakes, Path(path).parent))
         if config is not None:
             check_files(config, Path(path), mistakes)
     mistakes.raise_all()
     if config is None:
         raise AssertionError(f"{path}: no configuration, and no mistake either")
     return config
+
+
+def expanded_text(path: str | Path) -> str:
+    """Returns the file with every template expanded, as a file that has none. Raises
+    `ConfigErrors`."""
+    file, mistakes = read_yaml(Path(path), _TEXTS)
+    data = expanded(file, mistakes, Path(path).parent)
+    mistakes.raise_all()
+    return dumped(data)
 
 
 def built(data: Mapping[str, object], folder: Path | None = None) -> Config:

@@ -1,13 +1,13 @@
 """Builds the configuration from the data of the file, and notes every mistake."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from os.path import realpath
 from pathlib import Path as FilePath
 from typing import Any
 
 from gateway.config import parsers
-from gateway.config.computed_tags import with_computed
+from gateway.config.computed_tags import check_totals, with_computed
 from gateway.config.device_tags import DeviceTags, mapping
 from gateway.config.line_rules import check_line, line_wire
 from gateway.config.messages import Mistakes, Path, meant, shown
@@ -18,6 +18,7 @@ from gateway.config.model import (
     TagDefaults,
 )
 from gateway.config.records import (
+    AlarmsConfig,
     Config,
     HistoryConfig,
     LineConfig,
@@ -29,10 +30,10 @@ from gateway.config.records import (
 from gateway.config.served import (
     ServedDevice,
     ServedView,
+    check_retained,
     check_served_line,
     check_sources,
     only_served,
-    retained,
 )
 from gateway.config.sheet_tags import SheetTags
 from gateway.config.tag_rules import inherit
@@ -50,6 +51,7 @@ from gateway.protocols.registry import PROTOCOLS
 from gateway.transport.port import SerialPath
 
 STATE_FILE = FilePath("state.json")  # where there is a folder for it
+ALARM_FILE = FilePath("alarms.json")
 
 
 @dataclass(slots=True)
@@ -87,10 +89,12 @@ class Builder:
             self.mistakes.add(("lines",), "no lines: a gateway has at least one")
         lines = with_computed(lines, self._tags.computed, self.mistakes)
         self._check_ports(lines, raw_lines)
+        if top is not None and top.gateway.standby is not None:
+            check_totals(lines, self.mistakes)
         check_sources(lines, self.mistakes)
         if top is None:
             return None
-        self._check_retain(top, lines)
+        check_retained(lines, self._state_file(top), top.gateway.standby, self.mistakes)
         self._check_history(top)
         return Config(
             name=top.gateway.name,
@@ -102,6 +106,7 @@ class Builder:
             zenoh=self._zenoh(top),
             history=self._history(top),
             web=self._web(top),
+            alarms=self._alarms(top, lines),
             lines=tuple(lines),
             watch=top.gateway.watch_config,
             sheets=tuple(self._sheets.used),
@@ -143,8 +148,9 @@ class Builder:
             serial=serial,
             wire=wire,
             echo=line.echo,
+            listen_only=line.listen_only,
             serve=line.serve,
-            devices=tuple(devices),
+            devices=tuple(replace(one, listen_only=line.listen_only) for one in devices),
         )
 
     def _device(
@@ -260,15 +266,6 @@ class Builder:
                 "history.db and state.json",
             )
 
-    def _check_retain(self, top: FileSection, lines: list[LineConfig]) -> None:
-        why = ""
-        if self._state_file(top) is None:
-            why = "the gateway has no file for it: write `gateway: {state: state.json}`"
-        elif top.gateway.standby is not None:
-            why = "a standby would answer with the values of its own file, which are old"
-        for place in retained(lines) if why else ():
-            self.mistakes.add((*place, "retain"), why)
-
     def _zenoh(self, top: FileSection) -> ZenohConfig:
         found, own = top.zenoh, ("zenoh",)
         tls = found.tls
@@ -311,6 +308,13 @@ class Builder:
             name = STATE_FILE
         return None if name is None else self._written(name)
 
+    def _alarms(self, top: FileSection, lines: list[LineConfig]) -> AlarmsConfig:
+        found = top.alarms
+        path = None if found.path is None else self._written(found.path)
+        if path is None and (self.state_folder is not None or _have_alarms(lines)):
+            path = self._written(ALARM_FILE)
+        return AlarmsConfig(path=path, devices=found.devices, lines=found.lines)
+
     def _web(self, top: FileSection) -> WebConfig | None:
         if top.web is None:
             return None
@@ -341,6 +345,10 @@ class Builder:
 
 def _devices_of(raw: object) -> object:
     return raw.get("devices") if isinstance(raw, dict) else None
+
+
+def _have_alarms(lines: list[LineConfig]) -> bool:
+    return any(tag.alarm is not None for line in lines for tag in line.tags)
 
 
 def _either(own: float | None, default: float) -> float:

@@ -87,7 +87,19 @@ class Difference:
 
 def needs_restart(old: Config, new: Config) -> list[str]:
     """Returns the settings that changed and that only a restart takes over."""
-    return list(dict.fromkeys([*_changed(old, new, "", _TAKEN_OVER), *_served(old, new)]))
+    found = [*_changed(old, new, "", _TAKEN_OVER), *_served(old, new), *_kept(old, new)]
+    return list(dict.fromkeys(found))
+
+
+def _kept(old: Config, new: Config) -> Iterator[str]:
+    """Yields the devices that changed and have totals or debounced bits: these count reads."""
+    before = {device.name: (_port(line), device) for line in old.lines for device in line.devices}
+    after = {device.name: (_port(line), device) for line in new.lines for device in line.devices}
+    for name in before | after:
+        both = [one for one in (before.get(name), after.get(name)) if one is not None]
+        counts = any(tag.kept is not None for _, device in both for tag in device.tags)
+        if counts and (len(both) < 2 or not _alike(*both)):
+            yield f"{name}, which has totals or debounced bits,"
 
 
 def _served(old: Config, new: Config) -> Iterator[str]:
@@ -132,7 +144,7 @@ def compare(old: Config, new: Config) -> Difference:
     merged, opened = [], []
     for line in new.lines:
         known = lines.get(line.name)
-        if known is None or _port(known) != _port(line):
+        if known is None or _port(known) != _port(line) or _hears_others(known, line):
             opened.append(line)
             merged.append(line)
             changes = [DeviceChange(before.get(one.name), one) for one in line.devices]
@@ -148,6 +160,11 @@ def compare(old: Config, new: Config) -> Difference:
     closed = [name for name in lines if name not in stay]
     config, computed = _with_computed(old, new, replace(new, lines=tuple(merged)))
     return Difference(config, devices, closed, opened, computed)
+
+
+def _hears_others(known: LineConfig, line: LineConfig) -> bool:
+    """True for a listen-only line whose devices changed: it begins to listen again."""
+    return line.listen_only and not _alike(known.devices, line.devices)
 
 
 def _port(line: LineConfig) -> LineConfig:
@@ -186,7 +203,7 @@ def _with_computed(old: Config, file: Config, merged: Config) -> tuple[Config, C
         return merged, Computed()
     before = {device.name: device.enabled for device in old.devices}
     stay = {device.name for device in file.devices if before.get(device.name) is device.enabled}
-    made = {tag.key: tag for device in merged.devices for tag in device.wire_tags}
+    made = {tag.key: tag for device in merged.devices for tag in _plain(device)}
 
     def make(tag: Tag) -> Tag:
         if tag.key in made:
@@ -205,7 +222,7 @@ def _with_computed(old: Config, file: Config, merged: Config) -> tuple[Config, C
 
     def resolved(device: DeviceSettings) -> DeviceSettings:
         own = tuple(tag for tag in final.values() if tag.device == device.name)
-        tags = (*device.wire_tags, *own)
+        tags = (*_plain(device), *own)
         return device if tags == device.tags else replace(device, tags=tags)
 
     lines = (replace(line, devices=tuple(map(resolved, line.devices))) for line in merged.lines)
@@ -226,6 +243,10 @@ def _is_one_station(old: DeviceSettings, new: DeviceSettings) -> bool:
 
 def _tags(device: DeviceSettings | None) -> Sequence[Tag]:
     return () if device is None else device.wire_tags
+
+
+def _plain(device: DeviceSettings) -> Iterator[Tag]:
+    return (tag for tag in device.tags if tag.formula is None)
 
 
 def _computed(device: DeviceSettings) -> Iterator[Tag]:

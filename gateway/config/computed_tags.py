@@ -1,9 +1,10 @@
 """Makes computed tags: finds the inputs of their formulas, and loops."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+from gateway.config.alarm_rules import alarm_misfits, alarm_rule
 from gateway.config.device_tags import ComputedSource
 from gateway.config.messages import Mistakes, similar
 from gateway.config.records import LineConfig
@@ -14,6 +15,7 @@ from gateway.errors import ConfigError
 from gateway.protocols.driver import Address, Span, Unit
 from gateway.tags import Tag
 from gateway.tags.formula import Formula
+from gateway.tags.tag import CounterRule
 from gateway.values import Kind, Layout, ValueType
 
 if TYPE_CHECKING:
@@ -111,6 +113,9 @@ class _Maker:
         whole = parsed.whole and not any(one.value_type.startswith("float") for one in inputs)
         wrong: list[tuple[str, str]] = []
         shaping = computed_shaping(own, settings, wrong, whole=whole)
+        kind = ValueType(Kind.INT64 if whole else Kind.FLOAT64)
+        if own.alarm is not None:
+            wrong += alarm_misfits(own.alarm, kind)
         for setting, problem in wrong:
             self.mistakes.add((*source.path, setting), problem)
         return Tag(
@@ -120,14 +125,29 @@ class _Maker:
             address=Address("", 0),
             span=Span("", 0, 0),
             unit_kind=Unit.WORD,
-            layout=Layout(ValueType(Kind.INT64 if whole else Kind.FLOAT64)),
+            layout=Layout(kind),
             every=min(one.every for one in inputs),
             unit=settings.unit,
             description=settings.description,
             deadband=settings.deadband,
             history=settings.history,
             payload=settings.payload,
+            alarm=alarm_rule(own.alarm, settings.description),
             shaping=shaping,
             formula=Formula(own.computed, parsed.term, whole),
             inputs=tuple(inputs),
         )
+
+
+def check_totals(lines: Sequence[LineConfig], mistakes: Mistakes) -> None:
+    """Notes totals in a standby group: each of its gateways would have another one."""
+    for line in lines:
+        for device in line.devices:
+            for tag in device.tags:
+                if isinstance(tag.kept, CounterRule):
+                    place = ("lines", line.name, "devices", device.name, "tags", tag.name)
+                    mistakes.add(
+                        (*place, "counter"),
+                        "a total is kept by one gateway, and this one has a standby: remove "
+                        "counter, and count in the PLC",
+                    )

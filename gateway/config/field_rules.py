@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import replace
 
+from gateway.config.kept_rules import kept_tag
 from gateway.config.messages import Mistakes
 from gateway.config.model import TagDefaults, WriteSection
 from gateway.config.tag_rules import (
@@ -43,7 +44,7 @@ def field_tag(
     if tag.event:
         tag = replace(tag, publish=Publish.ALWAYS, heartbeat=None)
     check_bounds(source, tag, mistakes)
-    return tag
+    return kept_tag(source.own, settings, tag, source.path, mistakes)
 
 
 def _write(
@@ -74,6 +75,8 @@ def _misfits(
         yield "every", f"{name} is never polled: it has no interval"
     if not field.polled and not field.unsolicited and write is None:
         yield "write", f"{name} can only be written: it needs write: true"
+    if not field.polled and not field.unsolicited and source.own.alarm is not None:
+        yield "alarm", f"{name} can only be written: it can have no alarm"
     rule = source.own.write
     if isinstance(rule, WriteSection) and rule.verify and not field.polled:
         yield "write", f"{name} cannot be read back, no request reads it: remove verify"

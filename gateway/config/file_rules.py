@@ -20,6 +20,13 @@ def check_files(config: Config, own: FilePath, mistakes: Mistakes) -> None:
                 ("a file of the history", FilePath(f"{config.history.path}{tail}"))
                 for tail in _HISTORY[1:]
             ]
+        if path == ("alarms", "path"):
+            others += [
+                (f"a file of {named[0]}.{named[1]}", FilePath(f"{written}{tail}"))
+                for named, written, its in _written(config)
+                if named != path
+                for tail in its
+            ]
         for what, other in others:
             if any(_same(FilePath(f"{file}{tail}"), other) for tail in tails):
                 mistakes.add(
@@ -27,7 +34,11 @@ def check_files(config: Config, own: FilePath, mistakes: Mistakes) -> None:
                 )
 
 
-_MEANT: dict[Path, str] = {("history", "path"): "history.db", ("gateway", "state"): "state.json"}
+_MEANT: dict[Path, str] = {
+    ("history", "path"): "history.db",
+    ("gateway", "state"): "state.json",
+    ("alarms", "path"): "alarms.json",
+}
 
 
 def _written(config: Config) -> Iterator[tuple[Path, FilePath, tuple[str, ...]]]:
@@ -35,6 +46,8 @@ def _written(config: Config) -> Iterator[tuple[Path, FilePath, tuple[str, ...]]]
         yield ("history", "path"), config.history.path, _HISTORY
     if config.state_file is not None:
         yield ("gateway", "state"), config.state_file, _STATE
+    if config.alarms.path is not None:
+        yield ("alarms", "path"), config.alarms.path, _STATE
 
 
 def _read(config: Config, own: FilePath) -> Iterator[tuple[str, FilePath]]:

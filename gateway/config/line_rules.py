@@ -7,6 +7,7 @@ from gateway.config.model import LineSection
 from gateway.engine.device import DeviceSettings
 from gateway.planning.wire_timing import NETWORK_BAUD, WireTiming, character_bits
 from gateway.protocols.driver import EchoConflict
+from gateway.protocols.listening import Listenable
 from gateway.protocols.unsolicited import Unsolicited
 from gateway.stations.registry import can_simulate
 from gateway.transport.port import SerialSettings, SimulatorAddress, TcpAddress
@@ -20,6 +21,8 @@ def check_line(
     _check_stations(devices, path, mistakes)
     if line.format is not None:
         _check_format(line.format, devices, (*path, "format"), mistakes)
+    if line.listen_only:
+        _check_listening(line, devices, path, mistakes)
     for device in devices:
         driver, place = device.driver, (*path, "devices", device.name)
         if isinstance(line.port, SimulatorAddress) and not can_simulate(driver):
@@ -99,6 +102,37 @@ def _check_unsolicited(devices: Sequence[DeviceSettings], path: Path, mistakes: 
             "say which device sent it: give this device a line of its own, or write both as one "
             "device",
         )
+
+
+def _check_listening(
+    line: LineSection, devices: Sequence[DeviceSettings], path: Path, mistakes: Mistakes
+) -> None:
+    """Another master's requests and replies must be known, and found by one reader."""
+    if line.serve:
+        mistakes.add(
+            (*path, "listen_only"),
+            "a line with `serve: true` answers its master, so it cannot only listen: remove one",
+        )
+    if isinstance(line.port, SimulatorAddress):
+        mistakes.add((*path, "port"), "listen_only: the simulator has no other master to listen to")
+    framings = dict[object, str]()
+    for device in devices:
+        driver, place = device.driver, (*path, "devices", device.name, "protocol")
+        if not isinstance(driver, Listenable) or driver.traits.over_network:
+            mistakes.add(
+                place,
+                f"the line has `listen_only: true`, and values of {driver.protocol} cannot be "
+                "learned from another master: remove listen_only, or this device",
+            )
+            continue
+        other = framings.setdefault(driver.framing, device.name)
+        first = next(iter(framings.values()))
+        if other != first:
+            mistakes.add(
+                place,
+                f"the line has `listen_only: true`, and {first} has other frames: all devices of "
+                "such a line have one protocol and one format",
+            )
 
 
 def _check_network(

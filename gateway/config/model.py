@@ -20,12 +20,14 @@ from pydantic import (
 from pydantic import Tag as Choice
 
 from gateway.config import parsers
+from gateway.config.alarm_rules import check_alarm
 from gateway.config.setting_types import (
     DEADBAND_SCHEMA,
     FORMAT_SCHEMA,
     SCALE_SCHEMA,
     TYPE_SCHEMA,
     Baudrate,
+    Distance,
     Duration,
     Endpoint,
     Endpoints,
@@ -155,6 +157,18 @@ class HistorySection(Section):
     """The oldest samples are deleted when the file grows beyond this size."""
 
 
+class AlarmsSection(Section):
+    """The alarms of the gateway."""
+
+    path: FilePath | None = None
+    """Keeps alarms across restarts; left out: alarms.json in $STATE_DIRECTORY, or beside this file
+    if a tag has an alarm."""
+    devices: bool = True
+    """A device that does not reply is an alarm."""
+    lines: bool = True
+    """A line that is down is an alarm."""
+
+
 class WebSection(Section):
     """The status page and /metrics."""
 
@@ -184,6 +198,34 @@ class WriteSection(Section):
     def _order(self) -> Self:
         if self.min is not None and self.max is not None and self.min > self.max:
             raise ValueError(f"min {self.min:.15g} is above max {self.max:.15g}")
+        return self
+
+
+class AlarmSection(Section):
+    """The alarm of a number or a bit: docs/alarms.md."""
+
+    high_high: Finite | None = None
+    """A value from here on is in alarm, of the worse level."""
+    high: Finite | None = None
+    """A value from here on is in alarm."""
+    low: Finite | None = None
+    """A value from here downwards is in alarm."""
+    low_low: Finite | None = None
+    """A value from here downwards is in alarm, of the worse level."""
+    on: bool = False
+    """A bit is in alarm while it is on."""
+    off: bool = False
+    """A bit is in alarm while it is off."""
+    hysteresis: Distance = 0.0
+    """A limit is left when the value is so far from it, in the unit of the tag."""
+    delay: Duration = 0.0
+    """A limit counts when it is reached for so long."""
+    text: Text = ""
+    """A sentence for people; left out: the description of the tag."""
+
+    @model_validator(mode="after")
+    def _together(self) -> Self:
+        check_alarm({name: getattr(self, name) for name in type(self).model_fields})
         return self
 
 
@@ -262,6 +304,8 @@ class ComputedSection(Section):
     """Store the values on disk."""
     payload: Payload = Form.JSON
     """json: value, quality and time; raw: the bare value as text."""
+    alarm: AlarmSection | None = None
+    """Raise an alarm at a limit of the value."""
 
 
 class TagSection(TagDefaults, ShapingSettings):
@@ -271,6 +315,8 @@ class TagSection(TagDefaults, ShapingSettings):
     """As the maker writes it: D100, X17, D7.3, holding:100; for frames the name of a field."""
     event: bool = False
     """Publish every frame, even with the same value as the last: a bar code."""
+    alarm: AlarmSection | None = None
+    """Raise an alarm at a limit of the value, or while a bit is on."""
     source: Text | None = None
     """On a served line: the tag, as device/tag, whose value the master reads here."""
     retain: bool = False
@@ -328,6 +374,8 @@ class LineSection(Section):
     """true: the port receives its own requests, as with some two-wire RS-485 converters."""
     serve: bool = False
     """true: the devices are stations of this gateway, and a master on the line asks them."""
+    listen_only: bool = False
+    """true: learns the values from another master's traffic, and sends nothing, ever."""
     defaults: dict[str, Any] = {}
     devices: dict[str, Any]
     """The devices on this line, by name."""
@@ -341,6 +389,11 @@ class FileSection(Section):
     writers: WritersSection | None = None
     history: HistorySection | None = None
     web: WebSection | None = None
+    alarms: AlarmsSection = AlarmsSection()
+    templates: dict[str, Any] = {}
+    """Devices with parameters, which devices `use`: docs/templates.md."""
+    templates_from: str | list[str] = []
+    """Files with more templates."""
     defaults: dict[str, Any] = {}
     lines: dict[str, Any]
     """The lines, by name."""

@@ -194,6 +194,12 @@ def every_digit(written: object, as_float: Callable[[object], float]) -> float:
     return written
 
 
+def not_negative(value: float) -> float:
+    if not 0 <= value < math.inf:
+        raise ValueError(f"{value:.15g} is no distance: it is zero or more")
+    return value
+
+
 def scale(factor: float) -> float:
     if factor == 0:
         raise ConfigError("a scale of 0 makes every value the same")

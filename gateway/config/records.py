@@ -59,6 +59,15 @@ class HistoryConfig:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class AlarmsConfig:
+    """The file that keeps alarms, and the alarms that need no setting."""
+
+    path: Path | None = None  # None: a restart forgets them
+    devices: bool = True
+    lines: bool = True
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class WebConfig:
     """The address of the status page, and who may use it."""
 
@@ -86,6 +95,7 @@ class LineConfig:
     wire: WireTiming
     echo: bool | None  # the port receives its own requests; None: unknown
     serve: bool = False  # a master on the line asks, and the devices are stations of the gateway
+    listen_only: bool = False  # another master owns the wire: nothing is ever sent
     devices: tuple[DeviceSettings, ...]
 
     @property
@@ -110,6 +120,7 @@ class Config:
     zenoh: ZenohConfig
     history: HistoryConfig | None
     web: WebConfig | None
+    alarms: AlarmsConfig = AlarmsConfig()
     lines: tuple[LineConfig, ...]
     watch: bool = False  # a changed file is reloaded by itself
     sheets: tuple[SheetUse, ...] = ()  # files that the tags of some devices come from

@@ -26,6 +26,33 @@ from gateway.protocols.registry import PROTOCOLS
 
 _TIMES = (DURATION_SCHEMA["pattern"], INTERVAL_SCHEMA["pattern"])
 _PARTS: dict[str, type[Section]] = {"Line": LineSection, "Tag": TagSection, "Defaults": TagDefaults}
+_DEVICE_NAMES = rf"{NAME_PATTERN}|\{{"  # a repeated device has its number in the name: pump-{{n}}
+_NAMES_OF_TEMPLATES = {"type": "array", "items": {"type": "string"}}
+_USE: dict[str, Any] = {
+    "use": {
+        "anyOf": [{"type": "string"}, _NAMES_OF_TEMPLATES],
+        "description": "The template of the device, or several: docs/templates.md.",
+    },
+    "repeat": {
+        "type": "integer",
+        "minimum": 1,
+        "maximum": 10_000,
+        "description": "Make so many devices; {n} is the number of each, in its name too.",
+    },
+}
+_TEMPLATE: dict[str, Any] = {
+    "type": "object",
+    "description": "Settings and tags of devices, with expressions such as D{base + 1}.",
+    "properties": {
+        "parameters": {
+            "anyOf": [{"type": "object"}, _NAMES_OF_TEMPLATES],
+            "description": "The parameters with their defaults; null: the device gives a value.",
+        },
+        "use": _USE["use"],
+        "description": {"type": "string"},
+        "tags": {"type": "object"},
+    },
+}
 
 
 def schema() -> dict[str, Any]:
@@ -38,22 +65,28 @@ def schema() -> dict[str, Any]:
     del shared["Tag"]["required"]
     for protocol in PROTOCOLS:
         shared[protocol] = _device(protocol, shared)
+    shared["Template"] = _TEMPLATE
+    plain = {"not": {"required": ["use"]}}
     shared["Device"] = {
         "type": "object",
-        "required": ["protocol"],
-        "properties": {"protocol": {"enum": list(PROTOCOLS)}},
+        "properties": {"protocol": {"enum": list(PROTOCOLS)}, **_USE},
         "allOf": [
-            {
-                "if": {"properties": {"protocol": {"const": name}}, "required": ["protocol"]},
-                "then": _ref(name),
-            }
-            for name in PROTOCOLS
+            {"if": plain, "then": {"required": ["protocol"]}},
+            *(
+                {
+                    "if": {"properties": {"protocol": {"const": name}}, "required": ["protocol"]}
+                    | plain,
+                    "then": _ref(name),
+                }
+                for name in PROTOCOLS
+            ),
         ],
     }
+    root["properties"]["templates"]["additionalProperties"] = _ref("Template")
     root["properties"]["lines"] |= _by_name("Line") | {"minProperties": 1}
     root["properties"]["defaults"] = _defaults("file")
     line = shared["Line"]["properties"]
-    line["devices"] |= _by_name("Device") | {"minProperties": 1}
+    line["devices"] |= _by_name("Device", _DEVICE_NAMES) | {"minProperties": 1}
     line["defaults"] = _defaults("line")
     for part in (root, *shared.values()):
         for setting in part.get("properties", {}).values():

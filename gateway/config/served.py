@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path as FilePath
 from typing import Any
 
 from gateway.config import parsers
@@ -131,6 +132,12 @@ class ServedDevice:
         own = self._own(tag.name)
         place = ("tags", tag.name)
         source, retain = own.get("source"), own.get("retain") is True
+        if tag.kept is not None:
+            for setting in ("debounce", "counter"):
+                if setting in own:
+                    text = f"{setting} is for values that the gateway reads: remove it here"
+                    self._note((*place, setting), text)
+            tag = replace(tag, kept=None, inputs=(), shaping=tag.inputs[0].shaping)
         hold_last = own.get("hold_last", self.defaults.hold_last) is True
         inside = [served.takes(*cell) for cell in cells_of(tag.span)]
         accepted = any(inside)
@@ -165,17 +172,21 @@ class ServedDevice:
         return {}
 
     def _check_overlaps(self, rows: Sequence[Row]) -> None:
-        """Two tags may show one word only where both are bits of it, or where a master writes."""
+        """Two tags may show one word only as different parts of it, or where a master writes."""
         known: dict[tuple[str, int], list[Row]] = {}
         for row in rows:
             for cell in cells_of(row.tag.span):
                 others = known.setdefault(cell, [])
                 for other in others:
-                    bits = {row.tag.address.bit, other.tag.address.bit}
-                    if not row.accepted and (None in bits or len(bits) == 1):
+                    if not row.accepted and _bits(row.tag) & _bits(other.tag):
                         text = f"{other.tag.name} of this device is at {row.tag.text} already"
                         self._note(("tags", row.tag.name, "address"), text)
                 others.append(row)
+
+
+def _bits(tag: Tag) -> int:
+    """Returns the bits of each word that a tag has."""
+    return 0xFFFF_FFFF if tag.part is None else tag.part.mask << tag.part.shift
 
 
 def _role_problems(
@@ -260,9 +271,19 @@ def _sort(tag: Tag) -> str:
     return "number" if kind.is_number else "bit" if kind.kind is Kind.BOOL else "text"
 
 
-def retained(lines: Sequence[LineConfig]) -> Iterator[Path]:
-    """Yields the places of the tags with `retain: true`."""
-    return (path for path, row in _rows(lines) if row.retain)
+def check_retained(
+    lines: Sequence[LineConfig], state_file: FilePath | None, standby: str | None, to: Mistakes
+) -> None:
+    """Notes tags with `retain` in a gateway that cannot keep their values."""
+    if state_file is None:
+        why = "the gateway has no file for it: write `gateway: {state: state.json}`"
+    elif standby is not None:
+        why = "a standby would answer with the values of its own file, which are old"
+    else:
+        return
+    for path, row in _rows(lines):
+        if row.retain:
+            to.add((*path, "retain"), why)
 
 
 def _rows(lines: Sequence[LineConfig]) -> Iterator[tuple[Path, Row]]:

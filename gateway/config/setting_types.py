@@ -92,4 +92,10 @@ FilePath = Annotated[Path, PlainValidator(parsers.path), WithJsonSchema({"type":
 OrderName = Annotated[Order, PlainValidator(parsers.order), WithJsonSchema(_ORDER_SCHEMA)]
 Endpoint = Annotated[str, PlainValidator(parsers.endpoint), WithJsonSchema(_ENDPOINT_SCHEMA)]
 Endpoints = Annotated[list[Endpoint], AfterValidator(parsers.once)]
+Distance = Annotated[
+    float,
+    WrapValidator(parsers.every_digit),
+    AfterValidator(parsers.not_negative),
+    WithJsonSchema({"type": "number", "minimum": 0}),
+]
 Finite = Annotated[float, Field(allow_inf_nan=False), WrapValidator(parsers.every_digit)]

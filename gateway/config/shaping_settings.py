@@ -2,9 +2,19 @@
 
 from typing import Annotated, Any, Self
 
-from pydantic import BaseModel, ConfigDict, Field, PlainValidator, WithJsonSchema, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    Field,
+    PlainValidator,
+    Tag,
+    WithJsonSchema,
+    model_validator,
+)
 
 from gateway.config import shaping_parsers as parsers
+from gateway.config.setting_types import Duration
 from gateway.tags.shaping import Bounds, Names
 from gateway.values import Byte
 
@@ -38,6 +48,29 @@ Decimals = Annotated[int, Field(ge=0, le=15)] | None
 Clamp = Annotated[Bounds | None, PlainValidator(parsers.clamp), WithJsonSchema(_CLAMP_SCHEMA)]
 
 
+class CounterSection(BaseModel):
+    """A counter of the device that begins again at 0; left out: as wide as its type."""
+
+    model_config = CONFIG | ConfigDict(extra="forbid", frozen=True, strict=True)
+
+    bits: Annotated[int, Field(ge=1, le=64)] | None = None
+    """The width of the counter."""
+    top: Annotated[int, Field(ge=1, le=2**63 - 1)] | None = None
+    """The greatest count, such as 9999; instead of `bits`."""
+    most: Annotated[int, Field(ge=1, le=2**63 - 1)] | None = None
+    """The greatest step from one read to the next; more is no count. Left out: half the range."""
+
+
+def _counter_shape(value: object) -> str:
+    return "rule" if isinstance(value, (dict, CounterSection)) else "flag"
+
+
+Counter = Annotated[
+    Annotated[bool, Tag("flag")] | Annotated[CounterSection, Tag("rule")],
+    Discriminator(_counter_shape),
+]
+
+
 class ShapingDefaults(BaseModel):
     """Settings that shape a number: for a whole file, line or device, or for one tag."""
 
@@ -51,6 +84,9 @@ class ShapingDefaults(BaseModel):
     """A read is rounded to so many decimals, and so is a write."""
     clamp: Clamp = None
     """A read outside is shown as the nearest end, such as [0, 100] or [0, null]."""
+
+    debounce: Duration = 0.0
+    """A bit changes after it had the new value for this time; 0s: at once."""
 
     @model_validator(mode="after")
     def _both_ends(self) -> Self:
@@ -81,5 +117,7 @@ class ShapingSettings(BaseModel):
         dict[int, Any] | None, PlainValidator(parsers.bits), WithJsonSchema(_BITS_SCHEMA)
     ] = None
     """One tag for each named bit of the word, instead of the word: {0: pump, 3: fault}."""
+    counter: Counter = False
+    """The total of a counter that begins again at 0."""
     computed: str | None = None
     """Instead of an address: arithmetic with the names of tags, such as flow_a + flow_b."""

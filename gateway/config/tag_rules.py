@@ -3,6 +3,8 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from gateway.config.alarm_rules import alarm_misfits, alarm_rule
+from gateway.config.kept_rules import kept_tag
 from gateway.config.messages import Mistakes, Path
 from gateway.config.model import ComputedSection, TagDefaults, TagSection, WriteSection
 from gateway.config.shaping_rules import shaping_of
@@ -72,7 +74,7 @@ def build_tag(source: TagSource, driver: AnyDriver, mistakes: Mistakes) -> Tag |
     layout = _layout(source, settings, driver, area, kind)
     tag = assemble(source, settings, address, span, area.unit, layout, write, mistakes)
     check_bounds(source, tag, mistakes)
-    return tag
+    return kept_tag(source.own, settings, tag, source.path, mistakes)
 
 
 def address_of(source: TagSource, driver: AnyDriver, mistakes: Mistakes) -> Address | None:
@@ -119,6 +121,7 @@ def assemble(
         history=settings.history,
         payload=settings.payload,
         write=write,
+        alarm=alarm_rule(source.own.alarm, settings.description),
         shaping=shaping,
         names=names,
     )
@@ -199,6 +202,8 @@ def _misfits(
         yield "write", f"{first} is never read at station {driver.station}: it needs write: true"
     if not area.readable and (address.bit is not None or kind.kind in BYTES):
         yield "address", f"{first} is never read at station {driver.station}: write the whole word"
+    if not area.readable and source.own.alarm is not None:
+        yield "alarm", f"{first} is never read at station {driver.station}: it can have no alarm"
     if not area.readable and write is not None and write.verify:
         yield "write", f"{first} is never read at station {driver.station}: verify cannot work"
     yield from _unsuited(source, area, first, kind)
@@ -228,6 +233,8 @@ def only_for_numbers(source: TagSource, kind: ValueType) -> Iterator[tuple[str, 
     if not kind.is_number:
         for setting in filter(source.sets, ("scale", "offset", "deadband")):
             yield setting, f"a {kind} has no {setting}: only numbers have"
+    if source.own.alarm is not None:
+        yield from alarm_misfits(source.own.alarm, kind)
 
 
 def _write(

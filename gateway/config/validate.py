@@ -117,6 +117,10 @@ def _inner(annotation: Any) -> type[Section] | None:
     return next(filter(None, map(_inner, get_args(annotation))), None)
 
 
+_FLAGS = {
+    "write": "true, false or {min: 0, max: 100, verify: true}",
+    "counter": "true, or {bits: 16, most: 1000}",
+}
 _NOT = {
     "bool_type": "is neither true nor false",
     "int_type": "is no whole number",
@@ -144,7 +148,7 @@ def _sentence(detail: ErrorDetails, called: str, known: Collection[str]) -> str:
         case "value_error":
             return str(context["error"])
         case "bool_type" if "flag" in detail["loc"]:
-            return f"{value}: write true, false or {{min: 0, max: 100, verify: true}}"
+            return f"{value}: write {_FLAGS[str(detail['loc'][-2])]}"
         case "literal_error" | "enum":
             choices = str(context["expected"]).replace("'", "")
             return f"{value} is not known: use {choices}"

@@ -44,13 +44,15 @@ class DeviceSettings:
     verify_reads: int = 1  # reads in a row that must agree
     blocks: bool | Literal["only"] = False  # one put per scan: also, or instead of one per tag
     control: bool = False  # run, stop, ... are allowed
+    listen_only: bool = False  # another master asks it; nothing is ever sent
     enabled: bool = True
     tags: tuple[Tag, ...] = ()
     served: Served | None = None  # it is a station of the gateway, for a master on its line
     wire_tags: tuple[Tag, ...] = field(init=False, repr=False)  # those with an address
 
     def __post_init__(self) -> None:
-        found = tuple(tag for tag in self.tags if tag.formula is None)
+        tags = [tag for tag in self.tags if tag.formula is None]
+        found = tuple(tag if tag.kept is None else tag.inputs[0] for tag in tags)
         object.__setattr__(self, "wire_tags", found)
 
     @property
@@ -58,7 +60,7 @@ class DeviceSettings:
         """False for a device that is only written to, or only sends unsolicited frames."""
         areas = self.driver.areas
         used = [areas[tag.span.area] for tag in self.wire_tags] or areas.values()
-        return any(area.readable for area in used)
+        return any(area.readable for area in used) and not self.listen_only
 
 
 @dataclass(slots=True, eq=False)
@@ -205,6 +207,9 @@ class Device:
     def plan(self) -> None:
         """Plans the blocks that read the tags, without the bad addresses."""
         bad = self.bad_addresses
+        if self.settings.listen_only:
+            self.poll_nothing()
+            return
         blocks = plan(self.tags, self.driver, self.transactions, bad.cuts)
         if self.monitor.allowed:
             blocks = with_monitor_list(blocks, self.driver, self.seconds, bad.bad.keys())

@@ -26,6 +26,7 @@ from gateway.engine.jobs import (
     WriteTogether,
     resync_around,
 )
+from gateway.engine.listening import ONLY_LISTENS, Listening, listens
 from gateway.engine.poll_results import PollResults
 from gateway.engine.records import LineRecord
 from gateway.engine.request_results import RequestResults
@@ -65,7 +66,11 @@ class Engine:
         self._staleness = Staleness(self.schedule, self._effects)
         results = Results(name, self.schedule, self._staleness, self._effects)
         self._polls = PollResults(self.schedule, results, self._effects)
-        self._unsolicited = UnsolicitedFrames(devices, results, self._effects)
+        self._unsolicited: UnsolicitedFrames | Listening
+        if listens(devices):
+            self._unsolicited = Listening(devices, wire, results, self._effects)
+        else:
+            self._unsolicited = UnsolicitedFrames(devices, results, self._effects)
         self._stray = Stray(name, devices, results, self._effects)
         self._in_flight = InFlight()
         gap = max(GAP, 4 * wire.character)
@@ -199,6 +204,9 @@ class Engine:
     def submit(self, request: Request, now: float) -> list[Effect]:
         """Queues the request, to be sent after the current transaction, or refuses it."""
         queue, device = self.schedule.requests, request.device
+        if device.settings.listen_only:
+            self._effects.ended(request, BadValue(ONLY_LISTENS.format(line=self.name)))
+            return self._effects.take()
         if isinstance(request, Write):
             for older in queue.superseded(request):
                 self._effects.ended(older, Busy("a newer value took its place; not sent"))
@@ -226,9 +234,12 @@ class Engine:
 
     def received(self, data: bytes, now: float, time: int) -> list[Effect]:
         """Takes bytes that arrived outside of a transaction."""
-        self.record.unasked += len(data)
-        self._conclusions.shorter.disturbed(now)
-        self._stray.received(data, now, time)
+        if isinstance(self._unsolicited, Listening):
+            self.record.busy += len(data) * self.wire.character  # of another master
+        else:
+            self.record.unasked += len(data)
+            self._conclusions.shorter.disturbed(now)
+            self._stray.received(data, now, time)
         if self._unsolicited.speakers:
             self._conclusions.silence.heard()
         self._unsolicited.received(data, now, time)

@@ -63,7 +63,8 @@ def forecast(name: str, devices: Sequence[Device], wire: WireTiming) -> LineFore
     blocks = polled_blocks(devices)
     load = load_of(blocks) + sum(map(_marks, devices))
     longest = max((one.longest for one in blocks), default=0.0)
-    write = max((_longest_write(device) for device in devices), default=0.0)
+    written = [device for device in devices if not device.settings.listen_only]
+    write = max((_longest_write(device) for device in written), default=0.0)
     silence = max((device.longest_reply for device in devices), default=0.0)
     cycle = sum(one.seconds for one in blocks)
     requests = sum(1 / one.block.every for one in blocks)

@@ -50,8 +50,10 @@ class _Sender:
 
 
 def unsolicited_tags(device: Device) -> list[Tag]:
-    """Returns the tags whose values arrive only unsolicited."""
+    """Returns the tags whose values arrive without a request."""
     driver = device.driver
+    if device.settings.listen_only:
+        return [*device.tags]
     if not isinstance(driver, Unsolicited):
         return []
     return [tag for tag in device.tags if driver.unsolicited_only(tag.span)]

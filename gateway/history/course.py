@@ -6,6 +6,7 @@ the value before it is valid until the last sample of any tag that was recorded 
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from heapq import merge
 from itertools import chain
 from operator import itemgetter
@@ -60,7 +61,7 @@ class Course:
         file, runs, newest = self._recent.find(tag.key)
         stored = StoredRuns(self._reader, self._damage, file, period)
         numbers = stored.numbers({tag.key: tag}, runs)
-        look = _Look(self._reader, self._damage, file, runs, newest, numbers, period)
+        look = _Look(self._recent, self._reader, self._damage, file, runs, newest, numbers, period)
         begin = look.before()
         parts = list[_Part]()  # in the order of recording
         for run in stored.of(runs) if numbers or stored.damaged else ():
@@ -70,22 +71,20 @@ class Course:
             elif begin[0] <= last < period.first:
                 begin = begin[0], None, DAMAGED
         parts += [_in_memory(samples) for run in newest if (samples := _steps_of(run, period))]
-        steps = _with_gaps(begin, _merged(parts), look, now, min(self._recent.latest, now.time))
+        steps = _with_gaps(begin, _merged(parts), look, now)
         yield from buckets(steps, width, period, now.time, self._most)
         if (lost := stored.lost()) is not None:
             raise lost
 
 
-def _with_gaps(
-    begin: Step, steps: Iterator[Step], look: "_Look", now: Now, latest: int
-) -> Iterator[Step]:
-    """Adds the time without a gateway. `latest`: the time of the last sample of any tag."""
+def _with_gaps(begin: Step, steps: Iterator[Step], look: "_Look", now: Now) -> Iterator[Step]:
+    """Adds the time without a gateway."""
     last, value, _ = begin
     if last > EARLIEST:
         yield begin
     for found in steps:
         if found[2] == Reason.STARTING and value is not None:
-            yield _gap(last, found[0], look.runs)
+            yield look.gap(last, found[0])
         yield found
         last, value, _ = found
     if value is None:
@@ -93,14 +92,15 @@ def _with_gaps(
     follows = None if look.period.last >= now.time else look.after()
     if follows is not None:
         if follows[2] in (Reason.STARTING, DAMAGED):
-            yield _gap(last, follows[0], look.runs)
+            yield look.gap(last, follows[0])
     elif not now.is_valid:
-        yield _gap(max(last, latest), now.time, look.runs)
+        yield look.gap(last, now.time)
 
 
 class _Look(NamedTuple):
     """Finds the neighbours of a period: the samples of the tag before it and after it."""
 
+    recent: Recent
     reader: Reader
     damage: Damage
     file: Identity | None
@@ -108,6 +108,17 @@ class _Look(NamedTuple):
     newest: Sequence[Sequence[Sample]]
     numbers: dict[int, Tag]
     period: TimeRange
+
+    def gap(self, last: int, before: int) -> Step:
+        """Returns the gap after the last sample of any tag. `last`: the last one of this tag."""
+        times = [last, self.recent.latest_before(before)]
+        for run in self.runs:
+            if run.last < before:
+                times.append(run.last)
+            elif run.first < before:  # a changed file was loaded while the gateway ran
+                with suppress(Damaged):
+                    times.append(self.reader.latest_before(self.file, run, before) or last)
+        return max(times), None, NOT_RECORDED
 
     def before(self) -> Step:
         """Returns the last step before the period; `EARLIEST` if there is none."""
@@ -223,12 +234,6 @@ def _merged(parts: Sequence[_Part]) -> Iterator[Step]:
             place += 1
         steps = [chain.from_iterable(part.steps()) for _, part in sorted(together, key=_TIME)]
         yield from merge(*steps, key=_TIME) if len(steps) > 1 else steps[0]
-
-
-def _gap(last: int, before: int, runs: Sequence[SortedRun]) -> Step:
-    """Returns the gap after the last sample of any tag before this time."""
-    recorded = max((run.last for run in runs if run.last < before), default=last)
-    return max(last, recorded), None, NOT_RECORDED
 
 
 def _is_in(period: TimeRange, time: int) -> bool:

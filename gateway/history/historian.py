@@ -48,7 +48,9 @@ class Historian:
         longest = max(256, min(LONGEST_RUN, max_size // 1024))
         self._wall = wall
         self._recent = Recent(longest, min(OLDEST_RUN, keep / 20))
-        self._written, self._refused = rings = Outcomes(Ring.WRITTEN), Outcomes(Ring.REFUSED)
+        self._written, self._refused = Outcomes(Ring.WRITTEN), Outcomes(Ring.REFUSED)
+        self._alarms = Outcomes(Ring.ALARMS)
+        rings = self._written, self._refused, self._alarms
         self._reader = Reader(path)
         self._search = Search(self._recent, self._reader)
         self._course = Course(self._recent, self._reader, self._search.damage)
@@ -81,6 +83,10 @@ class Historian:
         by the gateway, and nothing was sent."""
         (self._refused if refused else self._written).add(time, outcome)
 
+    def record_alarm(self, time: int, change: str) -> None:
+        """Records one change of an alarm, as JSON; `time`: ns since 1970."""
+        self._alarms.add(time, change)
+
     def document(self) -> Mapping[str, object]:
         """The status document: `state` is `ok` or one sentence; counts since the start."""
         recent = self._recent
@@ -99,6 +105,8 @@ class Historian:
             "writes_lost": self._written.lost,
             "refusals_stored": self._refused.stored,
             "refusals_lost": self._refused.lost,
+            "alarms_stored": self._alarms.stored,
+            "alarms_lost": self._alarms.lost,
             "bytes": self._retention.size,
             "oldest": None if oldest is None else rfc3339(oldest),
         }
@@ -152,7 +160,14 @@ class Historian:
         """Yields outcomes of writes as on the `writes` key (JSON), in the order of time. Raises
         like `samples`."""
         period = self._range(time_range, limit, now)
-        return islice(self._writes(period), limit)
+        return islice(self._outcomes((self._written, self._refused), period), limit)
+
+    def alarms(
+        self, time_range: str, limit: int | None = None, now: int | None = None
+    ) -> Iterator[str]:
+        """Yields changes of alarms (JSON), in the order of time. Raises like `samples`."""
+        period = self._range(time_range, limit, now)
+        return islice(self._outcomes((self._alarms,), period), limit)
 
     def _range(self, text: str, limit: int | None, now: int | None) -> TimeRange:
         if limit is not None and not 1 <= limit <= HIGHEST_LIMIT:
@@ -162,9 +177,9 @@ class Historian:
             raise Busy(f"history cannot be read: {self._writer.trouble}")
         return period
 
-    def _writes(self, period: TimeRange) -> Iterator[str]:
+    def _outcomes(self, rings: Iterable[Outcomes], period: TimeRange) -> Iterator[str]:
         found = list[Iterable[Outcome]]()
-        for outcomes in (self._written, self._refused):
+        for outcomes in rings:
             pending = outcomes.pending(period)
             stored = self._reader.writes(outcomes.ring, pending.file, pending.last, period)
             found += (stored, pending.outcomes)

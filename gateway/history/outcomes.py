@@ -1,4 +1,4 @@
-"""Outcomes of writes that wait for the disk, where queries already find them.
+"""Outcomes of writes, and changes of alarms, that wait for the disk; queries already find them.
 
 Refusals of the gateway itself come as fast as a client can send. They have a ring of their own, so
 that they push out no write that a device may have executed.
@@ -20,6 +20,7 @@ class Ring(StrEnum):
 
     WRITTEN = "written"  # a device executed it, or may have
     REFUSED = "refused"  # nothing was sent
+    ALARMS = "alarms"  # a change of an alarm
 
 
 class Outcome(NamedTuple):

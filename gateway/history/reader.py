@@ -122,6 +122,12 @@ class Reader:
         with self._connection(file) as database:
             return sections.neighbour(database, last_run, tag, time, later=later)
 
+    def latest_before(self, file: Identity | None, run: SortedRun, time: int) -> int | None:
+        """Returns the time of the last sample of any tag in a run before `time`. Raises
+        `Damaged`."""
+        with self._connection(file) as database:
+            return sections.latest_before(database, run.number, time)
+
     def writes(
         self, ring: Ring, file: Identity | None, last: int, period: TimeRange
     ) -> Iterator[Outcome]:

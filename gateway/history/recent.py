@@ -136,6 +136,16 @@ class Recent:
                 [(run.number, run.samples, len(run.samples)) for run in self._runs],
             )
 
+    def latest_before(self, time: int) -> int:
+        """Returns the time of the newest sample in memory before `time`, of any tag; 0: none."""
+        with self._lock:
+            if self.latest < time:
+                return self.latest
+            for run in reversed(self._runs):
+                if run.samples and run.samples[0].time < time:
+                    return next(s.time for s in reversed(run.samples) if s.time < time)
+        return 0
+
     @property
     def waiting(self) -> int:
         """Samples that are not on disk yet."""

@@ -7,7 +7,7 @@ from gateway.history.file import HistoryFile
 from gateway.history.outcomes import Ring
 from gateway.history.recent import Recent, SortedRun
 
-_ROOM_OF_OUTCOME = 1024  # bytes in the file; outcomes take at most a tenth of it
+_ROOM_OF_OUTCOME = 1024  # bytes in the file; of writes and alarms a tenth each
 # Runs that may expire between two checks. Few, because the wall clock may be wrong for a while.
 _MOST_EXPIRED = 2
 
@@ -28,7 +28,7 @@ class Retention:
     def most_outcomes(self, ring: Ring) -> int:
         """Outcomes of writes that the file keeps."""
         most = self._max_size // 10 // _ROOM_OF_OUTCOME
-        return max(100, most if ring is Ring.WRITTEN else most // 10)
+        return max(100, most // 10 if ring is Ring.REFUSED else most)
 
     def run_was_sorted(self) -> None:
         """Checks the age of the runs at the next call of `make_room`."""

@@ -31,11 +31,12 @@ CREATE VIEW history AS
     FROM recent JOIN tag ON tag.id = recent.tag;
 """
 
-# Older files have none.
-_REFUSED = """
+# Older files lack them.
+_LATER = ("refused", "alarms")
+_OUTCOMES = """
 BEGIN IMMEDIATE;
-CREATE TABLE IF NOT EXISTS refused (id INTEGER PRIMARY KEY, time INTEGER, outcome TEXT);
-CREATE INDEX IF NOT EXISTS refused_time ON refused (time);
+CREATE TABLE IF NOT EXISTS {0} (id INTEGER PRIMARY KEY, time INTEGER, outcome TEXT);
+CREATE INDEX IF NOT EXISTS {0}_time ON {0} (time);
 COMMIT;
 """
 
@@ -70,5 +71,7 @@ def prepare(database: sqlite3.Connection, path: Path) -> None:
         database.executescript(f"BEGIN IMMEDIATE; {_MARK} COMMIT;")  # older files had none
     database.execute(sections.TABLE)
     sections.adopt_tags(database)
-    if not database.execute("SELECT 1 FROM sqlite_schema WHERE name = 'refused'").fetchall():
-        database.executescript(_REFUSED)
+    for table in _LATER:
+        there = database.execute("SELECT 1 FROM sqlite_schema WHERE name = ?", (table,))
+        if not there.fetchall():
+            database.executescript(_OUTCOMES.format(table))

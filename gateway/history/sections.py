@@ -171,6 +171,17 @@ def neighbour(
     return (int(found[0][0]), int(found[0][1])) if found else None
 
 
+def latest_before(database: sqlite3.Connection, run: int, time: int) -> int | None:
+    """Returns the time of the last sample of any tag in a run before `time`. Raises `Damaged`."""
+    try:
+        [(found,)] = database.execute(
+            "SELECT max(time) FROM sample WHERE run = ? AND time < ?", (run, time)
+        )
+    except _ERRORS as error:
+        raise _damaged(error) from error
+    return found if isinstance(found, int) else None
+
+
 def write_tag(database: sqlite3.Connection, number: int, key: str) -> None:
     """Writes the checksum of a tag's name."""
     database.execute(

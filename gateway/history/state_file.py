@@ -2,137 +2,73 @@
 
 It holds the addresses that each device refuses and the places where its requests must be split, so
 that the search for them is made once and not after every start. Without the file, or with a
-damaged one, the search is made again.
+damaged one, the search is made again. It also holds the totals of counters, which then begin again.
 """
 
-import os
-import threading
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from queue import SimpleQueue
 from typing import Any
 
 import orjson
-import structlog
 
 from gateway.engine.device import Device
+from gateway.history.saved_file import SavedFile
 from gateway.planning.bad_addresses import KnownBad
 from gateway.protocols.driver import Span
+from gateway.tags.kept import CounterState
 
-log = structlog.get_logger("gateway")
 FORMAT = 1
 LATEST = 2**63 - 1  # ns since 1970: the year 2262
+_Content = tuple[Mapping[str, KnownBad], Mapping[str, CounterState]]
 
 
 class StateFile:
-    """One file, and a thread that writes it, so that a stalled disk delays nothing else."""
+    """One file with what was learned of the devices."""
 
     def __init__(self, path: Path) -> None:
-        self._path = path
-        self._saved: bytes | None = None
-        self._trouble: str | None = None
-        self._queue: SimpleQueue[bytes | None] = SimpleQueue()  # None ends the thread
-        self._thread = threading.Thread(target=self._save_all, name="state", daemon=True)
-
-    # -- any thread --
+        self.counters: Mapping[str, CounterState] = {}  # by tag, as `restore` has read them
+        self._file = SavedFile(path)
+        self.start, self.close = self._file.start, self._file.close
+        self.save, self.save_soon = self._file.save, self._file.save_soon
+        self.save_last = self._file.save_last
 
     def restore(self, devices: Iterable[Device]) -> None:
         """Restores what the file knows of the devices, and plans again those that have a plan.
 
         Moves a file aside that cannot be parsed.
         """
-        learned_by_name = self._load()
+        learned_by_name, self.counters = self._file.load(_parse) or ({}, {})
         for device in devices:
             if (learned := learned_by_name.get(device.name)) is not None:
                 device.bad_addresses.restore(learned, device.tags)
                 if device.blocks:
                     device.plan()
 
-    def snapshot(self, devices: Iterable[Device]) -> bytes:
+    def snapshot(
+        self, devices: Iterable[Device], counters: Mapping[str, CounterState] | None = None
+    ) -> bytes:
         """Returns the content of the file for the present state of the devices."""
         return orjson.dumps(
             {
                 "form": FORMAT,
                 "devices": {d.name: _to_json(d.bad_addresses.known()) for d in devices},
+                "counters": {
+                    key: list(state) for key, state in {**self.counters, **(counters or {})}.items()
+                },
             },
             option=orjson.OPT_INDENT_2 | orjson.OPT_SORT_KEYS,
         )
 
-    def start(self) -> None:
-        """Starts the thread that saves."""
-        self._thread.start()
 
-    def save_soon(self, snapshot: bytes) -> None:
-        """Never waits. Ignored while another snapshot waits: a later one holds everything."""
-        if self._queue.empty():
-            self._queue.put(snapshot)
-
-    def save_last(self, snapshot: bytes) -> None:
-        """Never waits: `close` waits for this snapshot."""
-        self._queue.put(snapshot)
-        self._queue.put(None)
-
-    def close(self, within: float) -> bool:
-        """Blocks for at most `within` seconds; True if the thread has ended."""
-        if self._thread.ident is None:  # never started
-            return True
-        self._thread.join(max(0.0, within))
-        return not self._thread.is_alive()
-
-    # -- its own thread --
-
-    def _save_all(self) -> None:
-        while (snapshot := self._queue.get()) is not None:
-            self.save(snapshot)
-
-    def save(self, snapshot: bytes) -> None:
-        """Replaces the file, completely or not at all. Logs each kind of trouble once."""
-        if snapshot == self._saved:
-            return
-        temporary = self._path.with_name(self._path.name + ".new")
-        try:
-            with temporary.open("wb") as file:
-                file.write(snapshot)
-                file.flush()
-                os.fsync(file.fileno())
-            temporary.replace(self._path)
-        except OSError as error:
-            if self._trouble != str(error):
-                self._trouble = str(error)
-                log.warning("state file not saved", file=str(self._path), why=str(error))
-            return
-        self._saved, self._trouble = snapshot, None
-
-    # -- loading --
-
-    def _load(self) -> Mapping[str, KnownBad]:
-        try:
-            data = self._path.read_bytes()
-        except FileNotFoundError:
-            return {}
-        except OSError as error:
-            log.warning("state file not read", file=str(self._path), why=str(error))
-            return {}
-        try:
-            return _parse(orjson.loads(data))
-        except (ValueError, TypeError, KeyError, AttributeError) as error:
-            self._move_aside(repr(error))
-            return {}
-
-    def _move_aside(self, why: str) -> None:
-        aside = self._path.with_name(self._path.name + ".bad")
-        try:
-            self._path.replace(aside)
-        except OSError as error:
-            log.warning("state file damaged", file=str(self._path), why=why, not_moved=str(error))
-        else:
-            log.warning("state file damaged", file=str(self._path), why=why, moved_to=str(aside))
-
-
-def _parse(document: Mapping[str, Any]) -> dict[str, KnownBad]:
+def _parse(document: Any) -> _Content:
     if document["form"] != FORMAT:
         raise ValueError(f"form {document['form']} is not {FORMAT}")
-    return {name: _from_json(entry) for name, entry in document["devices"].items()}
+    devices = {name: _from_json(entry) for name, entry in document["devices"].items()}
+    counters = {
+        str(key): CounterState(int(last), int(total))
+        for key, (last, total) in document.get("counters", {}).items()
+    }
+    return devices, counters
 
 
 def _to_json(learned: KnownBad) -> dict[str, object]:

@@ -2,7 +2,7 @@
 
 import asyncio
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import structlog
 
@@ -30,6 +30,8 @@ class ArrivalClock:
         self._behind = 0.0  # seconds, until that time
         self._released = -NEVER
         self._timer: asyncio.TimerHandle | None = None
+        self._jumps = 0
+        self._jump = (0.0, 0.0)  # the last one, and when, in seconds of the monotonic clock
         self._now: Callable[[], float] = lambda: 0.0
 
     def start(self) -> None:
@@ -49,6 +51,12 @@ class ArrivalClock:
         """Returns ns since 1970."""
         behind = max(self._behind, self._now() - self._due)
         return self._wall() - int(behind * 1e9)
+
+    def document(self) -> Mapping[str, object]:
+        """The status document: jumps of the wall clock since the start."""
+        jump, at = self._jump
+        ago = round(time.monotonic() - at, 1) if self._jumps else None
+        return {"jumps": self._jumps, "last": round(jump, 1) if self._jumps else None, "ago": ago}
 
     def released(self) -> float:
         """Returns the time of the loop when it turned again after its process was held."""
@@ -74,5 +82,6 @@ class ArrivalClock:
         ahead = self._wall() - time.monotonic_ns()
         jump = (ahead - self._ahead) / 1e9
         if abs(jump) >= JUMP:
+            self._jumps, self._jump = self._jumps + 1, (jump, time.monotonic())
             log.warning("clock jumped", seconds=round(jump, 1), so="time stamps jump too")
         self._ahead = ahead

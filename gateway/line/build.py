@@ -13,6 +13,7 @@ from gateway.simulator.plant import animate, station_for
 from gateway.simulator.port import open_simulator
 from gateway.stations.station import Station
 from gateway.transport import Port, Receiver, SimulatorAddress, open_port
+from gateway.transport.listen_only import ListenOnlyPort
 
 OpenPort = Callable[[Receiver], Awaitable[Port]]
 
@@ -58,6 +59,15 @@ def opener(line: LineConfig) -> OpenPort:
     return lambda receiver: open_port(line.port, line.serial, receiver)
 
 
+def _without_writing(opens: OpenPort) -> OpenPort:
+    """Returns an opener whose ports can write nothing. The rule of listen-only lines is here."""
+
+    async def listening(receiver: Receiver) -> Port:
+        return ListenOnlyPort(await opens(receiver))
+
+    return listening
+
+
 def line_of(
     config: LineConfig,
     devices: Sequence[DeviceSettings],
@@ -76,4 +86,6 @@ def line_of(
     made = [Device(one, config.wire, plan_now=plan_now) for one in devices]
     engine = Engine(config.name, made, config.wire, seed)
     opens = open_port or opener(config)
+    if config.listen_only:
+        opens = _without_writing(opens)
     return Line(engine, opens, sink, echo=config.echo, wall=wall, seed=seed, duty=duty)

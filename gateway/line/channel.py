@@ -162,7 +162,8 @@ class Channel:
         echo.opened()
         self.loop = asyncio.get_running_loop()
         self.now = self.loop.time
-        self.quiet_since = 0.0  # the last time when the wire was busy
+        # The last time when the wire was busy; a reply to the connection before may just end.
+        self.quiet_since = self.now()
         self.alarm = Alarm()  # for the time-outs of its transactions
         self.lost_by: LineDown | None = None
         self.guarded: float | None = None  # the next frame is a write of this time

@@ -18,7 +18,7 @@ from gateway.engine.changes import Changes
 from gateway.engine.device import Device, DeviceSettings
 from gateway.engine.effects import Effect, LogEvent, OnlineChange, Pause, RequestEnded, Samples
 from gateway.engine.engine import Engine
-from gateway.engine.jobs import Idle, Poll, Reopen, Result, Settle, Traffic, Transacted
+from gateway.engine.jobs import Idle, Poll, Reopen, Settle, Traffic
 from gateway.engine.requests import WRITE_EXPIRY, Command, Outcome, Request, Write
 from gateway.errors import GatewayError, LineDown
 from gateway.line.changing import Changeable, WaitingChange
@@ -40,10 +40,6 @@ class SampleSink(Protocol):
     def samples(self, samples: Sequence[Sample]) -> None: ...
 
     def online(self, device: Device, online: bool) -> None: ...
-
-
-# Called after each job with its result, and the times of its begin and end by the line's clock.
-Watcher = Callable[[Transacted, Result, float, float], None]
 
 
 @dataclass(slots=True)
@@ -72,7 +68,8 @@ class Line:
         self.engine = engine
         self._open_port = open_port
         self._sink = sink
-        self._new_channel = _channels(engine, echo, duty or Duty())
+        self.wire_log = WireLog()
+        self._new_channel = _channels(engine, echo, duty or Duty(), self.wire_log)
         self._wall = wall
         self._random = random.Random(seed)  # noqa: S311  (jitter, not a secret)
         self._channel: Channel | None = None
@@ -82,7 +79,6 @@ class Line:
         self._wake = asyncio.Event()
         self._expiry = _Expiry()
         self._waiting: WaitingChange | None = None
-        self.watcher: Watcher | None = None
         self.tried = asyncio.Event()  # set once the port was opened, or could not be
 
     # Clients
@@ -154,7 +150,12 @@ class Line:
         if channel.echo.strip:
             data = channel.echo.without_rest(data)
         if data:
-            self._deliver(self.engine.received(data, now, self._wall()))
+            effects = self.engine.received(data, now, self._wall())
+            if self.wire_log.active:
+                for effect in effects:
+                    if isinstance(effect, Samples):
+                        self.wire_log.learned(effect.samples)
+            self._deliver(effects)
             self._wake.set()
 
     def lost(self, error: Exception) -> None:
@@ -239,8 +240,8 @@ class Line:
                     await self._perform_together((job, *engine.alongside(job, begun)), channel)
                     continue
             result = await perform(job, transaction)
-            if self.watcher is not None:
-                self.watcher(job, result, begun, now())
+            if self.wire_log.active:
+                self.wire_log.performed(job, result, begun, now())
             traffic = transaction.traffic
             self._deliver(engine.conclude(job, result, traffic, now(), self._wall()))
         raise self._lost
@@ -255,8 +256,8 @@ class Line:
             nonlocal left
             begun = channel.now()
             result = await perform(poll, transaction)
-            if self.watcher is not None:
-                self.watcher(poll, result, begun, channel.now())
+            if self.wire_log.active:
+                self.wire_log.performed(poll, result, begun, channel.now())
             left -= 1
             traffic = Traffic()
             if not left:
@@ -309,12 +310,12 @@ class Line:
         return self.engine.deadline
 
 
-def _channels(engine: Engine, echo: bool | None, duty: Duty) -> Callable[[Port], Channel]:
+def _channels(
+    engine: Engine, echo: bool | None, duty: Duty, wire_log: WireLog
+) -> Callable[[Port], Channel]:
     """Returns a function that makes the channel of an open port."""
     known = Echo(engine.name, echo)  # what is learned of the adapter stays
-    return lambda port: Channel(
-        port, engine.wire, WireLog(engine.name), known, may_not_send=duty.why_not
-    )
+    return lambda port: Channel(port, engine.wire, wire_log, known, may_not_send=duty.why_not)
 
 
 def _now() -> float:

@@ -38,7 +38,7 @@ class OnDemand:
 
         The age is monotonic time: a change of the system clock must not change it.
         """
-        if tag.formula is not None:
+        if tag.inputs:
             return all(self.is_fresh(one, max_age) for one in tag.inputs)
         place = self._place(tag.device)
         poll = self._poll(tag)
@@ -54,7 +54,7 @@ class OnDemand:
         The sample is bad if the device does not answer. Raises `Busy` if the line had no time for
         the read.
         """
-        if tag.formula is not None:
+        if tag.inputs:
             await asyncio.gather(*(self.fresh(one, max_age) for one in tag.inputs))
             return self._latest(tag)
         poll = self._poll(tag)

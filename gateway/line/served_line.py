@@ -15,9 +15,10 @@ import structlog
 
 from gateway.config import LineConfig
 from gateway.errors import LineDown
+from gateway.line.conversation import Conversation
 from gateway.line.duty import Duty
 from gateway.line.wire_log import WireLog
-from gateway.serving.answering import NOISE, Answerer, Answering, Heard, Wire
+from gateway.serving.answering import Answerer, Answering, Heard, Wire
 from gateway.serving.registers import Registers, Row, Served
 from gateway.serving.registry import answerer
 from gateway.serving.station import Presence, Station
@@ -66,11 +67,12 @@ class ServedLine:
         self.openings = 0
         self.trouble = ""  # why it is closed
         self.stale = 0  # requests that later bytes have followed
+        self.unsent = 0  # replies that later bytes have followed
         self._sink = sink
         self._open_port = open_port
         self._wall = wall
         self._duty = duty or Duty()
-        self._wire_log = WireLog(config.name)
+        self.wire_log = WireLog()
         self._lost = False
         self._wake = asyncio.Event()  # the port is lost, or a master is there again
 
@@ -195,12 +197,12 @@ class ServedLine:
         return self._duty.why_not(now, now)
 
     def heard(self, data: bytes) -> None:
-        if self._wire_log.active:
-            self._wire_log.heard(data)
+        if self.wire_log.active:
+            self.wire_log.heard(data)
 
     def sent(self, data: bytes) -> None:
-        if self._wire_log.active:
-            self._wire_log.sent(data)
+        if self.wire_log.active:
+            self.wire_log.sent(data)
 
     def take(self, heard: Heard, now: float) -> None:
         """Publishes what the master wrote, all of one request with one time."""
@@ -226,69 +228,6 @@ class ServedLine:
         """Notes that the port is lost."""
         self._lost = True
         self._wake.set()
-
-
-class Conversation:
-    """One master on one port: a wire, or one TCP connection."""
-
-    def __init__(self, line: ServedLine, *, network: bool = False) -> None:
-        """`network`: one of several connections."""
-        self.trouble = ""
-        self._line = line
-        self._network = network
-        self._machine = line.machine()
-        self._port: Port | None = None
-        self._reply: asyncio.TimerHandle | None = None
-        self._following = 0  # bytes since the request of the waiting reply
-
-    def opened(self, port: Port) -> None:
-        self._port = port
-
-    def received(self, data: bytes) -> None:
-        line, now = self._line, _now()
-        line.heard(data)
-        if self._port is None:
-            return
-        if line.why_not(now):  # what waited in the system while this process was held
-            self._machine = line.machine()
-            return
-        self._following += len(data)
-        if self._following > NOISE:
-            self._cancel()
-        heard = self._machine.hear(data, now)
-        if heard.reply:
-            self._following = 0
-            if heard.delay:
-                loop = asyncio.get_running_loop()
-                self._reply = loop.call_at(now + heard.delay, self._send, heard.reply)
-            else:
-                self._send(heard.reply)
-        line.take(heard, now)
-
-    def _send(self, reply: bytes) -> None:
-        self._reply = None
-        if self._port is None:
-            return
-        self._line.sent(reply)
-        try:
-            self._port.write(reply)
-        except LineDown as error:
-            self.lost(error)
-
-    def _cancel(self) -> None:
-        if self._reply is not None:
-            self._reply.cancel()
-            self._reply = None
-
-    def lost(self, error: Exception) -> None:
-        self.close()
-        self.trouble = str(error)
-        if not self._network:
-            self._line.ended()
-
-    def close(self) -> None:
-        self._cancel()
-        self._port = None
 
 
 def _now() -> float:

@@ -39,7 +39,7 @@ class Serving:
         self.lines = [
             ServedLine(line, sink, sample, wall=wall, duty=duty)
             for line in config.lines
-            if line.serve
+            if line.serve and any(device.enabled for device in line.devices)
         ]
         self._sink = sink
         self._wall = wall
@@ -47,26 +47,22 @@ class Serving:
         self._saving = asyncio.Lock()
         self._rows = {row.tag: row for one in self.stations for row in one.registers.served.rows}
         self._retained: dict[Tag, Value] = {}
-        self._remembering: dict[str, list[tuple[Registers, Row]]] = {}
+        # By source: the stations that answer with its last good value.
+        self.remembering: dict[str, list[tuple[Registers, Row]]] = {}
         for station in self.stations:
             for row in station.registers.served.rows:
                 if row.source is not None and row.hold_last:
-                    kept = self._remembering.setdefault(row.source, [])
+                    kept = self.remembering.setdefault(row.source, [])
                     kept.append((station.registers, row))
 
     @property
     def stations(self) -> Sequence[Station]:
         return [station for line in self.lines for station in line.stations.values()]
 
-    @property
-    def remembers(self) -> bool:
-        """True if a station answers with the last good value of some source."""
-        return bool(self._remembering)
-
     def remember(self, samples: Sequence[Sample]) -> None:
         """Keeps the good samples of the sources with `hold_last`."""
         for sample in samples:
-            for registers, row in self._remembering.get(sample.tag.key, ()):
+            for registers, row in self.remembering.get(sample.tag.key, ()):
                 registers.remember(row, sample)
 
     # Held values

@@ -1,38 +1,68 @@
-"""The wire log: every byte on a line with its time, for the log, for traces and for tests.
+"""The wire log: every byte and every job of a line, for those who watch it."""
 
-A line of the log is `12.345678 > 02 30 30 ...` (sent) or has `<` (received). Times are seconds
-of the line's clock.
-"""
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
-import logging
-from collections.abc import Callable
+from gateway.engine.jobs import Result, Transacted
+from gateway.tags import Sample
 
-log = logging.getLogger("gateway.wire")
-Listener = Callable[[str, bytes], None]
+
+class Piece(NamedTuple):
+    """Bytes that were sent (`>`) or received (`<`) together."""
+
+    way: str
+    data: bytes
+
+
+class Performed(NamedTuple):
+    """A job with its result, and the times of its begin and end by the line's clock."""
+
+    job: Transacted
+    result: Result
+    begun: float
+    ended: float
+
+
+class Learned(NamedTuple):
+    """Samples of bytes that were received without a request of this gateway."""
+
+    samples: Sequence[Sample]
+
+
+Event = Piece | Performed | Learned
+Listener = Callable[[Event], None]
 
 
 class WireLog:
-    """Passes the bytes of one line to its listeners and to the debug log."""
+    """Passes the bytes and the jobs of one line to its listeners."""
 
-    __slots__ = ("_listeners", "active", "line")
+    __slots__ = ("_listeners", "active")
 
-    def __init__(self, line: str) -> None:
-        self.line = line
+    def __init__(self) -> None:
         self._listeners: list[Listener] = []
-        self.active = log.isEnabledFor(logging.DEBUG)  # an inactive log costs no time
+        self.active = False  # an inactive log costs no time
 
     def listen(self, listener: Listener) -> None:
-        """Adds a listener. It gets `>` or `<`, and the bytes."""
         self._listeners.append(listener)
         self.active = True
 
+    def forget(self, listener: Listener) -> None:
+        """Removes a listener; one that is not there is no mistake."""
+        self._listeners = [one for one in self._listeners if one != listener]
+        self.active = bool(self._listeners)
+
     def sent(self, data: bytes) -> None:
-        self._pass_on(">", data)
+        self._pass_on(Piece(">", data))
 
     def heard(self, data: bytes) -> None:
-        self._pass_on("<", data)
+        self._pass_on(Piece("<", data))
 
-    def _pass_on(self, direction: str, data: bytes) -> None:
-        log.debug("%s %s %s", self.line, direction, data.hex(" "))
+    def performed(self, job: Transacted, result: Result, begun: float, ended: float) -> None:
+        self._pass_on(Performed(job, result, begun, ended))
+
+    def learned(self, samples: Sequence[Sample]) -> None:
+        self._pass_on(Learned(samples))
+
+    def _pass_on(self, event: Event) -> None:
         for listener in self._listeners:
-            listener(direction, data)
+            listener(event)

@@ -3,17 +3,22 @@
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+JUMP_SHOWN = 3600.0  # seconds
 Documents = Mapping[str, Mapping[str, Any]]  # by path: `status`, `lines/hall-1`, `devices/mixer`
 
 
 def faults(documents: Documents) -> Iterator[str]:
-    """Yields what needs a person: lines that are down, silent devices, history not written."""
+    """Yields what needs a person: lines that are down, silent devices, a lost router,
+    history not written."""
     for line, document in below("lines/", documents):
         if not document["open"]:
             yield f"line {line} is down: {document['trouble'] or 'not opened yet'}"
     for device, document in below("devices/", documents):
         if document["standing"] == "silent":
             yield f"{device} is silent: {document['diagnosis']}"
+    zenoh = documents.get("zenoh", {})
+    if (wanted := zenoh.get("connect")) and not {"router", "peer"} & set(zenoh["to"]):
+        yield f"Zenoh: not connected to {' or '.join(wanted)}: its clients get no values"
     history = documents.get("history", {"state": "ok"})
     if history["state"] != "ok":
         yield f"history: {history['state']}"
@@ -42,6 +47,12 @@ def warnings(documents: Documents) -> Iterator[str]:
     if reload.get("refused"):
         more = f" and {len(reload['why']) - 1} more" if len(reload["why"]) > 1 else ""
         yield f"the changed file was refused at {reload['refused']}: {reload['why'][0]}{more}"
+    clock = documents.get("clock", {})
+    if (ago := clock.get("ago")) is not None and ago < JUMP_SHOWN:
+        yield (
+            f"the clock of this machine jumped by {clock['last']:+.1f} s {ago / 60:.0f} min ago: "
+            "times before and after it do not belong together"
+        )
     if lost := documents.get("history", {}).get("lost"):
         yield f"history: {lost} samples were lost since the start"
 

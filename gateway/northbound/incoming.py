@@ -7,6 +7,7 @@ from typing import TypeVar
 import zenoh
 
 from gateway.northbound.acceptance import Acceptance, Sender
+from gateway.northbound.alarms import Acknowledgements
 from gateway.northbound.audit import Audit
 from gateway.northbound.commands import Commands
 from gateway.northbound.inbox import Inbox
@@ -43,7 +44,9 @@ class Incoming:
         self._history = history
         self._acceptance = acceptance
         # Of clients that another part of the gateway has admitted: Zenoh and its writers do not.
-        self._admitted = Writes(plant, index, audit, Acceptance(plant.duty, None))
+        admitted = Acceptance(plant.duty, None)
+        self._admitted = Writes(plant, index, audit, admitted)
+        self._acknowledgements = Acknowledgements(keys, plant, audit, admitted)
         self._queries: Queries | None = None
         self._puts: PutWrites | None = None
         self._declarations: Declarations | None = None
@@ -66,14 +69,20 @@ class Incoming:
         payload as on Zenoh; `arrived`: by the loop's clock."""
         return await self._admitted.write(self._keys.set(tag), data, Sender(by, None, arrived))
 
+    def acknowledge(self, alarm: str, data: bytes, by: str, arrived: float) -> bytes | Failure:
+        """Acknowledges for a client that another part of the gateway has admitted as `by`."""
+        sender = Sender(by, None, arrived)
+        return self._acknowledgements.acknowledge(self._keys.alarm(alarm), data, sender)
+
     def start(self, session: zenoh.Session) -> "Declarations":
         """Returns the declarations that send queries and puts here."""
         stamp = session.new_timestamp
         writes = Writes(self._plant, self._index, self._audit, self._acceptance)
         commands = Commands(self._keys, self._plant, stamp, self._audit, self._acceptance)
         replies = Replies(self._keys, self._plant, self._index, stamp, self._history)
+        acknowledgements = Acknowledgements(self._keys, self._plant, self._audit, self._acceptance)
         self._queries = Queries(
-            self._plant, self._index, writes, commands, replies, self._documents
+            self._plant, self._index, writes, commands, replies, self._documents, acknowledgements
         )
         self._puts = PutWrites(writes, self._index)
         queries = Inbox(self._queries.take, self._queries.refuse)

@@ -3,11 +3,13 @@
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Literal, Protocol
 
+from gateway.alarms import Alarms
 from gateway.engine.requests import CommandResult
 from gateway.history.buckets import Bucket
 from gateway.history.course import Now
 from gateway.history.question import Question
 from gateway.line.duty import Duty
+from gateway.line.wire_log import WireLog
 from gateway.tags import Sample, Tag, WriteResult
 from gateway.tags.recorded import Recorded, RecordedQuery
 from gateway.values import Value
@@ -27,11 +29,21 @@ class Device(Protocol):
         """True: each scan is also published as one `@block`. "only": single values are not."""
 
 
-class Plant(Protocol):
+class Lines(Protocol):
+    """The lines of the plant."""
+
+    def wire_logs(self) -> Mapping[str, WireLog]:
+        """Returns the wire logs by line."""
+
+
+class Plant(Lines, Protocol):
     """The devices, their samples, writes and commands. All but `sample` on the event loop."""
 
     @property
     def duty(self) -> Duty: ...
+
+    @property
+    def alarms(self) -> Alarms: ...
 
     def devices(self) -> Iterable[Device]: ...
 
@@ -105,6 +117,12 @@ class History(Protocol):
 
     def writes(self, time_range: str, limit: int | None, now: int) -> Iterator[str]:
         """Outcomes of writes and commands, as on the `writes` key. Raises like `samples`."""
+
+    def alarms(self, time_range: str, limit: int | None, now: int) -> Iterator[str]:
+        """Changes of alarms, as JSON in the order of time. Raises like `samples`."""
+
+    def record_alarm(self, time: int, change: str) -> None:
+        """Records one change; `time`: ns since 1970. Never blocks."""
 
     def record_write(self, time: int, outcome: str, *, refused: bool) -> None:
         """Records one outcome, as on the `writes` key; `time`: ns since 1970. `refused`: nothing

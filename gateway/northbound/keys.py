@@ -10,7 +10,9 @@ declared for a single device, tag or command below `<prefix>/`: the wildcards be
     <prefix>/<device>/@run              a command; also @stop, @loopback, @model
     <prefix>/<device>/@block            all tags of the device that changed in one scan
     <prefix>/@gateway/<name>/…          state and statistics, the outcome of every write
+    <prefix>/@gateway/<name>/alarms/…   its alarms
     <prefix>/@gateway/<name>/alive/…    liveliness tokens of its devices
+    <prefix>/@gateway/<name>/lines/<line>/@trace    the exchanges of a line, while it is watched
     <prefix>/@gateway/<name>/page     the last reply to a query with `page`
     <prefix>/@gateway/<name>/claim/…    its claim to its devices: a document, and a token
     <prefix>/@standby/<group>/…         liveliness tokens of the gateways of a standby group
@@ -39,6 +41,7 @@ class Family(StrEnum):
     META = "meta"
     BLOCK = "block"
     STATUS = "status"
+    ALARM = "alarm"
     COMMAND = "command"
 
 
@@ -66,6 +69,9 @@ def parse_key(key: str) -> ParsedKey:
     if late:
         return ParsedKey(Family.LAST, stem)
     if "@gateway" in (chunks := key.split("/")):
+        below = chunks[chunks.index("@gateway") + 2 :]
+        if below[:1] == ["alarms"] and len(below) > 1:
+            return ParsedKey(Family.ALARM, key)
         is_command = chunks[-3:-2] == ["lines"] and chunks[-1] == "global"
         return ParsedKey(Family.COMMAND if is_command else Family.STATUS, key)
     return ParsedKey(Family.VALUE, key)
@@ -123,6 +129,10 @@ class Keys:
         """The outcome of every write."""
         return f"{self.own}/writes"
 
+    def alarm(self, name: str) -> str:
+        """An alarm: `device/tag`, `device`, or `line:name`."""
+        return f"{self.own}/alarms/{name}"
+
     @property
     def page(self) -> str:
         """The last reply to a query with `page`."""
@@ -175,6 +185,11 @@ class Keys:
     def to_all(self, line: str) -> str:
         """A command to every station of a line."""
         return f"{self.own}/lines/{line}/global"
+
+    def trace(self, line: str) -> str:
+        """The exchanges of a line. No wildcard matches it: a client of all status keys must not
+        start the traces of all lines."""
+        return f"{self.own}/lines/{line}/@trace"
 
     def block(self, device: str) -> str:
         return f"{self.prefix}/{device}/@block"

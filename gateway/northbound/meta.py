@@ -4,6 +4,7 @@ import orjson
 
 from gateway.tags import Tag
 from gateway.tags.shaping import PLAIN, Bounds
+from gateway.tags.tag import CounterRule
 
 
 def meta(tag: Tag) -> bytes:
@@ -16,7 +17,7 @@ def meta_fields(tag: Tag) -> dict[str, object]:
     low, high = shaping.clamp or Bounds()
     return {
         "type": tag.value_type,
-        "raw_type": str(tag.layout.type),
+        "raw_type": str((tag if tag.kept is None else tag.inputs[0]).layout.type),
         "address": tag.text,
         "unit": tag.unit,
         "description": tag.description,
@@ -28,6 +29,8 @@ def meta_fields(tag: Tag) -> dict[str, object]:
         "decimals": shaping.decimals,
         "clamp": None if shaping.clamp is None else {"min": low, "max": high},
         "invert": shaping.invert,
+        "debounce": tag.kept if isinstance(tag.kept, float) else None,
+        "counter": tag.kept._asdict() if isinstance(tag.kept, CounterRule) else None,
         "computed": None if tag.formula is None else tag.formula.text,
         "enum": None
         if tag.names is None

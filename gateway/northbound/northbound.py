@@ -13,6 +13,7 @@ from gateway.errors import GatewayError
 from gateway.northbound import secrets
 from gateway.northbound.acceptance import Acceptance
 from gateway.northbound.admission import Admission
+from gateway.northbound.alarms import AlarmPublisher
 from gateway.northbound.audit import Audit
 from gateway.northbound.inbox import Inbox
 from gateway.northbound.incoming import Declarations, Incoming
@@ -27,6 +28,7 @@ from gateway.northbound.republish import Republisher
 from gateway.northbound.session import (
     CLOSE_WITHIN,
     configure,
+    connect_endpoints,
     drop_limit,
     off_loop,
     open_session,
@@ -34,6 +36,7 @@ from gateway.northbound.session import (
 from gateway.northbound.standby import GroupSettings
 from gateway.northbound.status_publisher import StatusPublisher
 from gateway.northbound.tag_index import TagIndex
+from gateway.northbound.traces import Traces
 from gateway.northbound.watchdog import Watchdog
 from gateway.northbound.writers import Writers
 from gateway.tags import Sample, Tag, WriteResult
@@ -90,8 +93,15 @@ class Northbound:
         losses = Losses(drop_limit(self._config))
         self._publisher = Publisher(self.keys, losses)
         self._batches = ScanBatches(self._publisher, index)
+        alarms = AlarmPublisher(self.keys, plant, self._publisher, history)
         self._republisher = Republisher(
-            self._batches.publish, plant, index, self._links, losses, settings.refresh
+            self._batches.publish,
+            plant,
+            index,
+            self._links,
+            losses,
+            settings.refresh,
+            alarms.publish_all,
         )
         audit = Audit(
             partial(self._publisher.document, self.keys.writes),
@@ -138,6 +148,10 @@ class Northbound:
         """Writes for the client `by`, whom another part of the gateway has admitted; `tag`:
         `device/name`; `data`: the payload as on Zenoh; `arrived`: by the loop's clock."""
         return await self._incoming.write(tag, data, by, arrived)
+
+    def acknowledge(self, alarm: str, data: bytes, by: str, arrived: float) -> bytes | Failure:
+        """Acknowledges an alarm for the client `by`, as `write` does; `data`: as on Zenoh."""
+        return self._incoming.acknowledge(alarm, data, by, arrived)
 
     @property
     def active(self) -> asyncio.Event:
@@ -239,6 +253,8 @@ class Northbound:
             self._plant.begin()
             self._incoming.begin()
             await off_loop(self._declare_plant, declarations)
+            traces = Traces(self.keys, self._plant, self._publisher.document)
+            self._declared += await off_loop(traces.declare, session, traces.inbox())
             await self._republisher.publish_all()
             self._status.publish()
             self.opened.set()
@@ -285,7 +301,8 @@ class Northbound:
     def _collect_status(self) -> Mapping[str, Mapping[str, object]]:
         documents = dict(self._plant.status())
         documents["status"] = {**documents["status"], **self._admission.claiming.status()}
-        zenoh_document = {**self.counters(), "to": self._links.kinds()}
+        links = {"to": self._links.kinds(), "connect": connect_endpoints(self._config)}
+        zenoh_document = {**self.counters(), **links}
         own = {"zenoh": zenoh_document, "outcomes": self._incoming.outcomes()}
         return {**documents, **own, **self._admission.documents()}
 

@@ -40,6 +40,7 @@ class Problem(StrEnum):
     BUSY = "busy"  # too many requests are waiting; nothing was done
     UNKNOWN_TAG = "unknown-tag"
     NOT_ALLOWED = "not-allowed"  # the client's signature is missing, wrong or too old
+    NOTHING_TO_ACKNOWLEDGE = "nothing-to-acknowledge"  # the alarm is normal, or was raised again
     BAD_QUERY = "bad-query"  # a read with parameters that cannot be parsed
     DAMAGED = "damaged"  # a part of the history file is lost; all the rest was answered
     NO_HISTORY = "no-history"  # a read of the past from a gateway without history

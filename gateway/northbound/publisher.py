@@ -14,7 +14,7 @@ times as long, and for a moment after a link has returned puts on declared keys 
 import asyncio
 import threading
 import time
-from collections.abc import Hashable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from itertools import count
@@ -43,8 +43,9 @@ class Published:
     dropped: int = 0  # events and documents: the queue was full, or no session was open yet
 
 
-# A bool declares or undeclares the liveliness token, a dict holds the samples of a block.
-_Data = Sample | bytes | bool | dict[str, Sample]
+# A bool declares or undeclares the liveliness token, a dict holds the samples of a block, and a
+# function makes a document.
+_Data = Sample | bytes | bool | dict[str, Sample] | Callable[[], bytes]
 # One put. A plain tuple: creating a named tuple takes as long as queueing it.
 _Entry = tuple[zenoh.Timestamp | None, str, _Data]
 
@@ -136,6 +137,18 @@ class Publisher:
         """Queues a status document or the outcome of a write."""
         self._queue_event(key, document)
 
+    def latest(self, key: str, make: Callable[[], bytes]) -> None:
+        """Queues a document that the publishing thread makes: only the latest of each key is put.
+
+        Opening a session publishes all of them.
+        """
+        if self._session is None or self._closing:
+            return
+        with self._filled:
+            self._waiting.pop(key, None)
+            self._waiting[key] = (self._session.new_timestamp(), key, make)
+            self._filled.notify()
+
     def set_online(self, device: str, online: bool) -> None:
         """Declares or undeclares the device's liveliness token."""
         self._online[device] = online
@@ -223,9 +236,11 @@ class Publisher:
             encoding.put_json(session, key, data, stamp)
         elif isinstance(data, dict):
             encoding.put_json(session, key, payload.block(data.values()), stamp)
-        else:
+        elif isinstance(data, bool):
             self._set_token(session, key, declared=data)
             return
+        else:
+            encoding.put_json(session, key, data(), stamp)
         self.counters.published += 1
 
     def _set_token(self, session: zenoh.Session, key: str, *, declared: bool) -> None:

@@ -16,6 +16,7 @@ from gateway.engine.requests import CommandResult
 from gateway.errors import BadValue, Busy
 from gateway.history.question import is_of_past
 from gateway.northbound.acceptance import sender
+from gateway.northbound.alarms import Acknowledgements
 from gateway.northbound.answers import Answer, AnswerPool, QueryCounters
 from gateway.northbound.commands import Commands
 from gateway.northbound.interfaces import Plant
@@ -46,6 +47,7 @@ class Queries:
         commands: Commands,
         replies: Replies,
         documents: StatusDocuments,
+        acknowledgements: Acknowledgements,
     ) -> None:
         self._plant = plant
         self._index = index
@@ -53,6 +55,7 @@ class Queries:
         self._commands = commands
         self._replies = replies
         self._documents = documents
+        self._acknowledgements = acknowledgements
         self._pool = AnswerPool(partial(replies.outcome, _BUSY))
         self._tasks: set[asyncio.Task[None]] = set()
 
@@ -80,10 +83,10 @@ class Queries:
                 self._start(self._set(query, at))
             case Family.COMMAND:
                 self._start(self._command(query, at))
-            case Family.STATUS if query.parameters.get("_time") is not None:
-                self._pool.answer_history(query, partial(self._replies.writes, time.time_ns()))
+            case Family.ALARM:
+                self._take_alarm(query, parsed, at)
             case Family.STATUS:
-                self._start(self._status(query))
+                self._take_status(query)
             case Family.VALUE if is_of_past(query.parameters):
                 history = partial(self._replies.history, parsed, time.time_ns())
                 self._pool.answer_history(query, history)
@@ -108,6 +111,25 @@ class Queries:
         elif self._pool.admit_wide(query):
             task = self._start(self._fresh(query, parsed))
             task.add_done_callback(lambda _: self._pool.release_wide())
+
+    def _take_status(self, query: zenoh.Query) -> None:
+        if query.parameters.get("_time") is not None:
+            self._pool.answer_history(query, partial(self._replies.writes, time.time_ns()))
+        else:
+            self._start(self._status(query))
+
+    def _take_alarm(self, query: zenoh.Query, parsed: ParsedKey, at: float) -> None:
+        data = _data(query)
+        if data is not None:
+            key = str(query.key_expr)
+            result = self._acknowledgements.acknowledge(key, data, sender(query, at))
+            self._pool.answer(query, partial(self._replies.acknowledged, result))
+        elif query.parameters.get("_time") is not None:
+            self._pool.answer_history(query, partial(self._replies.past_alarms, time.time_ns()))
+        elif parsed.has_wildcard:
+            self._pool.answer_wide(query, self._replies.alarms)
+        else:
+            self._pool.answer(query, self._replies.alarms)
 
     async def close(self) -> None:
         """Ends the queries that wait for devices; their replies get half a second to leave."""

@@ -2,7 +2,9 @@
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import islice
 
+import orjson
 import zenoh
 
 from gateway.errors import BadValue, Busy, Damaged, GatewayError
@@ -11,6 +13,7 @@ from gateway.history.course import Now
 from gateway.history.question import Question, question
 from gateway.history.rows import has_value
 from gateway.northbound import buckets, encoding, pages, past, payload
+from gateway.northbound.alarms import alarm_fields
 from gateway.northbound.interfaces import History, Plant
 from gateway.northbound.keys import Family, Keys, ParsedKey
 from gateway.northbound.meta import meta
@@ -243,6 +246,47 @@ class Replies:
                 self._reply(query, self._keys.writes, outcome.encode(), self._stamp())
         except GatewayError as error:
             self._failed(error, query)
+
+    def alarms(self, query: zenoh.Query) -> None:
+        """Replies with the document of each alarm of the query."""
+        entries = self._plant.alarms.entries
+        try:
+            with self._turns.turn(Rank.CURRENT) as pause:
+                for name, entry in list(entries.items()):
+                    key = self._keys.alarm(name)
+                    if not query.key_expr.intersects(key):
+                        continue
+                    if self._ended:
+                        raise Busy(_INCOMPLETE)
+                    document = payload.document(alarm_fields(entry, self._plant.sample))
+                    self._reply(query, key, document, self._stamp())
+                    pause()
+        except GatewayError as error:
+            self._failed(error, query)
+
+    def past_alarms(self, now: int, query: zenoh.Query) -> None:
+        """Replies with recorded changes, each on the key of its alarm. `now` as in `history`."""
+        if self._history is None:
+            self.outcome(_NO_HISTORY, query)
+            return
+        try:
+            limit = _limit(query.parameters.get("limit"))
+            time_range = query.parameters.get("_time") or ""
+            found = self._history.alarms(time_range, None, now)
+            keys = ((self._keys.alarm(str(orjson.loads(row)["alarm"])), row) for row in found)
+            matching = (one for one in keys if query.key_expr.intersects(one[0]))
+            for key, row in islice(matching, limit):
+                if self._ended:
+                    raise Busy(_INCOMPLETE)
+                self._reply(query, key, row.encode(), self._stamp())
+        except GatewayError as error:
+            self._failed(error, query)
+
+    def acknowledged(self, result: bytes | Failure, query: zenoh.Query) -> None:
+        if isinstance(result, Failure):
+            self.outcome(result, query)
+        else:
+            self._reply(query, str(query.key_expr), result, self._stamp())
 
     def status(self, documents: dict[str, bytes], query: zenoh.Query) -> None:
         for key, document in documents.items():

@@ -62,6 +62,7 @@ def _line(line: ServedLine, now: float) -> Document:
         "devices": {one.name: one.presence.value for one in line.stations.values()},
         "busy_time": 0.0,
         "stale_requests": line.stale,
+        "unsent_replies": line.unsent,
         "measured": {
             "load": None,
             "requests_per_second": round(asked / open_for, 3) if open_for else None,

@@ -98,6 +98,14 @@ def as_client(config: zenoh.Config) -> zenoh.Config:
     return copy
 
 
+def connect_endpoints(config: zenoh.Config) -> list[str]:
+    """Returns the endpoints that the session connects to, for people."""
+    found = json.loads(config.get_json("connect/endpoints"))
+    if isinstance(found, dict):  # by mode
+        found = found.get(json.loads(config.get_json("mode")), [])
+    return [str(endpoint).partition("#")[0] for endpoint in found]
+
+
 def _from_file(path: Path) -> zenoh.Config:
     called = "zenoh config_file"
     text = ""

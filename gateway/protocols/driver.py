@@ -330,6 +330,15 @@ class EchoConflict(Protocol):
         """The setting and the reason; None where the settings of this device work."""
 
 
+@runtime_checkable
+class Dissected(Protocol):
+    """A driver whose frames Wireshark knows."""
+
+    @property
+    def dissector(self) -> str:
+        """The name of the dissector in Wireshark."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScanHints:
     """Settings of `scan` for a protocol."""

@@ -56,11 +56,11 @@ class Renewal:
             ]
         )
         await asyncio.gather(*[self._leave(line) for line in gateway.lines])
-        gateway.configure(difference.config)
         stay = [*gateway.lines]
         await asyncio.gather(
             *(self._arrive(line) for line in stay), *(self._open(one) for one in difference.opened)
         )
+        gateway.configure(difference.config)
         gateway.compute(difference.computed.started, difference.computed.gone)
 
     def _make(self, known: Mapping[str, tuple[Device, KnownBad]]) -> Mapping[str, Device]:

@@ -27,6 +27,7 @@ class Heard(NamedTuple):
     delay: float = 0.0
     done: tuple[Done, ...] = ()
     stale: int = 0  # requests that later bytes have followed: neither carried out nor answered
+    lost: bool = False  # where the next frame begins cannot be found any more
 
 
 SILENCE = Heard()

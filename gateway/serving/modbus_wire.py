@@ -29,17 +29,14 @@ class _Tcp:
             (only,) = self._data.values()
             self._data |= {unit: only for unit in _ANY_UNIT if unit not in self._data}
         self._heard = b""
-        self._lost = False
 
     def hear(self, data: bytes, now: float) -> Heard:
-        if self._lost:
-            return SILENCE
         self._heard += data
-        reply, done = b"", list[Done]()
+        reply, done, lost = b"", list[Done](), False
         while len(self._heard) >= _HEADER.size:
             number, protocol, length, unit = _HEADER.unpack_from(self._heard)
             if protocol or not 2 <= length <= 254:
-                self._lost = True  # no Modbus TCP: where the next frame begins is not known
+                self._heard, lost = b"", True  # no Modbus TCP
                 break
             end = length + 6
             if len(self._heard) < end:
@@ -51,7 +48,7 @@ class _Tcp:
             else:
                 answer = bytes((pdu[0] | EXCEPTION, _NO_PATH))
             reply += _HEADER.pack(number, 0, len(answer) + 1, unit) + answer
-        return Heard(reply, 0.0, tuple(done))
+        return Heard(reply, 0.0, tuple(done), lost=lost)
 
 
 class _Serial:

@@ -7,11 +7,9 @@ from enum import StrEnum
 from gateway.errors import BadValue
 from gateway.protocols.driver import Span
 from gateway.tags import Quality, Sample, Tag
-from gateway.values import Kind, Value
+from gateway.values import Value
 
 STALE_AFTER = 10.0  # seconds
-
-_FLOATS = (Kind.FLOAT32, Kind.FLOAT64)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -131,8 +129,8 @@ class Registers:
             if (units := known.get(row)) is None:
                 units = known[row] = self._units(row)
             tag = row.tag
-            if tag.address.bit is not None:
-                unit |= units[0] << tag.address.bit
+            if tag.part is not None:
+                unit = tag.part.into(unit, units[0])
             else:
                 unit |= units[cell[1] - tag.span.start]
         return unit
@@ -213,9 +211,9 @@ def _encoded(tag: Tag, sample: Sample | None) -> list[int] | None:
     if sample is None or sample.quality is not Quality.GOOD or sample.value is None:
         return None
     value = sample.value
-    whole = tag.layout.type.is_number and tag.layout.type.kind not in _FLOATS
+    whole = tag.layout.type.is_number and not tag.value_type.startswith("float")
     try:
-        if whole and isinstance(value, float) and tag.scale == 1 and tag.offset == 0:
+        if whole and isinstance(value, float):
             value = round(value)
         return tag.encode(value)
     except (BadValue, OverflowError, ValueError):

@@ -42,6 +42,7 @@ class Station:
     counts: Counts = field(default_factory=Counts)
     presence: Presence = Presence.STARTING
     _due: float = NEVER  # when the master is silent
+    _trouble: str = ""  # why the wire is lost
 
     @property
     def stale_after(self) -> float:
@@ -54,7 +55,7 @@ class Station:
 
     def opened(self, now: float) -> None:
         """Notes that the wire is open."""
-        self._due = now + self.stale_after
+        self._due, self._trouble = now + self.stale_after, ""
 
     def asked(self, done: Done, now: float, at: int) -> list[Sample]:
         """Notes a request. `at`: its arrival, ns since 1970. Returns the written samples."""
@@ -77,7 +78,7 @@ class Station:
 
     def lost(self, at: int, why: str) -> Sequence[Sample]:
         """Returns bad samples of what the master writes: the wire is lost."""
-        self._due, self.presence = NEVER, Presence.SILENT
+        self._due, self.presence, self._trouble = NEVER, Presence.SILENT, why
         return self._bad(Reason.LINE_DOWN, at, why)
 
     def _bad(self, reason: Reason, at: int, why: str) -> Sequence[Sample]:
@@ -88,6 +89,8 @@ class Station:
         """Returns a sentence for people; empty while the master is there."""
         if self.presence is not Presence.SILENT:
             return ""
+        if self._trouble:
+            return f"The line is down: {self._trouble}"
         since = "since the start" if self.counts.last is None else f"for {self.stale_after:g} s"
         return f"The master has sent no request to station {self.driver.station} {since}"
 

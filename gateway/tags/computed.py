@@ -27,32 +27,30 @@ def computed(tag: Tag, sample_of: Callable[[Tag], Sample]) -> Sample:
 
 
 class Dependents:
-    """The computed tags that follow from each tag."""
+    """The tags whose values are derived from each tag: computed, or kept over several reads."""
 
     def __init__(self, tags: Iterable[Tag]) -> None:
-        """`tags`: in any order; inputs that are computed too come first in `after`."""
+        """`tags`: in any order; `after` has each tag after its inputs."""
         self._order: dict[Tag, int] = {}  # a tag comes after its inputs
         self._of: dict[Tag, set[Tag]] = {}  # directly
         for tag in tags:
-            if tag.formula is not None:
-                self._add(tag)
+            self._add(tag)
 
     def _add(self, tag: Tag) -> None:
-        if tag in self._order:
+        if not tag.inputs or tag in self._order:
             return
         for one in tag.inputs:
-            if one.formula is not None:
-                self._add(one)
+            self._add(one)
             self._of.setdefault(one, set()).add(tag)
         self._order[tag] = len(self._order)
 
     def __bool__(self) -> bool:
         return bool(self._order)
 
-    def after(self, changed: Iterable[Tag]) -> Sequence[Tag]:
-        """Returns the computed tags that follow from changed ones, each after its inputs."""
-        found: set[Tag] = set()
-        waiting = list(changed)
+    def after(self, changed: Iterable[Tag], also: Iterable[Tag] = ()) -> Sequence[Tag]:
+        """Returns `also`, and the tags that follow from all these, each after its inputs."""
+        found = set(also)
+        waiting = [*changed, *found]
         while waiting:
             new = self._of.get(waiting.pop(), set()) - found
             found |= new

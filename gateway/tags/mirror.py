@@ -6,6 +6,7 @@ from operator import ne
 
 from gateway.tags import Publish, Quality, Reason, Sample, Tag, bad
 from gateway.tags.computed import Dependents, computed
+from gateway.tags.kept import Counted, CounterState, kept, memory_of
 from gateway.tags.scan import Latest, Samples, Scan
 
 
@@ -20,7 +21,12 @@ class Mirror:
     def __init__(self, tags: Iterable[Tag], now: int) -> None:
         """`now`: nanoseconds since 1970."""
         self._current = {tag: bad(tag, Reason.STARTING, now) for tag in tags}
-        self.dependents = Dependents(self._current)
+        self._dependents = Dependents(self._current)
+        self.derives = bool(self._dependents)
+        self.memories = {tag: memory_of(tag) for tag in self._current if tag.kept is not None}
+        self.pending: set[Tag] = set()  # kept tags whose value an equal read can change
+        self._raw = {tag.inputs[0] for tag in self.memories}
+        self._current |= {tag: bad(tag, Reason.STARTING, now) for tag in self._raw}
         self._published: dict[Tag, Sample] = {}
         self._begun = False
         # Tags whose latest sample is in a scan, with their place there.
@@ -40,12 +46,12 @@ class Mirror:
         entry = self._places.get(tag)
         if entry is None:
             current = self._current[tag]
-            return current if tag.formula is None else self._computed(tag, current)
+            return self._derived(tag, current) if tag.inputs else current
         latest, place = entry
         return latest.scan[place]
 
     def samples(self) -> Iterable[Sample]:
-        return map(self.__getitem__, self._current)
+        return (self[tag] for tag in self._current if tag not in self._raw)
 
     def update(self, samples: Iterable[Sample]) -> Sequence[Sample]:
         """Stores the samples. Returns those to publish, in their order."""
@@ -56,20 +62,57 @@ class Mirror:
             self._adopt(samples.latest, samples)
         return to_publish
 
-    def computed_after(self, samples: Iterable[Sample]) -> list[Sample]:
-        """Calculates the tags that follow from samples to publish. Returns those to publish."""
-        tags = self.dependents.after(sample.tag for sample in samples)
-        due = [self._store([self[tag]]) for tag in tags]
-        return [sample for one in due for sample in one]
+    def counters(self) -> dict[str, CounterState]:
+        """Returns the states of all counters that were read, by `device/name`."""
+        known = ((tag.key, memory) for tag, memory in self.memories.items())
+        return {
+            key: memory.state
+            for key, memory in known
+            if isinstance(memory, Counted) and memory.state is not None
+        }
 
-    def _computed(self, tag: Tag, current: Sample) -> Sample:
-        """Returns the present sample of a computed tag: a read of equal inputs moves its time."""
+    def restore(self, counters: Mapping[str, CounterState]) -> None:
+        """Goes on with the totals of an earlier gateway. Reads are missing since then."""
+        for tag, memory in self.memories.items():
+            if isinstance(memory, Counted) and (state := counters.get(tag.key)) is not None:
+                memory.state, memory.gap = state, True
+
+    def follow(self, samples: Sequence[Sample]) -> list[Sample]:
+        """Derives the values that follow from samples to publish. Returns all to publish.
+
+        The raw reads of kept values are not published.
+        """
+        due = [sample for sample in samples if sample.tag not in self._raw]
+        changed = [sample.tag for sample in samples]
+        for tag in self._dependents.after(changed, self.pending):
+            due += self._store([self._derive(tag)])
+        return due
+
+    def _derive(self, tag: Tag) -> Sample:
+        memory = self.memories.get(tag)
+        if memory is None:
+            return computed(tag, self.__getitem__)
+        sample = kept(tag, memory, self[tag.inputs[0]])
+        (self.pending.add if memory.pending else self.pending.discard)(tag)
+        return sample
+
+    def _derived(self, tag: Tag, current: Sample) -> Sample:
+        """Returns the present sample of a derived tag: a read of equal inputs moves its time.
+
+        It changes no memory: several threads call it.
+        """
+        if current.reason is Reason.DISABLED:
+            return current
+        if tag.kept is not None:
+            raw = self[tag.inputs[0]]
+            both_good = raw.quality is current.quality is Quality.GOOD
+            return current._replace(time=raw.time) if both_good else current
         try:
             sample = computed(tag, self.__getitem__)
         except KeyError:  # a reload is replacing an input: this tag follows at its end
             return bad(tag, Reason.STARTING, current.time)
         bad_before = sample.quality is Quality.BAD and _same_failure(current, sample)
-        return current if bad_before or current.reason is Reason.DISABLED else sample
+        return current if bad_before else sample
 
     def mark_published(self, samples: Iterable[Sample]) -> list[Sample]:
         """Records samples that are published again: deadband and heartbeat count from them.
@@ -104,9 +147,10 @@ class Mirror:
                 self._published[sample.tag] = sample
                 due.append(sample)
         self.forget(gone)
-        self.dependents = Dependents(self._current)
+        self._dependents = Dependents(self._current)
+        self.derives = bool(self._dependents)
         begun = {sample.tag for sample in first} - {sample.tag for sample in due}
-        for tag in self.dependents.in_order(begun):
+        for tag in self._dependents.after((), begun):
             due += self._store([computed(tag, self.__getitem__)])
         return due
 

@@ -21,7 +21,7 @@ class Latest:
     next read of the block is then compared with nothing.
     """
 
-    __slots__ = ("by_rule", "in_use", "scan", "superseded", "unasked")
+    __slots__ = ("alarmed", "by_rule", "in_use", "scan", "superseded", "unasked")
 
     def __init__(self) -> None:
         self.scan: Scan
@@ -29,6 +29,7 @@ class Latest:
         self.superseded = False
         self.by_rule: Collection[int] = ()  # places of tags with a deadband, a heartbeat ...
         self.unasked: Collection[int] = ()  # of these, tags that are published without a change
+        self.alarmed: Collection[int] | None = None  # places of tags with an alarm; None: not known
 
     def adopt(self, scan: "Scan") -> None:
         """Begins with a scan."""
@@ -36,6 +37,7 @@ class Latest:
         eager = [p for p, tag in places if tag.heartbeat or tag.publish is Publish.ALWAYS]
         self.by_rule = frozenset(eager).union(p for p, tag in places if tag.deadband is not None)
         self.unasked = tuple(eager)
+        self.alarmed = tuple(p for p, tag in places if tag.alarm is not None)
         self.scan, self.in_use = scan, True
 
 

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 from gateway.errors import BadValue, Garbled
 from gateway.protocols.driver import Address, Span, Unit
 from gateway.protocols.typed_fields import Shape
+from gateway.tags.alarm import AlarmRule
 from gateway.tags.decoding import (
     Decode,
     Part,
@@ -55,6 +56,13 @@ class WriteRule:
     latest: bool = False  # of several waiting writes only the latest is sent
 
 
+class CounterRule(NamedTuple):
+    """A counter has the values below `modulus`; a step of more than `most` is no count."""
+
+    modulus: int
+    most: int
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Tag:
     """One value of one device: its address, type, interval and rules."""
@@ -77,12 +85,18 @@ class Tag:
     history: bool = False
     payload: Form = Form.JSON
     write: WriteRule | None = None
+    alarm: AlarmRule | None = None
     shape: Shape | None = None  # for a field of a frame: a read gives the value itself
     event: bool = False  # every value is published, also an equal one
     shaping: Shaping | None = None
     names: Names | None = None
     formula: Formula | None = None  # of a computed tag: no address, read or write
-    inputs: tuple["Tag", ...] = ()  # of the formula, in its order
+    kept: float | CounterRule | None = (
+        None  # seconds that a bit must stay, or the rule of a counter
+    )
+    # Of the formula, in its order; of a kept value the one tag with its reads. These are the tags
+    # of another tag's value: this tag is not read itself.
+    inputs: tuple["Tag", ...] = ()
     part: Part | None = field(init=False, repr=False)  # of its word; None: whole words
     # From the unit of the span to the value, or from its units if it has several.
     convert: Decode = field(init=False, repr=False)
@@ -95,6 +109,9 @@ class Tag:
     def _decoder(self, shaping: Shaping | None) -> Decode:
         if self.formula is not None:
             return with_shaping(self.formula.value, shaping)
+        if self.kept is not None:
+            counter = isinstance(self.kept, CounterRule)  # the reads of a bit are inverted already
+            return field_decoder(self.layout, self._line, shaping if counter else None)
         if self.shape is not None:
             return field_decoder(self.layout, self._line, shaping)
         bit = self.address.bit
@@ -112,6 +129,9 @@ class Tag:
             object.__setattr__(twin, slot, getattr(self, slot))
         object.__setattr__(twin, "device", device)
         object.__setattr__(twin, "name", name)
+        if self.inputs:
+            inputs = tuple(one.copy(device, name) for one in self.inputs)
+            object.__setattr__(twin, "inputs", inputs)
         return twin
 
     @property

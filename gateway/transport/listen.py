@@ -32,7 +32,7 @@ class Listener:
         self._name = f"{where.host}:{where.port}"
         self._where = where
         self._socket: socket.socket | None = None
-        self._ports: set[StreamPort] = set()
+        self._ports: set[_Accepted] = set()
 
     async def open(self) -> None:
         """Raises `LineDown`."""
@@ -65,18 +65,13 @@ class Listener:
             log.warning("connection refused", port=self._name, why="too many masters")
             connection.close()
             return
-        receiver = _Registered(connect(), self._ports)
-        port = StreamPort(self._name, receiver)
+        accepted = _Accepted(self._name, connect(), self._ports)
         try:
             configure(connection)
-            receiver.port = port
-            self._ports.add(port)
-            receiver.receiver.opened(port)
-            port.ready()
-            await loop.connect_accepted_socket(lambda: port, connection)
+            await loop.connect_accepted_socket(lambda: accepted.stream, connection)
         except OSError as error:  # the master is gone already
             log.debug("connection lost", port=self._name, why=str(error))
-            self._ports.discard(port)
+            self._ports.discard(accepted)
             connection.close()
 
     async def close(self) -> None:
@@ -89,18 +84,28 @@ class Listener:
         self._ports.clear()
 
 
-class _Registered:
-    """Takes a lost connection out of the list."""
+class _Accepted:
+    """One connection; the port of its receiver. It is in the list until it is closed or lost."""
 
-    def __init__(self, receiver: Connected, ports: set[StreamPort]) -> None:
-        self.receiver = receiver
-        self.port: StreamPort | None = None
+    def __init__(self, name: str, receiver: Connected, ports: "set[_Accepted]") -> None:
+        self.stream = StreamPort(name, self)
+        self._receiver = receiver
         self._ports = ports
+        ports.add(self)
+        self.stream.ready()
+        receiver.opened(self)
+
+    def write(self, data: bytes) -> None:
+        """Raises `LineDown`."""
+        self.stream.write(data)
+
+    async def close(self) -> None:
+        self._ports.discard(self)
+        await self.stream.close()
 
     def received(self, data: bytes) -> None:
-        self.receiver.received(data)
+        self._receiver.received(data)
 
     def lost(self, error: Exception) -> None:
-        if self.port is not None:
-            self._ports.discard(self.port)
-        self.receiver.lost(error)
+        self._ports.discard(self)
+        self._receiver.lost(error)

@@ -6,12 +6,11 @@ are made on threads, because those of a large plant take long.
 
 import asyncio
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from itertools import islice
 from typing import Any
 
-import orjson
 from aiohttp import web
 
 from gateway.errors import BadValue, Busy, GatewayError
@@ -26,6 +25,8 @@ from gateway.northbound.payload import Failure, Problem
 from gateway.northbound.session import off_loop
 from gateway.tags import Tag
 from gateway.web.guard import BY, answer
+from gateway.web.replies import BODY_WITHIN, as_json, json_off_loop, raw
+from gateway.web.replies import limit as limit_of
 from gateway.web.sources import Documents, Sources
 
 STATE_AGE = 2.0  # seconds that the state of lines and devices may be old
@@ -33,7 +34,6 @@ MOST_ITEMS = 1000  # of one page
 MOST_SAMPLES = 10_000
 _ITEMS = 200
 _SAMPLES = 1000
-BODY_WITHIN = 5.0  # seconds
 HISTORY_WITHIN = 20.0  # seconds for one query
 HISTORY_AT_ONCE = 4  # queries; they read the disk
 # 200 only for an acknowledged write. 502 and above: it was sent, or the device cannot be reached.
@@ -80,14 +80,14 @@ class Api:
         return self._known[1]
 
     async def _status(self, _: web.Request) -> web.Response:
-        return _json(overview(await self._north.documents(STATE_AGE)))
+        return as_json(overview(await self._north.documents(STATE_AGE)))
 
     async def _lines(self, _: web.Request) -> web.Response:
         documents = await self._north.documents(STATE_AGE)
-        return await _json_off_loop(lambda: {"lines": dict(below("lines/", documents))})
+        return await json_off_loop(lambda: {"lines": dict(below("lines/", documents))})
 
     async def _device_page(self, request: web.Request) -> web.Response:
-        limit, after = _limit(request, _ITEMS, MOST_ITEMS), request.query.get("after", "")
+        limit, after = limit_of(request, _ITEMS, MOST_ITEMS), request.query.get("after", "")
         line = request.query.get("line")
         documents = await self._north.documents(STATE_AGE)
 
@@ -98,17 +98,17 @@ class Api:
             shown = {name: _without_requests(documents, name) for name in names[:limit]}
             return {"devices": shown, "next": names[limit - 1] if len(names) > limit else None}
 
-        return await _json_off_loop(page)
+        return await json_off_loop(page)
 
     async def _device(self, request: web.Request) -> web.Response:
         documents = await self._north.documents(STATE_AGE)
         name = request.match_info["device"]
         if (document := documents.get(f"devices/{name}")) is None:
             return answer(404, f"there is no device {payload.short(name)}")
-        return _json(document)
+        return as_json(document)
 
     async def _tags(self, request: web.Request) -> web.Response:
-        limit, after = _limit(request, _ITEMS, MOST_ITEMS), request.query.get("after")
+        limit, after = limit_of(request, _ITEMS, MOST_ITEMS), request.query.get("after")
         device, find = request.query.get("device"), request.query.get("find", "").lower()
         if device is not None and device not in self._devices:
             return answer(404, f"there is no device {payload.short(device)}")
@@ -119,7 +119,7 @@ class Api:
             tags = [{"tag": tag.key, **self._fields(tag)} for tag in found[:limit]]
             return {"tags": tags, "next": tags[-1]["tag"] if more else None}
 
-        return await _json_off_loop(page)
+        return await json_off_loop(page)
 
     def select(self, device: str | None, find: str, after: str | None, limit: int) -> list[Tag]:
         """Returns tags in the order of the file, after the tag `after`."""
@@ -145,7 +145,7 @@ class Api:
             return answer(404, f"there is no tag {payload.short(key)}")
         if history is None or not tag.history:
             return answer(404, f"no history is kept of {tag.key}: it needs `history: true`")
-        limit = _limit(request, _SAMPLES, MOST_SAMPLES)
+        limit = limit_of(request, _SAMPLES, MOST_SAMPLES)
         find = partial(_found, history, tag, dict(request.query), limit)
         is_valid = has_value(self._plant.sample(tag))
 
@@ -159,7 +159,7 @@ class Api:
             found = await off_loop(read)
         if isinstance(found, GatewayError):
             return answer(400 if isinstance(found, BadValue) else 503, str(found))
-        return await _json_off_loop(lambda: found)
+        return await json_off_loop(lambda: found)
 
     async def _write(self, request: web.Request) -> web.Response:
         arrived = asyncio.get_running_loop().time()
@@ -173,7 +173,7 @@ class Api:
         # The server does not cancel this when the client leaves: the write may be on the wire.
         result = await self._north.write(key, data, f"web {request[BY]}", arrived)
         status = _STATUS.get(result.problem, 500) if isinstance(result, Failure) else 200
-        return _raw(payload.outcome(result), status)
+        return raw(payload.outcome(result), status)
 
 
 def _found(
@@ -207,7 +207,7 @@ def _found(
 
 def overview(documents: Documents) -> dict[str, Any]:
     """Returns the state of the gateway, and sentences about what is wrong."""
-    parts = ("status", "zenoh", "outcomes", "history", "standby")
+    parts = ("status", "zenoh", "outcomes", "history", "standby", "alarms")
     return {
         **{name: documents[name] for name in parts if name in documents},
         "faults": [*faults(documents)],
@@ -223,25 +223,3 @@ def _devices_of(line: str, documents: Documents) -> Mapping[str, Any]:
 def _without_requests(documents: Documents, name: str) -> Mapping[str, Any]:
     document = documents[f"devices/{name}"]
     return {field: value for field, value in document.items() if field != "requests"}
-
-
-def _limit(request: web.Request, default: int, most: int) -> int:
-    text = request.query.get("limit", str(default))
-    if not (text.isascii() and text.isdigit() and len(text) < 9 and 1 <= int(text) <= most):
-        raise web.HTTPBadRequest(reason=f"limit is no count from 1 to {most}")
-    return int(text)
-
-
-async def _json_off_loop(make: Callable[[], object]) -> web.Response:
-    def body() -> bytes:
-        return orjson.dumps(make(), default=str, option=orjson.OPT_NON_STR_KEYS)
-
-    return _raw(await off_loop(body))
-
-
-def _json(found: object) -> web.Response:
-    return _raw(orjson.dumps(found, default=str, option=orjson.OPT_NON_STR_KEYS))
-
-
-def _raw(body: bytes, status: int = 200) -> web.Response:
-    return web.Response(body=body, status=status, content_type="application/json")

@@ -18,6 +18,7 @@ from aiohttp import ClientConnectionResetError, web
 from gateway.northbound import payload
 from gateway.northbound.faults import below
 from gateway.tags import Quality, Sample, Tag
+from gateway.web.alarms import alarms_shown
 from gateway.web.api import Api, overview
 from gateway.web.guard import answer
 from gateway.web.sources import Documents, Sources
@@ -85,7 +86,8 @@ class Events:
     def state(self, documents: Documents) -> dict[str, Any]:
         """Returns the state as all pages get it; made once for the same documents."""
         if self._state[0] is not documents:
-            self._state = documents, _state(documents)
+            alarms = alarms_shown(self._sources)
+            self._state = documents, {**_state(documents), "alarms": alarms}
         return self._state[1]
 
     async def handle(self, request: web.Request) -> web.StreamResponse:

@@ -97,6 +97,12 @@ def _metrics(documents: Documents, plant: Plant, *, ready: bool) -> Iterator[Met
     yield from _writes(documents["outcomes"])
     for name, field, text in _ZENOH:
         yield _one(name, text, {}, documents["zenoh"].get(field, 0))
+    alarms = _family("alarms", "Alarms by state", "state")
+    for state, count in documents["alarms"].items():
+        alarms.add_metric([state], count)
+    yield alarms
+    if (clock := documents.get("clock")) is not None:
+        yield _one("clock_jumps_total", "Jumps of the clock of the machine", {}, clock["jumps"])
     links = _family("zenoh_links", "Connections by kind", "to")
     for kind in ("router", "peer", "client"):
         links.add_metric([kind], documents["zenoh"]["to"].count(kind))

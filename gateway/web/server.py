@@ -14,6 +14,7 @@ from aiohttp import web
 from gateway.config import WebConfig
 from gateway.northbound.session import off_loop
 from gateway.web import assets, metrics
+from gateway.web.alarms import AlarmApi
 from gateway.web.api import Api
 from gateway.web.events import Events, Loads
 from gateway.web.guard import Guard, add_headers
@@ -46,6 +47,7 @@ class Server:
         self._app.add_routes(
             [
                 *self._api.routes(),
+                *AlarmApi(sources).routes(),
                 *assets.routes(),
                 web.get("/api/events", Events(sources, self._api, self._loads).handle),
                 web.get("/healthz", self._health),

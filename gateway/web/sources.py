@@ -4,16 +4,19 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from gateway.line.line import Watcher
-from gateway.northbound.interfaces import Device, History
+from gateway.alarms import Alarms
+from gateway.northbound.interfaces import Device, History, Lines
 from gateway.northbound.payload import Failure
 from gateway.tags import Sample, Tag, WriteResult
 
 Documents = Mapping[str, Mapping[str, Any]]  # by path: `status`, `lines/hall-1`, `devices/mixer`
 
 
-class Plant(Protocol):
+class Plant(Lines, Protocol):
     """The devices and their samples."""
+
+    @property
+    def alarms(self) -> Alarms: ...
 
     def devices(self) -> Iterable[Device]: ...
 
@@ -22,9 +25,6 @@ class Plant(Protocol):
 
     def sample(self, tag: Tag) -> Sample:
         """Returns the current sample; any thread may call it."""
-
-    def watch(self, line: str, watcher: Watcher | None) -> bool:
-        """Sets or removes the watcher of a line. False: there is no such line."""
 
 
 class North(Protocol):
@@ -35,6 +35,9 @@ class North(Protocol):
 
     async def write(self, tag: str, data: bytes, by: str, arrived: float) -> WriteResult | Failure:
         """Writes for the client `by`. `arrived`: by the loop's clock."""
+
+    def acknowledge(self, alarm: str, data: bytes, by: str, arrived: float) -> bytes | Failure:
+        """Acknowledges for the client `by`. Returns the document of the alarm."""
 
 
 @dataclass(frozen=True, slots=True)

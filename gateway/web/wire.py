@@ -3,49 +3,24 @@
 import asyncio
 import time
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple
 
-from gateway.engine.jobs import (
-    Answer,
-    Confirm,
-    Poll,
-    Probe,
-    ReadBack,
-    Repeat,
-    Result,
-    Settle,
-    Transacted,
-    WriteTogether,
-    requests_of,
-)
-from gateway.engine.requests import Command, Write
-from gateway.planning.planner import Block, describe
+from gateway.line.exchanges import Exchange, decoded
+from gateway.line.wire_log import Event, Performed
 from gateway.web.sources import Plant
 
 MOST_KEPT = 600  # exchanges of a line; a page asks four times a second
-_VERBS = {
-    Write: "write",
-    WriteTogether: "write",
-    ReadBack: "read back",
-    Confirm: "confirm",
-    Repeat: "repeat",
-}
-_SHOWN = 4  # values of a read
 
 
-class Exchange(NamedTuple):
-    """One job of a line. Times by the loop's clock."""
+class Numbered(NamedTuple):
+    """One exchange of a line. Times by the loop's clock."""
 
     number: int
     begun: float
     ended: float
-    device: str
-    kind: str  # read, write, probe, wait, other
-    what: str  # decoded: `read D100..D119`
-    result: str  # decoded values, or why it failed
-    failed: bool
+    exchange: Exchange
 
 
 class Recorder:
@@ -53,16 +28,21 @@ class Recorder:
 
     def __init__(self) -> None:
         self.watching = 0  # pages
-        self._kept: deque[tuple[int, Transacted, Result, float, float]] = deque(maxlen=MOST_KEPT)
+        self._kept: deque[tuple[int, Performed]] = deque(maxlen=MOST_KEPT)
         self._number = 0
 
-    def record(self, job: Transacted, result: Result, begun: float, ended: float) -> None:
-        self._number += 1
-        self._kept.append((self._number, job, result, begun, ended))
+    def record(self, event: Event) -> None:
+        if isinstance(event, Performed):
+            self._number += 1
+            self._kept.append((self._number, event))
 
-    def since(self, number: int) -> list[Exchange]:
+    def since(self, number: int) -> list[Numbered]:
         """Returns the exchanges after that number, decoded."""
-        return [_decoded(*one) for one in self._kept if one[0] > number]
+        return [
+            Numbered(own, one.begun, one.ended, decoded(one))
+            for own, one in self._kept
+            if own > number
+        ]
 
 
 class Wires:
@@ -75,11 +55,13 @@ class Wires:
     @contextmanager
     def watched(self, line: str) -> Iterator[Recorder | None]:
         """Records the line. None: there is no such line."""
-        recorder = self._recorders.get(line) or Recorder()
-        if line not in self._recorders and not self._plant.watch(line, recorder.record):
+        wire_log = self._plant.wire_logs().get(line)
+        if wire_log is None:
             yield None
             return
-        self._recorders[line] = recorder
+        recorder = self._recorders.setdefault(line, Recorder())
+        if not recorder.watching:
+            wire_log.listen(recorder.record)
         recorder.watching += 1
         try:
             yield recorder
@@ -87,49 +69,11 @@ class Wires:
             recorder.watching -= 1
             if not recorder.watching:
                 del self._recorders[line]
-                self._plant.watch(line, None)
+                wire_log.forget(recorder.record)
 
 
-def as_fields(exchange: Exchange) -> list[object]:
+def as_fields(one: Numbered) -> list[object]:
     """Returns what the page gets; the begin in ms since 1970."""
     behind = time.time() - asyncio.get_running_loop().time()
-    begun, took = (exchange.begun + behind) * 1000, exchange.ended - exchange.begun
-    return [exchange.number, round(begun, 1), round(took, 4), *exchange[3:]]
-
-
-def _decoded(number: int, job: Transacted, result: Result, begun: float, ended: float) -> Exchange:
-    kind, what = _what(job)
-    failed = isinstance(result, Exception)
-    if failed:
-        text = str(result)
-    elif isinstance(job, Poll):
-        text = _values(job.block, cast("Sequence[Any]", result))
-    else:
-        text = ""
-    return Exchange(number, begun, ended, job.device.name, kind, what, text, failed)
-
-
-def _what(job: Transacted) -> tuple[str, str]:
-    match job:
-        case Poll(block=block):
-            return "read", f"read {describe(block)}"
-        case Probe():
-            return "probe", "probe"
-        case Settle():
-            return "wait", "wait for a late reply"
-        case Answer():
-            return "other", "answer to its frame"
-        case Command(name=name):
-            return "write", f"command {name}"
-    writes = ", ".join(
-        f"{one.tag.name} = {one.value}" for one in requests_of(job) if isinstance(one, Write)
-    )
-    return "write", f"{_VERBS[type(job)]} {writes}"
-
-
-def _values(block: Block, units: Sequence[Any]) -> str:
-    decoder = block.decoder
-    samples = decoder.fields(units, 0) if block.of_fields else decoder.first(units, 0)
-    shown = [f"{one.tag.name} {one.value}" for one in samples[:_SHOWN] if one.value is not None]
-    more = len(samples) - len(shown)
-    return ", ".join(shown) + (f" and {more} more" if more else "")
+    begun, took = (one.begun + behind) * 1000, one.ended - one.begun
+    return [one.number, round(begun, 1), round(took, 4), *one.exchange]

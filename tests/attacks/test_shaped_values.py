@@ -1,10 +1,7 @@
 """Shaped values at the real program: names, parts of a word, ranges, formulas, there and back."""
 
 import struct
-from collections.abc import Iterator
-from typing import NamedTuple
-
-import pytest
+from pathlib import Path
 
 from tests.e2e.processes import Program, started, station, vigor_line, write_config
 from tests.zenoh_peer import ZenohPeer, free_endpoint
@@ -17,29 +14,33 @@ TAGS = {
     "flow": {"address": "D504", "type": "float32"},
     "sum": {"computed": "flow + level", "decimals": 2},
     "share": {"computed": "flow / mode"},
+    "parts": {"address": "D510", "type": "uint16", "counter": True},
+    "door": {"address": "M5", "debounce": "400ms"},
 }
 
 
-class Plant(NamedTuple):
-    plc: Program
-    endpoint: str
-
-
-@pytest.fixture(scope="module")
-def plant(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Plant]:
-    folder, endpoint = tmp_path_factory.mktemp("shaped"), free_endpoint()
-    line = vigor_line(str(folder / "tty"), TAGS)
-    config = write_config(folder / "config.yaml", endpoint, {"hall": line})
+async def test_reads_writes_formulas_and_totals_at_the_real_program(tmp_path: Path) -> None:
+    endpoint = free_endpoint()
+    line = vigor_line(str(tmp_path / "tty"), TAGS)
+    gateway = {"name": "demo", "state": "state.json"}
+    config = write_config(tmp_path / "config.yaml", endpoint, {"hall": line}, gateway=gateway)
     high, low = struct.unpack(">2H", struct.pack(">f", 235.388))
-    with station("pty", str(folder / "tty")) as plc:
+    with station("pty", str(tmp_path / "tty")) as plc:
         for number, word in enumerate((1, 0b1000, 0x12FE, 12000, low, high), 500):
             plc.tell(f"set 1 D {number} {word}")
+        plc.tell("set 1 D 510 65530")
+        with started(config) as program:
+            await _shaped(plc, endpoint)
+            assert program.end() == 0
+        plc.tell("set 1 D 510 10")
         with started(config):
-            yield Plant(plc, endpoint)
+            async with ZenohPeer("client", connect=[endpoint]) as client:
+                [reply] = await client.get("plant/mixer/parts?max_age=0s")
+    assert reply.json["value"] == 65546
 
 
-async def test_reads_writes_and_formulas_at_the_real_program(plant: Plant) -> None:
-    async with ZenohPeer("client", connect=[plant.endpoint]) as client:
+async def _shaped(plc: Program, endpoint: str) -> None:
+    async with ZenohPeer("client", connect=[endpoint]) as client:
 
         async def read(tag: str) -> dict[str, object]:
             [reply] = await client.get(f"plant/mixer/{tag}?max_age=0s")
@@ -66,7 +67,7 @@ async def test_reads_writes_and_formulas_at_the_real_program(plant: Plant) -> No
         assert await write("version", b"171") == 171
         assert await write("level", b"25") == 25.0
         assert await write("sum", b"1") == "not-writable"
-        words = [int(plant.plc.tell(f"get 1 D {number}")) for number in range(500, 504)]
+        words = [int(plc.tell(f"get 1 D {number}")) for number in range(500, 504)]
         assert words == [0, 0b1001, 0xABFE, 8000]
 
         assert await read("sum") == {"value": 260.39, **good}
@@ -76,5 +77,13 @@ async def test_reads_writes_and_formulas_at_the_real_program(plant: Plant) -> No
             "reason": "not-a-number",
             "detail": "division by zero",
         }
+        assert await read("parts") == {"value": 65530, **good}
+        plc.tell("set 1 D 510 3")
+        assert await read("parts") == {"value": 65539, **good}
+        assert await read("door") == {"value": False, **good}
+        door = await client.subscribe("plant/mixer/door")
+        plc.tell("set 1 M 5 1")
+        opened = await door.next(lambda sample: sample.json["value"] is True)
+        assert opened.json["quality"] == "good"
         [meta] = await client.get("plant/mixer/level/@meta")
     assert (meta.json["type"], meta.json["raw_type"]) == ("float64", "int16")

@@ -149,6 +149,13 @@ VALUES = '[...document.querySelectorAll("#values tr")].map((row) => row.cells[1]
 QUALITIES = '[...document.querySelectorAll("#values tr")].map((row) => row.cells[3].textContent)'
 
 
+ACKNOWLEDGE = f"""
+for (const [id, value] of Object.entries({{token: "{TOKEN}", name: "Ana", alarm: "line:yard"}}))
+  document.getElementById(`acknowledge-${{id}}`).value = value;
+document.getElementById("acknowledge-form").requestSubmit()
+"""
+
+
 async def test_the_page_is_live_and_turns_grey_at_once_when_the_gateway_ends(
     page: Page, tmp_path: Path
 ) -> None:
@@ -158,6 +165,11 @@ async def test_the_page_is_live_and_turns_grey_at_once_when_the_gateway_ends(
             'document.body?.className === "" && !!document.querySelector("#devices tr")'
         )
         assert "line yard is down" in await tab.value('document.querySelector("#wrong").innerText')
+        await tab.until('document.querySelector("#alarms").innerText.includes("line:yard")')
+        await tab.value(ACKNOWLEDGE)
+        await tab.until(
+            'document.querySelector("#acknowledge-result").textContent.includes("by Ana, now ack")'
+        )
         # By keyboard: the skip button leads to the devices, the button of the mixer to its values.
         await tab.value('document.querySelector("[data-device=mixer]").focus()')
         await tab.press("Enter")

@@ -13,8 +13,6 @@ META: dict[str, Any] = {
     "type": "int16",
     "unit": "",
     "description": "",
-    "scale": 1.0,
-    "offset": 0.0,
     "history": False,
     "payload": "json",
     "write": None,

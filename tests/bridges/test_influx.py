@@ -20,7 +20,7 @@ from tests.e2e.processes import ROOT, Program, free_port, listens, until
 from tests.zenoh_peer import free_endpoint
 
 TAGS: dict[str, dict[str, Any]] = {
-    "mixer/speed": {"type": "int16", "scale": 0.1},
+    "mixer/speed": {"type": "float64"},
     "mixer/total": {"type": "int64"},
     "mixer/name": {"type": "string[8]"},
 }

@@ -15,6 +15,7 @@ TAGS: dict[str, dict[str, Any]] = {
     "mixer/recipe": {"write": {"min": 1, "max": 40, "verify": False}},
     "mixer/raw": {"payload": "raw"},
     "oven/heat": {},
+    "scanner/code": {"type": "string[8]", "event": True},
 }
 
 
@@ -71,6 +72,11 @@ class Client:
         return subprocess.check_output([*command, *asked], text=True, timeout=20).split()
 
 
+def _is_seen(gateway: PlayedGateway, seen: Program) -> bool:
+    gateway.put("scanner/code", "A0")
+    return seen.has_said("plant/scanner/code", "A0")
+
+
 def test_a_client_of_the_broker_sees_no_good_value_that_is_not(
     mosquitto: Broker, tmp_path: Path
 ) -> None:
@@ -82,15 +88,18 @@ def test_a_client_of_the_broker_sees_no_good_value_that_is_not(
             gateway.put("mixer/speed", 12.5)
             with bridge("mqtt.py", *options) as first:
                 seen.says("plant/@bridge", "online")
-                assert '"value": 12.5, "quality": "good"' in seen.says("plant/mixer/speed")
-                before = [line.split()[0] for line in seen.lines].index("plant/@bridge")
-                assert any("12.5" in line for line in seen.lines[:before])
+                seen.says("plant/mixer/speed", '"value": 12.5, "quality": "good"')
                 assert '"unit": "rpm"' in seen.says("plant/@meta/mixer/speed")
 
                 gateway.put("mixer/speed", None, "no-reply")
                 seen.says("plant/mixer/speed", '"value": null', '"bad"', '"no-reply"')
                 gateway.put("mixer/raw", 77)
                 seen.says("plant/mixer/raw", '"value": 77', '"good"')
+                until(lambda: _is_seen(gateway, seen), "events arrive")
+                for code in ("A1", "A1", "B2"):  # an event is no last value
+                    gateway.put("scanner/code", code)
+                seen.says("plant/scanner/code", "B2")
+                assert sum('"A1"' in line for line in seen.lines) == 2
                 gateway.block("oven", heat=5)
                 seen.says("plant/oven/heat", '"value": 5', '"good"')
 
@@ -112,8 +121,13 @@ def test_a_client_of_the_broker_sees_no_good_value_that_is_not(
                 seen.says("plant/oven/heat", '"no-gateway"', after=after)
                 seen.says("plant/@bridge", "online", after=after)
                 assert not any('"good"' in line for line in seen.lines[after:])
+                gateway.documents["oven/heat"] = {"quality": "good", "value": [1]}  # no document
                 gateway.arrive()
+                seen.says("plant/oven/heat", '"garbled"', after=after)
                 seen.says("plant/mixer/speed", "13.5", '"good"', after=after)
+                assert not any(
+                    "scanner/code" in line and "B2" in line for line in seen.lines[after:]
+                )
 
                 broker.end(signal.SIGKILL)
                 after = len(seen.lines)
@@ -145,6 +159,7 @@ def test_a_command_is_written_once_and_has_its_outcome(mosquitto: Broker, tmp_pa
         with client.seen as seen:
             with bridge("mqtt.py", *options) as first:
                 seen.says("plant/@bridge", "online")
+                seen.says("plant/@meta/mixer/recipe")
                 assert '"written"' in outcome("7")
                 twice = '{"id": "a", "value": 8}'
                 assert '"id": "a", "outcome": "written"' in outcome(twice, "-q", "1")
@@ -170,6 +185,7 @@ def test_a_command_is_written_once_and_has_its_outcome(mosquitto: Broker, tmp_pa
             after = len(seen.lines)
             with bridge("mqtt.py", *options):
                 seen.says("plant/@bridge", "online", after=after)
+                seen.says("plant/@meta/mixer/recipe", after=after)
                 assert '"unclear"' in outcome('{"id": "b", "value": 8}', "-q", "1")
                 assert '"written"' in outcome(twice, "-q", "1")
                 assert len(gateway.written) == 5

@@ -14,7 +14,7 @@ from tests.e2e.processes import Program, free_port, started, until, vigor_line, 
 from tests.zenoh_peer import free_endpoint
 
 TAGS: dict[str, dict[str, Any]] = {
-    "mixer/speed": {"type": "int16", "scale": 0.1, "unit": "rpm", "description": "of the drum"},
+    "mixer/speed": {"type": "float64", "unit": "rpm", "description": "of the drum"},
     "mixer/recipe": {"write": {"min": 1, "max": 40, "verify": False}},
     "mixer/alarms/door": {"type": "bool"},
     "mixer/name": {"type": "string[8]"},
@@ -43,11 +43,14 @@ def plant(node: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Plant
     endpoint, url = free_endpoint(), f"opc.tcp://127.0.0.1:{free_port()}"
     folder = tmp_path_factory.mktemp("opcua")
     options = ("--connect", endpoint, "--listen", url, "--writes")
-    with PlayedGateway(endpoint, TAGS) as gateway, bridge("opcua.py", *options) as server:
+    with (
+        PlayedGateway(endpoint, TAGS) as gateway,
+        bridge("opcua.py", *options) as server,
+        Program(node, INTEROP / "opcua_client.js", folder) as client,
+    ):
         server.says("listening")
-        with Program(node, INTEROP / "opcua_client.js", url, folder) as client:
-            client.says("ready")
-            yield Plant(endpoint, gateway, client)
+        client.tell(f"connect {url}")
+        yield Plant(endpoint, gateway, client)
     assert "Traceback" not in "\n".join(server.lines)
 
 
@@ -132,6 +135,8 @@ def test_an_opc_ua_client_reads_a_gateway_and_its_history(plant: Plant, tmp_path
         times = [known["time"] for known in whole]
         assert sorted(set(times)) == times
         assert back[::-1][: len(whole)] == whole
+        last = plant.ask("history", speed, 0, 3, "last")["values"]
+        assert last[::-1][: len(whole)] == whole
         assert plant.ask("history", recipe, 60, 0) == {"status": "BadHistoryOperationUnsupported"}
 
         gateway.end(signal.SIGKILL)

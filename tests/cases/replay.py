@@ -1,14 +1,10 @@
 """Reads wire logs, so that a recording from a plant becomes a test: docs/wire-log-to-test.md."""
 
-import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-# `hall-1 > 02 30` as the gateway logs it, or `12.345678 > 02 30`; a journal's prefix may precede.
-PIECE = re.compile(
-    r"(?:^|\s)(?:\d+\.\d+|(?P<line>[^\s<>]+)) (?P<way>[<>]) (?P<data>[0-9a-f]{2}(?: [0-9a-f]{2})*)$"
-)
+from gateway.line.wire_file import LoggedPiece, entries
 
 
 class Piece(NamedTuple):
@@ -22,15 +18,10 @@ Transaction = list[str]  # a `tests.doubles.Script`: one request and the bytes t
 
 
 def pieces(log: Path, line: str | None = None) -> Iterator[Piece]:
-    """The pieces of one line of the plant in their order; other lines of text are skipped.
-
-    `line`: the name of the line; pieces of other lines are skipped. A piece without a name belongs
-    to every line.
-    """
-    for text in log.read_text("utf-8").splitlines():
-        match = PIECE.search(text.rstrip())
-        if match and (line is None or match["line"] in (line, None)):
-            yield Piece(match["way"], match["data"])
+    """The pieces of one line of the plant in their order; other lines of text are skipped."""
+    for entry in entries(log.read_text("utf-8").splitlines(), line):
+        if isinstance(entry, LoggedPiece):
+            yield Piece(entry.way, entry.data.hex(" "))
 
 
 def transactions(log: Path, line: str | None = None) -> list[Transaction]:

@@ -1,6 +1,5 @@
 """Wire logs of plants, one folder for each case; docs/wire-log-to-test.md explains the method."""
 
-import sys
 from pathlib import Path
 
 import pytest
@@ -10,7 +9,6 @@ from gateway.protocols.driver import Span
 from gateway.protocols.vigor import Vigor
 from tests.cases.replay import pieces, transactions
 from tests.doubles import Script, octets
-from tests.e2e.processes import Program, until
 from tests.vectors import vectors
 
 LATE = Path(__file__).parent / "late_reply_and_bad_address" / "wire.log"
@@ -49,23 +47,3 @@ def test_every_form_of_a_wire_log_is_read(tmp_path: Path) -> None:
     )
     assert transactions(log, "hall-1") == [["> 02 30", "< 06 30"], ["> 02 31"]]
     assert len(list(pieces(log))) == 5
-
-
-def test_the_log_of_a_running_gateway_is_read(tmp_path: Path) -> None:
-    config, log = tmp_path / "plant.yaml", tmp_path / "wire.log"
-    config.write_text(
-        "zenoh: {listen: []}\n"
-        "lines: {hall-1: {port: simulator, devices: {mixer: {protocol: vigor, station: 1,"
-        " tags: {speed: {address: D100}}}}}}\n"
-    )
-    run = (sys.executable, "-m", "gateway", "run", config, "--log-level", "debug")
-    with Program(*run) as program:
-
-        def two_transactions() -> bool:
-            log.write_text("\n".join(program.lines))
-            return len(transactions(log, "hall-1")) >= 2
-
-        until(two_transactions, "two requests are logged")
-    request, *received = transactions(log, "hall-1")[0]
-    assert request.startswith("> 02 30 31")
-    assert received[0].startswith("< 06 30 31")

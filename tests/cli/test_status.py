@@ -142,3 +142,21 @@ def test_control_characters_of_a_device_do_not_reach_the_terminal(healthy: dict[
 )
 def test_a_span_of_time(seconds: float, text: str) -> None:
     assert span(seconds) == text
+
+
+def test_a_lost_router_is_said() -> None:
+    documents: dict[str, Any] = {"zenoh": {"connect": ["tcp/10.0.0.1:7447"], "to": ["client"]}}
+    said = "Zenoh: not connected to tcp/10.0.0.1:7447: its clients get no values"
+    assert list(faults(documents)) == [said]
+    for to in ("router", "peer"):
+        documents["zenoh"]["to"] = ["client", to]
+        assert list(faults(documents)) == []
+
+
+def test_a_jump_of_the_clock_is_said_for_an_hour() -> None:
+    documents: dict[str, Any] = {"status": {"refused_devices": {}}}
+    documents["clock"] = {"jumps": 1, "last": -600.0, "ago": 61.0}
+    [said] = warnings(documents)
+    assert said.startswith("the clock of this machine jumped by -600.0 s 1 min ago")
+    documents["clock"]["ago"] = 3601.0
+    assert list(warnings(documents)) == []

@@ -341,7 +341,7 @@ LINES = [
         "(N, E or O) and stop bits (1 or 2), such as 7E1",
         "6: lines.hall.echo: 'maybe' is neither true nor false",
         "7: lines.hall.parity: no setting of a line: "
-        "use port, baudrate, format, echo, serve, defaults or devices",
+        "use port, baudrate, format, echo, serve, listen_only, defaults or devices",
     ),
     bad(
         "negative baud rate",
@@ -611,6 +611,23 @@ TAGS = [
         f"9: {M}.tags.b.scale: 'big' is no number",
         f"10: {M}.tags.c.offset: nan is no number that can be used",
         f"11: {M}.tags.d.offset: true is no number",
+    ),
+    bad(
+        "alarms",
+        tags("a: {address: D1, alarm: {}}", "b: {address: D2, alarm: {high: 5, low: 7}}",
+             "c: {address: D3, alarm: {on: true}}", "d: {address: M1, alarm: {high: 1}}",
+             "e: {address: M2, alarm: {on: true, off: true}}",
+             "f: {address: D4, alarm: {high: 5, low: 4, hysteresis: 1}}",
+             "g: {address: D5, alarm: {high: 5, hysteresis: -1}}",
+             'h: {address: D6, type: "string[2]", alarm: {high: 5}}'),
+        f"8: {M}.tags.a.alarm: an alarm needs a limit, such as high: 80, or for a bit on: true",
+        f"9: {M}.tags.b.alarm: low 7 is not below high 5",
+        f"10: {M}.tags.c.alarm: a int16 has limits, such as high: 80; only a bit has on and off",
+        f"11: {M}.tags.d.alarm: a bool has no limits: write on: true, or off: true",
+        f"12: {M}.tags.e.alarm: a bit has on: true or off: true, and no limit or hysteresis",
+        f"13: {M}.tags.f.alarm: hysteresis must be less than 1, the distance of low and high",
+        f"14: {M}.tags.g.alarm.hysteresis: -1 is no distance: it is zero or more",
+        f"15: {M}.tags.h.alarm: a string[2] has no alarm: only numbers and bits have",
     ),
     bad(
         "scale of a bit",

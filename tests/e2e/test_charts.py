@@ -28,12 +28,16 @@ async def test_the_time_without_a_gateway_is_a_gap(tmp_path: Path) -> None:
             good(tag("n"), 1, now - 3000 * SECOND),
         ]
         file.store(1, 0, earlier)
-    tags = {"speed": {"address": "D10", "history": True}, "n": {"address": "D11", "history": True}}
+    tags = {"speed": {"address": "D{first}"}, "n": {"address": "D{first + 1}"}}
+    template = {"parameters": ["first"], "defaults": {"history": True}, "tags": tags}
+    line = vigor_line("simulator", {})
+    line["devices"]["mixer"] |= {"use": "plc", "first": 10}
     endpoint = free_endpoint()
     config = write_config(
         tmp_path / "config.yaml",
         endpoint,
-        {"hall": vigor_line("simulator", tags)},
+        {"hall": line},
+        templates={"plc": template},
         history={"path": str(history)},
         web={"listen": f"127.0.0.1:{port}"},
     )

@@ -15,6 +15,8 @@ from typing import Any
 import pytest
 
 from gateway import service
+from gateway.alarms import Alarms
+from gateway.alarms.file import AlarmFile
 from gateway.app import Gateway
 from gateway.config import load
 from gateway.history import Historian
@@ -252,6 +254,6 @@ async def test_history_gets_the_time_that_zenoh_leaves() -> None:
     zenoh_task = asyncio.create_task(zenoh())
     await asyncio.sleep(0)
     # Private: the order and the times of the end are the subject; `run` needs signals and ports.
-    await service._close(zenoh_task, as_history, as_state_file)
+    await service._close(zenoh_task, as_history, as_state_file, AlarmFile(None, Alarms(())))
     assert history.given <= service.END_WITHIN - zenoh_takes < 2
     assert state_file.given <= service.STATE_FILE_WITHIN

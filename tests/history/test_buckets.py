@@ -266,6 +266,17 @@ def test_a_value_is_not_valid_while_no_gateway_ran(tmp_path: Path) -> None:
         assert drawn(course, 10, 30, Now(at(65), is_valid=True)) == [("partial", 2), ("bad", 0)]
 
 
+def test_a_start_of_one_tag_ends_its_value_at_the_last_sample_of_another(tmp_path: Path) -> None:
+    """A changed file is loaded while the gateway runs."""
+    samples = [good(SPEED, 5, at(0)), good(DOOR, 1, at(12)), bad(SPEED, Reason.STARTING, at(15))]
+    for runs in ([samples], [samples[:1], samples[1:]], [samples, [good(DOOR, 2, at(30))]]):
+        with filed(tmp_path / f"{len(runs[-1])}.db", runs) as (course, _):
+            assert drawn(course, 0, 20, Now(at(40), is_valid=True)) == [
+                ("good", 10),
+                ("partial", 2),
+            ]
+
+
 def test_a_value_is_not_valid_over_samples_that_are_lost(tmp_path: Path) -> None:
     runs = [[good(SPEED, n, at(n)) for n in range(begin, begin + 10)] for begin in (0, 10, 20, 30)]
     with filed(tmp_path / "h.db", [*runs, []]) as (course, _):

@@ -137,6 +137,12 @@ class SlowHistory:
     def writes(self, time_range: str, limit: int | None, now: int) -> Iterator[str]:
         return self._answer(time_range, now, ["{}"])
 
+    def alarms(self, time_range: str, limit: int | None, now: int) -> Iterator[str]:
+        raise NotImplementedError
+
+    def record_alarm(self, time: int, change: str) -> None:
+        raise NotImplementedError
+
     def record_write(self, time: int, outcome: str, *, refused: bool) -> None:
         raise NotImplementedError
 

@@ -1,20 +1,20 @@
-// npm's OPC UA client, controlled by commands: `node opcua_client.js ENDPOINT FOLDER`. It prints
-// `ready`, then executes commands from its standard input and prints `ok` and JSON after each:
+// npm's OPC UA client, controlled by commands: `node opcua_client.js FOLDER`, for its certificates. It
+// executes commands from its standard input and prints `ok` and JSON after each:
 //
+//     connect opc.tcp://127.0.0.1:4840       the first command
 //     browse i=85                 the nodes below: their ids
 //     read ns=2;s=mixer/speed     value, type, status, source time
 //     meta ns=2;s=mixer/speed     data type, access level, description, unit and range
 //     write ns=2;s=mixer/recipe Int16 7      the status code
 //     start …  /  written         the same write in the background; waits for its status code
-//     history ns=2;s=mixer/speed SECONDS COUNT [back]     of the last seconds; counts and values
+//     history ns=2;s=mixer/speed SECONDS COUNT [back|last]   of the last seconds; `back`: the newest
+//                                            first; `last`: the newest first, without a start
 //     watch ns=2;s=mixer/speed    prints `changed ns=2;s=mixer/speed STATUS VALUE` from now on
 "use strict";
 
 const readline = require("node:readline");
 const ua = require("node-opcua-client");
 const { OPCUACertificateManager } = require("node-opcua-certificate-manager");
-
-const [endpointUrl, folder] = process.argv.slice(2);
 
 function shown(value) {
     return {
@@ -56,10 +56,11 @@ async function write(session, nodeId, type, text) {
     return code.name;
 }
 
-async function history(session, nodeId, seconds, count, back) {
+async function history(session, nodeId, seconds, count, order) {
     const now = new Date();
     const begin = new Date(now - seconds * 1000);
-    const [startTime, endTime] = back ? [now, begin] : [begin, now];
+    const times = { back: [now, begin], last: [null, now] };
+    const [startTime, endTime] = times[order] ?? [begin, now];
     const historyReadDetails = new ua.ReadRawModifiedDetails({
         isReadModified: false,
         startTime,
@@ -105,15 +106,12 @@ async function watch(session, nodeId) {
     });
 }
 
-async function main() {
-    const clientCertificateManager = new OPCUACertificateManager({ rootFolder: folder });
+async function main(folder) {
     const client = ua.OPCUAClient.create({
-        clientCertificateManager,
+        clientCertificateManager: new OPCUACertificateManager({ rootFolder: folder }),
         endpointMustExist: false,
-        connectionStrategy: { initialDelay: 100, maxDelay: 200, maxRetry: 100 },
     });
-    await client.connect(endpointUrl);
-    const session = await client.createSession();
+    let session;
     let started;
     const commands = {
         browse,
@@ -121,13 +119,16 @@ async function main() {
         write,
         history,
         watch,
+        connect: async (_, endpointUrl) => {
+            await client.connect(endpointUrl);
+            session = await client.createSession();
+        },
         read: async (_, nodeId) => shown(await session.read({ nodeId })),
         start: async (...given) => {
             started = write(...given);
         },
         written: () => started,
     };
-    console.log("ready");
     for await (const line of readline.createInterface({ input: process.stdin })) {
         const [name, ...given] = line.split(" ");
         const answer = await commands[name](session, ...given);
@@ -137,4 +138,4 @@ async function main() {
     await client.disconnect();
 }
 
-main();
+main(...process.argv.slice(2));

@@ -66,7 +66,7 @@ def opened(
     if not needs_resync:
         device.health.answered()
     may_not_send = (duty or Duty()).why_not
-    channel = Channel(port, wire, WireLog("test"), Echo("test", echo), may_not_send=may_not_send)
+    channel = Channel(port, wire, WireLog(), Echo("test", echo), may_not_send=may_not_send)
     channel.quiet_since = quiet_since
     frames = [] if unmatched is None else unmatched
     port.talk = Transaction(channel, device, lambda _, frame, echo: frames.append(frame))

@@ -171,7 +171,7 @@ def test_other_bytes_after_a_transaction_end_the_wait_for_the_echo() -> None:
 
 
 def channel(baudrate: int = 9600) -> Channel:
-    return Channel(FakePort(), WireTiming(baudrate, 10), WireLog("hall"), Echo("hall", None))
+    return Channel(FakePort(), WireTiming(baudrate, 10), WireLog(), Echo("hall", None))
 
 
 @pytest.mark.parametrize("baudrate", [9600, 19200, 38400, 115200])
@@ -249,7 +249,7 @@ async def test_a_pause_delays_the_next_request() -> None:
 @on_virtual_time
 async def test_a_lost_port_sends_nothing() -> None:
     far = FakePort()
-    port = Channel(far, WireTiming(9600, 10), WireLog("hall"), Echo("hall", None))
+    port = Channel(far, WireTiming(9600, 10), WireLog(), Echo("hall", None))
     port.lost_by = LineDown("unplugged")
     with pytest.raises(LineDown, match="unplugged"):
         port.send(b"1", 0.0)

@@ -1,14 +1,19 @@
 """Values that clients write and a master reads."""
 
+import asyncio
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from gateway.app import Gateway
+from gateway.cli import direct
 from gateway.config import built
 from gateway.errors import BadValue, Busy
-from gateway.tags import Quality, Tag
+from gateway.tags import Quality, Reason, Tag
+from gateway.transport import TcpAddress, listen
+from tests.interop.peers import free_port
 
 TAGS = {
     "limit": {"address": "holding:1", "write": {"max": 50}, "retain": True},
@@ -65,3 +70,42 @@ async def test_a_held_value_outside_new_limits_is_dropped(tmp_path: Path) -> Non
     one = gateway(tmp_path)
     one.serving.restore()
     assert one.sample(tag(one, "limit")).quality is Quality.BAD
+
+
+async def test_direct_access_sends_nothing_on_the_wire_of_a_master(tmp_path: Path) -> None:
+    config = gateway(tmp_path).config
+    tags = config.devices[0].tags
+    order, limit = tags[2], tags[0]
+    [sample] = await direct.read(config, [order])
+    assert sample.reason is Reason.LINE_DOWN
+    with pytest.raises(BadValue, match="only the running gateway has it"):
+        await direct.write(config, limit, 1)
+
+
+async def test_a_connection_ends_with_bytes_that_are_no_modbus_and_the_next_is_served(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(listen, "MOST_CONNECTIONS", 2)
+    one = gateway(tmp_path)
+    [line] = one.serving.lines
+    number = free_port()
+    line.config = replace(line.config, port=TcpAddress("127.0.0.1", number))
+    task = asyncio.create_task(line.run())
+    while not line.is_open:
+        await asyncio.sleep(0)
+    for _ in range(3):
+        reader, writer = await asyncio.open_connection("127.0.0.1", number)
+        writer.write(b"GET / HTTP/1.1\r\n\r\n")
+        assert await reader.read() == b""
+        writer.close()
+        await writer.wait_closed()
+    ends = [await asyncio.open_connection("127.0.0.1", number) for _ in range(3)]
+    for _, writer in ends:
+        writer.write(bytes.fromhex("0001 0000 0006 01 06 0064 0001"))
+    assert len(await ends[0][0].readexactly(12)) == 12
+    assert await ends[2][0].read() == b""  # one too many
+    task.cancel()
+    await asyncio.wait([task])
+    assert await ends[0][0].read() == b""
+    for _, writer in ends:
+        writer.close()

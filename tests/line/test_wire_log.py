@@ -1,45 +1,31 @@
-"""The wire log: its listeners, its lines in the log, and no cost while it is off."""
+"""The wire log: its listeners, and no cost while it is off."""
 
-import logging
-
-import pytest
-
-from gateway.line.wire_log import WireLog
-
-
-@pytest.fixture(autouse=True)
-def quiet_log(caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level(logging.INFO, "gateway.wire")
+from gateway.line.wire_log import Event, Piece, WireLog
 
 
 def test_without_a_listener_the_wire_log_is_off() -> None:
-    assert not WireLog("hall").active
+    assert not WireLog().active
 
 
 def test_a_listener_turns_it_on_and_gets_every_byte_with_its_direction() -> None:
-    wire_log = WireLog("hall")
-    passed: list[tuple[str, bytes]] = []
-    wire_log.listen(lambda direction, data: passed.append((direction, data)))
+    wire_log, passed = WireLog(), list[Event]()
+    wire_log.listen(passed.append)
     assert wire_log.active
     wire_log.sent(b"\x02\x30")
     wire_log.heard(b"\x06")
-    assert passed == [(">", b"\x02\x30"), ("<", b"\x06")]
+    assert passed == [Piece(">", b"\x02\x30"), Piece("<", b"\x06")]
 
 
-def test_every_listener_gets_the_bytes_from_then_on() -> None:
-    wire_log = WireLog("hall")
-    first, second = list[bytes](), list[bytes]()
-    wire_log.listen(lambda _, data: first.append(data))
+def test_every_listener_gets_the_bytes_until_it_is_forgotten() -> None:
+    wire_log = WireLog()
+    first, second = list[Event](), list[Event]()
+    take = first.append
+    wire_log.listen(take)
     wire_log.sent(b"1")
-    wire_log.listen(lambda _, data: second.append(data))
-    wire_log.sent(b"2")
-    assert (first, second) == ([b"1", b"2"], [b"2"])
-
-
-def test_the_debug_log_turns_it_on(caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level(logging.DEBUG, "gateway.wire")
-    wire_log = WireLog("hall")
+    wire_log.listen(second.append)
+    wire_log.forget(take)
     assert wire_log.active
-    wire_log.sent(b"\x02\x30")
-    wire_log.heard(b"\x06")
-    assert [record.getMessage() for record in caplog.records] == ["hall > 02 30", "hall < 06"]
+    wire_log.sent(b"2")
+    wire_log.forget(second.append)
+    assert not wire_log.active
+    assert (first, second) == ([Piece(">", b"1")], [Piece(">", b"2")])

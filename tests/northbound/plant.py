@@ -7,6 +7,7 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from gateway.alarms import Alarms
 from gateway.config import ZenohConfig
 from gateway.engine.requests import CommandResult
 from gateway.errors import (
@@ -14,7 +15,7 @@ from gateway.errors import (
     Busy,
 )
 from gateway.line.duty import Duty
-from gateway.line.line import Watcher
+from gateway.line.wire_log import WireLog
 from gateway.northbound import Northbound
 from gateway.protocols.driver import Address, Span, Unit
 from gateway.tags import Reason, Sample, Tag, WriteResult, WriteRule, bad, good
@@ -50,6 +51,7 @@ class PlainPlant:
         self.duty = Duty()
         self._devices = devices
         self._tags = {tag.key: tag for device in devices for tag in device.tags}
+        self.alarms = Alarms(self._tags.values())
         self.samples = {
             key: bad(tag, Reason.STARTING, time.time_ns()) for key, tag in self._tags.items()
         }
@@ -63,13 +65,10 @@ class PlainPlant:
         self.known_commands: Mapping[str, frozenset[str]] = {}
         self.command_result: CommandResult | Exception = CommandResult("acknowledged", 1, 0.1)
         self.commanded: list[tuple[str, str, str]] = []
-        self.watchers: dict[str, Watcher] = {}  # by line
+        self.hall = WireLog()
 
-    def watch(self, line: str, watcher: Watcher | None) -> bool:
-        self.watchers.pop(line, None)
-        if watcher is not None:
-            self.watchers[line] = watcher
-        return line == "hall"
+    def wire_logs(self) -> Mapping[str, WireLog]:
+        return {"hall": self.hall}
 
     def devices(self) -> Iterable[PlainDevice]:
         return self._devices

@@ -43,7 +43,7 @@ async def served(gateway: Gateway, until: str) -> None:
 
 async def test_before_the_first_transaction(tmp_path: Path) -> None:
     documents = made(tmp_path).status()
-    assert set(documents) == {"status", "lines/hall", "devices/mixer"}
+    assert set(documents) == {"status", "alarms", "lines/hall", "devices/mixer"}
     status = documents["status"]
     assert (status["name"], status["tags"]) == ("demo", 2)
     assert (status["lines"], status["devices"]) == ({"hall": False}, {"mixer": "starting"})
@@ -76,7 +76,7 @@ async def test_a_failing_device_has_a_diagnosis(tmp_path: Path) -> None:
 
 async def test_a_disabled_device_has_no_document_of_its_own(tmp_path: Path) -> None:
     documents = made(tmp_path, enabled=False).status()
-    assert set(documents) == {"status", "lines/hall"}
+    assert set(documents) == {"status", "alarms", "lines/hall"}
     assert documents["status"]["devices"] == {}
 
 

@@ -56,6 +56,12 @@ class RecordedWrites:
     def writes(self, time_range: str, limit: int | None, now: int) -> Iterator[str]:
         raise NotImplementedError
 
+    def alarms(self, time_range: str, limit: int | None, now: int) -> Iterator[str]:
+        raise NotImplementedError
+
+    def record_alarm(self, time: int, change: str) -> None:
+        raise NotImplementedError
+
     def record_write(self, time: int, outcome: str, *, refused: bool) -> None:
         self.recorded.append(json.loads(outcome))
 

@@ -41,7 +41,7 @@ async def test_an_interval_changes_and_no_value_turns_bad() -> None:
         await asyncio.sleep(10)
         assert all(sample.quality is Quality.GOOD for sample in plant.published)
         assert plant.online[states:] == []
-        assert 49 <= sum(name == "mixer" for name, _, _ in polls) <= 102  # two blocks or one
+        assert 49 <= sum(name == "mixer" for name, _ in polls) <= 102  # two blocks or one
         assert plant.gateway.lines[0].engine.record.opened == 1
 
 
@@ -58,7 +58,7 @@ async def test_the_reload_of_one_of_64_lines_costs_the_others_no_poll() -> None:
         changed = [n for n, one in enumerate(plant.gateway.enabled_devices) if one not in devices]
         assert changed == [7]
         for n, found in enumerate(polls):
-            begun = [at for _, at, _ in found]
+            begun = [at for _, at in found]
             gaps = [b - a for a, b in pairwise(begun)]
             assert max(gaps) < 1.05, n
             assert plant.gateway.enabled_devices[n].record.overruns == 0
@@ -217,6 +217,29 @@ async def test_computed_tags_follow_their_inputs() -> None:
         await plant.reload(lambda data: device(data, "oven")["tags"].pop("sum"))
         assert plant.gateway.tag("oven/sum") is None
         assert plant.of("oven/sum")[-1].reason is Reason.DISABLED
+
+
+@on_virtual_time
+async def test_alarms_follow_their_tags_devices_and_lines() -> None:
+    def alarmed(data: Data, high: float) -> None:
+        device(data, "mixer")["tags"]["level"]["alarm"] = {"high": high}
+
+    data = file(hall={"mixer": vigor(1), "oven": vigor(2)}, yard={"pump": vigor(3)})
+    alarmed(data, -1.0)
+    async with running(data) as plant:
+        alarms = plant.gateway.alarms
+        await plant.until_good("mixer/level")
+        assert list(alarms.open) == ["mixer/level"]
+        await plant.reload(lambda data: device(data, "mixer").update(defaults={"every": "200ms"}))
+        assert list(alarms.open) == ["mixer/level"]
+        await asyncio.sleep(2)  # the line goes on with the alarm of the tag
+        assert plant.sample("mixer/level").quality is Quality.GOOD
+        await plant.reload(lambda data: device(data, "mixer").update(station=7))
+        assert list(alarms.open) == ["mixer/level"]  # bad quality never clears an alarm
+        await plant.reload(lambda data: alarmed(data, 30000.0))
+        assert list(alarms.open) == []
+        await plant.reload(lambda data: data["lines"].pop("hall"))
+        assert set(alarms.entries) == {"pump", "line:yard"}
 
 
 @on_virtual_time

@@ -17,6 +17,7 @@ SOURCES = {
     "speed": {"address": "D100"},
     "level": {"address": "D110", "type": "float32"},
     "run": {"address": "M5"},
+    "gear": {"address": "D130"},
     "name": {"address": "D120", "type": "string[8]"},
 }
 MIXER = {"protocol": "vigor", "station": 1, "tags": SOURCES}

@@ -1,7 +1,7 @@
 """Modbus TCP stations of the gateway, without a connection."""
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gateway.tags import Quality, Reason
@@ -13,6 +13,7 @@ TAGS = {
     "kept": {"address": "holding:5", "source": "mixer/speed", "hold_last": True},
     "run": {"address": "coil:0", "source": "mixer/run"},
     "bit": {"address": "holding:6.3", "source": "mixer/run"},
+    "high": {"address": "holding:6", "type": "uint8", "byte": "high", "source": "mixer/gear"},
     "limit": {"address": "input:7", "write": True},
     "setpoint": {"address": "holding:100", "type": "int16"},
     "ramp": {"address": "holding:102", "type": "float32", "word_order": "high_first"},
@@ -30,7 +31,8 @@ HMI = {
 
 def bench() -> Bench:
     made = Bench("tcp://127.0.0.1:5020", {"hmi": HMI})
-    made.values = {"mixer/speed": 1234, "mixer/level": 1.5, "mixer/run": True, "hmi/limit": 9}
+    made.values = {"mixer/speed": 1234, "mixer/level": 1.5, "mixer/run": True, "mixer/gear": 5}
+    made.values["hmi/limit"] = 9
     return made
 
 
@@ -48,7 +50,7 @@ def test_a_master_reads_the_values_of_other_tags_in_their_own_types() -> None:
     made = bench()
     assert ask(made, "03 0000 0003") == "03 06 04 d2 00 00 3f c0"  # 1.5, low word first
     assert ask(made, "01 0000 0001") == "01 01 01"
-    assert ask(made, "03 0006 0001") == "03 02 00 08"
+    assert ask(made, "03 0006 0001") == "03 02 05 08"
     assert ask(made, "04 0007 0001") == "04 02 00 09"
 
 
@@ -142,6 +144,17 @@ def test_what_a_silent_master_wrote_turns_bad_until_it_writes_again() -> None:
     assert ask(made, "03 0064 0001") == "03 02 00 08"
 
 
+def test_a_lost_port_turns_what_the_master_wrote_bad() -> None:
+    made = bench()
+    [station] = made.line.stations.values()
+    ask(made, "06 0064 0007")
+    assert {one.reason for one in station.lost(1, "closed")} == {Reason.LINE_DOWN}
+    assert station.diagnosis() == "The line is down: closed"
+    station.opened(made.now)
+    assert ask(made, "03 0064 0001") == "83 04"
+    assert station.diagnosis() == ""
+
+
 def test_units_of_other_stations_have_no_path_and_a_single_station_has_two_more() -> None:
     made = bench()
     assert ask(made, "03 0000 0001", unit=2) == "83 0a"
@@ -158,13 +171,14 @@ def test_requests_in_one_piece_and_in_many_are_all_answered() -> None:
     assert len(replies) == 23
 
 
-def test_after_bytes_that_are_no_modbus_nothing_is_answered() -> None:
+def test_bytes_that_are_no_modbus_end_the_connection() -> None:
     made = bench()
-    assert made.ask(b"GET / HTTP/1.1\r\n\r\n") == b""
-    assert made.ask(bytes.fromhex("0001 0000 0006 01 06 0064 0001")) == b""
-    assert made.written == []
+    heard = made.hear(b"GET / HTTP/1.1\r\n\r\n")
+    assert heard.lost
+    assert heard.reply == b""
 
 
+@settings(max_examples=40, deadline=None)
 @given(st.lists(st.binary(max_size=40), max_size=8), st.binary(max_size=12))
 def test_any_bytes_write_nothing_outside_accept(pieces: list[bytes], pdu: bytes) -> None:
     made = bench()

@@ -181,6 +181,19 @@ class _Info:
         return object()
 
 
+class _Publisher:
+    """A publisher of a key that no client subscribes to."""
+
+    matching = False
+
+    @property
+    def matching_status(self) -> "_Publisher":
+        return self
+
+    def declare_matching_listener(self, _: object) -> object:
+        return object()
+
+
 class Session:
     """The session of the gateway."""
 
@@ -223,6 +236,9 @@ class Session:
     def declare_subscriber(self, key: str, handler: Any, allowed_origin: object) -> object:
         self._subscribers.append((key, handler.callback))
         return object()
+
+    def declare_publisher(self, _: str) -> _Publisher:
+        return _Publisher()
 
     def liveliness(self) -> _Liveliness:
         return _Liveliness(self)

@@ -118,6 +118,7 @@ class SimWire:
         self._sendings: list[Sending] = []
         self._ours_until = 0.0
         self._replied: tuple[float, Speaker | None] = (-math.inf, None)  # until when, and who
+        self._heard_until = -math.inf  # the end of the last reply that the gateway heard
         self.server = DeviceServer(self)
         self._context = copy_context()  # the world's, also where the gateway sends
 
@@ -237,8 +238,8 @@ class SimWire:
         return math.ceil(missing / self.wire.character) if 0.0 < missing <= needed else 0
 
     def silence_at(self, start: float) -> float:
-        """Returns the seconds of silence before a request, after a reply."""
-        return start - self._replied[0]
+        """Returns the seconds of silence before a request, after a reply that the gateway heard."""
+        return start - self._heard_until
 
     def ask(self, station: Speaker, data: bytes, end: float, request: bytes) -> None:
         """The request, which ended at `end`, reaches the station."""
@@ -296,6 +297,7 @@ class SimWire:
             self.watch.passed("<", data)
             if sending.request and sending.station is not None and sending.data.endswith(data):
                 self.watch.answered_other(sending.station, sending.request, sending.data)
+            self._heard_until = max(self._heard_until, sending.end)
             self._ear.received(data)
 
     @property

@@ -125,19 +125,19 @@ def test_a_computed_value_follows_its_inputs_and_is_as_new_as_the_newest() -> No
     mirror = Mirror(tag.values(), 0)
     assert mirror[tag["share"]].reason is Reason.STARTING
     changed = mirror.update([good(tag["a"], 30, 1000), good(tag["b"], 70, 2000)])
-    found = mirror.computed_after(changed)
-    assert values(found) == {"total": 100, "share": 30.0}
-    assert {sample.time for sample in found} == {2000}
-    assert mirror.computed_after(mirror.update([good(tag["a"], 30, 3000)])) == []
+    found = mirror.follow(changed)
+    assert values(found) == {"a": 30, "b": 70, "total": 100, "share": 30.0}
+    assert {sample.time for sample in found[2:]} == {2000}
+    assert mirror.follow(mirror.update([good(tag["a"], 30, 3000)])) == []
     assert mirror[tag["total"]].time == 3000  # read again: still 100
 
 
 def test_a_bad_input_makes_it_bad_and_is_named() -> None:
     tag = tags_of(*ROWS)
     mirror = Mirror(tag.values(), 0)
-    mirror.computed_after(mirror.update([good(tag["a"], 30, 1000), good(tag["b"], 70, 1000)]))
+    mirror.follow(mirror.update([good(tag["a"], 30, 1000), good(tag["b"], 70, 1000)]))
     lost = bad(tag["b"], Reason.NO_REPLY, 2000, "No byte came back")
-    total, share = mirror.computed_after(mirror.update([lost]))
+    _, total, share = mirror.follow(mirror.update([lost]))
     assert total == bad(tag["total"], Reason.NO_REPLY, 2000, "input b is bad: No byte came back")
     assert (share.quality, share.reason) == (Quality.BAD, Reason.NO_REPLY)
     assert share.detail == "input total is bad: input b is bad: No byte came back"
@@ -146,14 +146,12 @@ def test_a_bad_input_makes_it_bad_and_is_named() -> None:
 def test_a_division_by_zero_is_bad_until_the_divisor_changes() -> None:
     tag = tags_of(*ROWS)
     mirror = Mirror(tag.values(), 0)
-    found = mirror.computed_after(
-        mirror.update([good(tag["a"], 5, 1000), good(tag["b"], -5, 1000)])
-    )
-    assert found[1] == bad(tag["share"], Reason.NOT_A_NUMBER, 1000, "division by zero")
-    assert mirror.computed_after(mirror.update([good(tag["b"], -5, 2000)])) == []
+    found = mirror.follow(mirror.update([good(tag["a"], 5, 1000), good(tag["b"], -5, 1000)]))
+    assert found[3] == bad(tag["share"], Reason.NOT_A_NUMBER, 1000, "division by zero")
+    assert mirror.follow(mirror.update([good(tag["b"], -5, 2000)])) == []
     assert mirror[tag["share"]].time == 1000  # when it became bad
-    found = mirror.computed_after(mirror.update([good(tag["b"], 5, 3000)]))
-    assert values(found) == {"total": 10, "share": 50.0}
+    found = mirror.follow(mirror.update([good(tag["b"], 5, 3000)]))
+    assert values(found) == {"b": 5, "total": 10, "share": 50.0}
 
 
 def test_the_type_of_a_computed_value_follows_from_its_inputs() -> None:

@@ -80,7 +80,7 @@ def test_the_silence_before_a_request_is_kept_although_timers_fire_early() -> No
         port, driver = SilentPort(), ModbusRtu(station=0)
         timing = replace(driver.timing, silence=silence, silence_chars=0.0)
         device = made_device("all", driver, wire, timing, [make_tag("coil:0", driver)])
-        channel = Channel(port, wire, WireLog("line"), Echo("line", None))
+        channel = Channel(port, wire, WireLog(), Echo("line", None))
         for _ in range(100):
             port.quiet_since = channel.quiet_since = asyncio.get_running_loop().time()
             await driver.write(Transaction(channel, device), Span("coil", 0, 1), [1])

@@ -67,6 +67,7 @@ class PlainNorth:
         return {
             "status": status,
             "zenoh": ZENOH,
+            "alarms": {"normal": 3, "active": 1},
             "outcomes": Counts().document(),
             **DOCUMENTS,
             **self.changed,
@@ -77,6 +78,11 @@ class PlainNorth:
         await self.gate.wait()
         self.written.append((tag, data, by))
         return self.endings.get(data, Failure(Problem.UNKNOWN_TAG, "no such tag"))
+
+    def acknowledge(self, alarm: str, data: bytes, by: str, arrived: float) -> bytes | Failure:
+        self.written.append((alarm, data, by))
+        ending = self.endings.get(data, Failure(Problem.NOTHING_TO_ACKNOWLEDGE, "it is normal"))
+        return ending if isinstance(ending, Failure) else b"{}"
 
 
 class Answer(NamedTuple):

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from gateway.northbound.payload import Failure, Problem
-from gateway.tags import WriteResult, good
+from gateway.tags import AlarmRule, Level, WriteResult, good
 from gateway.web.server import Server
 from gateway.web.sources import Sources
 from tests.history.recorded import SPEED, history
@@ -54,6 +54,8 @@ async def test_the_description_has_every_address_and_no_other() -> None:
         ("/api/tags?limit=1001", "/api/tags", 400),
         ("/api/tags?device=none", "/api/tags", 404),
         ("/api/history?tag=mixer/speed", "/api/history", 404),
+        ("/api/alarms?state=all&limit=1", "/api/alarms", 200),
+        ("/api/alarms?state=none", "/api/alarms", 400),
     ],
 )
 async def test_an_answer_is_as_described(address: str, path: str, status: int) -> None:
@@ -224,10 +226,10 @@ async def test_a_line_is_watched_only_while_a_page_shows_it() -> None:
         writer.write(b"GET /api/events?line=hall HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
         async with asyncio.timeout(5):
             await reader.readuntil(b"event: time")
-            assert set(client.plant.watchers) == {"hall"}
+            assert client.plant.hall.active
             writer.close()
             await writer.wait_closed()
-            while client.plant.watchers:
+            while client.plant.hall.active:
                 await asyncio.sleep(0.001)
 
 
@@ -242,9 +244,40 @@ async def test_a_page_that_takes_nothing_is_dropped(monkeypatch: pytest.MonkeyPa
         _, writer = await asyncio.open_connection("127.0.0.1", client.port, limit=1024)
         writer.write(b"GET /api/events?line=hall HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
         async with asyncio.timeout(10):
-            while not client.plant.watchers:
+            while not client.plant.hall.active:
                 await asyncio.sleep(0.001)
-            while client.plant.watchers:  # the reader takes 2 kB, then nothing
+            while client.plant.hall.active:  # the reader takes 2 kB, then nothing
                 await asyncio.sleep(0.01)
         assert (await client.ask("/healthz")).status == 200
         writer.close()
+
+
+def alarmed() -> PlainPlant:
+    rule = AlarmRule({Level.HIGH: 80}, text="too fast")
+    tags = [tag("mixer", name, alarm=rule) for name in ("speed", "level", "flow")]
+    plant = PlainPlant(PlainDevice("mixer", tuple(tags)))
+    for one in tags[:2]:
+        plant.samples[one.key] = good(one, 85, 5)
+    return plant
+
+
+async def test_alarms_are_listed_in_pages() -> None:
+    plant = alarmed()
+    plant.alarms.judge([plant.samples["mixer/speed"], plant.samples["mixer/level"]])
+    async with serving(plant=plant) as client:
+        first = (await client.ask("/api/alarms?limit=1")).json
+        second = (await client.ask(f"/api/alarms?limit=1&after={first['next']}")).json
+        both = {one["alarm"] for page in (first, second) for one in page["alarms"]}
+        assert (both, second["next"]) == ({"mixer/speed", "mixer/level"}, None)
+        assert first["counts"] == {"normal": 1, "active": 2, "acknowledged": 0, "returned": 0}
+        assert violations(first, schema("/api/alarms", 200)) == []
+        assert len((await client.ask("/api/alarms?state=all")).json["alarms"]) == 3
+
+
+async def test_an_alarm_is_acknowledged_with_a_token_only(tokens: Path) -> None:
+    path = "/api/alarms/acknowledge?alarm=mixer/speed"
+    body = b'{"by": "Ana"}'
+    async with serving(tokens_file=tokens) as client:
+        assert (await client.ask(path, "POST", body, Content_Type="application/json")).status == 401
+        assert (await client.ask(path, "POST", body, **AS_JSON)).status == 409
+        assert client.north.written == [("mixer/speed", body, "web alice")]

@@ -14,6 +14,7 @@ import zenoh
 from gateway.cli.client.arguments import matches, tags_by_key
 from gateway.cli.client.rows import Row, document, raw, reason, without_gateway
 from gateway.cli.client.signing import signature
+from gateway.cli.client.tracing import traced
 from gateway.cli.client.value_pages import paged
 from gateway.config import Config
 from gateway.config.commands import TO_ALL
@@ -108,6 +109,25 @@ class Client:
         if any(reply.err is not None for reply in replies):
             return None
         return [document(reply.ok.payload.to_bytes()) for reply in replies if reply.ok is not None]
+
+    def alarms(self) -> list[dict[str, Any]]:
+        """Returns the document of each alarm. Raises `GatewayError`."""
+        replies = self._answers(self._keys.alarm("**"))
+        if not replies:
+            self.status()  # a gateway may have no alarms
+        return [document(reply.ok.payload.to_bytes()) for reply in replies if reply.ok is not None]
+
+    def acknowledge(self, alarm: str, by: str) -> dict[str, object]:
+        """Returns the document of the alarm, or `error ...`. Raises as `write`."""
+        key = self._keys.alarm(alarm)
+        status = self._keys.status("status")
+        return self._request(key, json.dumps({"by": by}).encode(), status)
+
+    def trace(self, line: str, until: float | None) -> Iterator[dict[str, Any]]:
+        """Yields the trace of a line, in parts. Raises `GatewayError` if nobody serves it."""
+        session, keys = self._session, self._keys
+        served = partial(self.status, f"lines/{line}")
+        return traced(session, keys, line, until, served, self._tell)
 
     def write(self, tag: str, value: Value) -> dict[str, object]:
         """Returns the outcome as the gateway sends it: `value ...` or `error ...`.

@@ -20,6 +20,7 @@ from gateway.protocols.computer_link.codec import (
     Text,
 )
 from gateway.protocols.computer_link.devices import DEVICE, PROFILES, Profile, ProfileName
+from gateway.protocols.computer_link.ear import Read, learn, link_ear
 from gateway.protocols.computer_link.replies import (
     AREA_C_ECHO,
     NO_REPLY_CAUSES,
@@ -37,6 +38,7 @@ from gateway.protocols.computer_link.scattered import (
 )
 from gateway.protocols.devices import parse_device, spell_device
 from gateway.protocols.driver import Address, Area, Cost, ScanHints, Span, Talk, Timing, Traits
+from gateway.protocols.listening import Ear, Learn
 
 LinkTalk = Talk[Frame]
 T = TypeVar("T")
@@ -240,6 +242,18 @@ class ComputerLink:
         """Sends a loopback. No data reply has its letter Z; the rest is the `probe_token`."""
         await self._loopback(talk, f"Z{probe_token & 0xFFFF:04X}")
         return 0xFFFF
+
+    # Listening to another master
+
+    @property
+    def framing(self) -> Hashable:
+        return self.protocol, self.frame_format, self.sum_check
+
+    def ear(self, character: float) -> Ear:
+        return link_ear(self.frame_format, self.sum_check)
+
+    def learn(self, read: Read, span: Span) -> Learn | None:
+        return learn(read, self._limits, span)
 
     # The shapes of replies
 

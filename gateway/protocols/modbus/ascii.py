@@ -45,7 +45,7 @@ class AsciiCodec:
         frames = []
         for line in lines:
             text = line[line.rfind(b":") :] + b"\n"
-            body = _body(text)
+            body = body_of(text)
             if body and self._damage is None:
                 frames.append(Frame(body[0], body[1:]))
             elif not body and self._is_reply(text):
@@ -58,7 +58,7 @@ class AsciiCodec:
         return len(text) == self._size and text.upper().startswith(self._head)
 
 
-def _body(text: bytes) -> bytes:
+def body_of(text: bytes) -> bytes:
     """Returns station and PDU of a frame from colon to line feed; empty for a bad frame."""
     if not text.startswith(b":") or not text.endswith(b"\r\n"):
         return b""

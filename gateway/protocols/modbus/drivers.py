@@ -16,6 +16,7 @@ from gateway.protocols.driver import (
     Timing,
     Traits,
 )
+from gateway.protocols.listening import Ear, Learn
 from gateway.protocols.modbus import ascii as ascii_
 from gateway.protocols.modbus import mbap, rtu
 from gateway.protocols.modbus.addressing import (
@@ -27,6 +28,7 @@ from gateway.protocols.modbus.addressing import (
     Limits,
 )
 from gateway.protocols.modbus.ascii import AsciiCodec
+from gateway.protocols.modbus.ear import MbapEar, Read, RtuEar, ascii_ear
 from gateway.protocols.modbus.frame import Frame
 from gateway.protocols.modbus.master import Master
 from gateway.protocols.modbus.mbap import MbapCodec
@@ -101,6 +103,13 @@ class _Modbus:
         return self._master.resync(talk, outstanding, probe_token, spans)
 
     @property
+    def framing(self) -> Hashable:
+        return self.protocol
+
+    def learn(self, read: Read, span: Span) -> Learn | None:
+        return self._master.learn(read, span)
+
+    @property
     def unnumbered(self) -> bool:
         return not self._master.numbered
 
@@ -126,6 +135,7 @@ class ModbusRtu(_Modbus):
     protocol: Literal["modbus-rtu"] = "modbus-rtu"
 
     scan_hints: ClassVar = ScanHints(formats=("8N1", "8E1", "8O1", "8N2"))
+    dissector: ClassVar = "mbrtu"
     _traits: ClassVar = Traits(baudrate=9600, format="8E1", binary=True, word_type=Kind.UINT16)
 
     @property
@@ -135,6 +145,9 @@ class ModbusRtu(_Modbus):
 
     def codec(self) -> Codec[Frame]:
         return RtuCodec()
+
+    def ear(self, character: float) -> Ear:
+        return RtuEar(character)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -153,6 +166,9 @@ class ModbusAscii(_Modbus):
     def codec(self) -> Codec[Frame]:
         return AsciiCodec()
 
+    def ear(self, character: float) -> Ear:
+        return ascii_ear()
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ModbusTcp(_Modbus):
@@ -163,6 +179,7 @@ class ModbusTcp(_Modbus):
     window: int = 1  # the most outstanding requests that the device accepts
 
     scan_hints: ClassVar = ScanHints(formats=())
+    dissector: ClassVar = "mbtcp"
     _traits: ClassVar = Traits(baudrate=None, word_type=Kind.UINT16)
 
     @property
@@ -171,6 +188,9 @@ class ModbusTcp(_Modbus):
 
     def codec(self) -> Codec[Frame]:
         return MbapCodec()
+
+    def ear(self, character: float) -> Ear:
+        return MbapEar()
 
 
 def _master(device: _Modbus) -> Master:

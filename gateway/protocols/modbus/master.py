@@ -10,6 +10,7 @@ from gateway.protocols.driver import Area, Cost, Span, Talk, Unit
 from gateway.protocols.harmless import HarmlessReads, told_from
 from gateway.protocols.modbus import pdu
 from gateway.protocols.modbus.addressing import Dialect, Limits, Place
+from gateway.protocols.modbus.ear import Read
 from gateway.protocols.modbus.frame import READ_BITS, Frame, answer_length
 
 _REMEMBERED = 1024  # spans whose request is kept ready
@@ -118,18 +119,35 @@ class Master:
         registers = span.size * place.registers
         request = pdu.read_request(place.function, place.at(span.start), registers)
         length = answer_length(request)
-        if _is_bits(place):
-            units = pdu.bits_in(registers)
-        elif place.area.unit is Unit.DWORD:
-            units = pdu.dwords_in(span.size, low_first=self.low_first)
-        else:
-            units = pdu.words_in(registers)
+        units = self._units_in(place, span)
         head = bytes((place.function, length - 2))
         prepared = ReadRequest(request, head, length, self.chars(length), units)
         if len(self._prepared) >= _REMEMBERED:
             self._prepared.clear()
         self._prepared[span] = prepared
         return prepared
+
+    def _units_in(self, place: Place, span: Span) -> Callable[[bytes], Sequence[int]]:
+        """Returns the decoder of a reply that holds the span and nothing else."""
+        if _is_bits(place):
+            return pdu.bits_in(span.size)
+        if place.area.unit is Unit.DWORD:
+            return pdu.dwords_in(span.size, low_first=self.low_first)
+        return pdu.words_in(span.size)
+
+    def learn(self, read: Read, span: Span) -> Callable[[bytes], Sequence[int]] | None:
+        """Returns the decoder of the span in the reply to a read; None if it is not all in it."""
+        place = self._place(span)
+        if place is None or self.broadcast or place.function != read.function:
+            return None
+        begin, size = place.at(span.start) - read.wire, span.size * place.registers
+        if begin < 0 or begin + size > read.size:
+            return None
+        if _is_bits(place):
+            of_all = pdu.bits_in(read.size)
+            return lambda reply: of_all(reply)[begin : begin + size]
+        units = self._units_in(place, span)
+        return lambda reply: units(reply[:2] + reply[2 + 2 * begin : 2 + 2 * (begin + size)])
 
     async def write(self, talk: Talk[Frame], span: Span, units: Sequence[int]) -> bool:
         request = self._write_request(span, units)

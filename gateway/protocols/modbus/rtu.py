@@ -75,7 +75,7 @@ class RtuCodec:
             if size == 0:
                 continue
             whole = bytes(heard[start : start + size])
-            if len(whole) == size and _is_sound(whole):
+            if len(whole) == size and is_sound(whole):
                 del heard[: start + size]
                 return Frame(whole[0], whole[1:-2])
             if whole[:2] != self._sent[:2] or self._may_be_echo(heard[start:]):
@@ -95,14 +95,14 @@ class RtuCodec:
         return sent[1] not in _ECHOED and sent.startswith(heard[: len(sent)])
 
 
-def _is_sound(whole: bytes) -> bool:
+def is_sound(whole: bytes) -> bool:
     """Returns True when a frame ends with its CRC."""
     return crc16(whole[:-2]) == whole[-2:]
 
 
 def _whole_reply(data: bytes) -> bool:
     """Returns True for exactly one whole reply."""
-    return len(data) >= _SHORTEST and _reply_size(data, 0) == len(data) and _is_sound(data)
+    return len(data) >= _SHORTEST and _reply_size(data, 0) == len(data) and is_sound(data)
 
 
 def _reply_size(heard: bytes | bytearray, start: int) -> int:
@@ -150,7 +150,7 @@ class RtuSlaveCodec:
             whole = bytes(heard[start : start + size])
             if len(whole) < size and whole[0] in self._addressed:
                 return None
-            if len(whole) == size and _is_sound(whole):
+            if len(whole) == size and is_sound(whole):
                 del heard[: start + size]
                 return Frame(whole[0], whole[1:-2])
         return self._unknown()
@@ -161,7 +161,7 @@ class RtuSlaveCodec:
             len(whole) < 4
             or whole[0] not in self._addressed
             or whole[1] in _KNOWN
-            or not _is_sound(whole)
+            or not is_sound(whole)
         ):
             return None
         self._heard.clear()

@@ -17,6 +17,7 @@ MOST_BYTES = 128  # that one 51 reads or one 61 writes
 SHORT_REPLY = 10  # characters of a reply without data
 LONGEST_REPLY = SHORT_REPLY + 2 * MOST_BYTES
 LONGEST_REQUEST = 14 + 2 * MOST_BYTES
+_SHORTEST_REQUEST = 8  # station and command between STX and ETX, and the sum
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,6 +113,28 @@ def _reply(match: re.Match[bytes]) -> Reply:
         raise Garbled("a reply with half a byte of data", whole, evidence=Evidence.SHAPE)
     names = head.decode("ascii")
     return Reply(int(names[:2], 16), names[2:4], names[4:], unhexlify(digits))
+
+
+def first_reply(data: bytes) -> tuple[Reply | None, int]:
+    """Returns the reply at the beginning of the bytes and its size; None: not whole yet.
+
+    Raises `Garbled`.
+    """
+    match = _REPLY.match(data)
+    return (None, 0) if match is None else (_reply(match), match.end())
+
+
+def first_request(data: bytes) -> tuple[bytes | None, int]:
+    """As `first_reply`, for a request: its bytes."""
+    match = _REQUEST.match(data)
+    if match is None:
+        return None, 0
+    whole = match[0]
+    if len(whole) < _SHORTEST_REQUEST or not frozenset(HEX_DIGITS).issuperset(whole[1:3]):
+        raise Garbled("no request", whole, evidence=Evidence.SHAPE)
+    if b"%02X" % (sum(whole[1:-2]) & 0xFF) != whole[-2:]:
+        raise Garbled("a request with a wrong sum", whole, evidence=Evidence.CHECKSUM)
+    return whole, len(whole)
 
 
 class RequestReader:

@@ -21,6 +21,7 @@ from gateway.protocols.driver import (
     Unit,
 )
 from gateway.protocols.harmless import HarmlessReads, told_from
+from gateway.protocols.listening import Ear, Learn
 from gateway.protocols.vigor.codec import (
     FORCE_OFF,
     FORCE_ON,
@@ -43,6 +44,7 @@ from gateway.protocols.vigor.devices import (
     bytes_from_bits,
     cover,
 )
+from gateway.protocols.vigor.ear import vigor_ear
 
 # Characters of a 51 request and of a 61 request without data; of a 70 or 71 request.
 _BLOCK_REQUEST, _FORCE_REQUEST = 14, 12
@@ -127,7 +129,7 @@ class Vigor:
         if covered is None:
             raise ConfigError(f"{span.size} of {span.area} from {span.start}: not in one request")
         data = await self._read_bytes(talk, covered.address, covered.size)
-        unit = AREAS[span.area].unit
+        unit = AREAS[span.area].unit  # as `_units`, which would be one more call for each poll
         if unit is Unit.BIT:
             return bits_from_bytes(data)[covered.ahead : covered.ahead + span.size]
         form = f"<{len(data) // 4}I" if unit is Unit.DWORD else f"<{len(data) // 2}H"
@@ -189,6 +191,24 @@ class Vigor:
         if covered is not None:
             await self._read_bytes(talk, covered.address, covered.size)
 
+    # Listening to another master
+
+    @property
+    def framing(self) -> Hashable:
+        return self.protocol
+
+    def ear(self, character: float) -> Ear:
+        return vigor_ear()
+
+    def learn(self, read: tuple[int, int], span: Span) -> Learn | None:
+        """`read`: address and number of the bytes."""
+        covered, (address, count) = cover(span), read
+        if covered is None or covered.address < address:
+            return None
+        begin = covered.address - address
+        end = begin + covered.size
+        return None if end > count else lambda data: _units(data[begin:end], span, covered)
+
     # The shapes of replies
 
     @property
@@ -233,6 +253,15 @@ class Vigor:
         bits = bits_from_bytes(await self._read_bytes(talk, covered.address, covered.size))
         bits[covered.ahead : len(bits) - covered.behind] = units
         return bits
+
+
+def _units(data: bytes, span: Span, covered: Cover) -> Sequence[int]:
+    """Returns the units of `span`, of its bytes."""
+    unit = AREAS[span.area].unit
+    if unit is Unit.BIT:
+        return bits_from_bytes(data)[covered.ahead : covered.ahead + span.size]
+    form = f"<{len(data) // 4}I" if unit is Unit.DWORD else f"<{len(data) // 2}H"
+    return struct.unpack(form, data)  # low byte first
 
 
 def _pick(outstanding: Span | None, spans: Sequence[Span]) -> Callable[[int], Span]:

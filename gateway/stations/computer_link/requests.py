@@ -2,13 +2,9 @@
 
 from gateway.protocols.checksums import byte_sum
 from gateway.protocols.computer_link.codec import ACK, CL, ENQ, EOT, NAK, FrameFormat
+from gateway.protocols.computer_link.requests import HEADER, NEVER, area_length
 
-_HEADER = 7  # station, PC number, command, wait
 _LONGEST = 600
-_NOT_YET, _NEVER = 10_000, 20_000  # longer than any request
-_BARE = ("RR", "RS", "MB", "MN", "MW", "PC")
-_ENTRY = {"BW": 1, "WW": 4, "BT": 6, "WT": 9, "BM": 5, "WM": 5, "TT": 1}
-_HEX = frozenset("0123456789ABCDEF")
 
 
 class RequestReader:
@@ -59,37 +55,14 @@ class RequestReader:
             if not block.endswith(b"\r\n"):
                 return []
             del block[-2:]
-        elif len(block) != _HEADER + _area_length(block.decode("latin-1")) + self._sum:
+        elif len(block) != HEADER + area_length(block.decode("latin-1")) + self._sum:
             return []
         self._block = None
         return [block.decode("latin-1")]
 
     def _ends_with_the_piece(self, block: bytearray) -> bool:
-        if self._frame_format == 4 or len(block) < _HEADER + self._sum:
+        if self._frame_format == 4 or len(block) < HEADER + self._sum:
             return False
-        if _area_length(block.decode("latin-1")) != _NEVER:
+        if area_length(block.decode("latin-1")) != NEVER:
             return False
         return not self._sum or byte_sum(bytes(block[:-2])) == block[-2:]
-
-
-def _area_length(text: str) -> int:
-    """Returns the characters of the area; _NOT_YET before, _NEVER for an unknown command."""
-    command, area = text[4:6], text[_HEADER:]
-    if len(text) < _HEADER:
-        return _NOT_YET
-    if command in _BARE:
-        return 0
-    if command == "GW":
-        return 1
-    if command in ("BR", "WR"):
-        return 7
-    if command not in _ENTRY:
-        return _NEVER
-    before = 5 if command in ("BW", "WW") else 0
-    count = area[before : before + 2]
-    if len(count) < 2:
-        return _NOT_YET
-    if not _HEX.issuperset(count):
-        return _NEVER
-    entry = 8 if command == "WW" and "CN200" <= area[:5] <= "CN255" else _ENTRY[command]
-    return before + 2 + int(count, 16) * entry

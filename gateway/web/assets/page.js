@@ -162,7 +162,8 @@ function takeTime([now, steady]) {
 function takeState(state) {
   const standby = state.standby ? `, ${state.standby}` : "";
   put("name", state.name);
-  document.title = `${state.faults.length ? `(${state.faults.length}) ` : ""}${state.name}`;
+  const wanted = state.faults.length + state.alarms.shown.filter((one) => one.state !== "acknowledged").length;
+  document.title = `${wanted ? `(${wanted}) ` : ""}${state.name}`;
   const history = state.history === null ? "" : `, history ${state.history === "ok" ? "ok" : "not ok"}`;
   put("about", `${state.version}, up ${span(state.up)}, ${state.tags} tags, ${state.links.length} Zenoh links${history}${standby}`);
   const sentences = [
@@ -176,11 +177,74 @@ function takeState(state) {
     known.items = JSON.stringify(items);
     byId("wrong").replaceChildren(...items.map(([kind, text]) => element("li", text, kind)));
   }
+  showAlarms(state.alarms);
   known.lines = state.lines;
   for (const [name, device] of Object.entries(state.devices)) known.devices.set(name, device);
   showLines();
   if (Object.keys(state.devices).length) showDevices();
 }
+
+// -- alarms --
+
+const LEVELS = { high_high: "far too high", high: "too high", low: "too low", low_low: "far too low", on: "on", off: "off" };
+
+function showAlarms({ shown, more }) {
+  const text = JSON.stringify(shown);
+  if (text === known.alarms) return;
+  known.alarms = text;
+  byId("alarms").replaceChildren(...shown.map((one) => {
+    const row = element("tr");
+    const title = element("th", one.alarm);
+    title.scope = "row";
+    const limit = typeof one.limit === "number" ? ` (${one.limit})` : "";
+    const value = !("time" in one) ? "" : typeof one.value === "boolean" ? (one.value ? "on" : "off") : one.value;
+    const since = Date.parse(one.since);
+    const good = one.quality === "good";
+    const shownValue = !good ? `bad: ${one.reason ?? "not known"}` : one.unit ? `${value} ${one.unit}` : value;
+    const by = one.acknowledged;
+    row.append(
+      title,
+      element("td", one.state, one.state === "acknowledged" ? "acknowledged" : `unacknowledged ${one.state}`),
+      element("td", [one.text, LEVELS[one.level] && `${LEVELS[one.level]}${limit}`, one.detail].filter(Boolean).join(": ")),
+      element("td", String(shownValue), good ? "number value" : "number bad"),
+      element("td", Date.now() - since < 86400e3 ? clock(since) : new Date(since).toLocaleString(), "less"),
+      element("td", by ? `${by.by}, ${clock(Date.parse(by.time))}` : "no"),
+    );
+    return row;
+  }));
+  put("alarm-count", shown.length ? (more ? `and ${more} more: see api/alarms` : "") : "none");
+  const open = shown.filter((one) => one.state !== "acknowledged");
+  const chosen = byId("acknowledge-alarm").value;
+  byId("acknowledge-alarm").replaceChildren(...open.map((one) => {
+    const option = element("option", one.alarm);
+    option.dataset.raised = one.raised;
+    return option;
+  }));
+  if (open.some((one) => one.alarm === chosen)) byId("acknowledge-alarm").value = chosen;
+  byId("acknowledging").hidden = !open.length && !byId("acknowledge-result").textContent;
+}
+
+// The time of the alarm goes with it: an alarm that was raised again meanwhile is not acknowledged.
+byId("acknowledge-form").addEventListener("submit", async (event) => {
+  event.preventDefault();
+  token = byId("acknowledge-token").value.trim() || token;
+  const [chosen] = byId("acknowledge-alarm").selectedOptions;
+  if (!chosen) return;
+  const alarm = chosen.value;
+  const body = JSON.stringify({ by: byId("acknowledge-name").value.trim(), raised: chosen.dataset.raised });
+  put("acknowledge-result", "sending …");
+  try {
+    const reply = await fetch(`api/alarms/acknowledge?${new URLSearchParams({ alarm })}`, {
+      method: "POST", body, headers: { ...headers(), "Content-Type": "application/json" },
+    });
+    const found = await reply.json();
+    put("acknowledge-result", reply.ok ? `${alarm}: acknowledged by ${found.acknowledged.by}, now ${found.state}` : `${alarm}: ${found.reason ?? found.error}`);
+  } catch {
+    put("acknowledge-result", `${alarm}: the connection ended; it is not known whether it was acknowledged`);
+  }
+});
+
+// -- lines --
 
 function takeLoads(loads) {
   for (const [name, added] of Object.entries(loads)) {

@@ -1,0 +1,218 @@
+"""One alarm: a state machine after ISA-18.2. It does no I/O and has no clock.
+
+Only a good value changes what the limits say. A bad value holds everything: an alarm neither comes
+nor goes by it, and the time of a delay stands still.
+"""
+
+from collections.abc import Mapping
+from enum import StrEnum
+from typing import NamedTuple
+
+from gateway.errors import GatewayError
+from gateway.tags.alarm import BELOW, AlarmRule, Level
+from gateway.values import Value
+
+
+class NothingToAcknowledge(GatewayError):
+    """The alarm needs no acknowledgement, or is not the one that the operator saw."""
+
+
+class State(StrEnum):
+    """States of an alarm. The names of ISA-18.2 are in docs/alarms.md."""
+
+    NORMAL = "normal"
+    ACTIVE = "active"  # a limit is reached; not acknowledged
+    ACKNOWLEDGED = "acknowledged"  # a limit is still reached
+    RETURNED = "returned"  # no limit is reached any more; not acknowledged
+
+
+class Event(StrEnum):
+    """Events that change an alarm."""
+
+    RAISED = "raised"  # a limit is reached, or a worse one
+    EASED = "eased"  # only a less severe limit is still reached
+    ENDED = "ended"  # no limit is reached any more
+    ACKNOWLEDGED = "acknowledged"
+
+
+_S, _E = State, Event
+TRANSITIONS: Mapping[tuple[State, Event], State] = {
+    (_S.NORMAL, _E.RAISED): _S.ACTIVE,
+    (_S.ACTIVE, _E.RAISED): _S.ACTIVE,
+    (_S.ACKNOWLEDGED, _E.RAISED): _S.ACTIVE,
+    (_S.RETURNED, _E.RAISED): _S.ACTIVE,
+    (_S.ACTIVE, _E.EASED): _S.ACTIVE,
+    (_S.ACKNOWLEDGED, _E.EASED): _S.ACKNOWLEDGED,
+    (_S.ACTIVE, _E.ENDED): _S.RETURNED,
+    (_S.ACKNOWLEDGED, _E.ENDED): _S.NORMAL,
+    (_S.ACTIVE, _E.ACKNOWLEDGED): _S.ACKNOWLEDGED,
+    (_S.RETURNED, _E.ACKNOWLEDGED): _S.NORMAL,
+}
+IN_ALARM = (State.ACTIVE, State.ACKNOWLEDGED)  # a limit is reached
+UNACKNOWLEDGED = (State.ACTIVE, State.RETURNED)
+
+
+class Acknowledgement(NamedTuple):
+    """The operator that acknowledged. `via`: the client that sent it, if it is known."""
+
+    by: str
+    time: int  # ns since 1970
+    via: str | None = None
+
+
+class Status(NamedTuple):
+    """An alarm at one moment. Replaced as a whole: any thread may read it.
+
+    `level` is the worst limit that is reached; in state `returned` the last one. Times in ns since
+    1970; 0: never.
+    """
+
+    state: State = State.NORMAL
+    level: Level | None = None
+    since: int = 0  # the state or the level began
+    raised: int = 0  # of the last event `raised`: an acknowledgement is for this one
+    value: Value | None = None  # at the last event
+    acknowledged: Acknowledgement | None = None  # of the last event `raised`
+
+
+class _Condition:
+    """One limit: reached or not, with hysteresis; it counts after the delay."""
+
+    __slots__ = ("_delay", "_hysteresis", "_limit", "_sign", "_since", "_waited", "active", "level")
+
+    def __init__(self, rule: AlarmRule, level: Level, limit: float) -> None:
+        self.level = level
+        self.active = False  # reached for as long as the delay
+        self._sign = -1 if level in BELOW else 1
+        self._limit = self._sign * limit
+        self._hysteresis = rule.hysteresis
+        self._delay = rule.delay
+        self._waited: float | None = None  # good time since the limit is reached; None: it is not
+        self._since: float | None = None  # that time runs since then
+
+    @property
+    def due(self) -> float | None:
+        """When the delay ends; None while it does not run."""
+        if self._since is None or self._waited is None:
+            return None
+        return self._since + self._delay - self._waited
+
+    def judge(self, value: float, now: float) -> None:
+        value *= self._sign
+        is_left = value < self._limit and value <= self._limit - self._hysteresis
+        if is_left or (self._waited is None and value < self._limit):
+            self._waited = self._since = None
+            self.active = False
+            return
+        if self._waited is None:
+            self._waited = 0.0
+        if not self.active and self._since is None:
+            self._since = now
+
+    def elapse(self, now: float) -> bool:
+        """True if the delay has ended now."""
+        if self.due is None or now < self.due:
+            return False
+        self.active, self._since = True, None
+        return True
+
+    def suspend(self, now: float) -> None:
+        """Holds the time of the delay."""
+        if self._since is not None and self._waited is not None:
+            self._waited += max(0.0, now - self._since)
+            self._since = None
+
+    def restore(self) -> None:
+        self.active, self._waited, self._since = True, 0.0, None
+
+
+class Alarm:
+    """The alarm of one value. `now`: seconds of a steady clock; `time`: ns since 1970."""
+
+    __slots__ = ("_conditions", "good", "rule", "status", "value")
+
+    def __init__(self, rule: AlarmRule) -> None:
+        self.rule = rule
+        self.status = Status()
+        self.good = False  # the quality of the value
+        self.value: Value | None = None  # the last good one
+        worst_first = [level for level in Level if level in rule.limits]
+        self._conditions = [_Condition(rule, level, rule.limits[level]) for level in worst_first]
+
+    @property
+    def due(self) -> float | None:
+        """When `elapse` is to be called; None: not needed."""
+        return min((one.due for one in self._conditions if one.due is not None), default=None)
+
+    def judge(self, value: Value, now: float, time: int) -> Event | None:
+        """Applies a good value. Call `elapse` with the same time before it."""
+        self.good, self.value = True, value
+        if isinstance(value, str):
+            return None
+        for condition in self._conditions:
+            condition.judge(value, now)
+        return self.elapse(now, time)
+
+    def suspend(self, now: float) -> None:
+        """Applies a bad value: the alarm stays as it is."""
+        self.good = False
+        for condition in self._conditions:
+            condition.suspend(now)
+
+    def elapse(self, now: float, time: int) -> Event | None:
+        """Applies the delays that have ended."""
+        new = [one.level for one in self._conditions if one.elapse(now)]
+        level = next((one.level for one in self._conditions if one.active), None)
+        before = self.status
+        if level is (before.level if before.state in IN_ALARM else None):
+            return None
+        event = Event.ENDED
+        if level is not None:
+            event = Event.RAISED if level in new else Event.EASED
+        state = TRANSITIONS[before.state, event]
+        changed = before._replace(state=state, since=time, value=self.value)
+        if event is Event.RAISED:
+            changed = changed._replace(level=level, raised=time, acknowledged=None)
+        elif event is Event.EASED or state is State.NORMAL:
+            changed = changed._replace(level=level)
+        self.status = changed
+        return event
+
+    def acknowledge(
+        self, by: str, time: int, via: str | None = None, raised: int | None = None
+    ) -> Event | None:
+        """Acknowledges for an operator. `raised`: the event that the operator saw.
+
+        Returns None for a repeat, which changes nothing. Raises `NothingToAcknowledge`.
+        """
+        status = self.status
+        if raised is not None and raised != status.raised:
+            raise NothingToAcknowledge("it was raised again meanwhile: look at it first")
+        if status.state in UNACKNOWLEDGED:
+            state = TRANSITIONS[status.state, Event.ACKNOWLEDGED]
+            self.status = status._replace(
+                state=state,
+                since=time,
+                level=status.level if state in IN_ALARM else None,
+                acknowledged=Acknowledgement(by, time, via),
+            )
+            return Event.ACKNOWLEDGED
+        known = status.acknowledged
+        if known is None or (status.state is State.NORMAL and raised is None and known.by != by):
+            raise NothingToAcknowledge("it is normal: there is nothing to acknowledge")
+        return None
+
+    def restore(self, status: Status) -> None:
+        """Takes over the status before a restart. A limit that the file no longer has is left."""
+        levels = [one.level for one in self._conditions]
+        if status.state in IN_ALARM and status.level not in levels:
+            state = TRANSITIONS[status.state, Event.ENDED]
+            level = status.level if state is State.RETURNED else None
+            status = status._replace(state=state, level=level)
+        self.status = status
+        if status.state not in IN_ALARM or status.level is None:
+            return
+        is_below = status.level in BELOW
+        for condition in self._conditions[levels.index(status.level) :]:
+            if (condition.level in BELOW) is is_below:  # with a limit its less severe one
+                condition.restore()

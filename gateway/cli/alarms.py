@@ -1,0 +1,144 @@
+"""The `alarms` command: the alarms of the running gateway, and the acknowledgement of one."""
+
+import json
+import sys
+import time
+from collections.abc import Sequence
+from contextlib import nullcontext, suppress
+from typing import Annotated, Any
+
+import typer
+from rich.console import RenderableType
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from gateway.alarms.watched import LINE
+from gateway.cli.client import Client, connected, suggestion
+from gateway.cli.terminal import (
+    FAILED,
+    USER_MISTAKE,
+    AsJson,
+    ConfigPath,
+    err,
+    out,
+    printable,
+)
+from gateway.config import Config, load
+from gateway.errors import ConfigError, GatewayError
+
+EVERY = 1.0  # seconds between two views of --watch
+_ORDER = ("active", "returned", "acknowledged", "normal")
+_STYLES = {"active": "red", "returned": "yellow", "acknowledged": "yellow"}
+_MISTAKES = ("bad-value", "unknown-tag")
+
+
+def alarms(
+    config: ConfigPath,
+    watch: Annotated[
+        bool, typer.Option("--watch", help="Show them again every second. Ctrl-C ends it.")
+    ] = False,
+    every: Annotated[bool, typer.Option("--all", help="Also alarms that are normal.")] = False,
+    ack: Annotated[
+        str | None,
+        typer.Option("--ack", metavar="ALARM", help="Acknowledge device/tag, device or line:name."),
+    ] = None,
+    by: Annotated[
+        str | None, typer.Option("--by", metavar="NAME", help="Operator that acknowledges.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Print the alarms that are not normal, from the running gateway, or acknowledge one."""
+    if (ack is None) is not (by is None):
+        raise ConfigError("--ack needs --by NAME, the operator that acknowledges, and --by --ack")
+    loaded = load(config)
+    if ack is not None and ack not in (known := _known(loaded)):
+        raise ConfigError(f"there is no alarm {ack} in {config}{suggestion(ack, known)}")
+    with connected(loaded, err.print) as client:
+        if ack is not None and by is not None:
+            _acknowledge(client, ack, by, as_json=as_json)
+        elif watch and not as_json:
+            with suppress(KeyboardInterrupt):
+                _follow(client, every=every)
+        else:
+            found = _alarms(client, every=every)
+            if as_json:
+                print(json.dumps(found))
+            else:
+                out.print(view(found))
+
+
+def _known(config: Config) -> dict[str, None]:
+    """Returns the names of all alarms of the file."""
+    tags = (tag.key for device in config.devices for tag in device.tags if tag.alarm is not None)
+    devices = (device.name for device in config.devices)
+    return dict.fromkeys([*tags, *devices, *(f"{LINE}{line.name}" for line in config.lines)])
+
+
+def _alarms(client: Client, *, every: bool) -> list[dict[str, Any]]:
+    found = [one for one in client.alarms() if every or one["state"] != "normal"]
+    # Of one state the newest first.
+    found.sort(key=lambda one: str(one["since"]), reverse=True)
+    return sorted(found, key=lambda one: _ORDER.index(one["state"]))
+
+
+def _acknowledge(client: Client, alarm: str, by: str, *, as_json: bool) -> None:
+    answer = client.acknowledge(alarm, by)
+    if as_json:
+        print(json.dumps(answer))
+    if "error" in answer:
+        if not as_json:
+            err.print(printable(f"{answer['error']}: {answer['reason']}"), style="red")
+        sys.exit(USER_MISTAKE if answer["error"] in _MISTAKES else FAILED)
+    if not as_json:
+        known: Any = answer["acknowledged"]
+        text = f"{alarm}: acknowledged by {known['by']} at {known['time']}, now {answer['state']}"
+        print(printable(text))
+
+
+def _follow(client: Client, *, every: bool) -> None:
+    with Live(console=out, auto_refresh=False) if out.is_terminal else nullcontext() as live:
+        while True:
+            shown: RenderableType
+            try:
+                shown = view(_alarms(client, every=every))
+            except GatewayError as error:
+                shown = Text(printable(str(error)), style="red")
+            if live is None:
+                out.print(shown)
+            else:
+                live.update(shown, refresh=True)
+            time.sleep(EVERY)
+
+
+def view(found: Sequence[dict[str, Any]]) -> RenderableType:
+    """Returns the alarms as a table."""
+    if not found:
+        return Text("no alarms")
+    table = Table(box=None, pad_edge=False)
+    for column in ("alarm", "state", "limit", "value", "since", "acknowledged by", "text"):
+        table.add_column(column)
+    for one in found:
+        limit = "" if one["limit"] in (None, True, False) else f" {one['limit']:g}"
+        by = one["acknowledged"]
+        texts = (one["text"], one.get("detail", "") if one["value"] is True else "")
+        table.add_row(
+            Text(printable(one["alarm"])),
+            Text(one["state"], style=_STYLES.get(one["state"], "")),
+            Text(f"{one['level'] or ''}{limit}"),
+            Text(printable(_value(one)), style="" if one["quality"] == "good" else "red"),
+            Text(str(one["since"] or "")[:19].replace("T", " ")),
+            Text(printable("" if by is None else by["by"])),
+            Text(printable(": ".join(text for text in texts if text))),
+        )
+    return table
+
+
+def _value(one: dict[str, Any]) -> str:
+    if one["quality"] != "good":
+        return f"bad {one.get('reason') or ''}".strip()
+    if "time" not in one:  # of a line or a device
+        return "-"
+    if isinstance(one["value"], bool):
+        return "on" if one["value"] else "off"
+    return f"{one['value']} {one['unit']}".strip()

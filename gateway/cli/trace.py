@@ -1,0 +1,103 @@
+"""The `trace` command: the exchanges of a line as they pass, from the running gateway."""
+
+import json
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from gateway.cli.capture import Capture
+from gateway.cli.client import connected
+from gateway.cli.recording import Recording
+from gateway.cli.terminal import AsJson, ConfigPath, err, printable
+from gateway.config import Config, LineConfig, load, parsers
+from gateway.config.messages import meant
+from gateway.errors import ConfigError
+from gateway.line.wire_file import event_lines
+
+LineName = Annotated[str, typer.Argument(metavar="LINE", help="A line of the file.")]
+_WIDTH = 40  # characters of the request
+
+
+def trace(
+    config: ConfigPath,
+    line: LineName,
+    show_bytes: Annotated[
+        bool, typer.Option("--bytes", help="Show the bytes below each exchange.")
+    ] = False,
+    record: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Record into files of this folder.")
+    ] = None,
+    keep: Annotated[
+        str, typer.Option(metavar="SIZE", help="The most that the recording may take.")
+    ] = "100MB",
+    pcapng: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write the bytes for Wireshark.")
+    ] = None,
+    for_: Annotated[
+        str | None, typer.Option("--for", metavar="TIME", help="End after this time: 30s, 2min.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Print each exchange of a line, decoded, as it passes. Ctrl-C ends it."""
+    loaded = load(config)
+    found = line_named(loaded, line)
+    if found.serve:
+        raise ConfigError(
+            f"{line} is a served line: only the lines that the gateway asks are traced"
+        )
+    size = parsers.size(keep)
+    until = None if for_ is None else time.monotonic() + parsers.duration(for_)
+    with ExitStack() as stack:
+        client = stack.enter_context(connected(loaded, err.print))
+        recording = None
+        if record is not None:
+            recording = stack.enter_context(Recording(record, line, size))
+            err.print(f"recording {line} into {recording.path}; Ctrl-C ends it")
+        capture = None if pcapng is None else stack.enter_context(Capture(pcapng, found))
+        stack.enter_context(suppress(KeyboardInterrupt))
+        for event in _events(client.trace(line, until)):
+            if recording is not None:
+                recording.add(event_lines(event))
+            if capture is not None and "way" in event:
+                capture.add(event["time"], event["way"], bytes.fromhex(event["bytes"]))
+            if as_json:
+                print(json.dumps(event), flush=True)
+            elif record is None and ("way" not in event or show_bytes):
+                print(printable(shown(event)), flush=True)
+
+
+def line_named(config: Config, name: str) -> LineConfig:
+    """Raises `ConfigError` for a line that is not in the file."""
+    lines = {line.name: line for line in config.lines}
+    if name not in lines:
+        raise ConfigError(f"there is no line {name}: {meant(name, lines)}")
+    return lines[name]
+
+
+def shown(event: dict[str, Any]) -> str:
+    """Returns one event as a line for people, with the local time."""
+    at = event["time"]
+    clock = time.strftime("%H:%M:%S", time.localtime(at)) + f"{at % 1:.3f}"[1:]
+    if "way" in event:
+        return f"{clock}   {event['way']} {event['bytes']}"
+    text = f"{event['device']}: {event['what']}"
+    failed = "! " if event["failed"] else ""
+    result = f"  {failed}{event['result']}" if event["result"] else ""
+    return f"{clock} {event['took'] * 1000:8.1f} ms  {text:{_WIDTH}}{result}".rstrip()
+
+
+def _events(documents: Iterator[dict[str, Any]]) -> Iterator[dict[str, Any]]:
+    """Yields the events of the documents. Says how many were lost on the way."""
+    number = None
+    for document in documents:
+        lost = document["missed"]
+        if number is not None and document["number"] > number + 1:
+            err.print(f"{document['number'] - number - 1} parts of the trace were lost on the way")
+        if lost:
+            err.print(f"{lost} events were left out: the line is too fast")
+        number = document["number"]
+        yield from document["events"]

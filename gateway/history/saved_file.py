@@ -1,0 +1,101 @@
+"""A small file that is replaced as a whole, by a thread: a stalled disk delays nothing else."""
+
+import os
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from queue import SimpleQueue
+from typing import TypeVar
+
+import orjson
+import structlog
+
+log = structlog.get_logger("gateway")
+T = TypeVar("T")
+
+
+class SavedFile:
+    """One file, and the thread that writes it."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._saved: bytes | None = None
+        self.trouble: str | None = None  # why the last snapshot is not saved
+        self._queue: SimpleQueue[bytes | None] = SimpleQueue()  # None ends the thread
+        self._thread = threading.Thread(target=self._save_all, name="state", daemon=True)
+
+    # -- any thread --
+
+    def start(self) -> None:
+        """Starts the thread that saves."""
+        self._thread.start()
+
+    def save_soon(self, snapshot: bytes) -> bool:
+        """Never waits. False while another snapshot waits: then this one is ignored."""
+        if not self._queue.empty():
+            return False
+        self._queue.put(snapshot)
+        return True
+
+    def save_last(self, snapshot: bytes) -> None:
+        """Never waits: `close` waits for this snapshot."""
+        self._queue.put(snapshot)
+        self._queue.put(None)
+
+    def close(self, within: float) -> bool:
+        """Blocks for at most `within` seconds; True if the thread has ended."""
+        if self._thread.ident is None:  # never started
+            return True
+        self._thread.join(max(0.0, within))
+        return not self._thread.is_alive()
+
+    # -- its own thread --
+
+    def _save_all(self) -> None:
+        while (snapshot := self._queue.get()) is not None:
+            self.save(snapshot)
+
+    def save(self, snapshot: bytes) -> None:
+        """Replaces the file, completely or not at all. Logs each kind of trouble once."""
+        if snapshot == self._saved:
+            return
+        temporary = self._path.with_name(self._path.name + ".new")
+        try:
+            with temporary.open("wb") as file:
+                file.write(snapshot)
+                file.flush()
+                os.fsync(file.fileno())
+            temporary.replace(self._path)
+        except OSError as error:
+            if self.trouble != str(error):
+                self.trouble = str(error)
+                log.warning("state file not saved", file=str(self._path), why=str(error))
+            return
+        self._saved, self.trouble = snapshot, None
+
+    # -- loading --
+
+    def load(self, parse: Callable[[object], T]) -> T | None:
+        """Returns the parsed content; None without a file. Moves a file aside that `parse` refuses
+        by ValueError, TypeError, KeyError or AttributeError."""
+        try:
+            data = self._path.read_bytes()
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            log.warning("state file not read", file=str(self._path), why=str(error))
+            return None
+        try:
+            return parse(orjson.loads(data))
+        except (ValueError, TypeError, KeyError, AttributeError) as error:
+            self._move_aside(repr(error))
+            return None
+
+    def _move_aside(self, why: str) -> None:
+        aside = self._path.with_name(self._path.name + ".bad")
+        try:
+            self._path.replace(aside)
+        except OSError as error:
+            log.warning("state file damaged", file=str(self._path), why=why, not_moved=str(error))
+        else:
+            log.warning("state file damaged", file=str(self._path), why=why, moved_to=str(aside))

@@ -1,0 +1,32 @@
+"""The alarm of a tag, as the file describes it: limits, hysteresis, delay."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+
+
+class Level(StrEnum):
+    """The kinds of limits. Of one side the worse one comes first."""
+
+    HIGH_HIGH = "high_high"
+    HIGH = "high"
+    LOW_LOW = "low_low"
+    LOW = "low"
+    ON = "on"
+    OFF = "off"
+    OFFLINE = "offline"  # of a device
+    DOWN = "down"  # of a line
+
+
+BELOW = frozenset({Level.LOW, Level.LOW_LOW, Level.OFF})  # reached from above
+
+
+@dataclass(frozen=True, slots=True)
+class AlarmRule:
+    """A limit is reached at its value, and left when the value is `hysteresis` away from it. It
+    counts after `delay` seconds."""
+
+    limits: Mapping[Level, float]  # a bit has one limit: its value in alarm
+    hysteresis: float = 0.0
+    delay: float = 0.0
+    text: str = ""  # for people

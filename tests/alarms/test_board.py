@@ -1,0 +1,253 @@
+"""All alarms of a gateway: which samples are judged, timers of delays, lines and devices."""
+
+import asyncio
+import sys
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import orjson
+import pytest
+from structlog.testing import capture_logs
+
+from gateway.alarms import Alarms, Entry, Event, Reading, State
+from gateway.alarms.file import AlarmFile
+from gateway.app import Gateway
+from gateway.config import load
+from gateway.tags import AlarmRule, Deadband, Level, Reason, Tag, bad, good
+from gateway.tags.mirror import Mirror
+from gateway.tags.scan import Decoder
+from tests.e2e.processes import vigor_line, write_config
+from tests.northbound.plant import tag
+from tests.sim.virtual import on_virtual_time
+
+RULE = AlarmRule({Level.HIGH: 80}, hysteresis=5, delay=5)
+SPEED = tag("mixer", "speed", alarm=RULE)
+AT_ONCE = tag("mixer", "speed", alarm=AlarmRule({Level.HIGH: 80}), deadband=Deadband(5))
+LEVEL = tag("mixer", "level")
+
+
+class Board:
+    """Alarms, and their changes."""
+
+    def __init__(self, *tags: Tag) -> None:
+        self.alarms = Alarms(tags, wall=lambda: 7)
+        self.changes: list[tuple[str, Event | None]] = []
+        self.alarms.subscribe(self._changed)
+
+    def _changed(self, entry: Entry, event: Event | None) -> None:
+        self.changes.append((entry.key, event))
+
+    def state(self, key: str = "mixer/speed") -> State:
+        return self.alarms.entries[key].status.state
+
+    def take(self, value: float, time: int = 1) -> None:
+        self.alarms.judge([good(SPEED, value, time), good(LEVEL, 1, time)])
+
+
+@on_virtual_time
+async def test_a_delay_ends_although_the_value_is_sent_once() -> None:
+    """A value that is published on change only, or a frame that arrives once."""
+    board = Board(SPEED, LEVEL)
+    board.take(85)
+    await asyncio.sleep(4.9)
+    assert board.state() is State.NORMAL
+    await asyncio.sleep(0.2)
+    assert board.state() is State.ACTIVE
+    assert board.alarms.counts() == {"normal": 0, "active": 1, "acknowledged": 0, "returned": 0}
+
+
+@on_virtual_time
+async def test_a_jump_of_the_clock_ends_no_delay() -> None:
+    board = Board(SPEED)
+    board.take(85, time=10**18)
+    board.take(86, time=10**18 + 3600 * 10**9)
+    await asyncio.sleep(4.9)
+    board.take(87, time=1)
+    assert board.state() is State.NORMAL
+    await asyncio.sleep(0.2)
+    assert board.state() is State.ACTIVE
+
+
+@on_virtual_time
+async def test_bad_quality_is_reported_and_changes_no_state() -> None:
+    board = Board(SPEED)
+    board.take(85)
+    await asyncio.sleep(6)
+    for reason in (Reason.NO_REPLY, Reason.LINE_DOWN):
+        board.alarms.judge([bad(SPEED, reason, 2)])
+    assert board.state() is State.ACTIVE
+    board.take(85)
+    assert board.changes == [
+        ("mixer/speed", None),  # good for the first time
+        ("mixer/speed", Event.RAISED),
+        ("mixer/speed", None),  # bad
+        ("mixer/speed", None),  # good
+    ]
+
+
+class Nothing:
+    remembering = False
+
+
+def gateway_of(tags: list[Tag]) -> Any:
+    """Returns a gateway with only what a scan meets."""
+    gateway: Any = object.__new__(Gateway)
+    gateway.alarms, gateway.mirror = Alarms(tags), Mirror(tags, 0)
+    gateway._on_demand, gateway._subscribers = SimpleNamespace(waiting={}), []
+    gateway.serving = Nothing()
+    return gateway
+
+
+def _scans(tags: list[Tag], values: list[list[int]]) -> list[Any]:
+    """Returns scans of one block, as the engine makes them."""
+    decoder = Decoder(tags, range(len(tags)))
+    scans = [decoder.first(values[0], 1)]
+    for units in values[1:]:
+        scans.append(decoder.after(scans[-1], units, 2))
+    return scans
+
+
+@on_virtual_time
+async def test_each_read_is_judged_also_within_the_deadband() -> None:
+    gateway = gateway_of([AT_ONCE, LEVEL])
+    entry = gateway.alarms.entries["mixer/speed"]
+    for scan, state in zip(
+        _scans([AT_ONCE, LEVEL], [[79, 0], [80, 0], [79, 0]]),
+        (State.NORMAL, State.ACTIVE, State.RETURNED),
+        strict=True,
+    ):
+        gateway.samples(scan)
+        assert entry.status.state is state
+
+
+@on_virtual_time
+async def test_a_scan_without_alarms_costs_nothing() -> None:
+    """No call into this room, however many alarms other blocks have."""
+    others = [tag("mixer", f"n{number}") for number in range(50)]
+    gateway = gateway_of([SPEED, *others])
+    plain, alarmed = _scans(others, [[1] * 50] * 3), _scans([SPEED], [[1], [2], [3]])
+    gateway.samples(plain[0])
+    gateway.samples(alarmed[0])
+    calls = {
+        "plain": _calls(gateway.samples, plain[1]),
+        "alarmed": _calls(gateway.samples, alarmed[1]),
+    }
+    assert calls["plain"] == 0 < calls["alarmed"]
+
+
+def _calls(function: Any, scan: Any) -> int:
+    found = 0
+
+    def profile(frame: FrameType, event: str, _: Any) -> None:
+        nonlocal found
+        found += event == "call" and "gateway/alarms/" in frame.f_code.co_filename
+
+    sys.setprofile(profile)
+    try:
+        function(scan)
+    finally:
+        sys.setprofile(None)
+    return found
+
+
+@on_virtual_time
+async def test_a_line_is_an_alarm_and_its_devices_hold() -> None:
+    board = Board()
+    line, device = [Reading(False)], [Reading(False)]
+    rule = AlarmRule({Level.DOWN: True}, delay=3.0)
+    board.alarms.watch("line:hall", rule, lambda: line[0])
+    board.alarms.watch("mixer", AlarmRule({Level.OFFLINE: True}), lambda: device[0])
+    running = asyncio.create_task(board.alarms.run())
+    await asyncio.sleep(1)
+    device[0] = Reading(True, "no byte came back")
+    await asyncio.sleep(2)
+    assert board.state("mixer") is State.ACTIVE
+    line[0], device[0] = Reading(True, "no such port"), Reading(None)
+    await asyncio.sleep(5)
+    assert (board.state("line:hall"), board.state("mixer")) == (State.ACTIVE, State.ACTIVE)
+    line[0], device[0] = Reading(False), Reading(False)
+    await asyncio.sleep(2)
+    assert (board.state("line:hall"), board.state("mixer")) == (State.RETURNED, State.RETURNED)
+    running.cancel()
+
+
+async def test_acknowledged_alarms_survive_a_restart(tmp_path: Path) -> None:
+    path = tmp_path / "alarms.json"
+    before = Board(AT_ONCE)
+    file = AlarmFile(path, before.alarms)
+    async with file.kept():
+        before.alarms.judge([good(AT_ONCE, 85, 5)])
+        before.alarms.acknowledge("mixer/speed", "Ana", "hmi")
+    assert file.close(5)
+    after = Board(SPEED)
+    restored = AlarmFile(path, after.alarms)
+    async with restored.kept():
+        status = after.alarms.entries["mixer/speed"].status
+        assert status == before.alarms.entries["mixer/speed"].status
+        assert status.acknowledged is not None
+        assert status.acknowledged.by == "Ana"
+        assert after.alarms.counts()["acknowledged"] == 1
+    assert restored.close(5)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"", b"[]", b'{"form": 2, "alarms": {}}', b'{"form": 1, "alarms": {"mixer/speed": {}}}'],
+)
+async def test_a_damaged_file_is_said_and_moved_aside(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "alarms.json"
+    path.write_bytes(content)
+    board = Board(SPEED)
+    file = AlarmFile(path, board.alarms)
+    with capture_logs() as logs:
+        async with file.kept():
+            assert board.state() is State.NORMAL
+    assert file.close(5)
+    assert logs[0]["event"] == "state file damaged"
+    assert (tmp_path / "alarms.json.bad").read_bytes() == content
+    assert orjson.loads(path.read_bytes()) == {"alarms": {}, "form": 1}
+
+
+async def test_each_change_is_on_disk_at_once(tmp_path: Path) -> None:
+    """A gateway that is killed has told no operator more than the disk knows for long."""
+    path = tmp_path / "alarms.json"
+    board = Board(AT_ONCE)
+    file = AlarmFile(path, board.alarms)
+    async with file.kept(), asyncio.timeout(20):
+        board.alarms.judge([good(AT_ONCE, 85, 5)])
+        for state, change in (
+            ("active", lambda: None),
+            ("acknowledged", lambda: board.alarms.acknowledge("mixer/speed", "Ana")),
+        ):
+            change()
+            while f'"state": "{state}"'.encode() not in (
+                path.read_bytes() if path.exists() else b""
+            ):
+                await asyncio.sleep(0.01)
+    assert file.close(5)
+
+
+@on_virtual_time
+async def test_a_computed_tag_and_a_debounced_bit_have_alarms(tmp_path: Path) -> None:
+    tags = {
+        "a": {"address": "D1"},
+        "twice": {"computed": "a * 2", "alarm": {"high": 80}},
+        "door": {"address": "M1", "debounce": "1s", "alarm": {"on": True}},
+    }
+    lines = {"hall": vigor_line("simulator", tags)}
+    gateway = Gateway(load(write_config(tmp_path / "c.yaml", "tcp/127.0.0.1:7447", lines)))
+    [one] = [tag for device in gateway.config.devices for tag in device.tags if tag.name == "a"]
+    entry = gateway.alarms.entries["mixer/twice"]
+    for value, state in ((39, State.NORMAL), (40, State.ACTIVE), (39, State.RETURNED)):
+        gateway.samples([good(one, value, 1)])
+        assert entry.status.state is state
+    door = next(tag for device in gateway.config.devices for tag in device.tags if tag.kept)
+    [reads] = door.inputs
+    for value, at, state in (
+        (False, 1, State.NORMAL),
+        (True, 2, State.NORMAL),
+        (True, 2 * 10**9, State.ACTIVE),
+    ):
+        gateway.samples([good(reads, value, at)])
+        assert gateway.alarms.entries["mixer/door"].status.state is state

@@ -1,0 +1,70 @@
+"""Alarms of a real gateway: a silent PLC and a restart neither clear nor forget one."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from tests.e2e.processes import (
+    gateway,
+    plc_gateway,
+    started,
+    station,
+    vigor_line,
+    write_config,
+)
+from tests.zenoh_peer import Received, ZenohPeer, free_endpoint
+
+SPEED = "plant/@gateway/demo/alarms/mixer/speed"
+
+
+def seen(state: str, quality: str) -> Callable[[Received], bool]:
+    def matches(sample: Received) -> bool:
+        found = sample.json
+        return sample.key == SPEED and (found["state"], found["quality"]) == (state, quality)
+
+    return matches
+
+
+async def test_an_alarm_survives_bad_values_and_a_restart(tmp_path: Path) -> None:
+    endpoint, pty = free_endpoint(), tmp_path / "pty"
+    alarm = {"high": 80, "hysteresis": 5, "delay": "300ms", "text": "too fast"}
+    line = vigor_line(str(pty), {"speed": {"address": "D10", "alarm": alarm}})
+    file = write_config(
+        tmp_path / "plant.yaml",
+        endpoint,
+        {"hall": line},
+        history={"path": "history.db"},
+        alarms={"path": "alarms.json"},
+    )
+    with station("pty", str(pty)) as plc:
+        with started(file) as first:
+            async with ZenohPeer("client", connect=[endpoint]) as client:
+                changes = await client.subscribe("plant/@gateway/demo/alarms/**")
+                plc.tell("set 1 D 10 85")
+                active = (await changes.next(seen("active", "good"))).json
+                assert (active["level"], active["limit"], active["value"]) == ("high", 80, 85)
+                plc.tell("mute 1")
+                await changes.next(seen("active", "bad"))
+                done = plc_gateway("alarms", file, "--ack", "mixer/speed", "--by", "Ana")
+                assert (done.code, "acknowledged by Ana" in done.out) == (0, True)
+                await changes.next(seen("acknowledged", "bad"))
+                # The device is an alarm too; the line is none.
+                [refused] = await client.get(SPEED.replace("mixer/speed", "line:hall"), b'{"by":1}')
+                assert refused.json["error"] == "bad-value"
+            assert first.end() == 0
+        with gateway("run", file) as second:
+            second.says("Zenoh session ready")
+            async with ZenohPeer("client", connect=[endpoint]) as client:
+                [reply] = await client.get(SPEED)
+                assert (reply.json["state"], reply.json["quality"]) == ("acknowledged", "bad")
+                assert reply.json["acknowledged"]["by"] == "Ana"
+                assert reply.json["raised"] == active["raised"]
+                changes = await client.subscribe("plant/@gateway/demo/alarms/**")
+                plc.tell("set 1 D 10 76")  # within the hysteresis
+                plc.tell("speak 1")
+                await changes.next(seen("acknowledged", "good"))
+                plc.tell("set 1 D 10 75")
+                await changes.next(seen("normal", "good"))
+                rows = await client.get(f"{SPEED}?_time=[..]", consolidation="NONE")
+                events = [row.json["event"] for row in rows]
+                assert events == ["raised", "acknowledged", "ended"]
+            assert second.end() == 0

@@ -1,0 +1,36 @@
+"""The status codes of examples/bridges are complete, and those of docs/integrate.md."""
+
+import re
+
+from gateway.northbound.payload import Problem
+from gateway.tags import Reason
+from tests.e2e.processes import ROOT
+
+BRIDGES = ROOT / "examples" / "bridges"
+PAGE = (ROOT / "docs" / "integrate.md").read_text("utf-8")
+OF_READS = {Problem.BAD_QUERY, Problem.DAMAGED, Problem.NO_HISTORY}
+
+
+def codes(file: str) -> dict[str, str]:
+    pairs = re.findall(
+        r'^    "([\w-]+)": Code\.(\w+),$', (BRIDGES / file).read_text(), re.MULTILINE
+    )
+    return dict(pairs)
+
+
+def on_the_page(heading: str) -> dict[str, str]:
+    table = PAGE.partition(heading)[2].partition("\n\n")[0]
+    return dict(re.findall(r"^\| `([\w-]+)`[^|]*\| (\w+)", table, re.MULTILINE))
+
+
+def test_every_reason_of_a_bad_value_has_the_code_of_the_page() -> None:
+    known = codes("opcua_values.py")
+    assert known == on_the_page("| status code of the value |")
+    assert set(known) == {*Reason, "no-gateway"}
+
+
+def test_every_outcome_of_a_write_has_the_code_of_the_page() -> None:
+    known = codes("opcua.py")
+    assert {**known, "unclear": "BadTimeout"} == on_the_page("| status code of the write |")
+    assert set(known) == {*Problem, "no-gateway"} - OF_READS - {Problem.UNCLEAR}
+    assert "BadTimeout" not in known.values()

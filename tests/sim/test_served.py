@@ -1,0 +1,141 @@
+"""A served line beside a master that is late, collides and repeats, and beside other stations."""
+
+import asyncio
+import random
+from collections import Counter
+from collections.abc import Callable, Coroutine, Sequence
+from typing import Any
+
+import pytest
+
+from gateway.config import built
+from gateway.line.served_line import ServedLine
+from gateway.protocols.checksums import crc16
+from gateway.serving.station import Station
+from gateway.tags import Quality, Sample
+from gateway.transport import Port, Receiver
+
+CHARACTER = 11 / 19200
+REQUESTS = 400
+TAGS = {"order": {"address": "holding:4", "type": "uint32"}}
+PLC = {"protocol": "modbus-rtu", "station": 1, "accept": ["holding:4..holding:9"], "tags": TAGS}
+LINE = {"port": "/dev/ttyS9", "serve": True, "baudrate": 19200, "devices": {"plc": PLC}}
+REPLY = "01 10 0004 0002"
+
+
+def rtu(text: str) -> bytes:
+    body = bytes.fromhex(text)
+    return body + crc16(body)
+
+
+class Wire:
+    """Both ends of the line, and all that happened on it."""
+
+    def __init__(self) -> None:
+        self.receiver: Receiver | None = None
+        self.replies: list[tuple[float, bytes]] = []  # with the time when they begin
+        self.asked: list[float] = []  # ends of sound requests to station 1
+        self.given: list[Sample] = []
+
+    async def open(self, receiver: Receiver) -> Port:
+        self.receiver = receiver
+        return self
+
+    def write(self, data: bytes) -> None:
+        self.replies.append((asyncio.get_running_loop().time(), data))
+
+    async def close(self) -> None: ...
+
+    def samples(self, samples: Sequence[Sample]) -> None:
+        self.given += samples
+
+    def online(self, device: Station, online: bool) -> None: ...
+
+    async def send(self, data: bytes, draw: random.Random) -> None:
+        """Sends with the time of the characters, in the pieces of an adapter."""
+        assert self.receiver is not None
+        at = 0
+        while at < len(data):
+            piece = data[at : at + draw.choice((1, 4, 16, 64))]
+            await asyncio.sleep(len(piece) * CHARACTER)
+            self.receiver.received(piece)
+            at += len(piece)
+
+
+class Master:
+    """Writes another value each time, and makes mistakes."""
+
+    def __init__(self, wire: Wire, draw: random.Random) -> None:
+        self._wire = wire
+        self._draw = draw
+        self.sent = Counter[int]()  # sound writes, by value
+        self._value = 0
+
+    async def work(self) -> None:
+        for _ in range(REQUESTS):
+            act = self._draw.choice((self._write, self._write, self._damaged, self._others))
+            await act()
+            await asyncio.sleep(self._draw.choice((0.004, 0.02, 0.3)))
+
+    def _request(self) -> bytes:
+        self._value += 1
+        return rtu(f"01 10 0004 0002 04 {self._value & 0xFFFF:04x} {self._value >> 16:04x}")
+
+    async def _write(self) -> None:
+        request = self._request()
+        for _ in range(self._draw.choice((1, 1, 1, 2, 3))):  # it repeats, and may not wait
+            await self._wire.send(request, self._draw)
+            self._wire.asked.append(asyncio.get_running_loop().time())
+            self.sent[self._value] += 1
+            await asyncio.sleep(self._draw.choice((0.0, 0.001, 0.05, 0.1)))
+
+    async def _damaged(self) -> None:
+        request = bytearray(self._request())
+        if self._draw.random() < 0.5:
+            del request[self._draw.randrange(2, len(request)) :]
+        else:
+            request[self._draw.randrange(len(request))] ^= 1 << self._draw.randrange(8)
+        await self._wire.send(bytes(request), self._draw)
+        await asyncio.sleep(0.1)  # its time-out
+
+    async def _others(self) -> None:
+        """Another station replies with the bytes of a write to station 1."""
+        data = self._request()
+        await self._wire.send(rtu("03 03 0000 0008"), self._draw)
+        await asyncio.sleep(self._draw.choice((0.002, 0.01)))
+        await self._wire.send(rtu(f"03 03 {len(data):02x} {data.hex()}"), self._draw)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_an_acknowledged_write_is_published_exactly_once(
+    seed: int, run_virtual: Callable[[Coroutine[Any, Any, Any]], Any]
+) -> None:
+    wire, draw = Wire(), random.Random(seed)
+
+    async def story() -> tuple[Master, ServedLine]:
+        [config] = built({"lines": {"panel": LINE}}).lines
+        line = ServedLine(config, wire, lambda row: None, open_port=wire.open)
+        task = asyncio.create_task(line.run())
+        while not line.is_open:
+            await asyncio.sleep(0.01)
+        master = Master(wire, draw)
+        await master.work()
+        await asyncio.sleep(1)
+        task.cancel()
+        await asyncio.wait([task])
+        return master, line
+
+    master, line = run_virtual(story())
+    assert {reply for _, reply in wire.replies} == {rtu(REPLY)}
+    published = Counter(one.value for one in wire.given if one.quality is Quality.GOOD)
+    # Only what the master sent, and each write once; some replies gave way to the next request.
+    assert all(published[value] <= master.sent[value] for value in published)
+    assert published.total() == len(wire.replies) + line.unsent
+    assert line.unsent > 0
+    assert len(wire.replies) > REQUESTS / 3
+    # It answers one request with one reply, after the silence and within 10 ms.
+    for at, _ in wire.replies:
+        waits = [at - asked for asked in wire.asked if asked <= at]
+        assert min(waits) + 1e-9 >= 0.00175
+        assert min(waits) <= 0.010
+    assert len({at for at, _ in wire.replies}) == len(wire.replies)
