@@ -47,16 +47,11 @@ def check(
         lines = app.forecasts(loaded, report)
     few = sum(len(line.blocks) for line in lines) <= 100
     out.print(plan(lines, every_block=few if blocks is None else blocks))
-    for served in (line for line in loaded.lines if line.serve):
-        out.print(served_plan(served))
-    for sentence in _listening(loaded):
-        out.print(sentence)
+    for part in _without_polls(loaded):
+        out.print(part)
     for note in _notes(loaded):
         err.print(f"note: {note}")
-    for line in lines:
-        if line.overloaded:
-            err.print(f"warning: {line.advice()}")
-    for warning in warnings:
+    for warning in (*(line.advice() for line in lines if line.overloaded), *warnings):
         err.print(f"warning: {warning}")
     if unwritable := list(_unwritable(loaded)):
         for sentence in unwritable:
@@ -67,20 +62,17 @@ def check(
         sys.exit(FAILED)
 
 
-def _listening(config: Config) -> Iterator[str]:
-    """Yields which tags of the listen-only lines can be learned."""
+def _without_polls(config: Config) -> Iterator[RenderableType]:
+    """Yields the served lines, and which tags of the listen-only lines can be learned."""
+    yield from (served_plan(line) for line in config.lines if line.serve)
     for line in config.lines:
         if not line.listen_only:
             continue
-        reasons = {
-            tag.key: why
-            for device in line.devices
-            for tag in device.tags
-            if (why := why_not_learned(device.driver, tag))
-        }
+        tags = [(device.driver, tag) for device in line.devices for tag in device.wire_tags]
+        reasons = {tag.key: why for driver, tag in tags if (why := why_not_learned(driver, tag))}
         yield (
-            f"line {line.name} only listens: {len(line.tags) - len(reasons)} of "
-            f"{_counted(len(line.tags), 'tag')} can be learned, when another master reads them"
+            f"line {line.name} only listens: {len(tags) - len(reasons)} of "
+            f"{_counted(len(tags), 'tag')} can be learned, when another master reads them"
         )
         yield from (f"  {key} cannot: {why}" for key, why in reasons.items())
 

@@ -26,7 +26,7 @@ class StateFile:
     """One file with what was learned of the devices."""
 
     def __init__(self, path: Path) -> None:
-        self.counters: Mapping[str, CounterState] = {}  # by tag, as `restore` has read them
+        self.counters: Mapping[str, CounterState] = {}  # as `restore` has read them
         self._file = SavedFile(path)
         self.start, self.close = self._file.start, self._file.close
         self.save, self.save_soon = self._file.save, self._file.save_soon

@@ -63,8 +63,11 @@ class Mirror:
         return to_publish
 
     def counters(self) -> dict[str, CounterState]:
-        """Returns the states of all counters that were read, by `device/name`."""
-        known = ((tag.key, memory) for tag, memory in self.memories.items())
+        """Returns the states of all counters that were read, by name and address.
+
+        With another address a total begins again: the step between two counters is no count.
+        """
+        known = ((_place(tag), memory) for tag, memory in self.memories.items())
         return {
             key: memory.state
             for key, memory in known
@@ -74,7 +77,7 @@ class Mirror:
     def restore(self, counters: Mapping[str, CounterState]) -> None:
         """Goes on with the totals of an earlier gateway. Reads are missing since then."""
         for tag, memory in self.memories.items():
-            if isinstance(memory, Counted) and (state := counters.get(tag.key)) is not None:
+            if isinstance(memory, Counted) and (state := counters.get(_place(tag))) is not None:
                 memory.state, memory.gap = state, True
 
     def follow(self, samples: Sequence[Sample]) -> list[Sample]:
@@ -223,6 +226,10 @@ class Mirror:
             if place not in latest.by_rule:
                 self._published[sample.tag] = sample
             del self._places[sample.tag]
+
+
+def _place(tag: Tag) -> str:
+    return f"{tag.key} {tag.text}"
 
 
 def _same_failure(current: Sample, sample: Sample) -> bool:

@@ -1,4 +1,4 @@
-"""What a tag makes of its raw value besides scale and offset, both ways; and names of numbers."""
+"""Shaping of a value besides scale and offset, in both directions, and names of numbers."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace

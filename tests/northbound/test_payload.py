@@ -23,6 +23,7 @@ from gateway.northbound.meta import meta
 from gateway.northbound.payload import Failure, Problem, WriteOutcome
 from gateway.protocols.driver import Address, Span, Unit
 from gateway.tags import Deadband, Reason, Tag, WriteResult, WriteRule, bad, good
+from gateway.tags.shaping import Names
 from gateway.values import Layout, Value, parse_type
 
 NOON = 1_795_176_000_123_456_789  # 2026-11-20T12:00:00.123456789Z
@@ -45,6 +46,18 @@ def test_a_good_value_as_the_contract_prints_it() -> None:
     assert payload.value(good(tag(), 12.5, NOON)) == (
         b'{"value":12.5,"quality":"good","time":"2026-11-20T12:00:00.123456Z"}'
     )
+
+
+def test_a_value_has_its_name_beside_it_if_there_is_one() -> None:
+    mode = tag(names=Names({0: "off", 1: "auto"}))
+    assert json.loads(payload.value(good(mode, 1, NOON))) == {
+        "value": 1,
+        "text": "auto",
+        "quality": "good",
+        "time": "2026-11-20T12:00:00.123456Z",
+    }
+    assert payload.value(good(mode, 7, NOON)) == payload.value(good(tag(), 7, NOON))
+    assert "text" not in json.loads(payload.value(bad(mode, Reason.NO_REPLY, NOON)))
 
 
 @pytest.mark.parametrize("reason", list(Reason))

@@ -159,12 +159,16 @@ def test_a_total_goes_on_after_a_restart_of_the_gateway() -> None:
     file = StateFile(Path("state.json"))
     file.save(file.snapshot([], parts.mirror.counters()))
 
+    again = StateFile(Path("state.json"))
     for unit, total in ((10, 65546), (2, 65540)):  # counted on; began again meanwhile
-        restarted, again = Reads(parts.tag), StateFile(Path("state.json"))
+        restarted = Reads(parts.tag)
         again.restore([])
         restarted.mirror.restore(again.counters)
         assert restarted.values((unit, 2000)) == [total]
-        assert again.counters == {"mixer/t": CounterState(4, 65540)}
+        assert again.counters == {"mixer/t D1": CounterState(4, 65540)}
+    moved = Reads(tag_of("D2, type: uint16, counter: true"))
+    moved.mirror.restore(again.counters)
+    assert moved.values((60000, 2000)) == [60000]
 
 
 def test_meta_describes_a_total() -> None:
