@@ -4,7 +4,7 @@ BIN := .venv/bin
 # A program of the tests starts twice as fast if its modules need not be compiled again.
 export PYTHONDONTWRITEBYTECODE =
 
-.PHONY: run test coverage check format schema sim fuzz soak mutants faults operator bench peers plant clean
+.PHONY: run test coverage check format schema sim fuzz soak mutants faults operator bench peers plant reloads clean
 
 run: .venv/installed
 	$(BIN)/plc-gateway run config.example.yaml
@@ -36,6 +36,10 @@ bench: .venv/ready
 	$(BIN)/python -m benchmarks.planning
 	$(BIN)/python -m benchmarks.start
 	$(BIN)/python -m benchmarks.northbound
+
+# Reloads under load: memory, missed polls, what is left over.
+reloads: .venv/ready
+	$(BIN)/python -m benchmarks.reload
 
 # This gateway beside its peers (docs/peers.md); .ci/install-peers installs them.
 peers: .venv/ready

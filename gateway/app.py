@@ -1,23 +1,25 @@
 """Connects the lines of a configuration with the last sample of every tag, without Zenoh."""
 
 import asyncio
+import itertools
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 from gateway import __version__
 from gateway.alarms import Alarms
 from gateway.alarms.watched import watch
 from gateway.config import Config, LineConfig
+from gateway.config.changes import DeviceChange
 from gateway.config.commands import check_command, every_command, speaker
 from gateway.engine.device import Device, DeviceSettings
 from gateway.engine.forecast import LineForecast, forecast
-from gateway.engine.jobs import Poll
 from gateway.engine.requests import WRITE_EXPIRY, CommandResult, Peeked
 from gateway.errors import BadValue, Busy, ConfigError, Offline
 from gateway.line.build import OpenPort, line_of, opener
 from gateway.line.duty import Duty
 from gateway.line.line import Line
+from gateway.line.on_demand import OnDemand
 from gateway.line.serving import Serving
 from gateway.line.wire_log import WireLog
 from gateway.northbound.served_status import served_documents
@@ -25,14 +27,13 @@ from gateway.northbound.status import Document, device_document, line_document, 
 from gateway.protocols.driver import Address
 from gateway.protocols.ranges import addresses, spans
 from gateway.serving.station import Station
-from gateway.tags import Quality, Reason, Sample, Tag, WriteResult, bad
+from gateway.tags import Reason, Sample, Tag, WriteResult, bad
 from gateway.tags.mirror import Mirror
 from gateway.tags.scan import Scan
 from gateway.tags.timestamps import rfc3339
 from gateway.values import Value
 
 MOST_PEEKED = 256  # addresses of one peek
-FRESH_WITHIN = 5.0  # seconds that a client waits for a read on demand
 
 
 def forecasts(
@@ -53,19 +54,15 @@ def forecasts(
     return found
 
 
+REMOVED = "removed from the file"
+
+
 class Subscriber(Protocol):
     """Receives the samples to publish and the device states, on the event loop."""
 
     def publish(self, samples: Sequence[Sample]) -> None: ...
 
     def set_online(self, device: str, online: bool) -> None: ...
-
-
-class _Reader(NamedTuple):
-    """A client that waits for a read that starts after `asked`, by the line's clock."""
-
-    answer: asyncio.Future[Sample]
-    asked: float
 
 
 class Gateway:
@@ -84,7 +81,7 @@ class Gateway:
 
         Without `plan_now` each line needs `plan` and `planned` before it runs.
         """
-        self.config = config
+        self.config, self._devices = config, config.devices
         self.duty = duty or Duty()
         self.mirror = Mirror((tag for device in config.devices for tag in device.tags), wall())
         self.lines: list[Line] = []
@@ -94,13 +91,15 @@ class Gateway:
         self._documents: dict[str, Callable[[], Document]] = {}  # of other parts, in the status
         self._tags = {tag.key: tag for device in config.devices for tag in device.tags}
         self._places: dict[str, tuple[Line, Device]] = {}
+        self._open_line, self._seeds = open_line, itertools.count()
         self._forecasts: dict[str, LineForecast] = {}
-        self._waiting: dict[Tag, list[_Reader]] = {}
+        self._on_demand = OnDemand(self._places.get, self.sample)
         self.alarms = Alarms(self._tags.values(), wall)
         self.add_document("alarms", self.alarms.counts)
         self.serving = Serving(config, self, self._find_sample, wall=wall, duty=self.duty)
-        for seed, line in enumerate(config.lines):
-            self._add_line(line, open_line(line), seed)
+        for line in config.lines:
+            if not line.serve:
+                self.add_line(line)
         watch(self.alarms, self.lines, config.alarms)
         if plan_now:
             for made in self.lines:
@@ -114,23 +113,28 @@ class Gateway:
         if self.config.standby is not None:
             self.mirror.begin(self._wall())
 
-    def _add_line(self, config: LineConfig, open_port: OpenPort, seed: int) -> None:
-        if config.serve:
-            return
+    def add_line(self, config: LineConfig) -> Line:
+        """Makes a line, which needs `plan` and `planned` before it runs."""
         devices = [device for device in config.devices if device.enabled]
         line = line_of(
             config,
             devices,
             self,
-            open_port=open_port,
+            open_port=self._open_line(config),
             wall=self._wall,
-            seed=seed,
+            seed=next(self._seeds),
             duty=self.duty,
             plan_now=False,
         )
         self.lines.append(line)
         for device in line.engine.devices:
             self._places[device.name] = (line, device)
+        return line
+
+    def remove_line(self, line: Line) -> None:
+        """Removes a line that has ended, and has no devices any more."""
+        self.lines.remove(line)
+        self._forecasts.pop(line.engine.name, None)
 
     @staticmethod
     def plan(line: Line) -> LineForecast:
@@ -142,9 +146,65 @@ class Gateway:
 
     def planned(self, line: Line, expected: LineForecast) -> None:
         """Takes over the plans of a line: it may run now."""
-        self._forecasts[line.engine.name] = expected
+        self.expect(line, expected)
         for device in line.engine.devices:
             line.engine.schedule.plan(device, 0.0)
+
+    def expect(self, line: Line, expected: LineForecast) -> None:
+        """Takes over the forecast of a line."""
+        self._forecasts[line.engine.name] = expected
+
+    def take_over(self, changes: Iterable[DeviceChange]) -> None:
+        """Takes over the tags of changed devices: their first, next or last samples."""
+        now, gone = self._wall(), list[Tag]()
+        for change in changes:
+            enabled = change.new is not None and change.new.enabled
+            reason = Reason.STARTING if enabled else Reason.DISABLED
+            started = [bad(tag, reason, now) for tag in change.started]
+            self.mirror.add(started, change.renewed)
+            if change.new is not None:
+                self._tags.update((tag.key, tag) for tag in change.new.wire_tags)
+            left = change.gone
+            ended = [tag for tag in left if self._tags[tag.key] is tag]
+            for tag in ended:
+                del self._tags[tag.key]
+            self.mirror.forget(left)  # last: other threads find the new tag instead
+            self.alarms.take_over([*change.started, *change.renewed.values()], left)
+            self.alarms.judge(started)
+            last = [bad(tag, Reason.DISABLED, now, REMOVED) for tag in ended]
+            self._publish([*started, *last])
+            gone += left
+        self._on_demand.changed(gone)
+
+    def compute(self, new: Sequence[Tag], gone: Sequence[Tag]) -> None:
+        """Takes over the computed tags, when all their inputs are taken over."""
+        if not (gone or new):
+            return
+        now = self._wall()
+        enabled = {device.name for device in self._devices if device.enabled}
+        self._tags.update((tag.key, tag) for tag in new)
+        first = [
+            bad(tag, Reason.STARTING if tag.device in enabled else Reason.DISABLED, now)
+            for tag in new
+        ]
+        self.alarms.take_over(new, gone)
+        found = self.mirror.compute(first, gone)
+        self.alarms.judge(found)
+        ended = [tag for tag in gone if self._tags.get(tag.key) is tag]
+        for tag in ended:
+            del self._tags[tag.key]
+        self._publish([*found, *(bad(tag, Reason.DISABLED, now, REMOVED) for tag in ended)])
+
+    def configure(self, config: Config) -> None:
+        """Has this configuration, after its changes are taken over."""
+        self.config, self._devices = config, config.devices
+        watch(self.alarms, self.lines, config.alarms)
+
+    def move(self, gone: Iterable[str], line: Line, devices: Iterable[Device] = ()) -> None:
+        """Notes the devices that the line has no longer, and those that it has now."""
+        for name in gone:
+            self._places.pop(name, None)
+        self._places |= {device.name: (line, device) for device in devices}
 
     def subscribe(self, subscriber: Subscriber) -> None:
         """Adds a subscriber. It receives each sample after the earlier subscribers."""
@@ -170,10 +230,10 @@ class Gateway:
             self.alarms.judge(samples)
         if self.serving.remembering:
             self.serving.remember(samples)
-        if self._waiting:
+        if waiting := self._on_demand.waiting:
             for sample in samples:
-                if sample.tag in self._waiting:
-                    self._answer(sample)
+                if sample.tag in waiting:
+                    self._on_demand.answer(sample)
         if self.mirror.derives and (changed or self.mirror.pending):
             changed = self.mirror.follow(changed)
             if self.alarms.of_tags:
@@ -194,18 +254,24 @@ class Gateway:
     # For the Zenoh side
 
     def devices(self) -> Iterable[DeviceSettings]:
-        return self.config.devices
+        return self._devices  # the same object until a reload
 
     def tag(self, key: str) -> Tag | None:
         return self._tags.get(key)
 
     def sample(self, tag: Tag) -> Sample:
-        return self.mirror[tag]
+        try:
+            return self.mirror[tag]
+        except KeyError:  # a reload removed it, or another tag has its place
+            current = self._tags.get(tag.key)
+            if current is None:
+                return bad(tag, Reason.DISABLED, self._wall(), REMOVED)
+            return self.mirror[current]
 
     def _find_sample(self, key: str) -> Sample | None:
         """Returns the sample of `device/tag`; None: no such tag in this process."""
         tag = self._tags.get(key)
-        return None if tag is None else self.mirror[tag]
+        return None if tag is None else self.sample(tag)
 
     def mark_published(self, samples: Sequence[Sample]) -> None:
         if changed := self.mirror.mark_published(samples):
@@ -216,6 +282,8 @@ class Gateway:
 
         Raises `BadValue` before anything is sent, otherwise a `GatewayError`.
         """
+        if self._tags.get(tag.key) is not tag:  # its scale or limits may be others now
+            raise Busy(f"the file was reloaded, and {tag.key} with it; not sent")
         if self.serving.holds(tag):
             return await self.serving.write(tag, value)
         if tag.device not in self._places:
@@ -238,6 +306,8 @@ class Gateway:
         Raises `BadValue` before anything is sent, otherwise a `GatewayError`.
         """
         check_command(self.config, device, command)
+        if device not in self._places:
+            raise Offline(f"device {device} is disabled; nothing was sent")
         line, receiver = self._places[device]
         loop = asyncio.get_running_loop()
         started = loop.time()
@@ -260,73 +330,20 @@ class Gateway:
         loop = asyncio.get_running_loop()
         started, units = loop.time(), list[int]()
         for part in parts:
+            if self._places.get(device) != (line, receiver):
+                raise Busy(f"the file was reloaded, and {device} with it; read it again")
             units += map(int, (await line.peek(receiver, part)).split())
         first = receiver.driver.spell(Address(area, numbers.start))
         return Peeked(first, units, self._wall(), loop.time() - started)
 
     def is_fresh(self, tag: Tag, max_age: float) -> bool:
-        """True if the last read is younger than `max_age` seconds, or no read is possible now.
-
-        The age is monotonic time: a change of the system clock must not change it.
-        """
-        if tag.inputs:
-            return all(self.is_fresh(one, max_age) for one in tag.inputs)
-        poll = self._poll(tag)
-        if poll is None or not self._places[tag.device][0].engine.is_open:
-            return True
-        if poll.last.at is None or self.mirror[tag].quality is Quality.BAD:
-            return False
-        return asyncio.get_running_loop().time() - poll.last.at < max_age
+        """True if the last read is younger than `max_age` seconds, or no read is possible now."""
+        return self._on_demand.is_fresh(tag, max_age)
 
     async def fresh(self, tag: Tag, max_age: float) -> Sample:
-        """Returns the last sample if it `is_fresh`, otherwise that of the next read.
-
-        Several clients share one read. The sample is bad if the device does not answer. Raises
-        `Busy` if the line had no time for the read.
-        """
-        if tag.inputs:
-            await asyncio.gather(*(self.fresh(one, max_age) for one in tag.inputs))
-            return self.mirror[tag]
-        poll = self._poll(tag)
-        if poll is None or self.is_fresh(tag, max_age):
-            return self.mirror[tag]
-        reader = _Reader(asyncio.get_running_loop().create_future(), poll.asked)
-        self._waiting.setdefault(tag, []).append(reader)
-        self._expedite(tag)
-        try:
-            async with asyncio.timeout(FRESH_WITHIN):
-                return await reader.answer
-        except TimeoutError:
-            if self.mirror[tag].quality is Quality.BAD:  # an offline device sends no sample
-                return self.mirror[tag]
-            raise Busy(f"{tag.key} could not be read within {FRESH_WITHIN:g} s") from None
-        finally:
-            self._waiting[tag].remove(reader)
-            if not self._waiting[tag]:
-                del self._waiting[tag]
-
-    def _answer(self, sample: Sample) -> None:
-        """Answers waiting clients. A read that started before the request does not satisfy it."""
-        tag = sample.tag
-        poll = self._poll(tag)
-        for reader in self._waiting[tag]:
-            if reader.answer.done():
-                continue
-            if sample.quality is Quality.BAD or poll is None or poll.asked > reader.asked:
-                reader.answer.set_result(self.mirror[tag])
-            else:
-                self._expedite(tag)
-
-    def _poll(self, tag: Tag) -> Poll | None:
-        """Returns the poll that reads the tag; None if the value is unsolicited."""
-        if tag.device not in self._places:
-            return None
-        line, device = self._places[tag.device]
-        return line.engine.schedule.reader(device, tag)
-
-    def _expedite(self, tag: Tag) -> None:
-        line, device = self._places[tag.device]
-        line.expedite(device, tag)
+        """Returns the last sample if it `is_fresh`, otherwise that of the next read. Raises
+        `Busy`."""
+        return await self._on_demand.fresh(tag, max_age)
 
     def status(self) -> Mapping[str, Document]:
         """Returns documents by path: `status`, `lines/<line>`, `devices/<device>`."""

@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import AsyncIterator, Callable, Coroutine, Mapping, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager
+from pathlib import Path
 from typing import Any
 
 import structlog
@@ -22,6 +23,7 @@ from gateway.line.duty import Duty
 from gateway.line.line import Line
 from gateway.northbound import Northbound, group_settings
 from gateway.northbound.session import off_loop
+from gateway.reload import LiveReload, Reloader, RunningLines
 from gateway.supervisor import Supervisor
 from gateway.tags import Sample
 
@@ -38,11 +40,12 @@ END_WITHIN = 1.7
 STATE_FILE_WITHIN = 0.5  # seconds; a lost state file costs only a new search
 
 
-async def run(config: Config, started: Callable[[], None] = lambda: None) -> None:
+async def run(config: Config, path: Path, started: Callable[[], None] = lambda: None) -> None:
     """Runs the service until SIGTERM or SIGINT. Raises `GatewayError` when it cannot start.
 
-    Calls `started` when everything is open on Zenoh: once, or each time that this gateway of a
-    standby group becomes active.
+    SIGHUP reloads the file at `path`, unless the terminal of the process has gone. Calls `started`
+    when everything is open on Zenoh: once, or each time that this gateway of a standby group
+    becomes active.
     """
     sys.setswitchinterval(THREAD_SWITCH)
     gc.set_threshold(*GC_THRESHOLDS)
@@ -55,16 +58,26 @@ async def run(config: Config, started: Callable[[], None] = lambda: None) -> Non
         supervisor.stopping()
         stop.set()
 
+    reloader = Reloader(path, config)
+    has_terminal = sys.stderr.isatty()
+
+    def hang_up() -> None:
+        if has_terminal and not sys.stderr.isatty():
+            end()
+        else:
+            supervisor.reloading()
+            reloader.want()
+
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, end)
-    loop.add_signal_handler(signal.SIGHUP, end if sys.stderr.isatty() else _ignore_hangup)
+    loop.add_signal_handler(signal.SIGHUP, hang_up)
     withheld: Mapping[str, str] = {}
     with supervisor.informed():
-        while (left := await _serve(config, withheld, stop, started, supervisor)) is not None:
+        while (left := await _serve(reloader, withheld, stop, started, supervisor)) is not None:
             withheld = left
             gc.unfreeze()  # the tags of the ended gateway
             gc.collect()
-            if withheld and len(withheld) == len(config.devices):
+            if withheld and len(withheld) == len(reloader.current.devices):
                 others = " and ".join(sorted(set(withheld.values())))
                 raise GatewayError(
                     f"gateway {others} serves every device of this file already: a device belongs "
@@ -73,12 +86,8 @@ async def run(config: Config, started: Callable[[], None] = lambda: None) -> Non
             log.warning("gateway starts over")  # the entry before says why
 
 
-def _ignore_hangup() -> None:
-    log.warning("signal ignored", signal="SIGHUP", so="a changed file counts after a restart")
-
-
 async def _serve(
-    file: Config,
+    reloader: Reloader,
     withheld: Mapping[str, str],
     stop: asyncio.Event,
     started: Callable[[], None],
@@ -90,7 +99,7 @@ async def _serve(
     of the standby group replaced this one, or if the event loop stood still: then it starts again.
     Otherwise None.
     """
-    config = file.without(withheld)
+    config = reloader.current.without(withheld)
     clock = ArrivalClock()
     duty = Duty(clock.released, shared=config.standby is not None)
     gateway = Gateway(config, clock, duty=duty, plan_now=False)
@@ -110,13 +119,15 @@ async def _serve(
     if history is not None:  # clients may have missed what was published
         gateway.subscribe(_Recording(history))
         gateway.add_document("history", history.document)
+    gateway.add_document("reload", reloader.document)
+    running = RunningLines()
     async with AsyncExitStack() as cleanup:  # in reverse order of the start
         clock.start()
         cleanup.callback(clock.stop)
         plans = _plan_lines(gateway, cleanup)
         zenoh = asyncio.create_task(northbound.run(), name="zenoh")
         cleanup.push_async_callback(_close, zenoh, history, state_file, alarm_file)
-        exclusive, active, opened, replaced, stopping = events = [
+        exclusive, active, opened, replaced, stopping, failed = events = [
             asyncio.create_task(event.wait())
             for event in (
                 northbound.exclusive,
@@ -124,11 +135,13 @@ async def _serve(
                 northbound.opened,
                 northbound.replaced,
                 stop,
+                running.failed,
             )
         ]
+        ends = [zenoh, stopping, replaced, failed]
         for event in events:
             cleanup.callback(event.cancel)
-        lines: list[asyncio.Task[None]] = []
+        live = LiveReload(reloader, gateway, northbound, running, plans, supervisor)
         await _first(exclusive, zenoh, stopping)
         if exclusive.done():  # otherwise another process may have this file and these lines
             if history is not None:
@@ -137,15 +150,19 @@ async def _serve(
             supervisor.says("waiting for the network, or as standby")
             if web is not None:
                 _start_web(web, cleanup)
-            await _first(active, zenoh, stopping, replaced)
+            reload = asyncio.create_task(live.run(), name="reload")
+            ends.append(reload)
+            cleanup.push_async_callback(_end, [reload])
+            await _first(active, *ends)
             if active.done():
-                supervisor.says(f"serving {len(config.devices)} devices")
+                supervisor.says(reloader.says)
                 await cleanup.enter_async_context(alarm_file.kept())
-                lines = await _start_lines(gateway, plans, history, state_file, cleanup)
-        await _first(opened, zenoh, stopping, replaced)
+                await _start_lines(gateway, plans, running, history, state_file, cleanup)
+                cleanup.push_async_callback(_end, [reload])  # before the lines: it starts some
+        await _first(opened, *ends)
         if opened.done():
             started()
-        await _first(zenoh, stopping, replaced, *lines)
+        await _first(*ends)
     if northbound.namesake:
         raise GatewayError(
             f"another gateway named {config.name} serves under {config.zenoh.prefix} already: "
@@ -208,23 +225,22 @@ async def _run_planned(line: Line, plan: asyncio.Task[None]) -> None:
 async def _start_lines(
     gateway: Gateway,
     plans: Sequence[asyncio.Task[None]],
+    running: RunningLines,
     history: Historian | None,
     state_file: StateFile | None,
     cleanup: AsyncExitStack,
-) -> list[asyncio.Task[None]]:
+) -> None:
     gateway.begin()
     if history is not None:
         history.record(gateway.mirror.samples())  # "starting" marks the restart
     if state_file is not None:
         await cleanup.enter_async_context(_saved(state_file, gateway))
-    lines = [
-        asyncio.create_task(_run_planned(line, plan), name=line.engine.name)
-        for line, plan in zip(gateway.lines, plans, strict=True)
-    ]
+    for line, plan in zip(gateway.lines, plans, strict=True):
+        running.start(line, line.engine.name, _run_planned(line, plan))
     gateway.serving.restore()
-    lines += [asyncio.create_task(one.run(), name=one.name) for one in gateway.serving.lines]
-    cleanup.push_async_callback(_end, lines)  # first, so that the last outcomes are published
-    return lines
+    for one in gateway.serving.lines:
+        running.start(one, one.name, one.run())
+    cleanup.push_async_callback(running.end_all)  # first, so that the last outcomes are published
 
 
 @asynccontextmanager

@@ -1,4 +1,4 @@
-"""Reports the service to its supervisor, systemd: ready, turning, stopping.
+"""Reports the service to its supervisor, systemd: ready, turning, reloading, stopping.
 
 The protocol is that of sd_notify(3): datagrams to the socket that $NOTIFY_SOCKET names. Without the
 variable nothing is sent.
@@ -7,6 +7,7 @@ variable nothing is sent.
 import asyncio
 import os
 import socket
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 
@@ -46,6 +47,10 @@ class Supervisor:
 
     def ready(self) -> None:
         self._report("READY=1")
+
+    def reloading(self) -> None:
+        """Reports that the file is read again, until `ready`."""
+        self._report(f"RELOADING=1\nMONOTONIC_USEC={time.monotonic_ns() // 1000}")
 
     def says(self, status: str) -> None:
         """Sends one line for people: `systemctl status` shows it."""

@@ -10,9 +10,10 @@ from typing import Any
 
 import pytest
 
-from gateway.app import FRESH_WITHIN, Gateway, forecasts
+from gateway.app import Gateway, forecasts
 from gateway.config import ZenohMode, load
 from gateway.errors import BadValue, LineDown, Offline
+from gateway.line.on_demand import FRESH_WITHIN
 from gateway.stations.vigor import VigorStation
 from gateway.tags import Quality, Reason, Sample, Tag, good
 from gateway.transport import Receiver

@@ -2,6 +2,7 @@
 
 import asyncio
 import os
+import re
 import socket
 import time
 from collections.abc import Iterator
@@ -45,9 +46,12 @@ async def test_ready_status_and_stop_are_reported(systemd: socket.socket) -> Non
     with supervisor.informed():
         supervisor.ready()
         supervisor.says("serving 3 devices")
+        supervisor.reloading()
         supervisor.stopping()
     supervisor.stopping()  # afterwards: too late
-    assert heard(systemd) == ["READY=1", "STATUS=serving 3 devices", "STOPPING=1"]
+    ready, status, reloading, stopping = heard(systemd)
+    assert (ready, status, stopping) == ("READY=1", "STATUS=serving 3 devices", "STOPPING=1")
+    assert re.fullmatch(r"RELOADING=1\nMONOTONIC_USEC=[0-9]+", reloading)
 
 
 async def test_a_loop_that_stands_still_gives_no_sign_of_life(systemd: socket.socket) -> None:

@@ -6,7 +6,7 @@ A scan whose tags have no alarm costs nothing: `Gateway.samples` sees that at th
 import asyncio
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import structlog
@@ -77,7 +77,45 @@ class Alarms:
 
     def watch(self, key: str, rule: AlarmRule, look: Callable[[], Reading]) -> None:
         """Adds the alarm of a line or a device. `look` returns its present state."""
+        if (known := self.entries.get(key)) is not None:  # another line or device has its place
+            known.look = look
+            return
         self._watched.append(self._add(Entry(key, rule, look=look)))
+
+    # -- a changed file --
+
+    def take_over(self, tags: Iterable[Tag], gone: Iterable[Tag]) -> None:
+        """Follows changed tags. The alarm of a tag with the same rule goes on."""
+        for tag in tags:
+            if tag.alarm is None:
+                continue
+            entry = self.entries.get(tag.key)
+            if entry is None or entry.tag is None or entry.tag.alarm != tag.alarm:
+                if entry is not None:
+                    self._remove(entry)
+                entry = self._add(Entry(tag.key, tag.alarm, tag))
+            entry.tag = tag
+            self._by_tag[tag] = entry
+        for tag in gone:
+            entry = self._by_tag.pop(tag, None)
+            if entry is not None and entry.tag is tag:
+                self._remove(entry)
+        self.of_tags = bool(self._by_tag)
+
+    def watch_only(self, keys: Collection[str]) -> None:
+        """Ends the alarms of other lines and devices."""
+        for entry in [entry for entry in self._watched if entry.key not in keys]:
+            self._watched.remove(entry)
+            self._remove(entry)
+
+    def _remove(self, entry: Entry) -> None:
+        if entry.timer is not None:
+            entry.timer.cancel()
+        if self.entries.get(entry.key) is entry:
+            del self.entries[entry.key]
+            self.open.pop(entry.key, None)
+            self._counts[entry.counted] -= 1
+            self.changed.set()
 
     def _add(self, entry: Entry) -> Entry:
         self.entries[entry.key] = entry

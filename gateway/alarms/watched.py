@@ -17,7 +17,10 @@ LINE = "line:"  # begins the key of the alarm of a line; no device has a colon i
 
 
 def watch(alarms: Alarms, lines: Iterable[Line], config: AlarmsConfig) -> None:
-    """Adds the alarms of lines and of their devices."""
+    """Adds the alarms of lines and of their devices, and ends those of others."""
+    lines = [*lines]
+    names = {device.name for line in lines for device in line.engine.devices}
+    alarms.watch_only(names | {f"{LINE}{line.engine.name}" for line in lines})
     for line in lines:
         name = line.engine.name
         if config.lines:

@@ -25,7 +25,7 @@ _ALL = frozenset({"tag written", "write failed", "command executed", "command fa
 # Changes of these are logged at once, up to `BURST` of them: a cable is plugged again soon.
 _STATES = frozenset(
     {
-        *("alarm", "device", "gateway", "history", "line", "standby state"),
+        *("alarm", "device", "file", "gateway", "history", "line", "standby state"),
         *("Zenoh link", "Zenoh session"),
     }
 )

@@ -63,7 +63,7 @@ def _serve(config: Config, path: Path, say: Callable[[str], None]) -> None:
     )
     hint = next_steps(config, path, program())
     with asyncio.Runner(loop_factory=new_event_loop) as runner:
-        runner.run(service.run(config, lambda: say(hint)))
+        runner.run(service.run(config, path, lambda: say(hint)))
     log.info("gateway stopped")
 
 

@@ -164,6 +164,9 @@ def _services(documents: Documents, outcomes: list[dict[str, Any]] | None) -> Ta
     history = documents.get("history")
     text = "not kept" if history is None else f"{history['state']}, {history['waiting']} waiting"
     table.add_row("history", Text(printable(text)))
+    if (reload := documents.get("reload")) is not None:
+        again = f", {reload['reloads']} reloads" if reload["reloads"] else ""
+        table.add_row("file", Text(printable(f"of {reload['loaded'][:19]}Z{again}")))
     if alarms := documents.get("alarms"):
         text = ", ".join(f"{n} {state}" for state, n in alarms.items() if n and state != "normal")
         table.add_row("alarms", Text(text or "none"))

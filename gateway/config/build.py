@@ -108,6 +108,7 @@ class Builder:
             web=self._web(top),
             alarms=self._alarms(top, lines),
             lines=tuple(lines),
+            watch=top.gateway.watch_config,
             sheets=tuple(self._sheets.used),
         )
 

@@ -71,6 +71,8 @@ class GatewaySection(Section):
     """A name shared by two gateways of one plant: one is active, the other is the standby."""
     standby_alone: Interval | None = None
     """Become active after this time without any Zenoh link; left out: wait for the network."""
+    watch_config: bool = False
+    """Reload this file, and the sheets that it names, one second after a change."""
     secret_file: FilePath | None = None
     """The file whose first line, the same for all gateways of a plant, signs claims and tokens."""
 

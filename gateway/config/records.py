@@ -122,6 +122,7 @@ class Config:
     web: WebConfig | None
     alarms: AlarmsConfig = AlarmsConfig()
     lines: tuple[LineConfig, ...]
+    watch: bool = False  # a changed file is reloaded by itself
     sheets: tuple[SheetUse, ...] = ()  # files that the tags of some devices come from
 
     @property

@@ -1,5 +1,6 @@
 """Applies the result of a job that is no good read, and decides what follows it."""
 
+from gateway.engine.changes import Changes
 from gateway.engine.effects import Effects
 from gateway.engine.health import State
 from gateway.engine.jobs import (
@@ -60,6 +61,12 @@ class Conclusions:
         self._requests = requests
         self._effects = effects
         self._gap = gap
+
+    def change(self, changes: Changes, now: float) -> None:
+        """Takes over changed devices."""
+        self.shorter.change(now)
+        for device in changes.left:
+            self.together.forget(device)
 
     def poll_failed(self, poll: Poll, result: Exception, now: float, time: int) -> None:
         """Applies the result of a poll without units."""

@@ -12,7 +12,7 @@ from gateway.engine.reply_shapes import ReplyShapes, reply_shapes
 from gateway.engine.station_silence import StationSilence
 from gateway.engine.turnaround import Turnaround
 from gateway.errors import LineDown
-from gateway.planning.bad_addresses import RETRIES, BadAddresses
+from gateway.planning.bad_addresses import RETRIES, BadAddresses, KnownBad
 from gateway.planning.monitor_lists import with_monitor_list
 from gateway.planning.planner import Block, around, plan, runs_of
 from gateway.planning.wire_timing import Transactions, WireTiming
@@ -55,6 +55,13 @@ class DeviceSettings:
         found = tuple(tag if tag.kept is None else tag.inputs[0] for tag in tags)
         object.__setattr__(self, "wire_tags", found)
 
+    @property
+    def answerable(self) -> bool:
+        """False for a device that is only written to, or only sends unsolicited frames."""
+        areas = self.driver.areas
+        used = [areas[tag.span.area] for tag in self.wire_tags] or areas.values()
+        return any(area.readable for area in used) and not self.listen_only
+
 
 @dataclass(slots=True, eq=False)
 class Device:
@@ -82,9 +89,7 @@ class Device:
         driver = self.driver
         self.bad_addresses = BadAddresses(driver.cost)
         self.turnaround = Turnaround(self.settings.turnaround)
-        used = [driver.areas[tag.span.area] for tag in self.tags] or driver.areas.values()
-        answerable = any(area.readable for area in used) and not self.settings.listen_only
-        self.health = Health(answerable=answerable)
+        self.health = Health(answerable=self.settings.answerable)
         self.window = driver.window if isinstance(driver, Windowed) else 1
         self.shapes = (
             None if self.broadcast else reply_shapes(driver, self.polled_tags, self.bad_addresses)
@@ -151,6 +156,25 @@ class Device:
     def takes_one_at_a_time(self, only: bool) -> None:
         """Notes if the device loses requests that are sent together."""
         self.one_at_a_time = only
+
+    def successor(self, settings: DeviceSettings, bad: KnownBad) -> "Device":
+        """Returns the same station with other settings of the file, without a plan yet. A thread
+        may do it; `take_over` gives it everything else that was learned. `bad`: addresses."""
+        new = Device(settings, self.wire, plan_now=False)
+        new.bad_addresses.restore(bad, settings.wire_tags)
+        if settings.turnaround == self.settings.turnaround:
+            new.turnaround = self.turnaround
+        return new
+
+    def take_over(self, old: "Device") -> None:
+        """Takes over the state of the same station. No request to it may be in flight."""
+        self.health, self.record, self.use = old.health, old.record, old.use
+        self.health.resyncs_elsewhere()
+        self.last_read, self.one_at_a_time = old.last_read, old.one_at_a_time
+        if (old.silence.safe, old.silence.least) == (self.silence.safe, self.silence.least):
+            self.silence = old.silence
+        if self.shapes is not None and old.shapes is not None:
+            old.shapes.longer, self.shapes = self.shapes.longer, old.shapes
 
     def restart(self, trouble: LineDown | None = None) -> None:
         """Starts again after the line was opened or lost."""

@@ -9,6 +9,7 @@ other entries take requests, bytes and events of the port. Effects are returned 
 from collections.abc import Sequence
 from typing import Any, cast
 
+from gateway.engine.changes import Changes
 from gateway.engine.conclusions import Conclusions
 from gateway.engine.device import Device
 from gateway.engine.effects import Effect, Effects
@@ -53,7 +54,8 @@ class Engine:
     def __init__(
         self, name: str, devices: Sequence[Device], wire: WireTiming, seed: int = 0
     ) -> None:
-        self.devices = devices
+        # One list for all parts of the engine: `change` changes it in place.
+        self.devices = devices = list(devices)
         self.is_open = False
         self.record = LineRecord()
         self.deadline = NEVER  # when `expire` must be called
@@ -256,6 +258,26 @@ class Engine:
             self._conclusions.shorter.disturbed(now)
         self._stray.unmatched(device, frame, now, time, echo=echo)
         self._unsolicited.unmatched(device, frame, now, time)
+        self._set_deadline()
+        return self._effects.take()
+
+    def change(self, changes: Changes, now: float) -> list[Effect]:
+        """Takes over changed devices, while `is_idle`. Waiting requests to them are refused."""
+        for device in changes.left:
+            for request in self.schedule.requests.withdraw(device):
+                why = f"the file was reloaded and changed {device.name}; not sent"
+                self._effects.ended(request, Busy(why))
+        for device in changes.removed:
+            self._effects.online(device, False)
+        for old, new in changes.replaced:
+            new.take_over(old)
+        self.devices[:] = changes.applied(self.devices)
+        self.schedule.change(changes, now)
+        self._staleness.change(changes, now, is_open=self.is_open)
+        self._unsolicited.change(changes, now)
+        self._stray.change(changes)
+        self._conclusions.change(changes, now)
+        self._polls.change(changes)
         self._set_deadline()
         return self._effects.take()
 

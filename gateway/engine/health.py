@@ -177,6 +177,11 @@ class Health:
         self._probe_token += 2
         return self._probe_token
 
+    def resyncs_elsewhere(self) -> None:
+        """Notes that resyncs have other spans from now on. Their replies are told apart from those
+        to earlier resyncs no longer, so that the line settles after the first reply."""
+        self._probe_token = 0
+
     def outstanding_requests(self, since: float) -> int:
         """Counts the requests sent after `since` that have no reply."""
         return sum(sent > since for sent in self._unanswered)

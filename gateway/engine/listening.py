@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, cast
 
+from gateway.engine.changes import Changes
 from gateway.engine.device import Device
 from gateway.engine.effects import Effects
 from gateway.engine.health import State
@@ -134,6 +135,12 @@ class Listening:
         self._pairing = Pairing(max(one.longest_reply for one in devices), self._character)
         self._heard = {tag: now for one in devices for tag in one.tags}
         self._look()
+
+    def change(self, changes: Changes, now: float) -> None:
+        """Stops listening: the line is closed, and perhaps opened again for other devices."""
+        self.speakers = ()
+        self._heard.clear()
+        self.due = math.inf
 
     def received(self, data: bytes, now: float, time: int) -> None:
         """Takes bytes, and learns what they tell."""

@@ -23,6 +23,10 @@ class Plans:
         self._waiting[device] = min(when, self._waiting.get(device, when))
         self.look(now)
 
+    def forget(self, device: Device) -> None:
+        """Forgets a device that the line no longer has."""
+        self._waiting.pop(device, None)
+
     def look(self, now: float) -> None:
         """Makes the next plan if its time has come."""
         self.next_at = math.inf

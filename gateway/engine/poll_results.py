@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
+from gateway.engine.changes import Changes
 from gateway.engine.device import Device
 from gateway.engine.effects import Effects, Samples
 from gateway.engine.health import State
@@ -36,6 +37,11 @@ class PollResults:
         self._results = results
         self._effects = effects
         self._plans = Plans(schedule)
+
+    def change(self, changes: Changes) -> None:
+        """Takes over changed devices: they have a new plan."""
+        for device in changes.left:
+            self._plans.forget(device)
 
     def read(self, poll: Poll, units: Sequence[int], now: float, time: int) -> None:
         """Applies a good read of a block."""

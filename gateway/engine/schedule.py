@@ -1,8 +1,9 @@
 """Decides the next job of one line."""
 
 import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
+from gateway.engine.changes import Changes
 from gateway.engine.device import Device
 from gateway.engine.health import PAUSE_LONGEST, State
 from gateway.engine.jobs import EXPEDITED, NOT_QUEUED, ON_DEMAND, Idle, LastRead, Poll, Probe
@@ -14,6 +15,7 @@ from gateway.planning.planner import Block
 from gateway.tags import Tag
 
 NEVER = float("inf")
+UNCHANGED: Mapping[Tag, Tag] = {}
 LONG = 10.0  # seconds: a longer interval is too long to wait for a first value
 ON_DEMAND_SHARE = 0.25  # share of the wire time for polls on demand that delay others
 FIRST_SHARE = 0.1  # share of the wire time for blocks of long intervals without good values
@@ -63,12 +65,16 @@ class Schedule:
 
     # Changes
 
-    def plan(self, device: Device, now: float) -> None:
-        """Makes polls of the blocks of the device. A poll of the same span keeps its due time."""
+    def plan(self, device: Device, now: float, renewed: Mapping[Tag, Tag] = UNCHANGED) -> None:
+        """Makes polls of the blocks of the device. A poll of the same span keeps its due time.
+
+        `renewed`: tags of the polls before whose values go on as those of other tags.
+        """
         before = self._polls.get(device, ())
         old = {poll.block.span: poll for poll in before}
-        read = {tag: poll.last.at for poll in before for tag in poll.block.tags}
-        seen = {tag for poll in before if poll.last.ever for tag in poll.block.tags}
+        by_tag = [(renewed.get(tag, tag), poll) for poll in before for tag in poll.block.tags]
+        read = {tag: poll.last.at for tag, poll in by_tag}
+        seen = {tag for tag, poll in by_tag if poll.last.ever}
         polls = []
         for block in device.blocks:
             known = old.get(block.span)
@@ -85,6 +91,24 @@ class Schedule:
         for poll in before:
             poll.live = False
         self._set_polls(device, polls, polls, now)
+
+    def change(self, changes: Changes, now: float) -> None:
+        """Takes over changed devices of the line, which are in `devices` already."""
+        for old, new in changes.replaced:
+            self._polls[new] = self._polls.pop(old)
+            self._readers.pop(old, None)
+            self.plan(new, now, changes.renewed)
+        for device in changes.removed:
+            self._readers.pop(device, None)
+            for poll in self._polls.pop(device):
+                poll.live = False
+        expedited = [poll for poll in self._queue.expedited if poll.live]
+        self._queue = PollQueue(shared=len(self.devices) > 1)
+        self._queue.expedited.extend(expedited)
+        for polls in self._polls.values():
+            self._queue.push_all(polls)
+        for device in changes.added:
+            self.plan(device, now)
 
     def replace(self, poll: Poll, blocks: Iterable[Block], now: float) -> None:
         """Replaces one poll by polls of these blocks, due at once."""

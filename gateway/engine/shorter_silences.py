@@ -63,9 +63,7 @@ class ShorterSilences:
     def __init__(self, line: str, devices: Sequence[Device], effects: Effects) -> None:
         self._line, self._effects = line, effects
         self._devices = devices
-        self._learning = [device for device in devices if device.silence.learns]
-        if any(isinstance(d.driver, Unsolicited) and d.driver.sends_unsolicited for d in devices):
-            self._learning.clear()  # the silence lets their frames begin
+        self._learning = _learning(devices)
         self.pace = Pace()
         self.step = 0  # so many times the safe silences are halved
         self.answered = 0  # polls at this step, after its silence
@@ -171,6 +169,14 @@ class ShorterSilences:
         if self.step:
             self._restore("the port was opened", now)
 
+    def change(self, now: float) -> None:
+        """Takes over changed devices of the line, which are in `devices` already."""
+        self.suspects = self.spoke = self._shape = None
+        if self.step:
+            self._restore("the devices of the line changed", now)
+        self._learning = _learning(self._devices)
+        self.look_at = float(self.pace.proof) if self._learning else math.inf
+
     def _pause(self, now: float) -> None:
         """Tries no shorter silence for a while, longer after each loss."""
         self._next = now + self.pace.pause * 2**self._losses
@@ -184,6 +190,13 @@ class ShorterSilences:
             device.silence.take_step(0, now)
             device.silence.keep_safe(at_rest=True)
         self._effects.info("silences restored", line=self._line, why=why)
+
+
+def _learning(devices: Sequence[Device]) -> list[Device]:
+    """Returns the devices whose silences may be shortened."""
+    if any(isinstance(d.driver, Unsolicited) and d.driver.sends_unsolicited for d in devices):
+        return []  # the silence lets their frames begin
+    return [device for device in devices if device.silence.learns]
 
 
 def _may_be_lost(poll: Poll) -> bool:

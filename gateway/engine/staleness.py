@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Sequence
 
 from gateway.engine.ages import polled_block, worst_ages
+from gateway.engine.changes import Changes
 from gateway.engine.device import Device
 from gateway.engine.effects import Effects
 from gateway.engine.health import State
@@ -32,6 +33,14 @@ class Staleness:
         self._ages: list[float] = []
         self._logged: dict[Device, float] = {}
 
+    def change(self, changes: Changes, now: float, *, is_open: bool) -> None:
+        """Takes over changed devices: values that go on may have shorter limits."""
+        for device in changes.left:
+            self._logged.pop(device, None)
+        if is_open:
+            soonest = min((limit for _, limit in self._limits()), default=NEVER)
+            self.due = min(self.due, now + soonest)
+
     def stop(self) -> None:
         """Stops, because the line is closed and all its values are bad."""
         self.due = NEVER
@@ -52,7 +61,7 @@ class Staleness:
         devices = self._schedule.devices
         failing = any(device.health.state is State.FAILING for device in devices)
         stretch = 1.0 if failing else 2.0
-        longest_reply = max(device.longest_reply for device in devices)
+        longest_reply = max((device.longest_reply for device in devices), default=0.0)
         longest_reply += self._schedule.unanswered.longest
         for poll, age in zip(*self._worst_ages(), strict=True):
             if poll.device.health.state is State.FAILING:

@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Sequence
 from typing import Any, cast
 
+from gateway.engine.changes import Changes
 from gateway.engine.device import Device
 from gateway.engine.effects import Effects
 from gateway.engine.results import Results
@@ -27,14 +28,16 @@ class Stray:
         self._devices = devices
         self._results = results
         self._effects = effects
-        # The devices whose frames are read, by their codecs: equal ones read the bytes once.
-        self._readers: dict[object, list[Device]] = {}
-        for device in devices:
-            if device.shapes is not None or isinstance(device.driver, StrayFrames):
-                self._readers.setdefault(_kind(device.driver.codec()), []).append(device)
+        self._readers = _readers(devices)
         self._codecs: dict[object, Codec[Any]] = {}
         self._last = float("-inf")
         self._logged: dict[Device, float] = {}
+
+    def change(self, changes: Changes) -> None:
+        """Takes over changed devices of the line, which are in `devices` already."""
+        self._readers = _readers(self._devices)
+        for device in changes.left:
+            self._logged.pop(device, None)
 
     def received(self, data: bytes, now: float, time: int) -> None:
         """Takes bytes that arrived outside of a transaction."""
@@ -87,6 +90,15 @@ class Stray:
         log = self._effects.info if due else self._effects.debug
         count = device.record.unasked
         log("stray frame", line=self._line, device=device.name, what=text, count=count)
+
+
+def _readers(devices: Sequence[Device]) -> dict[object, list[Device]]:
+    """Returns the devices whose frames are read, by their codecs: equal ones read bytes once."""
+    readers: dict[object, list[Device]] = {}
+    for device in devices:
+        if device.shapes is not None or isinstance(device.driver, StrayFrames):
+            readers.setdefault(_kind(device.driver.codec()), []).append(device)
+    return readers
 
 
 def _is_extra_reply(device: Device, frame: Any) -> bool:

@@ -32,6 +32,10 @@ class Together:
         self._effects = effects
         self._windows: dict[Device, _Window] = {}
 
+    def forget(self, device: Device) -> None:
+        """Forgets a device that the line no longer has."""
+        self._windows.pop(device, None)
+
     def others(self, poll: Poll, now: float) -> int:
         """Returns how many polls may be sent beside this one."""
         window = self._windows.get(poll.device)

@@ -2,9 +2,10 @@
 
 from collections import deque
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
+from gateway.engine.changes import Changes
 from gateway.engine.device import Device
 from gateway.engine.effects import Effects
 from gateway.engine.jobs import Answer, Idle
@@ -58,6 +59,14 @@ def unsolicited_tags(device: Device) -> list[Tag]:
     return [tag for tag in device.tags if driver.unsolicited_only(tag.span)]
 
 
+def _senders(device: Device, now: float) -> list[_Sender]:
+    """Returns the sender of the device, if it sends unsolicited frames."""
+    driver = device.driver
+    if not (isinstance(driver, Unsolicited) and driver.sends_unsolicited):
+        return []
+    return [_Sender(device, driver.listener(now), driver.unsolicited)]
+
+
 class UnsolicitedFrames:
     """The listeners of one line: one for each device that sends unsolicited frames."""
 
@@ -73,11 +82,22 @@ class UnsolicitedFrames:
         """Starts the listeners. The port may have been opened in the middle of a frame."""
         self._replies.clear()
         self._held_since = None
-        self.speakers = [
-            _Sender(device, device.driver.listener(now), device.driver.unsolicited)
-            for device in self._devices
-            if isinstance(device.driver, Unsolicited) and device.driver.sends_unsolicited
-        ]
+        self.speakers = [sender for one in self._devices for sender in _senders(one, now)]
+
+    def change(self, changes: Changes, now: float) -> None:
+        """Takes over changed devices. A listener goes on: it knows the ages of the fields."""
+        following = dict(changes.replaced)
+        stay = []
+        for sender in self.speakers:
+            if (new := following.get(sender.device)) is not None:
+                stay.append(replace(sender, device=new, tags={}))
+            elif sender.device not in changes.removed:
+                stay.append(sender)
+        self.speakers = stay + [s for device in changes.added for s in _senders(device, now)]
+        left = changes.left
+        kept = [reply for reply in self._replies if reply.device not in left]
+        self._replies.clear()
+        self._replies.extend(kept)
 
     def received(self, data: bytes, now: float, time: int) -> None:
         """Takes bytes that arrived outside of a transaction."""

@@ -2,13 +2,14 @@
 
 import time
 from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import replace
 
 from gateway.config import LineConfig
 from gateway.engine.device import Device, DeviceSettings
 from gateway.engine.engine import Engine
 from gateway.line.duty import Duty
 from gateway.line.line import Line, SampleSink
-from gateway.simulator.plant import station_for
+from gateway.simulator.plant import animate, station_for
 from gateway.simulator.port import open_simulator
 from gateway.stations.station import Station
 from gateway.transport import Port, Receiver, SimulatorAddress, open_port
@@ -17,17 +18,44 @@ from gateway.transport.listen_only import ListenOnlyPort
 OpenPort = Callable[[Receiver], Awaitable[Port]]
 
 
+class SimulatedLine:
+    """Opens the simulated devices of a line in memory. They keep their values when the line opens
+    again, and when the file is reloaded."""
+
+    def __init__(self, line: LineConfig) -> None:
+        self._line = line
+        self._devices: Sequence[DeviceSettings] = ()
+        self._stations: list[Station] = []  # in the order of the devices; the open line uses it
+
+    def __call__(self, receiver: Receiver) -> Awaitable[Port]:
+        if not self._stations:  # made when the line opens: a large plant has many
+            self._serve(self._line.devices)
+        return open_simulator(self._stations, self._line.wire, receiver)
+
+    def change(self, devices: Sequence[DeviceSettings]) -> None:
+        """Takes over changed devices."""
+        self._line = replace(self._line, devices=tuple(devices))
+        if self._stations:
+            self._serve(devices)
+
+    def _serve(self, devices: Sequence[DeviceSettings]) -> None:
+        known = {d.name: (d, s) for d, s in zip(self._devices, self._stations, strict=True)}
+        stations = []
+        for device in devices:
+            before, station = known.get(device.name, (None, None))
+            if before is None or station is None or before.driver != device.driver:
+                station = station_for(device.driver, device.wire_tags)
+            elif before is not device:
+                spans = {tag.span for tag in before.wire_tags}
+                animate(station, [tag for tag in device.wire_tags if tag.span not in spans])
+            stations.append(station)
+        self._devices, self._stations[:] = devices, stations
+
+
 def opener(line: LineConfig) -> OpenPort:
     """Returns a function that opens the port of the line, or its simulated devices in memory."""
     if isinstance(line.port, SimulatorAddress):
-        stations: list[Station] = []  # they keep their values when the line opens again
-
-        def simulated(receiver: Receiver) -> Awaitable[Port]:
-            if not stations:  # made when the line opens: a large plant has many
-                stations.extend(station_for(one.driver, one.wire_tags) for one in line.devices)
-            return open_simulator(stations, line.wire, receiver)
-
-        return simulated
+        return SimulatedLine(line)
     return lambda receiver: open_port(line.port, line.serial, receiver)
 
 

@@ -14,12 +14,14 @@ from typing import Any, NoReturn, Protocol
 
 import structlog
 
-from gateway.engine.device import Device
+from gateway.engine.changes import Changes
+from gateway.engine.device import Device, DeviceSettings
 from gateway.engine.effects import Effect, LogEvent, OnlineChange, Pause, RequestEnded, Samples
 from gateway.engine.engine import Engine
 from gateway.engine.jobs import Idle, Poll, Reopen, Settle, Traffic
 from gateway.engine.requests import WRITE_EXPIRY, Command, Outcome, Request, Write
 from gateway.errors import GatewayError, LineDown
+from gateway.line.changing import Changeable, WaitingChange
 from gateway.line.channel import NEVER, Alarm, Channel, Echo
 from gateway.line.duty import Duty
 from gateway.line.perform import perform
@@ -77,6 +79,7 @@ class Line:
         self._outcomes: dict[Request, asyncio.Future[Any]] = {}
         self._wake = asyncio.Event()
         self._expiry = _Expiry()
+        self._waiting: WaitingChange | None = None
         self.tried = asyncio.Event()  # set once the port was opened, or could not be
 
     # Clients
@@ -110,6 +113,30 @@ class Line:
         """Polls the tag's block before all other polls."""
         self.engine.expedite(device, tag)
         self._wake.set()
+
+    async def change(
+        self, changes: Changes, devices: Sequence[DeviceSettings], applied: Callable[[], None]
+    ) -> None:
+        """Takes over changed devices when the current transaction has ended. Calls `applied` at
+        once then: no sample comes between. `devices`: all of the line, for its simulated port.
+        Call it again only after it has returned."""
+        ended = asyncio.get_running_loop().create_future()
+        self._waiting = WaitingChange(changes, devices, applied, ended)
+        if self.engine.is_open:
+            self._wake.set()
+        else:
+            self._apply()
+        await ended
+
+    def _apply(self) -> None:
+        waiting, self._waiting = self._waiting, None
+        if waiting is not None:
+            self._deliver(self.engine.change(waiting.changes, _now()))
+            if isinstance(self._open_port, Changeable):
+                self._open_port.change(waiting.devices)
+            waiting.applied()
+            if not waiting.ended.done():
+                waiting.ended.set_result(None)
 
     # The receiver of the port
 
@@ -162,6 +189,7 @@ class Line:
                 self.tried.set()
             finally:
                 self._deliver(self.engine.stopped(_now()))
+                self._apply()
                 await self._close()  # last, because closing can be slow
             if served > REOPEN_LONGEST:
                 pause = REOPEN_FIRST
@@ -197,6 +225,8 @@ class Line:
         engine, now = self.engine, channel.now
         while self._lost is None:
             begun = now()
+            if self._waiting is not None and engine.is_idle:
+                self._apply()
             if engine.deadline <= begun:
                 self._expire()
             job = engine.next(begun)

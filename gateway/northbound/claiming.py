@@ -54,12 +54,32 @@ class Claiming:
         self._documents = ClaimDocuments(keys, secret)
         self._unanswered: set[str] = set()  # keys of claims that were seen but not read
         self._changed = asyncio.Event()
-        self._declared: list[object] = []  # Zenoh undeclares an object without a reference
+        # Zenoh undeclares an object without a reference.
+        self._token: tuple[zenoh.Session, zenoh.LivelinessToken] | None = None
+        self._declared: list[object] = []
 
     def withhold(self, devices: Mapping[str, str]) -> None:
         """Leaves devices to other gateways. Call it before `run`."""
         self.withheld = devices
         self._devices |= devices.keys()
+
+    def taken(self, devices: Iterable[str]) -> Mapping[str, str]:
+        """Returns those of the devices that other gateways serve, with their names."""
+        return {} if self._claims is None else self._claims.taken(devices)
+
+    async def change(self, devices: Iterable[str]) -> None:
+        """Claims these devices, and no others any more. The token is declared again: then other
+        gateways read the claim again."""
+        self._devices = frozenset(devices)
+        self.withheld = {name: g for name, g in self.withheld.items() if name in self._devices}
+        if self._claims is None:
+            return
+        before = self._claims.own
+        self._claims.change(self._devices, self.withheld)
+        if self._claims.own != before and self._token is not None:
+            session, token = self._token
+            await off_loop(token.undeclare)
+            await self._declare(session)
 
     def documents(self) -> dict[str, dict[str, object]]:
         """The own claim, by its path."""
@@ -94,9 +114,12 @@ class Claiming:
         await self._observe(await second.session(), claims)
 
     async def _claim(self, session: zenoh.Session, claims: Claims) -> None:
-        own = claims.claim(time.time_ns(), self.withheld)
-        key = self._keys.claim(own.session)
-        self._declared.append(await off_loop(session.liveliness().declare_token, key))
+        claims.claim(time.time_ns(), self.withheld)
+        await self._declare(session)
+
+    async def _declare(self, session: zenoh.Session) -> None:
+        key = self._keys.claim(str(session.zid()))
+        self._token = session, await off_loop(session.liveliness().declare_token, key)
 
     async def _until_seen(self, view: zenoh.Session, claims: Claims) -> None:
         """Waits until the own claim comes back: every later gateway sees it too."""

@@ -41,6 +41,12 @@ class Claims:
         self._others: dict[str, Claim] = {}  # by session
         self._free_since: float | None = None
 
+    def change(self, devices: Iterable[str], withheld: Iterable[str]) -> None:
+        """Has other devices from now on. The own claim keeps its place before later ones."""
+        self._devices = frozenset(devices)
+        if self.own is not None:
+            self.own = self.own._replace(devices=self._devices.difference(withheld))
+
     def found(self, claim: Claim) -> None:
         """Another gateway claims, or our own claim was seen."""
         if claim.session != self._session:
@@ -57,14 +63,16 @@ class Claims:
         self.own = Claim(ticket, self._session, self._name, self._group, devices)
         return self.own
 
-    def taken(self) -> dict[str, str]:
-        """Returns the devices of the file that belong to other gateways, with their names."""
+    def taken(self, devices: Iterable[str] | None = None) -> dict[str, str]:
+        """Returns the devices of the file, or of another one, that belong to other gateways, with
+        their names."""
         own = self.own
+        wanted = self._devices if devices is None else frozenset(devices)
         return {
             device: other.name
             for other in sorted(self._others.values(), reverse=True)  # the first one stays
             if self._group is None or other.group != self._group
-            for device in self._devices & other.devices
+            for device in wanted & other.devices
             if own is None or device not in own.devices or other < own
         }
 

@@ -43,6 +43,10 @@ def warnings(documents: Documents) -> Iterator[str]:
             yield f"line {line} is asked for {load:.1f} times what it carries: see `check`"
     for device, other in documents["status"]["refused_devices"].items():
         yield f"{device} is served by another gateway, {other}"
+    reload = documents.get("reload", {})
+    if reload.get("refused"):
+        more = f" and {len(reload['why']) - 1} more" if len(reload["why"]) > 1 else ""
+        yield f"the changed file was refused at {reload['refused']}: {reload['why'][0]}{more}"
     clock = documents.get("clock", {})
     if (ago := clock.get("ago")) is not None and ago < JUMP_SHOWN:
         yield (

@@ -1,6 +1,6 @@
 """Everything that clients send to this gateway: queries and puts, from declaration to end."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict
 from typing import TypeVar
 
@@ -49,6 +49,7 @@ class Incoming:
         self._acknowledgements = Acknowledgements(keys, plant, audit, admitted)
         self._queries: Queries | None = None
         self._puts: PutWrites | None = None
+        self._declarations: Declarations | None = None
 
     def counters(self) -> dict[str, int]:
         """Queries and puts since the start."""
@@ -86,11 +87,25 @@ class Incoming:
         self._puts = PutWrites(writes, self._index)
         queries = Inbox(self._queries.take, self._queries.refuse)
         puts = Inbox(self._puts.take, self._puts.refuse)
-        return Declarations(session, self._keys, self._commands(), self._index, queries, puts)
+        self._declarations = Declarations(
+            session, self._keys, self._plant, self._index, queries, puts
+        )
+        return self._declarations
 
     def begin(self) -> None:
         """Call it when the gateway becomes active, before it takes queries for the plant."""
         self._acceptance.begin()
+
+    def become(self, index: TagIndex) -> frozenset[str]:
+        """Serves other devices from now on. Returns the names of those that have gone."""
+        gone = self._index.names - index.names
+        self._index.become(index)
+        return gone
+
+    def changed(self) -> None:
+        """Declares the keys of changed devices. Blocks."""
+        if self._declarations is not None:
+            self._declarations.changed()
 
     async def close(self) -> None:
         """Ends what waits for devices; replies that are on their way get half a second."""
@@ -104,63 +119,71 @@ class Incoming:
         if self._queries is not None:
             self._queries.end()
 
-    def _commands(self) -> list[str]:
-        """Returns the commands of all devices; those to a line lie under the status keys."""
-        return sorted(frozenset().union(*self._plant.commands().values()))
-
 
 class Declarations:
     """Declares queryables, subscribers and tokens. Each call blocks: not on the event loop.
 
-    Zenoh undeclares an object that is no longer referenced, so the caller keeps the results.
+    Zenoh undeclares an object that is no longer referenced, so this one must live as long.
     """
 
     def __init__(
         self,
         session: zenoh.Session,
         keys: Keys,
-        commands: list[str],
+        plant: Plant,
         index: TagIndex,
         queries: Inbox[zenoh.Query],
         puts: Inbox[zenoh.Sample],
     ) -> None:
         self._session = session
         self._keys = keys
-        self._commands = commands
-        self._devices = index.devices
+        self._plant = plant
+        self._index = index
         self._queries = queries
         self._puts = puts
+        self._queryables: dict[str, zenoh.Queryable[None]] = {}  # by key
+        self._others: list[object] = []
 
-    def status(self) -> list[object]:
+    def status(self) -> None:
         """Declares the status keys; a standby gateway answers them too."""
-        return [self._queryable(self._keys.statuses)]
+        self._declare([self._keys.statuses])
 
-    def plant(self) -> list[object]:
+    def plant(self) -> None:
         """Declares values, writes and commands; only the active gateway answers them.
 
         Other gateways may share the prefix, and Zenoh queries all of them, because no queryable is
         `complete`. So a write reaches each of them, and only the gateway of its device takes it.
         """
-        keys = [self._keys.values, self._keys.late, self._keys.metas, self._keys.sets]
-        keys.append(self._keys.peek("*"))
-        keys += [self._keys.commands(command) for command in self._commands]
-        if any(device.blocks for device in self._devices):
-            keys.append(self._keys.blocks)
-        return [
-            *(self._queryable(key) for key in keys),
-            self._session.declare_subscriber(
-                self._keys.sets,
-                _direct(self._puts),
-                allowed_origin=zenoh.Locality.REMOTE,
-            ),
-        ]
+        self._declare(self._plant_keys())
+        puts = self._session.declare_subscriber(
+            self._keys.sets, _direct(self._puts), allowed_origin=zenoh.Locality.REMOTE
+        )
+        self._others.append(puts)
 
-    def token(self) -> list[object]:
+    def changed(self) -> None:
+        """Declares the keys of other devices, and undeclares those that no device has any more."""
+        wanted = self._plant_keys()
+        self._declare(wanted)
+        for key in self._queryables.keys() - {*wanted, self._keys.statuses}:
+            self._queryables.pop(key).undeclare()  # type: ignore[no-untyped-call]  # as above
+
+    def token(self) -> None:
         """Declares the gateway's liveliness token."""
-        return [self._session.liveliness().declare_token(self._keys.own)]
+        self._others.append(self._session.liveliness().declare_token(self._keys.own))
 
-    def _queryable(self, key: str) -> object:
-        return self._session.declare_queryable(key, _direct(self._queries), complete=False)
+    def _plant_keys(self) -> list[str]:
+        """Returns the keys of values, writes and commands; those of a line are status keys."""
+        commands = sorted(frozenset().union(*self._plant.commands().values()))
+        keys = [self._keys.values, self._keys.late, self._keys.metas, self._keys.sets]
+        keys += [self._keys.peek("*"), *map(self._keys.commands, commands)]
+        return [*keys, self._keys.blocks] if self._index.with_blocks else keys
+
+    def _declare(self, keys: Iterable[str]) -> None:
+        for key in keys:
+            if key not in self._queryables:
+                self._queryables[key] = self._session.declare_queryable(
+                    key, _direct(self._queries), complete=False
+                )
 
 
 def _direct(inbox: Callable[[T], None]) -> "zenoh.handlers.Callback[T]":

@@ -1,7 +1,7 @@
 """The Zenoh side of the gateway: one session, its declarations, and their life."""
 
 import asyncio
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -17,7 +17,7 @@ from gateway.northbound.alarms import AlarmPublisher
 from gateway.northbound.audit import Audit
 from gateway.northbound.inbox import Inbox
 from gateway.northbound.incoming import Declarations, Incoming
-from gateway.northbound.interfaces import History, Plant
+from gateway.northbound.interfaces import Device, History, Plant
 from gateway.northbound.keys import Keys
 from gateway.northbound.link_monitor import LinkMonitor
 from gateway.northbound.losses import Losses
@@ -39,7 +39,7 @@ from gateway.northbound.tag_index import TagIndex
 from gateway.northbound.traces import Traces
 from gateway.northbound.watchdog import Watchdog
 from gateway.northbound.writers import Writers
-from gateway.tags import Sample, WriteResult
+from gateway.tags import Sample, Tag, WriteResult
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 
@@ -89,11 +89,10 @@ class Northbound:
         self._plant = plant
         self._links = LinkMonitor(is_peer=settings.mode is ZenohMode.PEER)
         index = TagIndex(self.keys, plant.devices())
-        devices = [device.name for device in index.devices]
-        self._admission = Admission(group, self.keys, self._config, devices, plant.duty)
+        self._admission = Admission(group, self.keys, self._config, index.names, plant.duty)
         losses = Losses(drop_limit(self._config))
         self._publisher = Publisher(self.keys, losses)
-        self._batches = ScanBatches(self._publisher, index.devices)
+        self._batches = ScanBatches(self._publisher, index)
         alarms = AlarmPublisher(self.keys, plant, self._publisher, history)
         self._republisher = Republisher(
             self._batches.publish,
@@ -176,6 +175,27 @@ class Northbound:
         """Notes devices of the file that are not in the plant. Call it before `run`."""
         self._admission.claiming.withhold(devices)
 
+    # -- a changed file --
+
+    def index(self, devices: Iterable[Device]) -> TagIndex:
+        """Returns the keys of other devices, for `change`. Any thread may call it."""
+        return TagIndex(self.keys, devices)
+
+    def taken(self, devices: Iterable[str]) -> Mapping[str, str]:
+        """Returns those of other devices that other gateways serve, with their names."""
+        return self._admission.claiming.taken(devices)
+
+    async def claim(self, devices: Iterable[str]) -> None:
+        """Claims these devices, and no others any more."""
+        await self._admission.claiming.change(devices)
+
+    async def change(self, index: TagIndex, gone: Iterable[Tag]) -> None:
+        """Serves the devices of the plant as they are now. `gone`: tags that it had before."""
+        self._publisher.forget(self._incoming.become(index), gone)
+        if self.opened.is_set():
+            await off_loop(self._incoming.changed)
+            self._status.publish()
+
     # -- life --
 
     async def run(self) -> None:
@@ -226,18 +246,19 @@ class Northbound:
         links = Inbox(self._links.take, lambda _: None)
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(self._watch_publisher())
-            self._declared += await off_loop(self._declare_first, session, declarations, links)
+            self._declared = await off_loop(self._declare_first, session, declarations, links)
             tasks.create_task(self._admission.run(session))
             tasks.create_task(self._status.run())
             await self._admission.active.wait()
             self._plant.begin()
             self._incoming.begin()
-            self._declared += await off_loop(self._declare_plant, declarations)
+            await off_loop(self._declare_plant, declarations)
             traces = Traces(self.keys, self._plant, self._publisher.document)
             self._declared += await off_loop(traces.declare, session, traces.inbox())
             await self._republisher.publish_all()
             self._status.publish()
             self.opened.set()
+            await off_loop(self._incoming.changed)  # a reload came between
             log.info("Zenoh session ready", prefix=self.keys.prefix, id=str(session.zid()))
             tasks.create_task(self._republisher.run())
 
@@ -248,13 +269,17 @@ class Northbound:
         links: Inbox[zenoh.TransportEvent | zenoh.LinkEvent],
     ) -> list[object]:
         """Declares everything that a standby gateway serves too."""
-        token = declarations.token() if self._admission.standby.enabled else []
-        return [*self._links.declare(session, links), *declarations.status(), *token]
+        declared = [*self._links.declare(session, links)]
+        declarations.status()
+        if self._admission.standby.enabled:
+            declarations.token()
+        return declared
 
-    def _declare_plant(self, declarations: Declarations) -> list[object]:
+    def _declare_plant(self, declarations: Declarations) -> None:
         """The token comes last: a client that sees it may query at once."""
-        plant = declarations.plant()
-        return plant if self._admission.standby.enabled else [*plant, *declarations.token()]
+        declarations.plant()
+        if not self._admission.standby.enabled:
+            declarations.token()
 
     async def _close(self, session: zenoh.Session) -> None:
         await self._incoming.close()

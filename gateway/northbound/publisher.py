@@ -24,9 +24,9 @@ import zenoh
 
 from gateway.northbound import encoding, payload
 from gateway.northbound.blocks import parts_of
-from gateway.northbound.interfaces import Device
 from gateway.northbound.keys import Keys
 from gateway.northbound.losses import Losses
+from gateway.northbound.tag_index import TagIndex
 from gateway.tags import Sample, Tag
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
@@ -159,6 +159,13 @@ class Publisher:
             self._waiting[("token", device)] = (None, key, online)
             self._filled.notify()
 
+    def forget(self, devices: Iterable[str], tags: Iterable[Tag]) -> None:
+        """Forgets devices and tags that the gateway no longer has. Their tokens end first."""
+        for device in devices:
+            self._online.pop(device, None)
+        for tag in tags:
+            self._value_keys.pop(tag, None)
+
     def _queue_event(self, key: str, data: Sample | bytes) -> None:
         with self._filled:
             if self._session is None or self._closing or self._waiting_events >= EVENTS_LIMIT:
@@ -253,11 +260,9 @@ def _samples(data: _Data) -> Iterable[Sample]:
 class ScanBatches:
     """Sorts the samples of a scan by how they are published. Event loop only; never blocks."""
 
-    def __init__(self, publisher: Publisher, devices: Iterable[Device]) -> None:
+    def __init__(self, publisher: Publisher, index: TagIndex) -> None:
         self._publisher = publisher
-        blocks = {device.name: device.blocks for device in devices}
-        self._with_blocks = frozenset(name for name, mode in blocks.items() if mode)
-        self._only_blocks = frozenset(name for name, mode in blocks.items() if mode == "only")
+        self._index = index
 
     def publish(self, samples: Sequence[Sample]) -> None:
         """One call is one scan. Samples of event tags all go out, in order, none replaced."""
@@ -265,14 +270,15 @@ class ScanBatches:
         if any(sample.tag.event for sample in samples):
             self._publisher.events(sample for sample in samples if sample.tag.event)
             values = [sample for sample in samples if not sample.tag.event]
-        if self._only_blocks:
-            values = [sample for sample in values if sample.tag.device not in self._only_blocks]
+        if only_blocks := self._index.only_blocks:
+            values = [sample for sample in values if sample.tag.device not in only_blocks]
         self._publisher.values(values)
-        if not self._with_blocks:
+        with_blocks = self._index.with_blocks
+        if not with_blocks:
             return
         scans: dict[str, list[Sample]] = {}
         for sample in samples:
-            if sample.tag.device in self._with_blocks:
+            if sample.tag.device in with_blocks:
                 scans.setdefault(sample.tag.device, []).append(sample)
         for device, changed in scans.items():
             self._publisher.block(device, changed)

@@ -55,7 +55,6 @@ class Replies:
         self._ended = False
         self._turns = Turns()
         self._clock = time.monotonic
-        self._only_blocks = {d.name for d in index.devices if d.blocks == "only"}
 
     def end(self) -> None:
         """Makes a long answer stop at the next tag."""
@@ -93,7 +92,7 @@ class Replies:
     def _current(self, family: Family, query: zenoh.Query, tag: Tag) -> None:
         if family is Family.META:
             self._reply(query, self._keys.meta(tag.key), meta(tag), self._stamp())
-        elif family is not Family.LAST or tag.device not in self._only_blocks:
+        elif family is not Family.LAST or tag.device not in self._index.only_blocks:
             # An AdvancedSubscriber would keep a value whose key is never put.
             self._value(query, tag)
 

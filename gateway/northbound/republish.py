@@ -7,7 +7,6 @@ only its bad quality is published again, as for other tags.
 """
 
 import asyncio
-import itertools
 import math
 from collections.abc import Awaitable, Callable, Sequence
 from contextlib import suppress
@@ -66,7 +65,9 @@ class Republisher:
             await self._alarms()
 
     def _publish_again(self, tags: Sequence[Tag]) -> None:
-        current = [self._plant.sample(tag) for tag in tags]
+        # A reload may have removed a tag meanwhile, or replaced it.
+        known = (self._plant.tag(tag.key) for tag in tags)
+        current = [self._plant.sample(tag) for tag in known if tag is not None]
         again = [s for s in current if not s.tag.event or s.quality is Quality.BAD]
         self._plant.mark_published(again)
         self._publish(again)
@@ -118,21 +119,25 @@ class Republisher:
 
     async def _refreshes(self) -> None:
         """Publishes the tags in turn, evenly over the time of `refresh`."""
-        tags = self._index.tags
-        if not tags:
-            return
-        few = math.ceil(len(tags) * _REFRESH_EVERY / self._refresh)
-        pause = self._refresh * few / len(tags)
         due = _now()
-        for start in itertools.cycle(range(0, len(tags), few)):
-            due += pause
-            await asyncio.sleep(due - _now())
-            self._publish_again(tags[start : start + few])
+        while True:
+            tags = self._index.tags
+            few = max(1, math.ceil(len(tags) * _REFRESH_EVERY / self._refresh))
+            pause = self._refresh * few / max(1, len(tags))
+            for start in range(0, max(1, len(tags)), few):
+                due += pause
+                await asyncio.sleep(due - _now())
+                self._publish_again(tags[start : start + few])
 
     async def _heartbeats(self) -> None:
-        tags = [tag for tag in self._index.tags if tag.heartbeat]
+        known: Sequence[Tag] = ()
+        tags: list[Tag] = []
         published_at: dict[Tag, float] = {}  # of bad samples, by the loop's clock
-        while tags:
+        while True:
+            if known is not self._index.tags:
+                known = self._index.tags
+                tags = [tag for tag in known if tag.heartbeat]
+                published_at = {tag: published_at[tag] for tag in tags if tag in published_at}
             await asyncio.sleep(_HEARTBEAT_CHECK)
             for start in range(0, len(tags), _BATCH_SIZE):
                 self._publish(self._due(tags[start : start + _BATCH_SIZE], published_at))
@@ -141,6 +146,8 @@ class Republisher:
     def _due(self, tags: list[Tag], published_at: dict[Tag, float]) -> list[Sample]:
         now, due = _now(), []
         for tag in tags:
+            if self._plant.tag(tag.key) is not tag:
+                continue
             sample = self._plant.sample(tag)
             if sample.quality is Quality.GOOD:
                 published_at.pop(tag, None)

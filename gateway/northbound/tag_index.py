@@ -1,6 +1,6 @@
 """The tags and devices that a key expression selects."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import zenoh
@@ -31,16 +31,16 @@ class TagIndex:
             )
             for device in devices
         ]
-        self._names = {entry.device.name for entry in self._entries}
         self._by_key = {key: tag for entry in self._entries for key, tag in entry.tags}
+        self.tags: Sequence[Tag] = list(self._by_key.values())
+        modes = {entry.device.name: entry.device.blocks for entry in self._entries}
+        self.names = frozenset(modes)
+        self.with_blocks = frozenset(name for name, mode in modes.items() if mode)
+        self.only_blocks = frozenset(name for name, mode in modes.items() if mode == "only")
 
-    @property
-    def devices(self) -> list[Device]:
-        return [entry.device for entry in self._entries]
-
-    @property
-    def tags(self) -> list[Tag]:
-        return list(self._by_key.values())
+    def become(self, other: "TagIndex") -> None:
+        """Takes over the devices of another index. Each look-up sees the old or the new ones."""
+        vars(self).update(vars(other))
 
     def tag_at(self, value_key: str) -> Tag | None:
         return self._by_key.get(value_key)
@@ -51,7 +51,7 @@ class TagIndex:
         Other gateways may share the prefix.
         """
         device = (self._keys.tag(key) or "").partition("/")[0]
-        return device in self._names or key.startswith(f"{self._keys.own}/")
+        return device in self.names or key.startswith(f"{self._keys.own}/")
 
     def tags_at(self, expression: str) -> list[Tag]:
         """Returns the tags whose value keys intersect `expression`."""

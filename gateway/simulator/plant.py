@@ -16,9 +16,14 @@ from gateway.values import Kind, Value
 def station_for(driver: AnyDriver, tags: Iterable[Tag]) -> Station:
     """Returns a simulated PLC for the driver; its tags move unless they are writable."""
     station = station_of(driver)
+    animate(station, tags)
+    return station
+
+
+def animate(station: Station, tags: Iterable[Tag]) -> None:
+    """Lets the values of tags move, unless they are writable."""
     for number, tag in enumerate(tags):
         _animate(station.memory, tag, number)
-    return station
 
 
 def _animate(memory: Memory, tag: Tag, number: int) -> None:

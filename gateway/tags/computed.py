@@ -55,4 +55,8 @@ class Dependents:
             new = self._of.get(waiting.pop(), set()) - found
             found |= new
             waiting += new
-        return sorted(found, key=self._order.__getitem__)
+        return self.in_order(found)
+
+    def in_order(self, tags: Iterable[Tag]) -> Sequence[Tag]:
+        """Returns computed tags, each after its inputs."""
+        return sorted(tags, key=self._order.__getitem__)

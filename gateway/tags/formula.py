@@ -5,7 +5,7 @@ The calculation is decimal, so 0.1 + 0.2 is 0.3, and integers of 64 bits are exa
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from decimal import Context, Decimal, DivisionByZero, InvalidOperation, Overflow
 
 from gateway.values import Value
@@ -31,7 +31,7 @@ class Formula:
     """One calculation. `whole`: of whole numbers only, without a division."""
 
     text: str
-    term: Term
+    term: Term = field(compare=False)  # the text says it all
     whole: bool
 
     def value(self, inputs: Sequence[Value]) -> Value:

@@ -110,7 +110,10 @@ class Mirror:
             raw = self[tag.inputs[0]]
             both_good = raw.quality is current.quality is Quality.GOOD
             return current._replace(time=raw.time) if both_good else current
-        sample = computed(tag, self.__getitem__)
+        try:
+            sample = computed(tag, self.__getitem__)
+        except KeyError:  # a reload is replacing an input: this tag follows at its end
+            return bad(tag, Reason.STARTING, current.time)
         bad_before = sample.quality is Quality.BAD and _same_failure(current, sample)
         return current if bad_before else sample
 
@@ -126,6 +129,41 @@ class Mirror:
             if last is not None and last.value != sample.value:
                 changed.append(sample)
         return changed
+
+    def add(self, samples: Iterable[Sample], renewed: Mapping[Tag, Tag]) -> None:
+        """Adds tags with their first samples, which are published. `renewed`: old tags to those
+        that go on with their samples."""
+        for sample in samples:
+            self._current[sample.tag] = self._published[sample.tag] = sample
+        for old, new in renewed.items():
+            self._current[new] = self[old]._replace(tag=new)
+            if (last := self._last_published(old)) is not None:
+                self._published[new] = last._replace(tag=new)
+
+    def compute(self, first: Iterable[Sample], gone: Iterable[Tag]) -> list[Sample]:
+        """Has other computed tags. `first`: the samples of those that are new. Returns all that
+        are to be published; a tag of a disabled device is disabled too."""
+        due = []
+        for sample in first:
+            self._current[sample.tag] = sample
+            if sample.reason is Reason.DISABLED:
+                self._published[sample.tag] = sample
+                due.append(sample)
+        self.forget(gone)
+        self._dependents = Dependents(self._current)
+        self.derives = bool(self._dependents)
+        begun = {sample.tag for sample in first} - {sample.tag for sample in due}
+        for tag in self._dependents.after((), begun):
+            due += self._store([computed(tag, self.__getitem__)])
+        return due
+
+    def forget(self, tags: Iterable[Tag]) -> None:
+        """Removes tags. Other threads must not look them up any more."""
+        for tag in tags:
+            if tag in self._places:
+                self._supersede(self._places[tag][0])
+            self._current.pop(tag, None)
+            self._published.pop(tag, None)
 
     def _last_published(self, tag: Tag) -> Sample | None:
         entry = self._places.get(tag)

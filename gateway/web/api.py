@@ -6,7 +6,7 @@ are made on threads, because those of a large plant take long.
 
 import asyncio
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from itertools import islice
 from typing import Any
@@ -57,7 +57,7 @@ class Api:
         self._plant = sources.plant
         self._north = sources.north
         self._history = sources.history
-        self._devices = {device.name: tuple(device.tags) for device in sources.plant.devices()}
+        self._known: tuple[object, Mapping[str, Sequence[Tag]]] = (None, {})
         self._history_turns = asyncio.Semaphore(HISTORY_AT_ONCE)
 
     def routes(self) -> list[web.RouteDef]:
@@ -70,6 +70,14 @@ class Api:
             web.get("/api/history", self._samples),
             web.post("/api/write", self._write),
         ]
+
+    @property
+    def _devices(self) -> Mapping[str, Sequence[Tag]]:
+        """The tags by device, made again after a reload."""
+        devices = self._plant.devices()
+        if self._known[0] is not devices:
+            self._known = devices, {device.name: tuple(device.tags) for device in devices}
+        return self._known[1]
 
     async def _status(self, _: web.Request) -> web.Response:
         return as_json(overview(await self._north.documents(STATE_AGE)))
@@ -115,10 +123,11 @@ class Api:
 
     def select(self, device: str | None, find: str, after: str | None, limit: int) -> list[Tag]:
         """Returns tags in the order of the file, after the tag `after`."""
-        names = [*self._devices] if device is None else [device]
+        known = self._devices
+        names = [*known] if device is None else [device]
         if after is not None and (start := after.partition("/")[0]) in names:
             names = names[names.index(start) :]
-        tags = (tag for name in names for tag in self._devices.get(name, ()))
+        tags = (tag for name in names for tag in known.get(name, ()))
         if after is not None:
             for tag in tags:
                 if tag.key == after:

@@ -3,7 +3,7 @@
 import asyncio
 import sys
 from pathlib import Path
-from types import FrameType
+from types import FrameType, SimpleNamespace
 from typing import Any
 
 import orjson
@@ -94,7 +94,7 @@ def gateway_of(tags: list[Tag]) -> Any:
     """Returns a gateway with only what a scan meets."""
     gateway: Any = object.__new__(Gateway)
     gateway.alarms, gateway.mirror = Alarms(tags), Mirror(tags, 0)
-    gateway._waiting, gateway._subscribers = {}, []
+    gateway._on_demand, gateway._subscribers = SimpleNamespace(waiting={}), []
     gateway.serving = Nothing()
     return gateway
 

@@ -28,7 +28,7 @@ async def serve(file, withheld, stop, started, supervisor):
     return {} if len(made) < 4 else None
 
 inner, service._serve, service.Gateway = service._serve, serve, make
-asyncio.run(service.run(load(Path(sys.argv[1]))))
+asyncio.run(service.run(load(file := Path(sys.argv[1])), file))
 """
 
 

@@ -30,7 +30,7 @@ async def run(line):
 
 usual, Gateway.plan = Gateway.plan, staticmethod(plan)
 usual_run, Line.run = Line.run, run
-asyncio.run(service.run(load(Path(sys.argv[1]))))
+asyncio.run(service.run(load(file := Path(sys.argv[1])), file))
 """
 
 

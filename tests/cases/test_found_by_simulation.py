@@ -91,7 +91,7 @@ async def test_a_client_that_gave_up_is_not_remembered(tmp_path: Path) -> None:
         for _ in range(3):
             with pytest.raises(Busy):
                 await gateway.fresh(tag, 0.0)
-    assert not gateway._waiting  # private: a leak shows in no public figure
+    assert not gateway._on_demand.waiting  # private: a leak shows in no public figure
 
 
 @on_virtual_time

@@ -251,6 +251,9 @@ async def test_an_event_is_not_published_again_when_the_link_returns() -> None:
         def __init__(self) -> None:
             self.tags = tags
 
+        def tag(self, key: str) -> Tag:
+            return next(tag for tag in tags if tag.key == key)
+
         def sample(self, tag: Tag) -> Sample:
             return good(tag, 1, 0)
 

@@ -72,7 +72,7 @@ class Bus:
     request: bytes = b""  # as it reached the stations
     writes: Counter[int] = field(default_factory=Counter)  # write frames by station number
     commands: Counter[int] = field(default_factory=Counter)
-    misled: set[Device] = field(default_factory=set)  # that accepted a damaged monitor list
+    misled: set[str] = field(default_factory=set)  # that accepted a damaged monitor list
     questions: deque[tuple[float, Asked]] = field(default_factory=lambda: deque(maxlen=64))
     open: dict[tuple[int, int], float] = field(default_factory=dict)  # Modbus TCP: since when
     foreign: Foreign = field(init=False)
@@ -305,7 +305,7 @@ class Bus:
             for way, heard in (("<", self.heard), (">", self.request))
             if self.hurt[way] >= since
         ]
-        if device is not None and device in self.misled:
+        if device is not None and device.name in self.misled:
             return True
         if device is not None and not summed(device):
             return bool(damaged)
@@ -316,9 +316,9 @@ class Bus:
         """Notes a device that took a damaged monitor list: its reads are wrong until the next."""
         self._registering = None
         if self.hurt_at >= self.sent_at and self.blind(self.sent_at):
-            self.misled.add(device)
+            self.misled.add(device.name)
         else:
-            self.misled.discard(device)
+            self.misled.discard(device.name)
 
 
 def summed(device: Device) -> bool:

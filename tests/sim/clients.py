@@ -201,7 +201,7 @@ class Client:
         was = judge.stations[tag.device].was(tag, sample.value, since, judge.now)
         excused = self.bus.hurt_at >= since or self.bus.untimely(tag.device)
         excused = excused or judge.foreign_at.get(tag) == judge.read_at[tag]
-        if not was and not excused and self.device not in self.bus.misled:
+        if not was and not excused and self.device.name not in self.bus.misled:
             judge.broke(f"{tag.key}: {sample.value!r} is not fresh within {most} s")
 
     # Commands

@@ -186,7 +186,7 @@ class Expectations:
             for line in gateway.lines:
                 self._look_at_queues(line.engine)
             # Private: a leak shows in no public figure.
-            waiting = sum(map(len, gateway._waiting.values()))
+            waiting = sum(map(len, gateway._on_demand.waiting.values()))
             if waiting > 2 * len(judge.enabled):
                 judge.broke(f"{waiting} clients that asked for fresh values are still remembered")
             timers = len(asyncio.get_running_loop()._scheduled)  # type: ignore[attr-defined]

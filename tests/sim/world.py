@@ -12,6 +12,7 @@ import random
 import tempfile
 from collections.abc import Callable, Coroutine, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ import structlog
 
 from gateway.app import Gateway
 from gateway.config import LineConfig, load
+from gateway.engine.changes import Changes
 from gateway.engine.device import DeviceSettings
 from gateway.engine.shorter_silences import Pace
 from gateway.protocols.frames import FrameDriver
@@ -247,6 +249,24 @@ class World:
                 tasks.append(asyncio.create_task(speaking))
         return tasks
 
+    async def _reload_now_and_then(self) -> None:
+        """Changes one device of the file at a time: no value and no write may be wrong for that."""
+        chance = random.Random(f"reload {self.story.seed}")
+        pause = chance.choice((10.0, 60.0, 600.0))
+        while True:
+            await asyncio.sleep(chance.expovariate(1 / pause))
+            name = chance.choice(sorted(self.devices))
+            old, line = self.devices[name], self._buses[name].line
+            guard = self._settings[name].late_guard * chance.choice((1.0, 1.1))
+            settings = replace(old.settings, late_guard=guard)
+            new = old.successor(settings, old.bad_addresses.known())
+            new.plan()
+            applied = partial(self.gateway.move, (), line, [new])
+            await line.change(Changes(replaced=[(old, new)]), (), applied)
+            self.devices[name] = new
+            self.note("reload", name)
+            self.story.counts["reloads"] += 1
+
     def _start(self, client: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
         """Starts a client: it stands still together with the gateway."""
         return asyncio.create_task(client, context=self.freezer.inside())
@@ -256,7 +276,8 @@ class World:
             asyncio.create_task(line.run(), name=line.engine.name, context=self.freezer.inside())
             for line in self.gateway.lines
         ]
-        others = [*self._tasks(), asyncio.create_task(self.expect.look_around())]
+        others = [*self._tasks(), self._start(self._reload_now_and_then())]
+        others.append(asyncio.create_task(self.expect.look_around()))
         suffering = asyncio.create_task(self.faults.suffer())
         done, _ = await asyncio.wait(
             lines + others, timeout=self.seconds, return_when=asyncio.FIRST_EXCEPTION

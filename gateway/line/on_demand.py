@@ -1,0 +1,110 @@
+"""Reads on demand: clients that wait for a sample that is younger than the latest one."""
+
+import asyncio
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
+
+from gateway.engine.device import Device
+from gateway.engine.jobs import Poll
+from gateway.errors import Busy
+from gateway.line.line import Line
+from gateway.tags import Quality, Sample, Tag
+
+FRESH_WITHIN = 5.0  # seconds that a client waits for a read on demand
+
+
+class _Reader(NamedTuple):
+    """A client that waits for a read that starts after `asked`, by the line's clock."""
+
+    answer: asyncio.Future[Sample]
+    asked: float
+
+
+class OnDemand:
+    """The waiting clients by tag. Several clients share one read."""
+
+    def __init__(
+        self,
+        place: Callable[[str], tuple[Line, Device] | None],
+        latest: Callable[[Tag], Sample],
+    ) -> None:
+        """`place` returns line and state of an enabled device, `latest` the sample of a tag."""
+        self.waiting: dict[Tag, list[_Reader]] = {}
+        self._place = place
+        self._latest = latest
+
+    def is_fresh(self, tag: Tag, max_age: float) -> bool:
+        """True if the last read is younger than `max_age` seconds, or no read is possible now.
+
+        The age is monotonic time: a change of the system clock must not change it.
+        """
+        if tag.inputs:
+            return all(self.is_fresh(one, max_age) for one in tag.inputs)
+        place = self._place(tag.device)
+        poll = self._poll(tag)
+        if place is None or poll is None or not place[0].engine.is_open:
+            return True
+        if poll.last.at is None or self._latest(tag).quality is Quality.BAD:
+            return False
+        return asyncio.get_running_loop().time() - poll.last.at < max_age
+
+    async def fresh(self, tag: Tag, max_age: float) -> Sample:
+        """Returns the last sample if it `is_fresh`, otherwise that of the next read.
+
+        The sample is bad if the device does not answer. Raises `Busy` if the line had no time for
+        the read.
+        """
+        if tag.inputs:
+            await asyncio.gather(*(self.fresh(one, max_age) for one in tag.inputs))
+            return self._latest(tag)
+        poll = self._poll(tag)
+        if poll is None or self.is_fresh(tag, max_age):
+            return self._latest(tag)
+        reader = _Reader(asyncio.get_running_loop().create_future(), poll.asked)
+        self.waiting.setdefault(tag, []).append(reader)
+        self._expedite(tag)
+        try:
+            async with asyncio.timeout(FRESH_WITHIN):
+                return await reader.answer
+        except TimeoutError:
+            if self._latest(tag).quality is Quality.BAD:  # an offline device sends no sample
+                return self._latest(tag)
+            raise Busy(f"{tag.key} could not be read within {FRESH_WITHIN:g} s") from None
+        finally:
+            self.waiting[tag].remove(reader)
+            if not self.waiting[tag]:
+                del self.waiting[tag]
+
+    def answer(self, sample: Sample) -> None:
+        """Answers waiting clients. A read that started before the request does not satisfy it."""
+        tag = sample.tag
+        poll = self._poll(tag)
+        for reader in self.waiting[tag]:
+            if reader.answer.done():
+                continue
+            if sample.quality is Quality.BAD or poll is None or poll.asked > reader.asked:
+                reader.answer.set_result(self._latest(tag))
+            else:
+                self._expedite(tag)
+
+    def changed(self, gone: Iterable[Tag]) -> None:
+        """Ends the waiting for tags that a reload removed or changed; others are read again."""
+        left = set(gone)
+        for tag, readers in self.waiting.items():
+            for reader in readers if tag in left else ():
+                if not reader.answer.done():
+                    reader.answer.set_exception(
+                        Busy(f"the file was reloaded, and {tag.key} with it")
+                    )
+            if tag not in left:
+                self._expedite(tag)
+
+    def _poll(self, tag: Tag) -> Poll | None:
+        """Returns the poll that reads the tag; None if the value is unsolicited."""
+        place = self._place(tag.device)
+        return None if place is None else place[0].engine.schedule.reader(place[1], tag)
+
+    def _expedite(self, tag: Tag) -> None:
+        if (place := self._place(tag.device)) is not None:
+            line, device = place
+            line.expedite(device, tag)
