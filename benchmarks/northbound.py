@@ -36,7 +36,7 @@ import zenoh
 
 from gateway.alarms import Alarms
 from gateway.config import ZenohConfig, ZenohMode
-from gateway.engine.requests import CommandResult
+from gateway.engine.requests import CommandResult, Peeked
 from gateway.line.duty import Duty
 from gateway.line.wire_log import WireLog
 from gateway.northbound import Northbound
@@ -103,6 +103,9 @@ class Plant:
     async def control(
         self, device: str, command: str, argument: str, within: float
     ) -> CommandResult:
+        raise NotImplementedError
+
+    async def peek(self, device: str, text: str) -> Peeked:
         raise NotImplementedError
 
     def is_fresh(self, tag: Tag, max_age: float) -> bool:

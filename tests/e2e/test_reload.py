@@ -49,7 +49,7 @@ async def test_clients_see_a_reload_and_a_bad_file_changes_nothing(tmp_path: Pat
             await tokens.next(lambda s: s.key == "plant/@gateway/demo/alive/pump")
             await asyncio.to_thread(program.says, "file reloaded", "removed=[]", "added=['pump']")
             metas = await client.get("plant/**/@meta")
-            assert {reply.key.removesuffix("/@meta") for reply in metas} == {
+            assert {str(reply.key).removesuffix("/@meta") for reply in metas} == {
                 *("plant/mixer/level", "plant/oven/heat", "plant/pump/flow")
             }
             [block] = await client.get("plant/mixer/@block")

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from gateway.alarms import Alarms
 from gateway.config import ZenohConfig
-from gateway.engine.requests import CommandResult
+from gateway.engine.requests import CommandResult, Peeked
 from gateway.errors import (
     BadValue,
     Busy,
@@ -108,6 +108,9 @@ class PlainPlant:
         if isinstance(self.command_result, Exception):
             raise self.command_result
         return self.command_result
+
+    async def peek(self, device: str, text: str) -> Peeked:
+        raise BadValue(f"{device} has no {text}")
 
     def is_fresh(self, tag: Tag, max_age: float) -> bool:
         return time.time_ns() - self.samples[tag.key].time < max_age * 1e9
