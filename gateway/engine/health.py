@@ -234,7 +234,8 @@ _SILENCE = (
 _ADVICE = {
     Evidence.ECHO: "Only our own request came back: the adapter echoes; set `echo: true`. "
     "The station itself does not reply",
-    Evidence.NOISE: "Bytes arrived that are no frame: check baud rate, parity and data bits",
+    Evidence.NOISE: "Bytes arrived that are no frame: check baud rate, parity, data bits, and "
+    "if A and B are swapped",
     Evidence.CHECKSUM: "Frames arrive with a wrong check sum: noise, missing termination, or sum "
     "check set differently on both sides",
     Evidence.STATION: "Another station replied: check the station numbers",
