@@ -520,7 +520,7 @@ def _example_keys() -> set[str]:
     devices = [device.name for device in config.devices]
     return {
         *(key for tag in tags for key in (keys.value(tag), keys.set(tag), keys.meta(tag))),
-        *(key for name in devices for key in (keys.device(name), keys.block(name))),
+        *(key for n in devices for key in (keys.device(n), keys.block(n), keys.peek(n))),
         *(keys.status(f"devices/{name}") for name in devices),
         *(keys.status(f"lines/{line.name}") for line in config.lines),
         *(keys.trace(line.name) for line in config.lines),

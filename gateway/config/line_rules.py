@@ -64,8 +64,8 @@ def _check_format(
         advice += "their Modbus mode"
     mistakes.add(
         path,
-        f"{given}, but {_named(others)} {protocol}, which is {traits.format} by its manual. "
-        f"{advice}",
+        f"{given}, but {_named(others)} {protocol}, which is {traits.format} by its "
+        f"manual or its own `format`. {advice}",
     )
 
 

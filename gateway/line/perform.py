@@ -33,7 +33,7 @@ from gateway.errors import (
 )
 from gateway.line.transaction import Transaction
 from gateway.planning.planner import Block
-from gateway.protocols.driver import Monitor, ScatteredWriter, Span, Talk
+from gateway.protocols.driver import Controllable, Monitor, ScatteredWriter, Span, Talk
 
 T = TypeVar("T")
 TWO_REPLIES = "two replies arrived, and the first may be that to an earlier write"
@@ -95,7 +95,7 @@ async def _perform(job: Transacted, transaction: Transaction) -> Result:
             return await _read_back(job, transaction)
         case Confirm():
             return await _confirm(job, transaction)
-        case Command():
+        case Command(span=span) if span is not None or isinstance(driver, Controllable):
             return await _command(job, driver, transaction)
         case Answer(frame=frame):
             await transaction.tell(frame)

@@ -60,7 +60,7 @@ async def test_a_write_that_arrived_while_the_gateway_was_held_is_refused(tmp_pa
             assert not reply.ok
             assert (reply.json["error"], "stood still" in reply.json["reason"]) == ("busy", True)
             assert plc.tell("get 1 D 500") == "50"
-            assert gateway.has_said("gateway stood still")
+            await asyncio.to_thread(gateway.says, "gateway stood still")
             await until_taken(client, b"51")
         assert plc.tell("get 1 D 500") == "51"
         assert not any("value=79" in line and "tag written" in line for line in gateway.lines)

@@ -36,8 +36,9 @@ class PartPeer(Peer):
         try:
             while True:
                 writer.write(self.hear(await reader.readuntil(b"\r\n")))
-        except asyncio.IncompleteReadError:
+        except (asyncio.IncompleteReadError, ConnectionError):
             writer.close()
+        finally:
             self.closed.set()
 
 

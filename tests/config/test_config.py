@@ -358,7 +358,8 @@ LINES = [
         on_line("port: simulator\nformat: 8N1\ndevices:\n"
                 "  mixer: {protocol: vigor, station: 1}\n"
                 "  oven: {protocol: vigor, station: 2}"),
-        "4: lines.hall.format: 8N1, but mixer and 1 more speak vigor, which is 7E1 by its manual. "
+        "4: lines.hall.format: 8N1, but mixer and 1 more speak vigor, which is 7E1 by its manual "
+        "or its own `format`. "
         "If the ports are really set to 8N1, write `format: 8N1` there too",
     ),
     bad(
@@ -366,7 +367,8 @@ LINES = [
         on_line("port: simulator\nbaudrate: 9600\nformat: 8E1\ndevices:\n"
                 "  mixer: {protocol: vigor, station: 1}\n"
                 "  oven: {protocol: modbus-rtu, station: 2}"),
-        "5: lines.hall.format: 8E1, but mixer speaks vigor, which is 7E1 by its manual. oven "
+        "5: lines.hall.format: 8E1, but mixer speaks vigor, which is 7E1 by its manual or "
+        "its own `format`. oven "
         "(modbus-rtu) needs 8 data bits: use two ports, or vigor devices in their Modbus mode",
     ),
     bad(

@@ -130,7 +130,13 @@ def test_a_slower_line_takes_longer(tmp_path: Path) -> None:
     path = write_config(
         tmp_path / "c.yaml",
         "tcp/127.0.0.1:7447",
-        {"hall": {**vigor_line("simulator", TWO_WORDS), "baudrate": 9600, "format": "8E1"}},
+        {
+            "hall": {
+                **vigor_line("simulator", TWO_WORDS, format="8E1"),
+                "baudrate": 9600,
+                "format": "8E1",
+            }
+        },
     )
     [line] = forecasts(load(path))
     assert line.cycle == pytest.approx(0.005 + READ_D1_D2 * 11 / 9600 + 0.005)

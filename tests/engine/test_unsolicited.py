@@ -617,6 +617,7 @@ lines:
       mixer:
         protocol: vigor
         station: 1
+        format: 8N1
         tags: {speed: {address: D0, every: 100ms}}
       reader:
         protocol: frames

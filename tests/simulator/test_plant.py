@@ -112,7 +112,7 @@ def test_every_device_of_the_example_has_its_plc() -> None:
         "modbus-tcp",
     }
     for found in config.devices:
-        for name, values in seen(found.driver, list(found.tags)).items():
+        for name, values in seen(found.driver, list(found.wire_tags)).items():
             assert None not in values, name
 
 
