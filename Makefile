@@ -10,11 +10,11 @@ run: .venv/installed
 	$(BIN)/plc-gateway run config.example.yaml
 
 test: .venv/ready
-	$(BIN)/python -m pytest -n 3 --dist worksteal
+	$(BIN)/python -m pytest -n 4 --dist worksteal
 
 # Branch coverage of the suite; subprocesses are not counted.
 coverage: .venv/ready
-	$(BIN)/python -m pytest -n 3 --dist worksteal --cov --cov-report=term --cov-report=html:build/coverage
+	$(BIN)/python -m pytest -n 4 --dist worksteal --cov --cov-report=term --cov-report=html:build/coverage
 
 check: .venv/ready
 	$(BIN)/ruff format --check .
