@@ -13,6 +13,7 @@ from gateway.line.wire_log import WireLog
 from gateway.planning.wire_timing import WireTiming, character_bits
 from gateway.protocols.driver import AnyDriver, ScanHints, Scannable
 from gateway.protocols.registry import PROTOCOLS
+from gateway.protocols.swapped import SWAPPED, KnownReplies, is_swapped
 from gateway.transport import (
     Port,
     Receiver,
@@ -209,7 +210,8 @@ class _Scan:
             await driver.resync(transaction, None, probe_token)
         except Unclear as error:
             if isinstance(error, Garbled):
-                self._report.noises.setdefault(self._serial, str(error))
+                swapped = isinstance(driver, KnownReplies) and is_swapped(error.data, driver)
+                self._report.noises.setdefault(self._serial, SWAPPED if swapped else str(error))
                 await transaction.settle(LONGEST_NOISE, QUIET)
             return False
         finally:

@@ -11,12 +11,13 @@ from gateway.engine.records import Record
 from gateway.engine.reply_shapes import ReplyShapes, reply_shapes
 from gateway.engine.station_silence import StationSilence
 from gateway.engine.turnaround import Turnaround
-from gateway.errors import LineDown
+from gateway.errors import Garbled, LineDown
 from gateway.planning.bad_addresses import RETRIES, BadAddresses, KnownBad
 from gateway.planning.monitor_lists import with_monitor_list
 from gateway.planning.planner import Block, around, plan, runs_of
 from gateway.planning.wire_timing import Transactions, WireTiming
 from gateway.protocols.driver import AnyDriver, Cost, Monitor, NoReplyCauses, Span, Timing, Windowed
+from gateway.protocols.swapped import SWAPPED, KnownReplies, is_swapped
 from gateway.serving.registers import Served
 from gateway.tags import Tag
 
@@ -144,14 +145,18 @@ class Device:
     def diagnosis(self) -> str:
         """Returns the likely cause of its trouble as a sentence; empty when there is none."""
         driver = self.driver
-        if self.health.trouble is None:
+        trouble = self.health.trouble
+        if trouble is None:
             if self.shapes is not None and self.shapes.answers_twice:
                 return ANSWERS_TWICE.format(station=driver.station)
             if self.one_at_a_time:
                 return f"It takes one request at a time, not {self.window}: set `window: 1`"
             return ""
+        heard = trouble.data if isinstance(trouble, Garbled) and not self.health.online else b""
+        if heard and isinstance(driver, KnownReplies) and is_swapped(heard, driver):
+            return SWAPPED
         causes = driver.no_reply_causes if isinstance(driver, NoReplyCauses) else ""
-        return diagnosis(self.health.trouble, causes)
+        return diagnosis(trouble, causes)
 
     def takes_one_at_a_time(self, only: bool) -> None:
         """Notes if the device loses requests that are sent together."""

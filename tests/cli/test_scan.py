@@ -14,6 +14,7 @@ from gateway.stations.modbus import ModbusStation
 from gateway.stations.station import Station
 from gateway.stations.vigor import VigorStation
 from gateway.transport import Port, Receiver, SerialSettings
+from tests.protocols.test_swapped import over_swapped_wires
 from tests.sim.virtual import on_virtual_time
 
 RIGHT = SerialSettings(19200, "7E1")
@@ -128,6 +129,13 @@ async def test_damaged_bytes_are_no_station_but_are_reported() -> None:
     assert stations(report) == [1]
     [sentence] = show.noises(report)
     assert sentence.startswith("at 9600 7E1 bytes arrived that are no reply: ")
+
+
+@on_virtual_time
+async def test_swapped_wires_are_named() -> None:
+    heard = over_swapped_wires(b"\x0601510034F2\x03C1", 7, "E")
+    report = await scan(sought(OldLine(nonsense=heard), "vigor", "1"))
+    assert "A and B are swapped" in next(iter(show.noises(report)))
 
 
 @pytest.mark.parametrize("frame_format", [1, 4])

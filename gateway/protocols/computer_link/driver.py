@@ -97,6 +97,10 @@ class ComputerLink:
             raise ConfigError(f"monitor_word_command {self.monitor_word_command!r} is not MN or MW")
 
     @property
+    def reply_starts(self) -> Sequence[bytes]:
+        return (b"\x02%02XFF" % self.station,)
+
+    @property
     def areas(self) -> Mapping[str, Area]:
         return self._limits.areas
 

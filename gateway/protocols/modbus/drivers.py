@@ -43,6 +43,13 @@ _DIALECTS = {"plain": PLAIN, "vigor": VIGOR, "k120s": K120S, "ex485lnk": EX485LN
 _FASTEST_SILENCE = 0.00175  # seconds; above 19200 baud 3.5 characters would be shorter
 
 
+# The begin of replies to short reads: function and number of bytes.
+_READ_REPLIES = [
+    *((function, 2 * words) for function in (3, 4) for words in range(1, 17)),
+    *((function, count) for function in (1, 2) for count in range(1, 9)),
+]
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Modbus:
     """The settings that all kinds share."""
@@ -149,6 +156,10 @@ class ModbusRtu(_Modbus):
     def ear(self, character: float) -> Ear:
         return RtuEar(character)
 
+    @property
+    def reply_starts(self) -> Sequence[bytes]:
+        return [bytes((self.station, *start)) for start in _READ_REPLIES]
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ModbusAscii(_Modbus):
@@ -168,6 +179,10 @@ class ModbusAscii(_Modbus):
 
     def ear(self, character: float) -> Ear:
         return ascii_ear()
+
+    @property
+    def reply_starts(self) -> Sequence[bytes]:
+        return [b":%02X%02X%02X" % (self.station, *start) for start in _READ_REPLIES]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -82,6 +82,10 @@ class Vigor:
             raise ConfigError(f"format: {self.format} is no character format such as 8N1")
 
     @property
+    def reply_starts(self) -> Sequence[bytes]:
+        return (b"\x06%02X%s00" % (self.station, READ.encode()),)
+
+    @property
     def areas(self) -> Mapping[str, Area]:
         return AREAS
 
