@@ -54,6 +54,8 @@ clean:
 	rm -rf .venv build dist *.egg-info .coverage
 
 .venv/installed: pyproject.toml constraints.txt
+	@$(PYTHON) -c "import sys; v = sys.version_info; v >= (3, 11) or sys.exit('This is Python %d.%d, \
+	the gateway needs 3.11 or newer. Name one: make PYTHON=python3.12 $(MAKECMDGOALS)' % v[:2])"
 	$(PYTHON) -m venv .venv
 	$(BIN)/pip install --quiet --upgrade pip
 	$(BIN)/pip install --quiet --constraint constraints.txt --editable .

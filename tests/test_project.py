@@ -1,8 +1,11 @@
 """The project's own files agree: version, licence, typing, supported Pythons, hosted CI."""
 
 import re
+import subprocess
+import sys
 import tomllib
 from importlib import resources
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -145,3 +148,19 @@ def test_the_contributors_page_names_only_files_and_targets_that_exist() -> None
     assert len(paths) >= 10
     assert [path for path in paths if not (ROOT / path).exists()] == []
     assert [name for name in targets if f"\n{name}:" not in makefile] == []
+
+
+def test_an_old_python_is_named_before_anything_is_made(tmp_path: Path) -> None:
+    for name in ("Makefile", "pyproject.toml", "constraints.txt"):
+        (tmp_path / name).write_bytes((ROOT / name).read_bytes())
+    old = tmp_path / "python3.10"
+    old.write_text(
+        f"#!{sys.executable}\nimport sys\nsys.version_info = (3, 10, 13)\nexec(sys.argv[2])\n"
+    )
+    old.chmod(0o755)
+    done = subprocess.run(
+        ["make", "run", f"PYTHON={old}"], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode != 0
+    assert "This is Python 3.10, the gateway needs 3.11 or newer" in done.stderr
+    assert not (tmp_path / ".venv").exists()
