@@ -24,7 +24,9 @@ base64. It ends with its standard input.
 
 import asyncio
 import base64
+import itertools
 import json
+import os
 import socket
 import sys
 import threading
@@ -42,11 +44,24 @@ TIMEOUT = 10.0  # seconds a test waits for anything
 BARRIER = "*/@gateway/*/status"
 
 
+# Ports below those that the system gives to connections; each worker of the tests has its own.
+FIRST_PORT, PORTS = 12_000, 5_000
+_WORKER = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw")) % 4
+_numbers = itertools.count(os.getpid())
+
+
+def free_port() -> int:
+    """Returns a free port of the loopback that this process has not used recently."""
+    while True:
+        port = FIRST_PORT + PORTS * _WORKER + next(_numbers) % PORTS
+        with socket.socket() as probe, suppress(OSError):
+            probe.bind(("127.0.0.1", port))
+            return port
+
+
 def free_endpoint() -> str:
     """Returns a loopback endpoint with a free port."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    return f"tcp/127.0.0.1:{free_port()}"
 
 
 # -- the test's side ---------------------------------------------------------------------------

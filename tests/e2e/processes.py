@@ -3,7 +3,6 @@
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -11,6 +10,8 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, Self
+
+from tests.zenoh_peer import free_port as free_port
 
 PATIENCE = 20.0  # seconds; never waited for when all is well
 ROOT = Path(__file__).parents[2]
@@ -195,13 +196,6 @@ def device_server(ser2net: str, folder: Path, tty: Path, number: int) -> Program
     program = Program(ser2net, "-n", "-u", "-c", config, "-P", folder / "ser2net.pid")
     until(lambda: listens(number), "ser2net listens")  # it does not say so itself
     return program
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        number: int = probe.getsockname()[1]
-    return number
 
 
 def listens(number: int) -> bool:
