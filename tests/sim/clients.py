@@ -234,7 +234,7 @@ class Client:
             case _, BadValue():  # another client may send `global` at the same time
                 true = argument in ("no\x01", "maybe") and (sent == 0 or name == "global")
             case _, Busy() | Offline() | LineDown():
-                true = sent == 0
+                true = sent == 0 or name == "global"  # as above
             case "run" | "stop", str():
                 true = sent == 1 and obeyed == 1 and runs is (name == "run")
             case "run" | "stop", Refused():
