@@ -118,7 +118,7 @@ class SimWire:
         self._sendings: list[Sending] = []
         self._ours_until = 0.0
         self._replied: tuple[float, Speaker | None] = (-math.inf, None)  # until when, and who
-        self._heard_until = -math.inf  # the end of the last reply that the gateway heard
+        self._heard_until = -math.inf  # when the gateway heard a reply last
         self.server = DeviceServer(self)
         self._context = copy_context()  # the world's, also where the gateway sends
 
@@ -297,7 +297,7 @@ class SimWire:
             self.watch.passed("<", data)
             if sending.request and sending.station is not None and sending.data.endswith(data):
                 self.watch.answered_other(sending.station, sending.request, sending.data)
-            self._heard_until = max(self._heard_until, sending.end)
+            self._heard_until = now()  # the last characters may have been lost
             self._ear.received(data)
 
     @property
