@@ -112,8 +112,8 @@ class Engine:
             in_flight.open_polls = in_flight.together = 1
             in_flight.charged = None if job.expedited else job.device
         else:
-            if type(job) is Write and (others := self.schedule.requests.companions(job)):
-                job = WriteTogether(job.device, [job, *others])
+            if type(job) is Write and (shared := self.schedule.requests.companions(job)):
+                job = WriteTogether(job.device, shared.writes, shared.run)
             if job.device.shapes is not None:
                 resync_around(job, job.device.shapes, now)
             in_flight.charged = job.device if isinstance(job, Probe) else None
@@ -225,6 +225,15 @@ class Engine:
             self._effects.ended(request, Busy(why))
         self._set_deadline()
         return self._effects.take()
+
+    def submit_group(self, writes: Sequence[Write], now: float) -> list[Effect]:
+        """Queues the writes of one group, or refuses them all."""
+        if not self.schedule.requests.has_room(len(writes)):
+            why = f"line {self.name}: too many requests are waiting; not sent"
+            for write in writes:
+                self._effects.ended(write, Busy(why))
+            return self._effects.take()
+        return [effect for write in writes for effect in self.submit(write, now)]
 
     def expedite(self, device: Device, tag: Tag) -> None:
         """Polls the tag's block before all other polls, for a read on demand."""

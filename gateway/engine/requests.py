@@ -1,18 +1,17 @@
-"""Requests of clients: writes and commands, and the queue in which they wait for the line."""
+"""Requests of clients: writes, alone or in groups, and commands."""
 
-from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from gateway.engine.device import Device
-from gateway.errors import GatewayError
-from gateway.protocols.driver import AnyDriver, Controllable, ScatteredWriter, Span
+from gateway.engine.long_writes import LongWrite, long_write
+from gateway.errors import GatewayError, NotSent
+from gateway.protocols.driver import AnyDriver, Controllable, Span
 from gateway.tags import Tag, WriteResult
 from gateway.values import Value
 
 WRITE_EXPIRY = 5.0  # seconds after which a waiting request is no longer sent
-MOST_WAITING = 1000  # requests
 
 
 class Peeked(NamedTuple):
@@ -46,6 +45,14 @@ NO_RESYNCS = Resyncs()
 
 
 @dataclass(slots=True, eq=False)
+class Group:
+    """Writes of one client to one device. They are sent in their order; after the first that is
+    not done none is sent."""
+
+    failed: str = ""  # the tag of the first that was not done
+
+
+@dataclass(slots=True, eq=False)
 class Write:
     """A value for a tag. Times in seconds of the line's clock."""
 
@@ -56,11 +63,16 @@ class Write:
     within: float = WRITE_EXPIRY
     alone: bool = False  # refused together with others before any was done: now sent alone
     resyncs: Resyncs = NO_RESYNCS
+    group: Group | None = None
     value: Value = field(init=False)  # as the device will hold it, rounded to its steps
+    long: LongWrite | None = field(init=False, default=None)  # None: one request is enough
 
     def __post_init__(self) -> None:
         value = self.tag.from_units(self.units)
         self.value = False if value is None else value
+        if self.tag.span.size > 1:
+            elements = len(value) if isinstance(value, tuple) else 0
+            self.long = long_write(self.device.driver, self.tag.span, elements)
 
     @property
     def expires(self) -> float:
@@ -76,8 +88,8 @@ class Write:
 
     @property
     def latest(self) -> bool:
-        """True if only the last of several waiting writes is sent."""
-        return self.tag.write is not None and self.tag.write.latest
+        """True if only the last of several waiting writes is sent. In a group each is sent."""
+        return self.group is None and self.tag.write is not None and self.tag.write.latest
 
     def holds(self, units: Sequence[int]) -> bool:
         """Returns True if `units`, as read back, are the written value."""
@@ -121,18 +133,9 @@ class Command:
 Request = Write | Command
 
 
-def can_share(writes: Sequence[Write]) -> bool:
-    """Returns True if all these writes to one device fit in one request.
-
-    A known bad address goes alone: the device would refuse the others with it.
-    """
-    device = writes[0].device
-    driver, spans = device.driver, [write.tag.span for write in writes]
-    if not isinstance(driver, ScatteredWriter) or not all(write.plain for write in writes):
-        return False
-    if any(bad.overlaps(span) for bad in device.bad_addresses.bad for span in spans):
-        return False
-    return driver.scattered_write_cost(spans) is not None
+def after_failed(group: Group) -> NotSent:
+    """Returns the outcome of the writes that follow one that was not done."""
+    return NotSent(f"not sent, because {group.failed} before it failed")
 
 
 def why_not_commanded(driver: AnyDriver, command: str, *, control: bool) -> str:
@@ -143,68 +146,3 @@ def why_not_commanded(driver: AnyDriver, command: str, *, control: bool) -> str:
     if command not in known:
         return f"{command!r} is none of its commands: {', '.join(sorted(known))}"
     return "" if control else "`control: true` is missing in the file"
-
-
-class RequestQueue:
-    """The waiting requests of one line. Requests to one device keep their order."""
-
-    def __init__(self) -> None:
-        self.waiting: deque[Request] = deque()
-
-    @property
-    def first(self) -> Request:
-        return self.waiting[0]
-
-    def take(self) -> Request | None:
-        """Takes out the first request to a device that needs no resync."""
-        for request in self.waiting:
-            if not request.device.health.needs_resync:
-                self.waiting.remove(request)
-                return request
-        return None
-
-    def submit(self, request: Request) -> bool:
-        """Adds a request. Returns False if too many requests wait already."""
-        if len(self.waiting) >= MOST_WAITING:
-            return False
-        self.waiting.append(request)
-        return True
-
-    def superseded(self, write: Write) -> list[Request]:
-        """Takes out the waiting writes that `write` replaces, if its tag has `latest`."""
-        if not write.latest:
-            return []
-        return self._out(lambda other: isinstance(other, Write) and other.tag is write.tag)
-
-    def companions(self, write: Write) -> list[Write]:
-        """Takes out the next writes to the device that fit in one request with this one."""
-        found: list[Write] = []
-        for request in self.waiting:
-            if request.device is not write.device:
-                continue
-            if not isinstance(request, Write) or not can_share([write, *found, request]):
-                break
-            found.append(request)
-        if found:
-            self._out(lambda request: request in found)
-        return found
-
-    def each_alone(self, writes: Sequence[Write]) -> None:
-        """Puts back writes of which none was done: now one by one."""
-        for write in reversed(writes):
-            write.alone = True
-            self.waiting.appendleft(write)
-
-    def withdraw(self, device: Device | None = None) -> list[Request]:
-        """Takes out all waiting requests, or those to one device."""
-        return self._out(lambda request: device is None or request.device is device)
-
-    def expired(self, now: float) -> list[Request]:
-        """Takes out the requests that have waited too long."""
-        return self._out(lambda request: request.expires <= now) if self.waiting else []
-
-    def _out(self, which: Callable[[Request], bool]) -> list[Request]:
-        taken = [request for request in self.waiting if which(request)]
-        if taken:
-            self.waiting = deque(request for request in self.waiting if not which(request))
-        return taken
