@@ -252,9 +252,13 @@ def resync_around(job: Transacted, shapes: ReplyShapes, now: float) -> None:
     match job:
         case Write() | WriteTogether():
             write = job if isinstance(job, Write) else job.writes[0]
-            before, after = shapes.written(*_sent_by(job), now)
+            span, units, reads = write.tag.span, write.units, write.tag.part is not None
+            if isinstance(job, WriteTogether) and job.run is not None:
+                span, reads = job.run, needs_read(job.writes)
+                units = together(span, job.writes, [0] * span.size)
+            before, after = shapes.written(span, units, reads, now)
             write.resyncs = Resyncs(token() if before else None, token() if after else None)
-            if (long := write.long) is not None and not shapes.tells_apart(long, write.units):
+            if (long := write.long) is not None and not shapes.tells_apart(long, units):
                 long.tokens = [token() for _ in long.spans]
             return
         case Command():
@@ -265,17 +269,6 @@ def resync_around(job: Transacted, shapes: ReplyShapes, now: float) -> None:
         case Confirm(run=run):
             last = driver.reply_shape(run)
     shapes.sent(last, now)
-
-
-def _sent_by(job: Write | WriteTogether) -> tuple[Span, Sequence[int], bool]:
-    """Returns the span and units of the request, and True if the span is read before."""
-    if isinstance(job, Write):
-        return job.tag.span, job.units, job.tag.part is not None
-    if job.run is None:
-        first = job.writes[0]
-        return first.tag.span, first.units, False
-    reads = needs_read(job.writes)
-    return job.run, together(job.run, job.writes, [0] * job.run.size), reads
 
 
 # Results

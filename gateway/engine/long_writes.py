@@ -53,7 +53,9 @@ class LongWrite:
             return text
         units = ends[-1] - start
         low, high = ((number - start) * self.elements // units for number in (first, after))
-        return f"{text} ({f'element {low}' if high == low + 1 else f'elements {low} to {high - 1}'})"
+        return (
+            f"{text} ({f'element {low}' if high == low + 1 else f'elements {low} to {high - 1}'})"
+        )
 
 
 def long_write(driver: AnyDriver, span: Span, elements: int) -> LongWrite | None:

@@ -125,6 +125,8 @@ class RequestResults:
                 return write.result(now, time, acknowledged=False)
             case Sent():
                 self._acknowledged(device, now, time)
+                if result.held is None and result.refused_back is None:
+                    return write.result(now, time)
                 return _outcome(write, result, result.held, now, time)
             case Refused():
                 self._refused(device, result, now, time)

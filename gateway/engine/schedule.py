@@ -9,8 +9,7 @@ from gateway.engine.health import PAUSE_LONGEST, State
 from gateway.engine.jobs import EXPEDITED, NOT_QUEUED, ON_DEMAND, Idle, LastRead, Poll, Probe
 from gateway.engine.poll_queue import PollQueue
 from gateway.engine.probe_schedule import ProbeSchedule
-from gateway.engine.request_queue import RequestQueue
-from gateway.engine.requests import Request
+from gateway.engine.requests import Request, RequestQueue
 from gateway.engine.unanswered import Unanswered
 from gateway.planning.planner import Block
 from gateway.tags import Tag

@@ -21,6 +21,7 @@ from gateway.engine.jobs import (
     Transacted,
     WriteTogether,
 )
+from gateway.engine.long_writes import LongWrite
 from gateway.engine.requests import Command, Write
 from gateway.engine.runs import needs_read, own_units, together, verified
 from gateway.errors import (
@@ -161,7 +162,10 @@ async def _write(write: Write, talk: Transaction) -> Sent:
     if tag.part is not None:
         (word,) = await driver.read(talk, tag.span)
         units = [tag.part.into(word, write.units[0])]
-    sending = driver.write(talk, tag.span, units) if write.long is None else _one_by_one(write, talk)
+    if write.long is None:
+        sending = driver.write(talk, tag.span, units)
+    else:
+        sending = _one_by_one(write, write.long, talk)
     acknowledged = await _only_reply(sending, write, talk)
     if not acknowledged or tag.write is None or not tag.write.verify:
         return Sent(acknowledged)
@@ -171,11 +175,9 @@ async def _write(write: Write, talk: Transaction) -> Sent:
         return Sent(refused_back=error)
 
 
-async def _one_by_one(write: Write, talk: Transaction) -> bool:
+async def _one_by_one(write: Write, long: LongWrite, talk: Transaction) -> bool:
     """Sends the requests of a long write, and notes how far it comes."""
-    driver, long, at = write.device.driver, write.long, 0
-    if long is None:
-        raise AssertionError("one request is enough")
+    driver, at = write.device.driver, 0
     for number, span in enumerate(long.spans):
         long.asked = max(long.asked, number + 1)
         try:

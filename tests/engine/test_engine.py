@@ -39,7 +39,7 @@ from gateway.engine.jobs import (
     Traffic,
     Transacted,
 )
-from gateway.engine.request_queue import MOST_WAITING
+from gateway.engine.requests import MOST_WAITING
 from gateway.engine.unsolicited import REPLY_WITHIN
 from gateway.errors import (
     BadValue,

@@ -20,8 +20,7 @@ from gateway.engine.probes import (
     probe_seconds,
     short_timeout,
 )
-from gateway.engine.request_queue import MOST_WAITING
-from gateway.engine.requests import WRITE_EXPIRY, Write
+from gateway.engine.requests import MOST_WAITING, WRITE_EXPIRY, Write
 from gateway.engine.schedule import Schedule
 from gateway.errors import NoReply
 from gateway.planning.bad_addresses import RETRIES
