@@ -124,7 +124,7 @@ def _parquet_writer(columns: Sequence[Column]) -> Callable[[Path, Rows], int]:
 
 
 def _number(value: Value | None) -> float | None:
-    return None if value is None or isinstance(value, str) else float(value)
+    return None if value is None or isinstance(value, (str, tuple)) else float(value)
 
 
 def _text(value: Value | None) -> str | None:
