@@ -1,8 +1,8 @@
-"""Several tags written at once, on simulated wires: one request for a run, in order, all or less."""
+"""Several tags written at once, on simulated wires: one request for a run, in their order."""
 
 import asyncio
 import random
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import pytest
@@ -17,7 +17,6 @@ from gateway.values import Value
 from tests.engine.misbehaving import intercept
 from tests.line.slaves import plant as slaves
 from tests.line.slaves import slave
-from tests.sim.bench import Unruly
 from tests.sim.links import commands, link_device, link_plant, spelt
 from tests.sim.plant import Outcome, Plant, device, make_tag, plant, running
 from tests.sim.virtual import now, on_virtual_time
@@ -161,7 +160,7 @@ async def test_only_the_tag_that_the_device_holds_otherwise_differs() -> None:
     station = line.stations[0]
     write = station.memory.write
 
-    def but_one(area: str, start: int, values: list[int]) -> None:
+    def but_one(area: str, start: int, values: Iterable[int]) -> None:
         write(area, start, values)
         write(area, 1, [99])
 
