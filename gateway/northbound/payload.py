@@ -265,10 +265,10 @@ def _result(result: WriteResult | Failure) -> dict[str, Value | None]:
             return {"error": problem.value, "code": code, "reason": short(reason)}
 
 
-def loggable(requested: Value | None) -> Value | None:
+def loggable(requested: Value | None) -> Scalar | list[Scalar] | None:
     """Limits a requested value to a printable size; orjson writes at most 64 bits."""
     if isinstance(requested, tuple):
-        return tuple(map(_loggable, requested))
+        return list(map(_loggable, requested))
     return None if requested is None else _loggable(requested)
 
 
