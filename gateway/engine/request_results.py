@@ -9,6 +9,7 @@ from gateway.engine.jobs import (
     Answer,
     Confirm,
     HeldTogether,
+    Poll,
     ReadBack,
     Repeat,
     RequestJob,
@@ -246,7 +247,7 @@ class RequestResults:
             if request.group is not None and isinstance(outcome, GatewayError):
                 self._end_group(request.group, request.tag)
             poll = self._schedule.reader(request.device, request.tag)
-            if poll is not None:
+            if poll is not None and (request.group is None or not self._more(request.group, poll)):
                 self._schedule.expedite(poll)  # the client sees the new value soon
 
     def _end_group(self, group: Group, failed: Tag) -> None:
@@ -254,6 +255,18 @@ class RequestResults:
         group.failed = group.failed or failed.name
         for waiting in self._schedule.requests.of_group(group):
             self._effects.ended(waiting, after_failed(group))
+            poll = self._schedule.reader(waiting.device, waiting.tag)
+            if poll is not None:
+                self._schedule.expedite(poll)  # it has tags that were written before
+
+    def _more(self, group: Group, poll: Poll) -> bool:
+        """Returns True if tags of the poll are still to be written: one poll shows them all."""
+        schedule = self._schedule
+        return any(
+            schedule.reader(poll.device, write.tag) is poll
+            for write in schedule.requests.waiting
+            if isinstance(write, Write) and write.group is group
+        )
 
 
 def _outcome(

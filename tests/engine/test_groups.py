@@ -200,6 +200,24 @@ async def test_only_the_tag_that_the_device_holds_otherwise_differs() -> None:
         assert str(outcomes[3].once) == "not sent, because D1 before it failed"
 
 
+@on_virtual_time
+async def test_a_run_to_all_stations_is_one_broadcast_without_an_acknowledgement() -> None:
+    driver = ModbusRtu(station=0)
+    texts = ["holding:1", "holding:2", "holding:3"]
+    tags = [make_tag(text, driver, write=RULE, **SLOW) for text in texts]
+    everyone, one = slave(driver, tags), slave(ModbusRtu(station=1), [])
+    line = slaves([everyone, one])
+    async with running(line):
+        await asyncio.sleep(3)
+        asked = now()
+        outcomes = submit(line, everyone, [("holding:2", 2), ("holding:1", 1), ("holding:3", 3)])
+        await asyncio.sleep(1)
+        assert values_of(outcomes) == [2, 1, 3]
+        assert not any(outcome.once.acknowledged for outcome in outcomes)
+        assert [data[1] for data in writes(line, asked)] == [16]
+        assert line.stations[1].memory.read("holding", 1, 3) == [1, 2, 3]
+
+
 # After the first that is not done
 
 
