@@ -30,6 +30,7 @@ from gateway.protocols.driver import Span
 from gateway.tags import Tag
 
 BROADCAST_PAUSE = 0.1  # seconds
+_SHOWN = 3  # elements of an array that differ
 STOPPED = "the gateway stopped before the acknowledgement arrived; it may be done"
 
 
@@ -278,5 +279,15 @@ def _outcome(
     if sent.refused_back is not None and verified(write.tag):
         return Differs(f"acknowledged, but reading back was refused: {sent.refused_back}")
     if held is not None and not write.holds(held):
-        return Differs(f"acknowledged, but the device now holds {write.tag.decode(held)!r}")
+        return Differs(f"acknowledged, but the device now holds {_differing(write, held)}")
     return write.result(now, time, verified=held is not None)
+
+
+def _differing(write: Write, held: Sequence[int]) -> str:
+    """Names the value that was read back; of an array the elements that are others."""
+    wanted, found = write.value, write.tag.decode(held)
+    if not isinstance(wanted, tuple) or not isinstance(found, tuple):
+        return repr(found)
+    others = [n for n, (one, other) in enumerate(zip(wanted, found, strict=True)) if one != other]
+    shown = ", ".join(f"{found[n]!r} in element {n}" for n in others[:_SHOWN])
+    return shown + (f" and {len(others) - _SHOWN} more" if len(others) > _SHOWN else "")

@@ -418,6 +418,27 @@ async def test_a_long_write_that_breaks_off_accounts_for_every_address(
 
 
 @on_virtual_time
+async def test_an_array_that_the_device_holds_otherwise_names_its_elements() -> None:
+    tags = [make_tag("D100", type="uint16[8]", write=VERIFY, **SLOW)]
+    dev = device(tags)
+    line = plant([dev])
+    station = line.stations[0]
+    write = station.memory.write
+
+    def but_some(area: str, start: int, values: Iterable[int]) -> None:
+        write(area, start, values)
+        write(area, 103, [99, 4, 99, 99, 99])
+
+    async with running(line):
+        await asyncio.sleep(3)
+        station.memory.write = but_some  # type: ignore[method-assign]  # a program sets them
+        outcome = line.submit(dev, tags[0], tuple(range(8)))
+        await asyncio.sleep(1)
+        text = "acknowledged, but the device now holds 99 in element 3, 99 in element 5, "
+        assert str(outcome.once) == f"{text}99 in element 6 and 1 more"
+
+
+@on_virtual_time
 async def test_no_request_of_a_long_write_ends_inside_a_number() -> None:
     """Five registers fit in one request: two numbers, not two and a half."""
     driver = ModbusRtu(station=1, max_write_words=5)

@@ -13,6 +13,7 @@ from gateway.config import built
 from gateway.errors import BadValue, Busy
 from gateway.tags import Quality, Reason, Tag, WriteResult
 from gateway.transport import TcpAddress, listen
+from gateway.values import Value
 from tests.interop.peers import free_port
 
 TAGS = {
@@ -62,7 +63,7 @@ async def test_a_value_that_cannot_be_kept_is_refused_and_not_shown(tmp_path: Pa
 
 async def test_several_held_values_change_all_at_once_or_none(tmp_path: Path) -> None:
     one = gateway(tmp_path)
-    values = [(tag(one, "limit"), 42), (tag(one, "name"), "AB")]
+    values: list[tuple[Tag, Value]] = [(tag(one, "limit"), 42), (tag(one, "name"), "AB")]
     ends = await one.write_group(values)
     assert [end.value for end in ends if isinstance(end, WriteResult)] == [42, "AB"]
     assert one.sample(values[0][0]).time == one.sample(values[1][0]).time
