@@ -28,7 +28,8 @@ def write(
     config: ConfigPath,
     tag: Annotated[str, typer.Argument(metavar="TAG", help="device/tag")],
     value: Annotated[
-        str, typer.Argument(metavar="VALUE", help="JSON: true, 12.5, AB; on and off for bits")
+        str,
+        typer.Argument(metavar="VALUE", help="JSON: true, 12.5, AB, '[1, 2]'; on and off for bits"),
     ],
     without_gateway: Direct = False,
     as_json: AsJson = False,
@@ -70,7 +71,7 @@ def _parsed(text: str, tag: Tag) -> Value:
     if tag.names is not None and text in tag.names.by_number.values():
         return text  # `on` is a name here
     kind, parsed = tag.layout.type.kind, parse_value(text)
-    if kind is Kind.BOOL and text.lower() in _SWITCH:
+    if kind is Kind.BOOL and text.lower() in _SWITCH and tag.element is None:
         return _SWITCH[text.lower()]
     if kind is Kind.STRING and not isinstance(parsed, str):
         return text  # 12 is a text for this tag

@@ -18,12 +18,12 @@ import orjson
 
 from gateway.engine.requests import CommandResult
 from gateway.errors import BadValue, Busy, Damaged, GatewayError, LineDown, Offline, Refused
-from gateway.numerals import parse_decimal
+from gateway.numerals import Scalar, parse_decimal
 from gateway.tags import Quality, Reason, Sample, WriteResult
 from gateway.tags.timestamps import rfc3339
-from gateway.values import Value
+from gateway.values import LONGEST_ARRAY, Value
 
-LONGEST_WRITE = 64 * 1024  # bytes; a tag holds 250 characters at most
+LONGEST_WRITE = 64 * 1024  # bytes; a tag holds 250 characters or 2000 elements at most
 LONGEST_REASON = 300
 _GOOD = Quality.GOOD  # looking up a member of an enumeration takes 0.2 µs
 
@@ -217,6 +217,12 @@ def _result(result: WriteResult | Failure) -> dict[str, Value | None]:
 
 def loggable(requested: Value | None) -> Value | None:
     """Limits a requested value to a printable size; orjson writes at most 64 bits."""
+    if isinstance(requested, tuple):
+        return tuple(map(_loggable, requested))
+    return None if requested is None else _loggable(requested)
+
+
+def _loggable(requested: Scalar) -> Scalar:
     match requested:
         case str():
             return short(requested)
@@ -236,7 +242,8 @@ def short(text: str) -> str:
 
 
 def parse_write(payload: bytes) -> Value:
-    """Returns the value of a write: a JSON scalar, or `{"value": scalar}`. Raises `BadValue`."""
+    """Returns the value of a write: a JSON scalar, a list of them (for an array), or
+    `{"value": …}` around it. Raises `BadValue`."""
     if not payload.strip():
         raise BadValue("the payload is empty: send a JSON value such as 12.5")
     if len(payload) > LONGEST_WRITE:
@@ -259,7 +266,8 @@ def parse_write(payload: bytes) -> Value:
         raise
     except ValueError:  # an integer of more than 4300 digits
         raise BadValue("the number in the payload is too long") from None
-    return _scalar(found.value if isinstance(found, _Wrapped) else found)
+    value = found.value if isinstance(found, _Wrapped) else found
+    return _elements(value) if isinstance(value, list) else _scalar(value)
 
 
 @dataclass(frozen=True, slots=True)
@@ -284,7 +292,16 @@ def _finite(text: str) -> int | float:
     return number
 
 
-def _scalar(found: object) -> Value:
+def _elements(found: list[object]) -> Value:
+    if len(found) > LONGEST_ARRAY:
+        raise BadValue(f"the list has {len(found)} values, more than {LONGEST_ARRAY}")
+    try:
+        return tuple(map(_scalar, found))
+    except BadValue as error:
+        raise BadValue(f"in the list: {error}") from None
+
+
+def _scalar(found: object) -> Scalar:
     match found:
         case bool() | int() | float():
             return found
@@ -293,4 +310,4 @@ def _scalar(found: object) -> Value:
                 raise BadValue("the text holds half a surrogate pair")
             return found
         case _:
-            raise BadValue('send one JSON value: true, 12.5, "AB", or {"value": 12.5}')
+            raise BadValue('send a JSON value: true, 12.5, "AB", {"value": 12.5}, or a list')

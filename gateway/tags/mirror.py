@@ -3,8 +3,9 @@
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import compress, count
 from operator import ne
+from typing import Any
 
-from gateway.tags import Publish, Quality, Reason, Sample, Tag, bad
+from gateway.tags import Deadband, Publish, Quality, Reason, Sample, Tag, bad
 from gateway.tags.computed import Dependents, computed
 from gateway.tags.kept import Counted, CounterState, kept, memory_of
 from gateway.tags.scan import Latest, Samples, Scan
@@ -251,9 +252,19 @@ def _changed(tag: Tag, last: Sample, sample: Sample) -> bool:
     old, new = last.value, sample.value
     if tag.deadband is None or old is None or new is None:
         return old != new
-    if isinstance(old, (bool, str)) or isinstance(new, (bool, str)):
-        return old != new
-    band = tag.deadband.amount
-    if tag.deadband.percent:
+    if isinstance(old, (bool, str, tuple)) or isinstance(new, (bool, str, tuple)):
+        return old != new and (tag.element is None or _one_moved(tag.deadband, old, new))
+    return old != new and _moved(tag.deadband, old, new)
+
+
+def _moved(deadband: Deadband, old: float, new: float) -> bool:
+    band = deadband.amount
+    if deadband.percent:
         band = abs(old) * band / 100
-    return old != new and abs(new - old) >= band
+    return abs(new - old) >= band
+
+
+def _one_moved(deadband: Deadband, old: Any, new: Any) -> bool:
+    """Returns True if an element of an array moved by the deadband; staying never counts."""
+    pairs = zip(old, new, strict=True)
+    return any(before != after and _moved(deadband, before, after) for before, after in pairs)

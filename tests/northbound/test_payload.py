@@ -131,13 +131,34 @@ def test_a_write_is_a_scalar_or_an_object_with_the_value(sent: bytes, value: Val
     assert type(found) is type(value)
 
 
+@pytest.mark.parametrize("sent", [b'[true, 1, 1.0, "A"]', b'{"value": [true, 1, 1.0, "A"]}'])
+def test_a_write_of_an_array_is_a_list(sent: bytes) -> None:
+    found = payload.parse_write(sent)
+    assert found == (True, 1, 1.0, "A")
+    assert list(map(type, found)) == [bool, int, float, str]
+    assert json.loads(payload.outcome(WriteResult(found, NOON, 0.03)))["value"] == [
+        True,
+        1,
+        1.0,
+        "A",
+    ]
+
+
+def test_the_audit_of_a_list_has_a_printable_size() -> None:
+    assert payload.loggable((2**70, 1.5)) == ("1180591620717411303424", 1.5)
+
+
 @pytest.mark.parametrize(
     "sent",
     [
         b"",
         b" \n",
         b"null",
-        b"[1]",
+        b"[[1]]",
+        b"[null]",
+        b'[{"value": 1}]',
+        b"[1, NaN]",
+        b"[" + b"0," * 2000 + b"0]",
         b"{}",
         b'{"value": null}',
         b'{"value": {"value": 1}}',
@@ -172,7 +193,7 @@ def test_any_bytes_are_a_value_or_a_bad_value(sent: bytes) -> None:
         found = payload.parse_write(sent)
     except BadValue:
         return
-    assert isinstance(found, (bool, int, float, str))
+    assert isinstance(found, (bool, int, float, str, tuple))
 
 
 @pytest.mark.parametrize(
