@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from gateway.engine.device import Device
+from gateway.engine.requests import MOST_WAITING, Group, Write
 from gateway.errors import Busy, NotSent, Refused, Unclear
 from gateway.protocols.checksums import crc16
 from gateway.protocols.computer_link import ComputerLink
@@ -15,6 +16,7 @@ from gateway.protocols.modbus import ModbusRtu
 from gateway.tags import Tag, WriteResult, WriteRule
 from gateway.values import Value
 from tests.engine.misbehaving import intercept
+from tests.engine.rig import Rig
 from tests.line.slaves import plant as slaves
 from tests.line.slaves import slave
 from tests.sim.links import commands, link_device, link_plant, spelt
@@ -250,18 +252,14 @@ async def test_after_the_first_that_is_not_done_nothing_of_the_group_is_sent(fau
         assert station.memory.read("D", 40) == [40]
 
 
-@on_virtual_time
-async def test_a_group_without_room_is_refused_whole() -> None:
-    line, dev = vigor("D0", "D20")
-    async with running(line):
-        await asyncio.sleep(3)
-        asked = now()
-        for n in range(999):
-            line.submit(dev, spelt(dev, "D0"), n)
-        outcomes = submit(line, dev, [("D0", 1), ("D20", 2)])
-        assert all(isinstance(outcome.once, Busy) for outcome in outcomes)
-        await asyncio.sleep(0.1)
-        assert not [data for data in writes(line, asked) if data[5:9] == b"1C28"]
+def test_a_group_without_room_is_refused_whole() -> None:
+    rig = Rig()
+    rig.engine.schedule.requests.waiting.extend([rig.write("D0")] * (MOST_WAITING - 2))
+    group = Group()
+    tags = [spelt(rig.device, text) for text in ("D1", "D2")]
+    writes = [Write(rig.device, tag, tag.encode(7), rig.now, group=group) for tag in tags]
+    rig.note(rig.engine.submit_group(writes, rig.now))
+    assert [type(rig.outcomes[write]) for write in writes] == [Busy, Busy]
 
 
 @on_virtual_time
