@@ -11,9 +11,6 @@ from gateway.transport.port import (
     TcpAddress,
     parse_port,
 )
-from gateway.transport.rfc2217 import open_rfc2217
-from gateway.transport.serial_port import open_serial
-from gateway.transport.tcp import open_tcp
 
 
 async def open_port(
@@ -24,12 +21,19 @@ async def open_port(
     Raises `LineDown` with a sentence for people. The line, not this package, reopens a lost port.
     `open_simulator` opens the simulator, which needs its stations.
     """
+    # Imported here: serialx and the others take as long as the rest of a start.
     match where:
         case SerialPath():
+            from gateway.transport.serial_port import open_serial
+
             return await open_serial(where, settings, receiver, timeout=timeout)
         case TcpAddress():
+            from gateway.transport.tcp import open_tcp
+
             return await open_tcp(where, receiver, timeout=timeout, baudrate=settings.baudrate)
         case Rfc2217Address():
+            from gateway.transport.rfc2217 import open_rfc2217
+
             return await open_rfc2217(where, settings, receiver, timeout=timeout)
         case SimulatorAddress():
             raise ValueError("a simulator needs its stations: open_simulator")

@@ -16,7 +16,7 @@ from gateway.errors import (
 )
 from gateway.line.duty import Duty
 from gateway.line.wire_log import WireLog
-from gateway.northbound import Northbound
+from gateway.northbound.northbound import Northbound
 from gateway.protocols.driver import Address, Span, Unit
 from gateway.tags import Reason, Sample, Tag, WriteResult, WriteRule, bad, good
 from gateway.values import Layout, Value, parse_type
