@@ -2452,4 +2452,18 @@ MUTANTS = (
         "        changed: list[str] = []\n",
         "tests/reload/test_live.py",
     ),
+    Mutant(
+        "a served recording shows a value that may be of another request",
+        "line/recorded.py",
+        "            doubtful.pop((sample.tag.device, _unit(sample.tag.span)), None)\n",
+        "            pass\n",
+        "tests/line/test_recorded.py",
+    ),
+    Mutant(
+        "a served recording shows 0 for what it does not hold",
+        "simulator/recorded.py",
+        "        self.memory.guard = self._lacks\n",
+        "",
+        "tests/line/test_recorded.py",
+    ),
 )
