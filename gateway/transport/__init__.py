@@ -1,5 +1,7 @@
 """Ports: serial, TCP and RFC 2217, opened by `open_port`."""
 
+from importlib import import_module
+
 from gateway.transport.port import (
     Port,
     PortAddress,
@@ -12,6 +14,15 @@ from gateway.transport.port import (
     parse_port,
 )
 
+_OPENERS = {SerialPath: "serial_port", TcpAddress: "tcp", Rfc2217Address: "rfc2217"}
+
+
+def prepare(where: PortAddress) -> None:
+    """Imports what opens the port. It takes as long as a reply, so it precedes the first line; a
+    process that opens no port does without."""
+    if module := _OPENERS.get(type(where)):
+        import_module(f"{__name__}.{module}")
+
 
 async def open_port(
     where: PortAddress, settings: SerialSettings, receiver: Receiver, *, timeout: float = 5.0
@@ -21,7 +32,6 @@ async def open_port(
     Raises `LineDown` with a sentence for people. The line, not this package, reopens a lost port.
     `open_simulator` opens the simulator, which needs its stations.
     """
-    # Imported here: serialx and the others take as long as the rest of a start.
     match where:
         case SerialPath():
             from gateway.transport.serial_port import open_serial
@@ -50,4 +60,5 @@ __all__ = [
     "TcpAddress",
     "open_port",
     "parse_port",
+    "prepare",
 ]
