@@ -214,6 +214,10 @@ class Gateway:
         """Adds a document of another part to the status."""
         self._documents[path] = document
 
+    def drop_document(self, path: str) -> None:
+        """Removes a document of another part."""
+        self._documents.pop(path, None)
+
     def wire_logs(self) -> Mapping[str, WireLog]:
         polled = {line.engine.name: line.wire_log for line in self.lines}
         return polled | {line.name: line.wire_log for line in self.serving.lines}
@@ -230,10 +234,10 @@ class Gateway:
             self.alarms.judge(samples)
         if self.serving.remembering:
             self.serving.remember(samples)
-        if waiting := self._on_demand.waiting:
-            for sample in samples:
-                if sample.tag in waiting:
-                    self._on_demand.answer(sample)
+        if self._on_demand.arrived and type(samples) is not Scan:
+            self._on_demand.note(samples)
+        if self._on_demand.waiting:
+            self._on_demand.answer_all(samples)
         if self.mirror.derives and (changed or self.mirror.pending):
             changed = self.mirror.follow(changed)
             if self.alarms.of_tags:
@@ -339,6 +343,10 @@ class Gateway:
     def is_fresh(self, tag: Tag, max_age: float) -> bool:
         """True if the last read is younger than `max_age` seconds, or no read is possible now."""
         return self._on_demand.is_fresh(tag, max_age)
+
+    def age(self, tag: Tag) -> float:
+        """Returns the seconds since the last good read; infinite if there was none."""
+        return self._on_demand.age(tag)
 
     async def fresh(self, tag: Tag, max_age: float) -> Sample:
         """Returns the last sample if it `is_fresh`, otherwise that of the next read. Raises

@@ -37,6 +37,7 @@ from gateway.config.served import (
 )
 from gateway.config.sheet_tags import SheetTags
 from gateway.config.tag_rules import inherit
+from gateway.config.transfers import TransferRows
 from gateway.config.validate import (
     driver_of,
     driver_settings,
@@ -92,6 +93,7 @@ class Builder:
         if top is not None and top.gateway.standby is not None:
             check_totals(lines, self.mistakes)
         check_sources(lines, self.mistakes)
+        transfers = TransferRows(lines, self.mistakes).build(data.get("transfers"))
         if top is None:
             return None
         check_retained(lines, self._state_file(top), top.gateway.standby, self.mistakes)
@@ -108,6 +110,7 @@ class Builder:
             web=self._web(top),
             alarms=self._alarms(top, lines),
             lines=tuple(lines),
+            transfers=transfers,
             watch=top.gateway.watch_config,
             sheets=tuple(self._sheets.used),
         )
@@ -313,7 +316,9 @@ class Builder:
         path = None if found.path is None else self._written(found.path)
         if path is None and (self.state_folder is not None or _have_alarms(lines)):
             path = self._written(ALARM_FILE)
-        return AlarmsConfig(path=path, devices=found.devices, lines=found.lines)
+        return AlarmsConfig(
+            path=path, devices=found.devices, lines=found.lines, transfers=found.transfers
+        )
 
     def _web(self, top: FileSection) -> WebConfig | None:
         if top.web is None:

@@ -9,7 +9,7 @@ from gateway.engine.device import DeviceSettings
 from gateway.tags import Tag
 
 # Parts of a configuration that a reload takes over. All others need a restart.
-_TAKEN_OVER = {"lines", "sheets", "watch"}
+_TAKEN_OVER = {"lines", "sheets", "transfers", "watch"}
 # Settings of a tag that do not change the meaning of its value. After a change of any other one
 # the value begins again.
 _HARMLESS = {"every", "description", "deadband", "publish", "heartbeat", "history"}
@@ -79,6 +79,11 @@ class Difference:
     closed: Sequence[str]  # lines whose port is closed; a line in both is opened again
     opened: Sequence[LineConfig]
     computed: Computed
+
+    @property
+    def renewed(self) -> Mapping[Tag, Tag]:
+        """Old tags to those that go on with their values."""
+        return {old: new for one in self.devices.values() for old, new in one.renewed.items()}
 
     def __bool__(self) -> bool:
         computed = self.computed.started or self.computed.gone
