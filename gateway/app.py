@@ -31,6 +31,7 @@ from gateway.tags import Reason, Sample, Tag, WriteResult, bad
 from gateway.tags.mirror import Mirror
 from gateway.tags.scan import Scan
 from gateway.tags.timestamps import rfc3339
+from gateway.transfers.forecast import transfer_forecasts, with_transfers
 from gateway.values import Value
 
 MOST_PEEKED = 256  # addresses of one peek
@@ -51,7 +52,7 @@ def forecasts(
         found.append(forecast(line.name, devices, line.wire))
         if report is not None:
             report("planning the requests", len(found) / len(config.lines))
-    return found
+    return with_transfers(found, transfer_forecasts(config, found))
 
 
 REMOVED = "removed from the file"

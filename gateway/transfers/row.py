@@ -90,15 +90,14 @@ class Row:
 
     def next(self, source: Reading, now: float) -> Carry | None:
         """Returns the write that is due, which begins now; its end is reported to `ended`."""
-        carry = None
-        if self.writing is None and now >= self._not_before:
-            value = self._note_age(source, now)
-            if value is None:
-                carry = self._substitute(now)
-            elif self._is_due(value, now):
-                carry = Carry(value, self.rule.stale - source.age)
-        self.writing = carry
-        return carry
+        value = self._note_age(source, now)
+        if self.writing is not None or now < self._not_before:
+            return None
+        if value is None:
+            self.writing = self._substitute(now)
+        elif self._is_due(value, now):
+            self.writing = Carry(value, self.rule.stale - source.age)
+        return self.writing
 
     def _note_age(self, source: Reading, now: float) -> Value | None:
         """Returns the value if it may be carried."""

@@ -97,6 +97,7 @@ def _metrics(documents: Documents, plant: Plant, *, ready: bool) -> Iterator[Met
     yield from _writes(documents["outcomes"])
     for name, field, text in _ZENOH:
         yield _one(name, text, {}, documents["zenoh"].get(field, 0))
+    yield from _transfers(documents)
     alarms = _family("alarms", "Alarms by state", "state")
     for state, count in documents["alarms"].items():
         alarms.add_metric([state], count)
@@ -150,6 +151,20 @@ def _devices(documents: Documents, plant: Plant) -> Iterator[Metric]:
                 family.add_metric(place, document[field])
         yield family
     yield _qualities(plant, line_of)
+
+
+def _transfers(documents: Documents) -> Iterator[Metric]:
+    rows = [*below("transfers/", documents)]
+    labels = ("transfer", "from", "to")
+    works = _family("transfer_works", "1: the last value was carried", *labels)
+    ends = _family("transfer_writes_total", "Writes of transfers by outcome", *labels, "outcome")
+    for number, document in rows:
+        place = [number, document["from"], document["to"]]
+        works.add_metric(place, document["state"] == "carried")
+        for outcome in ("carried", "not_done", "refused", "unclear"):
+            ends.add_metric([*place, outcome], document[outcome])
+    if rows:
+        yield from (works, ends)
 
 
 def _qualities(plant: Plant, line_of: Mapping[str, str]) -> Metric:
