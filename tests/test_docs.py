@@ -136,6 +136,7 @@ def test_every_page_with_files_is_checked() -> None:
     assert set(counted) == {
         *("/README.md", "configuration.md", "vigor.md", "computer-link.md", "modbus.md"),
         *("first-plant.md", "import.md", "peek.md", "serve.md", "shaping.md", "systems.md"),
+        "transfers.md",
         *("templates.md", "trace.md", "alarms.md"),
         *("tutorial-computer-link.md", "tutorial-modbus.md", "tutorial-vigor.md"),
     }
@@ -208,6 +209,8 @@ def settings(heading: str) -> dict[str, str]:
     page = "configuration-protocols.md" if heading in PROTOCOLS else "configuration.md"
     if heading in ("alarm", "alarms"):
         page = "alarms.md"
+    if heading == "Settings":
+        page = "transfers.md"
     rows = table(page, heading, "setting")
     if heading == "A tag":
         rows += table("shaping.md", "Settings", "setting")
@@ -238,7 +241,7 @@ def properties(*names: str) -> set[str]:
     [
         *(("gateway", "GatewaySection"), ("zenoh", "ZenohSection"), ("tls", "TlsSection")),
         *(("writers", "WritersSection"), ("history", "HistorySection")),
-        *(("alarm", "AlarmSection"), ("alarms", "AlarmsSection")),
+        *(("alarm", "AlarmSection"), ("alarms", "AlarmsSection"), ("Settings", "Transfer")),
         *(("web", "WebSection"), ("A line", "Line"), ("A tag", "Tag"), ("write", "WriteSection")),
     ],
 )
@@ -530,6 +533,7 @@ def _example_keys() -> set[str]:
             keys.status("alarms"),
             keys.alarm("**"),
             keys.status("status"),
+            keys.status("transfers/1"),
             keys.writes,
             keys.page,
         ),

@@ -1,6 +1,6 @@
 """The settings of one row of `transfers:`: docs/transfers.md."""
 
-from typing import Annotated, Any, Literal, NamedTuple, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, Field, PlainValidator, WithJsonSchema, model_validator
 
@@ -24,18 +24,13 @@ _IF_STALE_SCHEMA: dict[str, Any] = {
 }
 
 
-class IfStale(NamedTuple):
-    """The value that is written when the source is too old; None: nothing is written."""
-
-    write: Value | None = None
-
-
-def _if_stale(value: object) -> IfStale:
-    if value == "skip" or isinstance(value, IfStale):
-        return value if isinstance(value, IfStale) else IfStale()
+def _if_stale(value: object) -> Value | None:
+    """Returns the value to write; None: nothing is written."""
+    if value is None or value == "skip":
+        return None
     match value:
         case {"write": bool() | int() | float() | str() | list() as known, **rest} if not rest:
-            return IfStale(known)  # type: ignore[arg-type]  # the target checks the elements
+            return known  # type: ignore[return-value]  # the target checks the elements
     raise ConfigError(f"{shown(value)}: write skip, or {{write: 0}} with the value to write")
 
 
@@ -56,9 +51,9 @@ class TransferSection(Section):
     """carried value = value of the source x scale + offset"""
     stale: Interval | None = None
     """A value whose last read is older is not carried; left out: 5s, or three intervals of it."""
-    if_stale: Annotated[IfStale, PlainValidator(_if_stale), WithJsonSchema(_IF_STALE_SCHEMA)] = (
-        IfStale()
-    )
+    if_stale: Annotated[
+        Value | None, PlainValidator(_if_stale), WithJsonSchema(_IF_STALE_SCHEMA)
+    ] = None
     """The source is too old: skip writes nothing, {write: 0} writes this value once."""
 
     @model_validator(mode="after")

@@ -62,7 +62,7 @@ class TransferRows:
             scale=own.scale,
             offset=own.offset,
             stale=own.stale or max(SHORTEST_STALE, INTERVALS * source.every),
-            substitute=own.if_stale.write,
+            substitute=own.if_stale,
         )
 
     def _check_loops(self, rows: Sequence[tuple[TransferRule, Tag, Tag]]) -> None:
@@ -148,9 +148,9 @@ def _misfits(own: TransferSection, source: Tag, target: Tag) -> Iterator[tuple[s
         read = f"{source.key} is read every {source.every:g} s: it would always be too old"
         longer = f"stale: {INTERVALS * source.every:g}s"
         yield "stale", f"{read}; write {longer}, or a shorter `every` at that tag"
-    if own.if_stale.write is not None:
+    if own.if_stale is not None:
         try:
-            target.encode(own.if_stale.write)
+            target.encode(own.if_stale)
         except BadValue as error:
             yield "if_stale.write", f"{target.key} cannot take it: {error}"
 

@@ -154,6 +154,14 @@ def test_after_an_unclear_write_the_value_before_is_a_change() -> None:
     assert carried(one, 4, 3.0) is not None
 
 
+def test_an_unclear_value_that_was_left_and_came_back_is_carried() -> None:
+    one = row()
+    assert carried(one, 5, 1.0) is not None
+    assert [carried(one, value, 1.5) for value in (6, 5)] == [None, None]
+    one.ended(UNCLEAR, 2.0)
+    assert one.next(good(5), 2.0) == Carry(5, within=5.0)
+
+
 def test_a_refused_write_is_not_repeated_until_the_next_change() -> None:
     one = row()
     assert carried(one, 500, 1.0) is not None
