@@ -161,9 +161,9 @@ async def _serve(
             await _first(active, *ends)
             if active.done():
                 supervisor.says(reloader.says)
+                transfers.start()  # before the alarms are restored: it has some
                 await cleanup.enter_async_context(alarm_file.kept())
                 await _start_lines(gateway, plans, running, history, state_file, cleanup)
-                transfers.start()
                 cleanup.push_async_callback(transfers.stop)  # before the lines
                 cleanup.push_async_callback(_end, [reload])  # before the lines: it starts some
         await _first(opened, *ends)
