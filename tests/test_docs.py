@@ -137,7 +137,7 @@ def test_every_page_with_files_is_checked() -> None:
         *("/README.md", "configuration.md", "vigor.md", "computer-link.md", "modbus.md"),
         *("first-plant.md", "import.md", "peek.md", "serve.md", "shaping.md", "systems.md"),
         "transfers.md",
-        *("templates.md", "trace.md", "alarms.md"),
+        *("templates.md", "trace.md", "alarms.md", "arrays.md"),
         *("tutorial-computer-link.md", "tutorial-modbus.md", "tutorial-vigor.md"),
     }
     assert sum(counted.values()) >= 11

@@ -19,6 +19,7 @@ TAGS = {
     "limit": {"address": "holding:1", "write": {"max": 50}, "retain": True},
     "name": {"address": "holding:10", "type": "string[4]", "write": True},
     "order": {"address": "holding:100"},
+    "steps": {"address": "holding:20", "type": "int16[3]", "write": True, "retain": True},
 }
 
 
@@ -39,9 +40,11 @@ async def test_a_held_value_is_on_the_disk_before_it_is_acknowledged(tmp_path: P
     first = gateway(tmp_path)
     assert (await first.write(tag(first, "limit"), 42)).value == 42
     assert (await first.write(tag(first, "name"), "AB")).value == "AB"
+    assert (await first.write(tag(first, "steps"), (1, -2, 3))).value == (1, -2, 3)
     again = gateway(tmp_path)
     again.serving.restore()
     assert again.sample(tag(again, "limit")).value == 42
+    assert again.sample(tag(again, "steps")).value == (1, -2, 3)
     assert again.sample(tag(again, "name")).quality is Quality.BAD  # without `retain`
 
 

@@ -1,0 +1,25 @@
+"""The outcomes of several writes that were submitted together."""
+
+import asyncio
+from collections.abc import Sequence
+
+from gateway.errors import GatewayError, Unclear
+from gateway.tags import WriteResult
+
+
+async def ended(
+    writes: Sequence[asyncio.Future[WriteResult]], patience: float
+) -> list[WriteResult | GatewayError]:
+    """Returns the outcomes of `write_group`. What has not ended after `patience` seconds is
+    `Unclear`."""
+    await asyncio.wait(writes, timeout=patience)
+    found = list[WriteResult | GatewayError]()
+    for write in writes:
+        try:
+            found.append(write.result())
+        except asyncio.InvalidStateError:
+            write.cancel()
+            found.append(Unclear(f"not acknowledged within {patience:g} s: it may yet be done"))
+        except GatewayError as error:
+            found.append(error)
+    return found
