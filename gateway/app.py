@@ -265,6 +265,11 @@ class Gateway:
     def tag(self, key: str) -> Tag | None:
         return self._tags.get(key)
 
+    def target(self, key: str) -> Tag | None:
+        """Finds a tag that a transfer writes: also one that no client sees."""
+        others = (tag for device in self._devices for tag in device.targets)
+        return self._tags.get(key) or next((tag for tag in others if tag.key == key), None)
+
     def sample(self, tag: Tag) -> Sample:
         try:
             return self.mirror[tag]
@@ -289,7 +294,9 @@ class Gateway:
         Raises `BadValue` before anything is sent, otherwise a `GatewayError`.
         """
         if self._tags.get(tag.key) is not tag:  # its scale or limits may be others now
-            raise Busy(f"the file was reloaded, and {tag.key} with it; not sent")
+            place = self._places.get(tag.device)
+            if place is None or tag not in place[1].settings.targets:
+                raise Busy(f"the file was reloaded, and {tag.key} with it; not sent")
         if self.serving.holds(tag):
             return await self.serving.write(tag, value)
         if tag.device not in self._places:

@@ -68,6 +68,7 @@ class Builder:
     imports: Mapping[str, FilePath] = field(default_factory=dict)  # one more sheet of a device
     _devices: dict[str, str] = field(default_factory=dict)  # name -> its line
     _count: int = 0  # devices in the file
+    _intervals: dict[str, float] = field(default_factory=dict)  # by device: the default
     _tags: DeviceTags = field(init=False)
     _sheets: SheetTags = field(init=False)
 
@@ -94,7 +95,8 @@ class Builder:
         if top is not None and top.gateway.standby is not None:
             check_totals(lines, self.mistakes)
         check_sources(lines, self.mistakes)
-        transfers = TransferRows(lines, self.mistakes).build(data.get("transfers"))
+        rows = TransferRows(lines, self._intervals, self.mistakes)
+        lines, transfers = rows.build(data.get("transfers"))
         if top is None:
             return None
         check_retained(lines, self._state_file(top), top.gateway.standby, self.mistakes)
@@ -169,6 +171,7 @@ class Builder:
         driver = self._driver(raw.get("protocol"), own, path)
         defaults = self._defaults(raw, path, outer)
         real, driver = driver, ServedView(driver) if serve and driver is not None else driver
+        self._intervals[name] = defaults.every
         tags = self._tags.build(name, raw.get("tags"), (*path, "tags"), defaults, driver)
         sheets = len(self._sheets.used)
         own_sheet = None if settings is None else settings.tags_from

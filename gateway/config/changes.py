@@ -180,7 +180,8 @@ def _change(old: DeviceSettings | None, new: DeviceSettings, *, same: bool) -> D
     """Compares one device, without its computed tags. `same`: it was on this line."""
     if old is None or not same:
         return DeviceChange(old, new)
-    known = {tag.name: tag for tag in old.wire_tags}
+    known = {tag.name: tag for tag in (*old.wire_tags, *old.targets)}
+    new = replace(new, targets=tuple(_equal(known.get(tag.name), tag) for tag in new.targets))
     tags = tuple(_equal(known.get(tag.name), tag) for tag in new.wire_tags)
     others = tuple(tag for tag in new.tags if tag.formula is not None)
     if tags == old.wire_tags and replace(new, tags=()) == replace(old, tags=()):
@@ -188,7 +189,8 @@ def _change(old: DeviceSettings | None, new: DeviceSettings, *, same: bool) -> D
     if not (old.enabled and new.enabled and _is_one_station(old, new)):
         # No value goes on, so no tag does.
         tags = tuple(tag.copy(tag.device, tag.name) for tag in tags)
-        return DeviceChange(old, replace(new, tags=(*tags, *others)))
+        targets = tuple(tag.copy(tag.device, tag.name) for tag in new.targets)
+        return DeviceChange(old, replace(new, tags=(*tags, *others), targets=targets))
     renewed = {
         before: tag
         for tag in tags

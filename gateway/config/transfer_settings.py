@@ -29,9 +29,15 @@ def _if_stale(value: object) -> Value | None:
     if value is None or value == "skip":
         return None
     match value:
-        case {"write": bool() | int() | float() | str() | list() as known, **rest} if not rest:
-            return known  # type: ignore[return-value]  # the target checks the elements
+        case {"write": bool() | int() | float() | str() as known, **rest} if not rest:
+            return known
+        case {"write": list() as values, **rest} if not rest and all(map(_is_scalar, values)):
+            return tuple(values)
     raise ConfigError(f"{shown(value)}: write skip, or {{write: 0}} with the value to write")
+
+
+def _is_scalar(value: object) -> bool:
+    return isinstance(value, (bool, int, float, str))
 
 
 class TransferSection(Section):

@@ -1,9 +1,20 @@
 """The rule of a transfer, as the file describes it: which value is written where, and when."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
+from gateway.numerals import Scalar
 from gateway.tags.scaling import linear, scaled, scaled_float
+from gateway.tags.tag import Tag
 from gateway.values import Value
+
+
+def leaves(tag: Tag) -> Iterator[Tag]:
+    """Yields the tags with addresses that a value comes from: itself, or its inputs."""
+    if not tag.inputs:
+        yield tag
+    for one in tag.inputs:
+        yield from leaves(one)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,10 +45,20 @@ class TransferRule:
 
         `whole`: the target takes whole numbers only, so that the value is rounded.
         """
+        if not isinstance(known, tuple):
+            return self._one(known, whole=whole)
+        found = [self._one(one, whole=whole) for one in known]
+        values = tuple(one for one in found if one is not None)
+        return values if len(values) == len(found) else None
+
+    def _one(self, known: Scalar, *, whole: bool) -> Scalar | None:
         if isinstance(known, (bool, str)):
             return known
-        line = linear(self.scale, self.offset)
-        carried: float | None = known
+        line, carried = linear(self.scale, self.offset), known
         if line is not None:
-            carried = (scaled_float if isinstance(known, float) else scaled)(line)(known)  # type: ignore[arg-type]  # as the value is
-        return round(carried) if whole and carried is not None else carried
+            to = scaled_float(line) if isinstance(known, float) else scaled(line)
+            found = to(known)  # type: ignore[arg-type]  # whole numbers are whole
+            if found is None:
+                return None
+            carried = found
+        return round(carried) if whole else carried

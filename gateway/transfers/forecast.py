@@ -1,13 +1,12 @@
 """Calculates what the transfers cost their lines, and how old a carried value can be."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from gateway.config import Config
 from gateway.engine.device import Device
 from gateway.engine.forecast import LineForecast, TimedWrites, write_seconds
-from gateway.tags import Tag
-from gateway.tags.transfer import TransferRule
+from gateway.tags.transfer import TransferRule, leaves
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,8 +28,8 @@ def transfer_forecasts(config: Config, lines: Sequence[LineForecast]) -> list[Tr
     """Returns the rows of the file. `lines`: all polled lines."""
     if not config.transfers:
         return []
-    tags = {tag.key: tag for device in config.devices for tag in device.tags}
-    ages = {tag: row.worst_age for line in lines for row in line.blocks for tag in row.block.tags}
+    tags = {tag.key: tag for one in config.devices for tag in (*one.tags, *one.targets)}
+    polls = {tag: row for line in lines for row in line.blocks for tag in row.block.tags}
     latest = {line.name: line.worst_write for line in lines}
     places = {
         device.name: (line.name, Device(device, line.wire, plan_now=False))
@@ -44,10 +43,13 @@ def transfer_forecasts(config: Config, lines: Sequence[LineForecast]) -> list[Tr
         source, target = tags[rule.source], tags[rule.target]
         line, device = places.get(target.device, ("", None))
         seconds = 0.0 if device is None else write_seconds(device, target)
-        age = _age(source, ages)
-        if age is not None:
+        read = [polls[one] for one in leaves(source) if one in polls]
+        age = None
+        if read:
+            age = max(row.worst_age for row in read)
             age += (rule.every or 0.0) + latest.get(line, 0.0)
-        often = 1 / (rule.every or source.every)  # at most: it changes with each read
+        changes = min((row.block.every for row in read), default=source.every)
+        often = 1 / (rule.every or changes)  # at most: it changes with each read
         found.append(TransferForecast(rule, line, TimedWrites(often, seconds), age))
     return found
 
@@ -59,10 +61,3 @@ def with_transfers(
     return [
         line.with_writes([row.writes for row in rows if row.line == line.name]) for line in lines
     ]
-
-
-def _age(tag: Tag, ages: Mapping[Tag, float]) -> float | None:
-    if not tag.inputs:
-        return ages.get(tag)
-    found = [_age(one, ages) for one in tag.inputs]
-    return max((age for age in found if age is not None), default=None)

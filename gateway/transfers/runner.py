@@ -34,6 +34,9 @@ class Plant(Protocol):
 
     def tag(self, key: str) -> Tag | None: ...
 
+    def target(self, key: str) -> Tag | None:
+        """Finds a tag to be written: also one that is never read."""
+
     def sample(self, tag: Tag) -> Sample: ...
 
     def age(self, tag: Tag) -> float:
@@ -109,7 +112,7 @@ class Transfers:
             self._plant.drop_document(f"{FOLDER}/{one.rule.number}")
         before, self._running, self._by_source = self._running, [], {}
         for rule in rules:
-            source, target = self._plant.tag(rule.source), self._plant.tag(rule.target)
+            source, target = self._plant.tag(rule.source), self._plant.target(rule.target)
             if source is None or target is None:
                 continue  # of a device that another gateway serves
             known = next(

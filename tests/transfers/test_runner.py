@@ -155,6 +155,39 @@ async def test_the_age_of_a_value_counts_from_its_last_read() -> None:
         assert made.row(1)["why"] == "the last read of a/n is older than 3 s"
 
 
+@on_virtual_time
+async def test_a_range_is_carried_as_a_whole_and_goes_on_over_a_reload() -> None:
+    range_row = {"from": "a:D10..D12", "to": "b:D30..D32"}
+    async with rig(range_row, {"from": "a:M0..M2", "to": "b:M5..M7", "every": "1s"}) as made:
+        await made.put(7)
+        gateway = made.plant.gateway
+        words = [value for _, key, value, _ in made.written if "D30" in key]
+        assert words[-1][:1] == (7,)  # type: ignore[index]  # it is a tuple
+        assert len(words[-1]) == 3  # type: ignore[arg-type]
+        peeked = await gateway.peek("b", "D30..D32")
+        assert tuple(peeked.units) == words[-1]
+        assert made.row(2)["carried"] > 4
+        assert "b/ranges/to/D30..D32" not in {s.tag.key for s in made.plant.published}
+        count, before = made.row(1)["carried"], gateway.target("b/ranges/to/D30..D32")
+
+        def describe(data: Data) -> None:
+            data["lines"]["yard"]["devices"]["b"]["tags"]["n"]["description"] = "a copy"
+            data["transfers"].append(row())
+
+        await made.reload(describe)
+        assert gateway.target("b/ranges/to/D30..D32") is before
+        assert made.row(1)["carried"] > count
+        assert made.row(3)["carried"] == 1
+        await made.put(8)
+
+        def move(data: Data) -> None:
+            data["transfers"][0]["to"] = "b:D40..D42"
+
+        await made.reload(move)
+        assert made.row(1)["carried"] < count
+        assert tuple((await gateway.peek("b", "D40..D42")).units)[:1] == (8,)
+
+
 def own(plant: Any) -> tuple[OwnWrites, list[dict[str, Any]]]:
     outcomes: list[dict[str, Any]] = []
     audit = Audit(lambda data: outcomes.append(orjson.loads(data)))
