@@ -4,7 +4,7 @@ import asyncio
 import json
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -44,14 +44,7 @@ def write(
     loaded = load(config)
     known = tags_by_key(loaded)
     if any(device.name == tag for device in loaded.devices):
-        names = [value.partition("=")[0] for value in values]
-        group = {}
-        for name, text in zip(names, values, strict=True):
-            if "=" not in text:
-                raise ConfigError(f"{text} is no tag=value, as in {tag} recipe/a=1 recipe/b=2")
-            if names.count(name) > 1:
-                raise ConfigError(f"{name} is named twice")
-            group[name] = _value(config, known, f"{tag}/{name}", text.partition("=")[2])
+        group = _group(config, known, tag, values)
         answer = _write_group(loaded, tag, group, known, directly=without_gateway)
         lines = _group_lines(tag, answer)
     else:
@@ -71,6 +64,27 @@ def write(
                 print(outcome(key, end, held=key.partition("/")[0] in served))
     if "error" in answer:
         sys.exit(error_code(answer))
+
+
+def _group(
+    config: Path, known: Mapping[str, Tag], device: str, texts: Sequence[str]
+) -> dict[str, Value]:
+    """Returns the values by tag. Raises `ConfigError` with every mistake."""
+    group, mistakes = dict[str, Value](), list[str]()
+    for text in texts:
+        name, is_pair, value = text.partition("=")
+        if not is_pair:
+            mistakes.append(f"{text} is no tag=value, as in {device} recipe/a=1 recipe/b=2")
+        elif name in group:
+            mistakes.append(f"{device}/{name} is named twice")
+        else:
+            try:
+                group[name] = _value(config, known, f"{device}/{name}", value)
+            except (ConfigError, BadValue) as error:
+                mistakes.append(str(error))
+    if mistakes:
+        raise ConfigError("\n".join(mistakes))
+    return group
 
 
 def _value(config: Path, known: Mapping[str, Tag], name: str, text: str) -> Value:

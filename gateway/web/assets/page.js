@@ -7,7 +7,7 @@ const LATE = 3000; // ms that an event may be later than the fastest one
 const SLEPT = 10000; // ms in which this program did not run
 const SHOWN = 200; // rows of devices
 const WINDOW = 10000; // ms of the wire
-const LONGEST_SHOWN = 120; // characters of a value
+const LONGEST_LIST = 200; // characters of an array that are shown
 
 const known = { devices: new Map(), lines: [], loads: new Map(), exchanges: [], tags: new Map() };
 let token = "";
@@ -356,7 +356,7 @@ async function showTags() {
     const title = element("th", name);
     title.scope = "row";
     title.title = [tag.description, tag.type, tag.address].filter(Boolean).join(", ");
-    const cells = [element("td", "", "number value"), element("td", tag.unit), element("td"), element("td", "", "number"), element("td")];
+    const cells = [element("td", "", tag.length ? "value" : "number value"), element("td", tag.unit), element("td"), element("td", "", "number"), element("td")];
     if (tag.history && !tag.length) { // a list has no line
       const button = element("button", "trend", "link");
       button.type = "button";
@@ -367,7 +367,7 @@ async function showTags() {
     row.append(title, ...cells);
     byId("values").append(row);
     const { last } = known.tags.get(name) ?? {}; // its value may have come before its row
-    known.tags.set(name, { cells, last });
+    known.tags.set(name, { cells, last, isList: Boolean(tag.length) });
     if (last) showValue(last);
   }
 }
@@ -385,8 +385,8 @@ function showValue(last) {
   tag.last = last;
   if (!tag.cells) return;
   const text = last[2] ? last[1] : "–";
-  const isLong = text.length > LONGEST_SHOWN; // an array
-  tag.cells[0].textContent = isLong ? `${text.slice(0, LONGEST_SHOWN)}…` : text;
+  const isLong = tag.isList && text.length > LONGEST_LIST;
+  tag.cells[0].textContent = isLong ? `${text.slice(0, text.lastIndexOf(",", LONGEST_LIST) + 1)} …` : text;
   tag.cells[0].title = isLong ? text : "";
   showQuality(tag);
 }
