@@ -236,7 +236,7 @@ class Gateway:
             self.alarms.judge(samples)
         if self.serving.remembering:
             self.serving.remember(samples)
-        if self._on_demand.arrived and type(samples) is not Scan:
+        if self._on_demand.arrived:
             self._on_demand.note(samples)
         if self._on_demand.waiting:
             self._on_demand.answer_all(samples)

@@ -10,6 +10,7 @@ from gateway.engine.jobs import Poll
 from gateway.errors import Busy
 from gateway.line.line import Line
 from gateway.tags import Quality, Sample, Tag
+from gateway.tags.scan import Scan
 
 FRESH_WITHIN = 5.0  # seconds that a client waits for a read on demand
 
@@ -68,9 +69,10 @@ class OnDemand:
     def note(self, samples: Sequence[Sample]) -> None:
         """Notes when values arrived that no poll reads."""
         now = asyncio.get_running_loop().time()
-        for sample in samples:
-            if sample.tag in self.arrived:
-                self.arrived[sample.tag] = now
+        tags = samples.tags if type(samples) is Scan else [sample.tag for sample in samples]
+        for tag in tags:
+            if tag in self.arrived:
+                self.arrived[tag] = now
 
     async def fresh(self, tag: Tag, max_age: float) -> Sample:
         """Returns the last sample if it `is_fresh`, otherwise that of the next read.

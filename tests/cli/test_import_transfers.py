@@ -69,7 +69,7 @@ def test_without_a_file_the_rows_are_printed(
         (LINK, PLC, "", "plc", "has no device with station 5 or 2"),
         (LINK, VIGOR, "transfers: []\n", "plc", "has `transfers:` already"),
         ("Name,Address\na,D1\n", VIGOR, "", "plc", "is no communication table"),
-        (LINK.replace("D0", "Q0"), VIGOR, "", "plc", "'Q0"),
+        (LINK.replace("D0", "Q0"), VIGOR, "", "plc", "Q0: there is no device Q"),
     ],
 )
 def test_a_mistake_changes_nothing(

@@ -11,14 +11,18 @@ import pytest
 
 from gateway.errors import Busy, Unclear
 from gateway.line.duty import Duty
+from gateway.line.on_demand import OnDemand
 from gateway.northbound.audit import Audit
 from gateway.northbound.keys import Keys
 from gateway.northbound.own_writes import OwnWrites
-from gateway.tags import Tag, WriteResult
+from gateway.tags import Tag, WriteResult, good
+from gateway.tags.mirror import Mirror
+from gateway.tags.scan import Decoder
 from gateway.transfers import Transfers
 from gateway.values import Value
 from tests.northbound.plant import mixer
 from tests.reload.plant import Data, Plant, file, running, vigor
+from tests.sim.plant import make_tag
 from tests.sim.virtual import now, on_virtual_time
 
 SOURCE = {"n": {"address": "D10", "write": True}}
@@ -186,6 +190,23 @@ async def test_a_range_is_carried_as_a_whole_and_goes_on_over_a_reload() -> None
         await made.reload(move)
         assert made.row(1)["carried"] < count
         assert tuple((await gateway.peek("b", "D40..D42")).units)[:1] == (8,)
+
+
+@on_virtual_time
+async def test_the_age_of_a_value_that_no_poll_reads_counts_from_its_arrival() -> None:
+    tags = [make_tag(f"D{number}") for number in (1, 2)]
+    on_demand = OnDemand(lambda device: None, Mirror(tags, 0).__getitem__)
+    assert on_demand.age(tags[0]) == float("inf")
+    await asyncio.sleep(1)
+    decoder = Decoder(tags, range(2))
+    scan = decoder.first([7, 8], 1)  # as the line that only listens makes it
+    on_demand.note(scan)
+    await asyncio.sleep(2)
+    assert on_demand.age(tags[0]) == pytest.approx(2)
+    on_demand.note([good(tags[0], 9, 2)])  # as a frame or a master makes it
+    await asyncio.sleep(3)
+    assert on_demand.age(tags[0]) == pytest.approx(3)
+    assert on_demand.age(tags[1]) == float("inf")  # nothing asked for it before
 
 
 def own(plant: Any) -> tuple[OwnWrites, list[dict[str, Any]]]:
