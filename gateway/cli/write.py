@@ -33,7 +33,7 @@ def write(
     values: Annotated[
         list[str],
         typer.Argument(
-            metavar="VALUE...",
+            metavar="VALUE",
             help="JSON: true, 12.5, AB; on and off for bits. Of a device: tag=value ...",
         ),
     ],

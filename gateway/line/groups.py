@@ -12,13 +12,17 @@ async def ended(
 ) -> list[WriteResult | GatewayError]:
     """Returns the outcomes of `write_group`. What has not ended after `patience` seconds is
     `Unclear`."""
-    await asyncio.wait(writes, timeout=patience)
+    try:
+        await asyncio.wait(writes, timeout=patience)
+    finally:
+        for write in writes:
+            if not write.cancel() and not write.cancelled():
+                write.exception()  # seen, also if nothing waits for it any more
     found = list[WriteResult | GatewayError]()
     for write in writes:
         try:
             found.append(write.result())
-        except asyncio.InvalidStateError:
-            write.cancel()
+        except asyncio.CancelledError:
             found.append(Unclear(f"not acknowledged within {patience:g} s: it may yet be done"))
         except GatewayError as error:
             found.append(error)

@@ -31,6 +31,7 @@ from gateway.tags.timestamps import rfc3339
 from gateway.values import Value
 
 LONGEST_REASON = 300
+LOGGED_ELEMENTS = 128  # of a longer array the record has the beginning, as text
 _GOOD = Quality.GOOD  # looking up a member of an enumeration takes 0.2 µs
 
 
@@ -268,7 +269,8 @@ def _result(result: WriteResult | Failure) -> dict[str, Value | None]:
 def loggable(requested: Value | None) -> Scalar | list[Scalar] | None:
     """Limits a requested value to a printable size; orjson writes at most 64 bits."""
     if isinstance(requested, tuple):
-        return list(map(_loggable, requested))
+        found = list(map(_loggable, requested))
+        return found if len(found) <= LOGGED_ELEMENTS else short(orjson.dumps(found).decode())
     return None if requested is None else _loggable(requested)
 
 

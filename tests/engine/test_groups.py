@@ -371,6 +371,52 @@ async def test_a_long_write_that_breaks_off_accounts_for_every_address(
         assert [data[3] for data in writes(line, asked)] == list(range(100, at + 1, 4))
 
 
+def bits() -> tuple[Plant, Device]:
+    """200 points of a PLC that takes 160 in one request, and acknowledges all writes alike."""
+    driver = ComputerLink(station=5, profile="fx")
+    made = link_device(driver, "M0", type="bool[200]", write=RULE, every=60.0)
+    return link_plant([made]), made
+
+
+@on_virtual_time
+async def test_between_the_requests_of_a_long_write_a_resync_tells_their_replies_apart() -> None:
+    line, dev = bits()
+    value = tuple(n % 3 == 0 for n in range(200))
+    async with running(line):
+        await asyncio.sleep(3)
+        asked = now()
+        outcome = line.submit(dev, dev.tags[0], value)
+        await asyncio.sleep(2)
+        assert outcome.once.value == value
+        assert line.stations[0].memory.read("M", 0, 200) == [int(bit) for bit in value]
+        assert commands(line.stations[0], asked)[:4] == ["WW", "TT", "BW", "TT"]
+
+
+@on_virtual_time
+async def test_an_acknowledgement_that_comes_twice_acknowledges_no_second_request() -> None:
+    """The second request is lost, and the copy of the first reply looks like its reply."""
+    line, dev = bits()
+    station = line.stations[0]
+
+    def twice(data: bytes) -> list[bytes] | None:
+        if data[5:7] == b"BW":
+            return []
+        return None if data[5:7] != b"WW" else [b"\x0605FF", b"\x0605FF"]
+
+    async with running(line):
+        await asyncio.sleep(3)
+        asked = now()
+        intercept(station, twice)
+        outcome = line.submit(dev, dev.tags[0], (True,) * 200)
+        await asyncio.sleep(4)
+        assert isinstance(outcome.once, Unclear)
+        assert str(outcome.once).startswith(
+            "M0..M159 (elements 0 to 159) is unknown, M160..M199 (elements 160 to 199) was not "
+            "sent: two replies arrived"
+        )
+        assert "BW" not in commands(station, asked)
+
+
 def exception(function: int, code: int) -> bytes:
     """An exception reply of slave 1, with its CRC."""
     data = bytes([1, 0x80 | function, code])

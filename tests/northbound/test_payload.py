@@ -147,6 +147,8 @@ def test_a_write_of_an_array_is_a_list(sent: bytes) -> None:
 
 def test_the_audit_of_a_list_has_a_printable_size() -> None:
     assert payload.loggable((2**70, 1.5)) == ["1180591620717411303424", 1.5]
+    assert payload.loggable((1,) * 128) == [1] * 128
+    assert payload.loggable((True,) * 129) == f"[{'true,' * 59}true…"
 
 
 @pytest.mark.parametrize(
