@@ -15,6 +15,7 @@ from gateway.errors import (
     Offline,
     Refusal,
     Refused,
+    Superseded,
 )
 from gateway.tags import Reason
 
@@ -79,7 +80,7 @@ def outcome_of(error: GatewayError) -> Outcome:
     """Returns the end of a write that failed."""
     why = str(error) or type(error).__name__
     match error:
-        case BadValue():
+        case BadValue() | Superseded():
             return Outcome(End.REFUSED, None, why)
         case Refused(refusal=refusal) if refusal in _AGAIN:
             return Outcome(End.NOT_DONE, Code.ABNORMAL, why)

@@ -15,6 +15,7 @@ from gateway.errors import (
     Offline,
     Refusal,
     Refused,
+    Superseded,
     Unclear,
 )
 from gateway.tags import Reason
@@ -240,6 +241,7 @@ def test_a_source_that_is_young_again_needs_no_substitute() -> None:
     ("error", "end", "code"),
     [
         (Busy("5 s"), End.NOT_DONE, Code.ABNORMAL),
+        (Superseded("a newer value took its place"), End.REFUSED, None),
         (Offline("silent"), End.NOT_DONE, Code.NO_RESPONSE),
         (LineDown("unplugged"), End.NOT_DONE, Code.ABNORMAL),
         (Refused("busy", code="06", refusal=Refusal.BUSY), End.NOT_DONE, Code.ABNORMAL),
