@@ -9,6 +9,7 @@ from gateway.engine.jobs import (
     Answer,
     Confirm,
     HeldTogether,
+    Poll,
     ReadBack,
     Repeat,
     RequestJob,
@@ -29,6 +30,7 @@ from gateway.protocols.driver import Span
 from gateway.tags import Tag
 
 BROADCAST_PAUSE = 0.1  # seconds
+_SHOWN = 3  # elements of an array that differ
 STOPPED = "the gateway stopped before the acknowledgement arrived; it may be done"
 
 
@@ -246,7 +248,7 @@ class RequestResults:
             if request.group is not None and isinstance(outcome, GatewayError):
                 self._end_group(request.group, request.tag)
             poll = self._schedule.reader(request.device, request.tag)
-            if poll is not None:
+            if poll is not None and (request.group is None or not self._more(request.group, poll)):
                 self._schedule.expedite(poll)  # the client sees the new value soon
 
     def _end_group(self, group: Group, failed: Tag) -> None:
@@ -254,6 +256,18 @@ class RequestResults:
         group.failed = group.failed or failed.name
         for waiting in self._schedule.requests.of_group(group):
             self._effects.ended(waiting, after_failed(group))
+            poll = self._schedule.reader(waiting.device, waiting.tag)
+            if poll is not None:
+                self._schedule.expedite(poll)  # it has tags that were written before
+
+    def _more(self, group: Group, poll: Poll) -> bool:
+        """Returns True if tags of the poll are still to be written: one poll shows them all."""
+        schedule = self._schedule
+        return any(
+            schedule.reader(poll.device, write.tag) is poll
+            for write in schedule.requests.waiting
+            if isinstance(write, Write) and write.group is group
+        )
 
 
 def _outcome(
@@ -265,5 +279,15 @@ def _outcome(
     if sent.refused_back is not None and verified(write.tag):
         return Differs(f"acknowledged, but reading back was refused: {sent.refused_back}")
     if held is not None and not write.holds(held):
-        return Differs(f"acknowledged, but the device now holds {write.tag.decode(held)!r}")
+        return Differs(f"acknowledged, but the device now holds {_differing(write, held)}")
     return write.result(now, time, verified=held is not None)
+
+
+def _differing(write: Write, held: Sequence[int]) -> str:
+    """Names the value that was read back; of an array the elements that are others."""
+    wanted, found = write.value, write.tag.decode(held)
+    if not isinstance(wanted, tuple) or not isinstance(found, tuple):
+        return repr(found)
+    others = [n for n, (one, other) in enumerate(zip(wanted, found, strict=True)) if one != other]
+    shown = ", ".join(f"{found[n]!r} in element {n}" for n in others[:_SHOWN])
+    return shown + (f" and {len(others) - _SHOWN} more" if len(others) > _SHOWN else "")

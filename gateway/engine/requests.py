@@ -249,9 +249,13 @@ class RequestQueue:
         """Takes out all waiting requests, or those to one device."""
         return self._out(lambda request: device is None or request.device is device)
 
-    def of_group(self, group: Group) -> list[Request]:
+    def of_group(self, group: Group) -> list[Write]:
         """Takes out the waiting writes of a group."""
-        return self._out(lambda request: isinstance(request, Write) and request.group is group)
+        found = [one for one in self.waiting if isinstance(one, Write) and one.group is group]
+        if found:
+            members = set(found)
+            self._out(lambda request: request in members)
+        return found
 
     def has_room(self, count: int) -> bool:
         return len(self.waiting) + count <= MOST_WAITING

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from gateway.engine.device import Device
+from gateway.engine.requests import MOST_WAITING, Group, Write
 from gateway.errors import Busy, NotSent, Refused, Unclear
 from gateway.protocols.checksums import crc16
 from gateway.protocols.computer_link import ComputerLink
@@ -15,6 +16,7 @@ from gateway.protocols.modbus import ModbusRtu
 from gateway.tags import Tag, WriteResult, WriteRule
 from gateway.values import Value
 from tests.engine.misbehaving import intercept
+from tests.engine.rig import Rig
 from tests.line.slaves import plant as slaves
 from tests.line.slaves import slave
 from tests.sim.links import commands, link_device, link_plant, spelt
@@ -23,6 +25,7 @@ from tests.sim.virtual import now, on_virtual_time
 
 RULE, VERIFY, REPEAT = WriteRule(), WriteRule(verify=True), WriteRule(repeat=True)
 SLOW: dict[str, Any] = {"every": 60.0}
+RUN = ("D0", "D1", "D2")
 Values = Sequence[tuple[str, Value]]
 
 
@@ -141,6 +144,32 @@ async def test_bits_and_bytes_of_words_change_in_one_read_and_one_write() -> Non
 
 
 @on_virtual_time
+async def test_bits_whose_words_are_refused_before_the_write_are_written_one_by_one() -> None:
+    """Nothing was written: so the first is done, and the second alone is refused."""
+    line, dev = vigor("D7.3", "D8.2", "D9.1")
+    async with running(line):
+        await asyncio.sleep(3)
+        line.stations[0].inner.holes = {("D", 8)}
+        outcomes = submit(line, dev, [("D7.3", True), ("D8.2", True), ("D9.1", True)])
+        await asyncio.sleep(1)
+        assert values_of(outcomes) == [True, "Refused", "NotSent"]
+        assert line.stations[0].memory.read("D", 7, 1) == [8]
+
+
+@on_virtual_time
+async def test_a_word_and_its_bit_are_two_requests_in_their_order() -> None:
+    line, dev = vigor("D7", "D7.3", "D8")
+    async with running(line):
+        await asyncio.sleep(3)
+        asked = now()
+        outcomes = submit(line, dev, [("D7.3", True), ("D7", 16), ("D8", 5)])
+        await asyncio.sleep(1)
+        assert values_of(outcomes) == [True, 16, 5]
+        assert [data[5:11] for data in writes(line, asked)] == [b"1C0E02", b"1C0E04"]
+        assert line.stations[0].memory.read("D", 7, 2) == [16, 5]
+
+
+@on_virtual_time
 async def test_a_run_of_vigor_bits_never_writes_the_bits_around_it() -> None:
     """M0 to M7 fill a byte. M8 and M9 would take M10 to M15 with them: they are forced."""
     texts = [f"M{n}" for n in range(10)]
@@ -171,6 +200,24 @@ async def test_only_the_tag_that_the_device_holds_otherwise_differs() -> None:
         await asyncio.sleep(1)
         assert values_of(outcomes) == [5, "Differs", 7, "NotSent"]
         assert str(outcomes[3].once) == "not sent, because D1 before it failed"
+
+
+@on_virtual_time
+async def test_a_run_to_all_stations_is_one_broadcast_without_an_acknowledgement() -> None:
+    driver = ModbusRtu(station=0)
+    texts = ["holding:1", "holding:2", "holding:3"]
+    tags = [make_tag(text, driver, write=RULE, **SLOW) for text in texts]
+    everyone, one = slave(driver, tags), slave(ModbusRtu(station=1), [])
+    line = slaves([everyone, one])
+    async with running(line):
+        await asyncio.sleep(3)
+        asked = now()
+        outcomes = submit(line, everyone, [("holding:2", 2), ("holding:1", 1), ("holding:3", 3)])
+        await asyncio.sleep(1)
+        assert values_of(outcomes) == [2, 1, 3]
+        assert not any(outcome.once.acknowledged for outcome in outcomes)
+        assert [data[1] for data in writes(line, asked)] == [16]
+        assert line.stations[1].memory.read("holding", 1, 3) == [1, 2, 3]
 
 
 # After the first that is not done
@@ -205,18 +252,14 @@ async def test_after_the_first_that_is_not_done_nothing_of_the_group_is_sent(fau
         assert station.memory.read("D", 40) == [40]
 
 
-@on_virtual_time
-async def test_a_group_without_room_is_refused_whole() -> None:
-    line, dev = vigor("D0", "D20")
-    async with running(line):
-        await asyncio.sleep(3)
-        asked = now()
-        for n in range(999):
-            line.submit(dev, spelt(dev, "D0"), n)
-        outcomes = submit(line, dev, [("D0", 1), ("D20", 2)])
-        assert all(isinstance(outcome.once, Busy) for outcome in outcomes)
-        await asyncio.sleep(0.1)
-        assert not [data for data in writes(line, asked) if data[5:9] == b"1C28"]
+def test_a_group_without_room_is_refused_whole() -> None:
+    rig = Rig()
+    rig.engine.schedule.requests.waiting.extend([rig.write("D0")] * (MOST_WAITING - 2))
+    group = Group()
+    tags = [spelt(rig.device, text) for text in ("D1", "D2")]
+    writes = [Write(rig.device, tag, tag.encode(7), rig.now, group=group) for tag in tags]
+    rig.note(rig.engine.submit_group(writes, rig.now))
+    assert [type(rig.outcomes[write]) for write in writes] == [Busy, Busy]
 
 
 @on_virtual_time
@@ -289,24 +332,25 @@ async def test_a_run_that_was_refused_perhaps_in_part_is_read_back_with_one_requ
 
 
 @on_virtual_time
-async def test_an_unclear_run_is_read_back_for_its_tags_with_verify() -> None:
-    line, dev = vigor("D0", "D1", write=VERIFY)
+async def test_an_unclear_run_is_read_back_for_its_tags_with_verify_alone() -> None:
+    tags = [make_tag(text, write=RULE if text == "D2" else VERIFY, **SLOW) for text in RUN]
+    dev = device(tags)
+    line = plant([dev])
     station = line.stations[0]
 
     def deaf_after(data: bytes) -> list[bytes] | None:
         if data[3:5] != b"61":
             return None
-        station.memory.write("D", 0, [5, 6])
+        station.memory.write("D", 0, [5, 6, 7])
         return []
 
     async with running(line):
         await asyncio.sleep(3)
         asked = now()
         intercept(station, deaf_after)
-        outcomes = submit(line, dev, [("D0", 5), ("D1", 6)])
+        outcomes = submit(line, dev, [("D0", 5), ("D1", 6), ("D2", 7)])
         await asyncio.sleep(4)
-        assert values_of(outcomes) == [5, 6]
-        assert all(outcome.once.verified for outcome in outcomes)
+        assert values_of(outcomes) == [5, 6, "NoReply"]
         assert len(writes(line, asked)) == 1
 
 
@@ -369,6 +413,45 @@ async def test_a_long_write_that_breaks_off_accounts_for_every_address(
         assert ("is in the PLC" in text) == (at > 100)
         assert ("was not sent" in text) == (at < 108)
         assert [data[3] for data in writes(line, asked)] == list(range(100, at + 1, 4))
+
+
+@on_virtual_time
+async def test_an_array_that_the_device_holds_otherwise_names_its_elements() -> None:
+    tags = [make_tag("D100", type="uint16[8]", write=VERIFY, **SLOW)]
+    dev = device(tags)
+    line = plant([dev])
+    station = line.stations[0]
+    write = station.memory.write
+
+    def but_some(area: str, start: int, values: Iterable[int]) -> None:
+        write(area, start, values)
+        write(area, 103, [99, 4, 99, 99, 99])
+
+    async with running(line):
+        await asyncio.sleep(3)
+        station.memory.write = but_some  # type: ignore[method-assign]  # a program sets them
+        outcome = line.submit(dev, tags[0], tuple(range(8)))
+        await asyncio.sleep(1)
+        text = "acknowledged, but the device now holds 99 in element 3, 99 in element 5, "
+        assert str(outcome.once) == f"{text}99 in element 6 and 1 more"
+
+
+@on_virtual_time
+async def test_no_request_of_a_long_write_ends_inside_a_number() -> None:
+    """Five registers fit in one request: two numbers, not two and a half."""
+    driver = ModbusRtu(station=1, max_write_words=5)
+    tags = [make_tag("holding:100", driver, type="float32[5]", write=RULE, **SLOW)]
+    dev = slave(driver, tags)
+    line = slaves([dev])
+    async with running(line):
+        await asyncio.sleep(3)
+        asked = now()
+        outcome = line.submit(dev, tags[0], (1.5, 2.5, 3.5, 4.5, 5.5))
+        await asyncio.sleep(1)
+        assert outcome.once.value == (1.5, 2.5, 3.5, 4.5, 5.5)
+        assert [(data[3], data[5]) for data in writes(line, asked)] == [
+            *((100, 4), (104, 4), (108, 2))
+        ]
 
 
 def bits() -> tuple[Plant, Device]:

@@ -11,8 +11,9 @@ from gateway.app import Gateway
 from gateway.cli import direct
 from gateway.config import built
 from gateway.errors import BadValue, Busy
-from gateway.tags import Quality, Reason, Tag
+from gateway.tags import Quality, Reason, Tag, WriteResult
 from gateway.transport import TcpAddress, listen
+from gateway.values import Value
 from tests.interop.peers import free_port
 
 TAGS = {
@@ -58,6 +59,19 @@ async def test_a_value_that_cannot_be_kept_is_refused_and_not_shown(tmp_path: Pa
     assert one.sample(tag(one, "limit")).value == 42
     with pytest.raises(BadValue):
         await one.write(tag(one, "limit"), 51)
+
+
+async def test_several_held_values_change_all_at_once_or_none(tmp_path: Path) -> None:
+    one = gateway(tmp_path)
+    values: list[tuple[Tag, Value]] = [(tag(one, "limit"), 42), (tag(one, "name"), "AB")]
+    ends = await one.write_group(values)
+    assert [end.value for end in ends if isinstance(end, WriteResult)] == [42, "AB"]
+    assert one.sample(values[0][0]).time == one.sample(values[1][0]).time
+    with pytest.raises(BadValue, match="greatest value 50"):
+        await one.write_group([(tag(one, "name"), "CD"), (tag(one, "limit"), 51)])
+    with pytest.raises(BadValue, match="written by the master"):
+        await one.write_group([(tag(one, "name"), "CD"), (tag(one, "order"), 1)])
+    assert one.sample(tag(one, "name")).value == "AB"
 
 
 async def test_a_damaged_file_of_held_values_is_moved_aside(tmp_path: Path) -> None:

@@ -229,7 +229,7 @@ class World:
     def _tasks(self) -> list[asyncio.Task[None]]:
         """Starts all but the lines: clients, and devices that send by themselves."""
         tasks = []
-        haste = 10.0 if self.story.pace == "lean" else 1.0
+        haste = {"lean": 10.0, "groups": 3.0}.get(self.story.pace, 1.0)
         for device in self.devices.values():
             bus = self._buses[device.name]
             for who in ("writer", "reader", "boss"):
