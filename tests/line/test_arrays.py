@@ -18,12 +18,12 @@ async def test_all_elements_are_of_one_moment_whatever_the_wire_does() -> None:
     station.late = lambda chance: 0.4 if chance.random() < 0.05 else 0.0
     clockwork(station.memory, range(100, 155))
     async with running(line):
-        await asyncio.sleep(120)
+        await asyncio.sleep(60)
     values = [sample.value for _, sample in line.reported if sample.tag is steps]
     good = [value for value in values if isinstance(value, tuple)]
-    assert len(good) > 300
-    assert station.lost > 5
-    assert line.bench.damaged > 5
+    assert len(good) > 150
+    assert station.lost > 3
+    assert line.bench.damaged > 3
     for value in good:
         moments = {(int(word) - 1777 * n) % 65536 for word, n in zip(value, numbers, strict=True)}
         assert len(moments) == 1
