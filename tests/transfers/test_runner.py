@@ -188,6 +188,9 @@ async def test_a_range_is_carried_as_a_whole_and_goes_on_over_a_reload() -> None
             data["transfers"][0]["to"] = "b:D40..D42"
 
         await made.reload(move)
+        assert before is not None
+        with pytest.raises(Busy, match="the file was reloaded"):
+            await gateway.write(before, (1, 2, 3))
         assert made.row(1)["carried"] < count
         assert tuple((await gateway.peek("b", "D40..D42")).units)[:1] == (8,)
 
