@@ -117,7 +117,9 @@ def _metrics(documents: Documents, plant: Plant, *, ready: bool) -> Iterator[Met
 def _lines(documents: Documents) -> Iterator[Metric]:
     lines = [*below("lines/", documents)]
     up = _family("line_up", "1: the port is open", "line")
-    expected = _family("line_expected_load_ratio", "Load that check predicts; 1 is all", "line")
+    expected = _family(
+        "line_expected_load_ratio", "Load of the polls that check predicts; 1 is all", "line"
+    )
     for name, document in lines:
         up.add_metric([name], document["open"])
         expected.add_metric([name], document["expected"]["load"])
