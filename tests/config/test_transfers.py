@@ -92,6 +92,11 @@ def test_a_loop_is_refused_with_its_rows(rows: list[Any], loop: str) -> None:
     assert f"a loop: {loop}" in message
 
 
+def test_a_row_that_repeats_another_one_is_refused() -> None:
+    [message] = mistakes(row("a/speed", "b/copy"), row("a/speed", "b/copy", every="1s"))
+    assert "row 1 carries a/speed to b/copy already" in message
+
+
 def test_a_chain_is_no_loop() -> None:
     rows = row("a/speed", "b/copy"), row("b/copy", "a/limited"), row("a/limited", "b/word")
     assert len(config(*rows).transfers) == 3
