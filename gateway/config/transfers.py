@@ -13,6 +13,7 @@ from gateway.config.transfer_settings import TransferSection
 from gateway.config.validate import section
 from gateway.engine.device import DeviceSettings
 from gateway.errors import BadValue
+from gateway.protocols.unsolicited import Unsolicited
 from gateway.tags import Tag
 from gateway.tags.transfer import TransferRule, leaves
 
@@ -152,8 +153,9 @@ class _Finder:
             device = self.devices.get(one.device)
             if device is None or device.served is not None:
                 continue
-            area = device.driver.areas.get(one.span.area)
-            if area is not None and not area.readable:
+            driver = device.driver
+            arrives = isinstance(driver, Unsolicited) and driver.unsolicited_only(one.span)
+            if not (arrives or driver.areas[one.span.area].readable):
                 yield "from", f"{one.key} can only be written, so there is no value to carry"
 
     def unwritable(self, tag: Tag) -> Iterator[tuple[str, str]]:
