@@ -235,6 +235,7 @@ class Line:
     async def _close(self) -> None:
         channel, self._channel = self._channel, None
         self._transaction = None
+        self._expiry.alarm.cancel()  # its timer would keep an ended line alive
         if channel is not None:
             await channel.close()
 

@@ -1,12 +1,13 @@
 """Reloads the file of a running gateway, whenever that is wanted."""
 
 import asyncio
+import gc
 from collections.abc import Callable, Mapping, Sequence
 
 from gateway.app import Gateway
 from gateway.config import Config
 from gateway.config.changes import Difference, compare
-from gateway.northbound import Northbound
+from gateway.northbound.northbound import Northbound
 from gateway.northbound.session import off_loop
 from gateway.reload.lines import RunningLines
 from gateway.reload.reloader import Reloader
@@ -83,3 +84,12 @@ class LiveReload:
         gone = [tag for change in difference.devices.values() for tag in change.gone]
         await northbound.change(index, [*gone, *difference.computed.gone])
         await northbound.claim(names)
+        _collect()
+
+
+def _collect() -> None:
+    """Frees the objects of ended lines and devices: they refer to each other, and collections of
+    all objects are rare. Takes 10 ms with 50,000 tags."""
+    gc.unfreeze()
+    gc.collect()
+    gc.freeze()  # as after the start: later collections skip the tags
