@@ -32,6 +32,7 @@ from gateway.tags import Reason, Sample, Tag, WriteResult, bad
 from gateway.tags.mirror import Mirror
 from gateway.tags.scan import Scan
 from gateway.tags.timestamps import rfc3339
+from gateway.transfers.forecast import transfer_forecasts, with_transfers
 from gateway.values import Value
 
 MOST_PEEKED = 256  # addresses of one peek
@@ -52,7 +53,7 @@ def forecasts(
         found.append(forecast(line.name, devices, line.wire))
         if report is not None:
             report("planning the requests", len(found) / len(config.lines))
-    return found
+    return with_transfers(found, transfer_forecasts(config, found))
 
 
 REMOVED = "removed from the file"
@@ -215,6 +216,10 @@ class Gateway:
         """Adds a document of another part to the status."""
         self._documents[path] = document
 
+    def drop_document(self, path: str) -> None:
+        """Removes a document of another part."""
+        self._documents.pop(path, None)
+
     def wire_logs(self) -> Mapping[str, WireLog]:
         polled = {line.engine.name: line.wire_log for line in self.lines}
         return polled | {line.name: line.wire_log for line in self.serving.lines}
@@ -231,10 +236,10 @@ class Gateway:
             self.alarms.judge(samples)
         if self.serving.remembering:
             self.serving.remember(samples)
-        if waiting := self._on_demand.waiting:
-            for sample in samples:
-                if sample.tag in waiting:
-                    self._on_demand.answer(sample)
+        if self._on_demand.arrived:
+            self._on_demand.note(samples)
+        if self._on_demand.waiting:
+            self._on_demand.answer_all(samples)
         if self.mirror.derives and (changed or self.mirror.pending):
             changed = self.mirror.follow(changed)
             if self.alarms.of_tags:
@@ -260,6 +265,11 @@ class Gateway:
     def tag(self, key: str) -> Tag | None:
         return self._tags.get(key)
 
+    def target(self, key: str) -> Tag | None:
+        """Finds a tag that a transfer writes: also one that no client sees."""
+        others = (tag for device in self._devices for tag in device.targets)
+        return self._tags.get(key) or next((tag for tag in others if tag.key == key), None)
+
     def sample(self, tag: Tag) -> Sample:
         try:
             return self.mirror[tag]
@@ -284,7 +294,9 @@ class Gateway:
         Raises `BadValue` before anything is sent, otherwise a `GatewayError`.
         """
         if self._tags.get(tag.key) is not tag:  # its scale or limits may be others now
-            raise Busy(f"the file was reloaded, and {tag.key} with it; not sent")
+            place = self._places.get(tag.device)
+            if place is None or tag not in place[1].settings.targets:
+                raise Busy(f"the file was reloaded, and {tag.key} with it; not sent")
         if self.serving.holds(tag):
             return await self.serving.write(tag, value)
         if tag.device not in self._places:
@@ -362,6 +374,10 @@ class Gateway:
     def is_fresh(self, tag: Tag, max_age: float) -> bool:
         """True if the last read is younger than `max_age` seconds, or no read is possible now."""
         return self._on_demand.is_fresh(tag, max_age)
+
+    def age(self, tag: Tag) -> float:
+        """Returns the seconds since the last good read; infinite if there was none."""
+        return self._on_demand.age(tag)
 
     async def fresh(self, tag: Tag, max_age: float) -> Sample:
         """Returns the last sample if it `is_fresh`, otherwise that of the next read. Raises

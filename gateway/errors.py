@@ -4,7 +4,8 @@ GatewayError
 ├── ConfigError          fix the file; nothing has been sent
 ├── BadValue             refuse the write; nothing has been sent
 ├── Busy                 try again later; nothing has been sent
-│   └── NotSent          a write of a group, after another one that was not done
+│   ├── NotSent          a write of a group, after another one that was not done
+│   └── Superseded       a newer write of the same tag took its place: do not try again
 ├── Damaged              a part of the history file is lost; the rest can be read
 ├── Offline              the device is offline; nothing has been sent
 ├── LineDown             reopen the port; pending writes fail at once
@@ -36,6 +37,10 @@ class Busy(GatewayError):
 
 class NotSent(Busy):
     """A write of a group that was not sent, because another one of it was not done."""
+
+
+class Superseded(Busy):
+    """A waiting write whose place a newer one of the same tag took; nothing has been sent."""
 
 
 class Damaged(GatewayError):

@@ -139,6 +139,7 @@ def test_every_page_with_files_is_checked() -> None:
     assert set(counted) == {
         *("/README.md", "configuration.md", "vigor.md", "computer-link.md", "modbus.md"),
         *("first-plant.md", "import.md", "peek.md", "serve.md", "shaping.md", "systems.md"),
+        "transfers.md",
         *("templates.md", "trace.md", "alarms.md", "arrays.md"),
         *("tutorial-computer-link.md", "tutorial-modbus.md", "tutorial-vigor.md"),
     }
@@ -211,6 +212,8 @@ def settings(heading: str) -> dict[str, str]:
     page = "configuration-protocols.md" if heading in PROTOCOLS else "configuration.md"
     if heading in ("alarm", "alarms"):
         page = "alarms.md"
+    if heading == "Settings":
+        page = "transfers.md"
     rows = table(page, heading, "setting")
     if heading == "A tag":
         rows += table("shaping.md", "Settings", "setting")
@@ -241,7 +244,7 @@ def properties(*names: str) -> set[str]:
     [
         *(("gateway", "GatewaySection"), ("zenoh", "ZenohSection"), ("tls", "TlsSection")),
         *(("writers", "WritersSection"), ("history", "HistorySection")),
-        *(("alarm", "AlarmSection"), ("alarms", "AlarmsSection")),
+        *(("alarm", "AlarmSection"), ("alarms", "AlarmsSection"), ("Settings", "Transfer")),
         *(("web", "WebSection"), ("A line", "Line"), ("A tag", "Tag"), ("write", "WriteSection")),
     ],
 )
@@ -534,6 +537,7 @@ def _example_keys() -> set[str]:
             keys.status("alarms"),
             keys.alarm("**"),
             keys.status("status"),
+            keys.status("transfers/1"),
             keys.writes,
             keys.page,
         ),

@@ -74,6 +74,8 @@ class AlarmsSection(Section):
     """A device that does not reply is an alarm."""
     lines: bool = True
     """A line that is down is an alarm."""
+    transfers: bool = True
+    """A transfer that does not work is an alarm."""
 
 
 class WebSection(Section):
@@ -307,3 +309,5 @@ class FileSection(Section):
     defaults: dict[str, Any] = {}
     lines: dict[str, Any]
     """The lines, by name."""
+    transfers: list[Any] = []
+    """Values that the gateway reads from one PLC and writes to another: docs/transfers.md."""

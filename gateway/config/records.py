@@ -10,6 +10,7 @@ from gateway.config.zenoh_records import ZenohConfig
 from gateway.engine.device import DeviceSettings
 from gateway.planning.wire_timing import WireTiming
 from gateway.tags import Tag
+from gateway.tags.transfer import TransferRule
 from gateway.transport.port import PortAddress, SerialSettings, SimulatorAddress
 
 
@@ -29,6 +30,7 @@ class AlarmsConfig:
     path: Path | None = None  # None: a restart forgets them
     devices: bool = True
     lines: bool = True
+    transfers: bool = True
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -86,6 +88,7 @@ class Config:
     web: WebConfig | None
     alarms: AlarmsConfig = AlarmsConfig()
     lines: tuple[LineConfig, ...]
+    transfers: tuple[TransferRule, ...] = ()
     watch: bool = False  # a changed file is reloaded by itself
     sheets: tuple[SheetUse, ...] = ()  # files that the tags of some devices come from
 

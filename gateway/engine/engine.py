@@ -37,7 +37,7 @@ from gateway.engine.shorter_silences import ShorterSilences
 from gateway.engine.staleness import NEVER, Staleness
 from gateway.engine.stray import Stray
 from gateway.engine.unsolicited import UnsolicitedFrames
-from gateway.errors import BadValue, Busy, LineDown
+from gateway.errors import BadValue, Busy, LineDown, Superseded
 from gateway.planning.wire_timing import WireTiming
 from gateway.tags import Reason, Tag
 
@@ -206,7 +206,7 @@ class Engine:
             return self._effects.take()
         if isinstance(request, Write):
             for older in queue.superseded(request):
-                self._effects.ended(older, Busy("a newer value took its place; not sent"))
+                self._effects.ended(older, Superseded("a newer value took its place; not sent"))
         elif request.span is None:
             control = device.settings.control
             if why := why_not_commanded(device.driver, request.name, control=control):

@@ -2,7 +2,8 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 from gateway.engine.ages import load_of, polled_blocks, worst_ages
 from gateway.engine.device import Device
@@ -25,6 +26,13 @@ class BlockForecast:
     worst_age: float
 
 
+class TimedWrites(NamedTuple):
+    """Writes of one tag: `often` in a second at most, each takes `seconds`."""
+
+    often: float
+    seconds: float
+
+
 @dataclass(frozen=True, slots=True)
 class LineForecast:
     """One line while all its devices reply. Times in seconds."""
@@ -42,6 +50,12 @@ class LineForecast:
     seen_at_worst: float  # the same while as many others reply as delay it most
     shortest: float  # the shortest interval that is possible for all tags
     unsolicited: tuple[tuple[Device, int], ...]  # devices with their number of unsolicited tags
+
+    def with_writes(self, writes: Sequence[TimedWrites]) -> "LineForecast":
+        """Returns the forecast with writes that the gateway sends by itself."""
+        more = sum(one.often * one.seconds for one in writes)
+        often = sum(one.often for one in writes)
+        return replace(self, load=self.load + more, requests=self.requests + often)
 
     @property
     def overloaded(self) -> bool:
@@ -115,10 +129,10 @@ def _round(device: Device) -> float:
 
 
 def _longest_write(device: Device) -> float:
-    return max((_write_seconds(device, tag) for tag in device.tags if tag.write), default=0.0)
+    return max((write_seconds(device, tag) for tag in device.tags if tag.write), default=0.0)
 
 
-def _write_seconds(device: Device, tag: Tag) -> float:
+def write_seconds(device: Device, tag: Tag) -> float:
     """Returns the seconds of all transactions of one write of the tag, with its reads."""
     driver, back = device.driver, device.driver.cost(tag.span)
     long = long_write(driver, tag.span, tag.layout.type.count)

@@ -22,6 +22,7 @@ from gateway.northbound.keys import Keys
 from gateway.northbound.link_monitor import LinkMonitor
 from gateway.northbound.losses import Losses
 from gateway.northbound.one_process import only_process
+from gateway.northbound.own_writes import OwnWrites
 from gateway.northbound.payload import Failure, GroupResult
 from gateway.northbound.publisher import Publisher, ScanBatches
 from gateway.northbound.republish import Republisher
@@ -101,6 +102,7 @@ class Northbound:
             partial(self._publisher.document, self.keys.writes),
             None if history is None else history.record_write,
         )
+        self.own_writes = OwnWrites(self.keys, plant, audit)
         self._status = StatusPublisher(
             self.keys, self._collect_status, self._publisher, audit, status_every
         )

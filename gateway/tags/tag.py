@@ -170,6 +170,12 @@ class Tag:
         return exact_below(self.layout.type, line)
 
     @property
+    def is_whole(self) -> bool:
+        """True if it takes whole numbers only, as the device holds them."""
+        kind = self.layout.type
+        return self._line is None and kind.is_number and not kind.is_float
+
+    @property
     def value_type(self) -> str:
         """The type of the value, which a scale can make another one than that of the device."""
         kind = self.layout.type
