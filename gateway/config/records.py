@@ -10,6 +10,7 @@ from gateway.config.sheet_tags import SheetUse
 from gateway.engine.device import DeviceSettings
 from gateway.planning.wire_timing import WireTiming
 from gateway.tags import Tag
+from gateway.transport.at import ModemSettings
 from gateway.transport.port import PortAddress, SerialSettings, SimulatorAddress
 
 
@@ -95,6 +96,7 @@ class LineConfig:
     wire: WireTiming
     echo: bool | None  # the port receives its own requests; None: unknown
     serve: bool = False  # a master on the line asks, and the devices are stations of the gateway
+    modem: ModemSettings | None = None  # with a modem at the port
     listen_only: bool = False  # another master owns the wire: nothing is ever sent
     devices: tuple[DeviceSettings, ...]
 

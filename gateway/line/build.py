@@ -7,12 +7,13 @@ from dataclasses import replace
 from gateway.config import LineConfig
 from gateway.engine.device import Device, DeviceSettings
 from gateway.engine.engine import Engine
+from gateway.line.calling import ModemOpener
 from gateway.line.duty import Duty
 from gateway.line.line import Line, SampleSink
 from gateway.simulator.plant import animate, station_for
 from gateway.simulator.port import open_simulator
 from gateway.stations.station import Station
-from gateway.transport import Port, Receiver, SimulatorAddress, open_port
+from gateway.transport import ModemAddress, Port, Receiver, SimulatorAddress, open_port
 from gateway.transport.listen_only import ListenOnlyPort
 
 OpenPort = Callable[[Receiver], Awaitable[Port]]
@@ -56,6 +57,8 @@ def opener(line: LineConfig) -> OpenPort:
     """Returns a function that opens the port of the line, or its simulated devices in memory."""
     if isinstance(line.port, SimulatorAddress):
         return SimulatedLine(line)
+    if isinstance(line.port, ModemAddress) and line.modem is not None:
+        return ModemOpener(line.port, line.serial, line.modem)
     return lambda receiver: open_port(line.port, line.serial, receiver)
 
 

@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import Callable
+from dataclasses import dataclass, field
 
 import structlog
 
@@ -53,6 +54,14 @@ class Alarm:
         again = self._look()
         if again < NEVER:
             self.by(again, self._look)
+
+
+@dataclass(slots=True)
+class Expiry:
+    """Calls the line at the deadline of its engine."""
+
+    alarm: Alarm = field(default_factory=Alarm)
+    at: float = NEVER  # the deadline when the alarm was set last
 
 
 class Echo:

@@ -1,6 +1,10 @@
-"""Ports: serial, TCP and RFC 2217, opened by `open_port`."""
+"""Ports: serial, TCP and RFC 2217, opened by `open_port`, and modems on them by `open_modem`."""
 
+from gateway.errors import LineDown
+from gateway.transport.at import ModemSettings
+from gateway.transport.modem import ModemPort
 from gateway.transport.port import (
+    ModemAddress,
     Port,
     PortAddress,
     Receiver,
@@ -31,11 +35,41 @@ async def open_port(
             return await open_tcp(where, receiver, timeout=timeout, baudrate=settings.baudrate)
         case Rfc2217Address():
             return await open_rfc2217(where, settings, receiver, timeout=timeout)
+        case ModemAddress():
+            raise LineDown("a modem dials for a line of a file only")
         case SimulatorAddress():
             raise ValueError("a simulator needs its stations: open_simulator")
 
 
+async def open_modem(
+    where: ModemAddress,
+    settings: SerialSettings,
+    modem: ModemSettings,
+    receiver: Receiver,
+    *,
+    answers: bool = False,
+) -> ModemPort:
+    """Opens the port of a modem, and sets the modem up. As `open_port`.
+
+    `answers`: the modem takes incoming calls.
+    """
+    port = ModemPort(_name(where), modem, receiver, answers=answers)
+    await port.open(lambda below: open_port(where.port, settings, below))
+    return port
+
+
+def _name(where: ModemAddress) -> str:
+    match where.port:
+        case SerialPath(path):
+            return path
+        case TcpAddress(host, port) | Rfc2217Address(host, port):
+            return f"{host}:{port}"
+
+
 __all__ = [
+    "ModemAddress",
+    "ModemPort",
+    "ModemSettings",
     "Receiver",
     "Port",
     "PortAddress",
@@ -44,6 +78,7 @@ __all__ = [
     "SerialSettings",
     "SimulatorAddress",
     "TcpAddress",
+    "open_modem",
     "open_port",
     "parse_port",
 ]

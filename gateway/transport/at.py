@@ -1,0 +1,391 @@
+"""The AT commands of a modem, as a synchronous state machine.
+
+Bytes of the modem and the time go in; commands to send, data of the call and events come out. The
+commands are those of ITU-T V.250, which every modem since Hayes takes.
+"""
+
+import re
+from dataclasses import dataclass
+from enum import Enum, auto
+
+NEVER = float("inf")
+SETUP = "ATE0V1Q0"  # no echo; results, and as words
+KEEP_SILENT = "ATS0=0"  # the modem takes no call by itself
+HANG_UP, ANSWER, ESCAPE = "ATH", "ATA", "+++"
+# A modem needs a pause between its result and the next command (V.250 5.2.1 gives no number).
+PAUSE = 0.15  # seconds
+ESCAPE_WAIT = 1.0  # seconds for the result of +++, after the guard time
+ABORT_WAIT = 2.0  # seconds for the result of a dial that was broken off
+DTR_TIME = 0.6  # seconds without DTR; S25 of a modem is 50 ms
+RING_TIME = 6.0  # seconds between two rings, at most
+LOST = b"\r\nNO CARRIER"  # the modem's own text in the middle of the data
+_REFUSALS = (
+    *("BUSY", "NO CARRIER", "NO DIALTONE", "NO ANSWER", "ERROR", "DELAYED", "BLACKLISTED"),
+    *("VOICE", "FAX", "+CME ERROR", "+FCERROR"),
+)
+_LINE_END = re.compile(rb"[\r\n]")
+_MOST_KEPT = 256  # bytes of one line of the modem
+_AFTER = (SETUP, KEEP_SILENT)  # after the init strings, which may change them
+MOST_ESCAPES = 2  # in one hang-up
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ModemSettings:
+    """A modem and its calls. Times in seconds. Without `number` it only answers calls."""
+
+    number: str = ""
+    init: tuple[str, ...] = ("ATZ",)
+    dial_timeout: float = 60.0  # from the dial to the carrier
+    tries: int = 3  # calls that fail until the modem gives up
+    retry_pause: float = 10.0
+    idle: float = 5.0  # without an exchange, until the call is ended
+    guard: float = 1.0  # silence before and after +++
+    command_timeout: float = 5.0
+    hold: float = 0.1  # the longest time of the text NO CARRIER on the wire
+
+    @property
+    def dial_command(self) -> str:
+        """`ATDT` and the number, or `ATDP` where the number begins with P."""
+        tone = "" if self.number[:1] in ("T", "P") else "T"
+        return f"ATD{tone}{self.number}"
+
+
+@dataclass(frozen=True, slots=True)
+class Send:
+    """Bytes for the modem."""
+
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class SetDtr:
+    """Switches DTR, where there is one."""
+
+    on: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Ready:
+    """The modem takes commands, and no call is there."""
+
+
+@dataclass(frozen=True, slots=True)
+class Connected:
+    """The carrier is there. `text`: of the modem, such as CONNECT 9600."""
+
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Failed:
+    """The dial failed, in the words of the modem."""
+
+    why: str
+
+
+@dataclass(frozen=True, slots=True)
+class Received:
+    """Data of the call."""
+
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Ended:
+    """The call ended without our doing."""
+
+    why: str
+
+
+@dataclass(frozen=True, slots=True)
+class Broken:
+    """The modem does not obey: only a new opening of its port helps."""
+
+    why: str
+
+
+Event = Send | SetDtr | Ready | Connected | Failed | Received | Ended | Broken
+
+
+class State(Enum):
+    """What the modem does, as far as known."""
+
+    CLOSED = auto()
+    WAKING = auto()  # the first SETUP was sent
+    PAUSING = auto()  # before the next init string
+    STARTING = auto()  # an init string was sent
+    READY = auto()
+    DIALLING = auto()
+    ABORTING = auto()  # a dial took too long and was broken off
+    ANSWERING = auto()
+    ONLINE = auto()
+    DROPPING = auto()  # DTR is off
+    RAISED = auto()  # DTR is on again
+    GUARDING = auto()  # the silence before +++
+    ESCAPING = auto()  # +++ was sent
+    HANGING_UP = auto()  # ATH was sent
+
+
+class AtModem:
+    """One modem. Call `tick` at `due`, `open` first, `dial` and `hang_up` when `Ready` came."""
+
+    def __init__(self, settings: ModemSettings, *, answers: bool = False) -> None:
+        """`answers`: takes incoming calls."""
+        self.state = State.CLOSED
+        self.due = NEVER
+        self.dtr = False  # the port has this signal
+        self._settings = settings
+        self._answers = answers
+        self._line = b""  # the begun line of the modem
+        self._held = b""  # data that may be the beginning of the modem's own text
+        self._commands: list[str] = []  # to be sent before the modem is ready
+        self._escapes = 0  # of this hang-up
+        self._then: Event = Ready()  # the event at the end of the hang-up
+        self._heard = 0.0  # the last data of the call
+        self._rang = -NEVER
+        self._waking = True  # it was never ready
+        self._begun = False  # the first data of a call may be the rest of the modem's line end
+        self._events: list[Event] = []
+
+    # Requests
+
+    def open(self, now: float) -> list[Event]:
+        """Begins: the modem may still be in a call of before."""
+        self._escapes = 0
+        self._command(SETUP, State.WAKING, now + 2.0)
+        return self._taken()
+
+    def dial(self, now: float) -> list[Event]:
+        """Dials the number. `Connected` or `Failed` follows."""
+        if self.state is not State.READY:
+            self._events.append(Failed("the modem is not ready"))
+        elif now < self._rang + RING_TIME:  # ATD would take that call
+            self._events.append(Failed("RING: an incoming call"))
+        else:
+            command, timeout = self._settings.dial_command, self._settings.dial_timeout
+            self._command(command, State.DIALLING, now + timeout)
+        return self._taken()
+
+    def hang_up(self, now: float) -> list[Event]:
+        """Ends the call, or the dial. `Ready` or `Broken` follows."""
+        if self.state is State.READY:
+            self._events.append(Ready())
+        elif self.state in (State.ONLINE, State.DIALLING, State.ANSWERING, State.ABORTING):
+            self._begin_hang_up(Ready(), now)
+        return self._taken()
+
+    def carrier_lost(self) -> list[Event]:
+        """Takes the loss of the signal CD in a call."""
+        if self.state is State.ONLINE:
+            self._lost("NO CARRIER (the signal CD is off)")
+        return self._taken()
+
+    # Bytes and time
+
+    def feed(self, data: bytes, now: float) -> list[Event]:
+        """Takes bytes of the modem."""
+        while data:
+            if self.state is State.ONLINE:
+                self._data(data, now)
+                break
+            end = _LINE_END.search(data)
+            if end is None:
+                self._line = (self._line + data)[-_MOST_KEPT:]
+                break
+            line, data = self._line + data[: end.start()], data[end.end() :]
+            self._line = b""
+            if text := line.decode("ascii", "replace").strip():
+                self._take(text, now)
+        return self._taken()
+
+    def tick(self, now: float) -> list[Event]:
+        """Takes the time."""
+        if now < self.due:
+            return []
+        self.due = NEVER
+        settings = self._settings
+        match self.state:
+            case State.WAKING:
+                self._begin_hang_up(Ready(), now)  # it may be in a call of before
+            case State.PAUSING:
+                self._command(self._commands[0], State.STARTING, now + settings.command_timeout)
+            case State.STARTING:
+                self._break(f"does not answer {self._place}")
+            case State.DIALLING | State.ANSWERING:
+                why = f"no carrier within {settings.dial_timeout:g} s"
+                self._then = Failed(why) if self.state is State.DIALLING else Ready()
+                self._events.append(Send(b"\r"))  # any character breaks off the dial
+                self.state, self.due = State.ABORTING, now + ABORT_WAIT
+            case State.ABORTING:
+                self._begin_hang_up(self._then, now)
+            case State.ONLINE:
+                self._online(now)
+            case State.DROPPING:
+                self._events.append(SetDtr(True))
+                self.state, self.due = State.RAISED, now + PAUSE
+            case State.RAISED:
+                self._command(HANG_UP, State.HANGING_UP, now + ABORT_WAIT)
+            case State.GUARDING:
+                self._escapes += 1
+                self._events.append(Send(ESCAPE.encode()))
+                self.state, self.due = State.ESCAPING, now + settings.guard + ESCAPE_WAIT
+            case State.ESCAPING:
+                self._command(HANG_UP, State.HANGING_UP, now + settings.command_timeout)
+            case State.HANGING_UP:
+                if self._escapes < MOST_ESCAPES:
+                    self._guard(now)
+                elif self._waking:
+                    self._break("does not answer AT commands: check cable, power and baud rate")
+                else:
+                    self._break("does not hang up")
+        return self._taken()
+
+    # Lines of the modem
+
+    def _take(self, text: str, now: float) -> None:
+        """Takes one line of the modem. An echo of a command is no result."""
+        word = text.upper()
+        failed = next((known for known in _REFUSALS if word.startswith(known)), "")
+        if word.startswith("NO DIAL TONE"):
+            failed = "NO DIALTONE"
+        match self.state:
+            case State.WAKING if word in ("OK", "0"):  # 0: OK, before V1 counts
+                self._start(now)
+            case State.STARTING if word in ("OK", "0"):
+                self._commands.pop(0)
+                self._next_command(now)
+            case State.STARTING if failed == "ERROR" and self._commands[0] == KEEP_SILENT:
+                self._commands.pop(0)  # a modem that never takes a call
+                self._next_command(now)
+            case State.STARTING if failed:
+                self._break(f"answers {text} to {self._place}")
+            case State.READY if word == "RING":
+                self._rang = now
+                if self._answers:
+                    timeout = self._settings.dial_timeout
+                    self._command(ANSWER, State.ANSWERING, now + timeout)
+            case State.READY if word.startswith("CONNECT"):
+                if self._answers:
+                    self._connected(text, now)
+                else:  # it took a call by itself: a number would go to a stranger as data
+                    self._begin_hang_up(Ready(), now)
+            case State.DIALLING | State.ANSWERING if word.startswith("CONNECT"):
+                self._connected(text, now)
+            case State.DIALLING if failed:
+                self._events.append(Failed(text))
+                self._rest()
+            case State.ANSWERING if failed:  # the caller hung up
+                self._rest()
+            case State.ABORTING if failed or word == "OK" or word.startswith("CONNECT"):
+                self._begin_hang_up(self._then, now)
+            case State.ESCAPING if word in ("OK", "NO CARRIER"):
+                self._command(HANG_UP, State.HANGING_UP, now + self._settings.command_timeout)
+            case State.HANGING_UP if word in ("OK", "0"):
+                self._hung_up(now)
+
+    @property
+    def _place(self) -> str:
+        """The present init string: only its number, because it may hold a PIN."""
+        init = len(self._settings.init)
+        sent = 1 + init + len(_AFTER) - len(self._commands)
+        return self._commands[0] if sent > init else f"init string {sent} of {init}"
+
+    def _start(self, now: float) -> None:
+        self._commands = [*self._settings.init, *_AFTER]
+        self._next_command(now)
+
+    def _next_command(self, now: float) -> None:
+        if self._commands:
+            self.state, self.due = State.PAUSING, now + PAUSE
+        else:
+            self._waking = False
+            self._events.append(Ready())
+            self._rest()
+
+    def _command(self, text: str, state: State, until: float) -> None:
+        self._line = b""
+        self._events.append(Send(f"{text}\r".encode("ascii")))
+        self.state, self.due = state, until
+
+    def _rest(self) -> None:
+        self.state, self.due, self._held = State.READY, NEVER, b""
+
+    def _break(self, why: str) -> None:
+        self._events.append(Broken(f"the modem {why}"))
+        self.state, self.due, self._held = State.CLOSED, NEVER, b""
+
+    # The call
+
+    def _connected(self, text: str, now: float) -> None:
+        self._events.append(Connected(text))
+        self.state, self._held, self._begun, self._heard = State.ONLINE, b"", False, now
+        self._set_due()
+
+    def _data(self, data: bytes, now: float) -> None:
+        """Passes data on, except what may be the beginning of the modem's own text."""
+        if not self._begun:  # the line feed of CONNECT
+            self._begun, data = True, data.removeprefix(b"\n")
+        self._heard = now
+        data = self._held + data
+        place = data.find(LOST)
+        if place >= 0:
+            self._received(data[:place])
+            self._lost("NO CARRIER")
+            return
+        kept = _suffix(data)
+        self._held = data[len(data) - kept :]
+        self._received(data[: len(data) - kept])
+        self._set_due()
+
+    def _received(self, data: bytes) -> None:
+        if data:
+            self._events.append(Received(data))
+
+    def _lost(self, why: str) -> None:
+        """Ends the call. Held bytes are dropped: they are the modem's, or end a broken frame."""
+        self._events.append(Ended(why))
+        self._rest()
+
+    def _online(self, now: float) -> None:
+        if self._held and self._heard + self._settings.hold <= now:
+            held, self._held = self._held, b""
+            self._received(held)
+        if self._answers and self._heard + self._settings.idle <= now:
+            self._begin_hang_up(Ended(f"the caller was silent for {self._settings.idle:g} s"), now)
+        else:
+            self._set_due()
+
+    def _set_due(self) -> None:
+        idle = self._settings.idle if self._answers else NEVER
+        self.due = self._heard + (self._settings.hold if self._held else idle)
+
+    # The end of a call
+
+    def _begin_hang_up(self, then: Event, now: float) -> None:
+        """`then` is reported when the modem has hung up."""
+        self._then, self._escapes, self._held = then, 0, b""
+        if self.dtr:
+            self._events.append(SetDtr(False))
+            self.state, self.due = State.DROPPING, now + DTR_TIME
+        else:
+            self._guard(now)
+
+    def _guard(self, now: float) -> None:
+        self.state, self.due, self._line = State.GUARDING, now + self._settings.guard, b""
+
+    def _hung_up(self, now: float) -> None:
+        if self._waking:  # it is not set up yet
+            self._start(now)
+            return
+        self._events.append(self._then)
+        self._rest()
+
+    def _taken(self) -> list[Event]:
+        events, self._events = self._events, []
+        return events
+
+
+def _suffix(data: bytes) -> int:
+    """Returns the length of the longest end of `data` that begins the modem's text."""
+    most = min(len(data), len(LOST) - 1)
+    return next((size for size in range(most, 0, -1) if data.endswith(LOST[:size])), 0)
