@@ -336,6 +336,11 @@ class Gateway:
         first = receiver.driver.spell(Address(area, numbers.start))
         return Peeked(first, units, self._wall(), loop.time() - started)
 
+    def dialling(self, device: str) -> float:
+        """Returns the seconds that a request may wait for a telephone call; 0: for none."""
+        place = self._places.get(device)
+        return 0.0 if place is None else place[0].dialling
+
     def is_fresh(self, tag: Tag, max_age: float) -> bool:
         """True if the last read is younger than `max_age` seconds, or no read is possible now."""
         return self._on_demand.is_fresh(tag, max_age)

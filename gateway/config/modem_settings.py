@@ -33,7 +33,9 @@ def phone_number(text: object) -> str:
 def init_strings(value: object) -> tuple[str, ...]:
     strings = [value] if isinstance(value, str) else value
     if not isinstance(strings, list):
-        raise ConfigError(f"{shown(value)} is no init string: write it as ATZ, or several as a list")
+        raise ConfigError(
+            f"{shown(value)} is no init string: write it as ATZ, or several as a list"
+        )
     for text in strings:
         if not isinstance(text, str) or not _INIT.match(text):
             raise ConfigError(f"{shown(text)} is no init string: it begins with AT, as in AT&F")

@@ -9,7 +9,16 @@ from gateway.engine.calls import CallRules, Calls
 from gateway.engine.effects import Effect
 from gateway.errors import CallEnded
 from gateway.line.channel import Channel
-from gateway.transport import ModemAddress, ModemPort, ModemSettings, Port, Receiver, open_modem
+from gateway.transport import (
+    ModemAddress,
+    ModemPort,
+    ModemSettings,
+    OpenBelow,
+    Port,
+    Receiver,
+    open_modem,
+    open_port,
+)
 from gateway.transport.port import SerialSettings
 
 
@@ -34,9 +43,10 @@ class ModemOpener:
     where: ModemAddress
     serial: SerialSettings
     modem: ModemSettings
+    opens: OpenBelow = open_port
 
     def __call__(self, receiver: Receiver) -> Awaitable[ModemPort]:
-        return open_modem(self.where, self.serial, self.modem, receiver)
+        return open_modem(self.where, self.serial, self.modem, receiver, opens=self.opens)
 
 
 def dialling(opener: Callable[[Receiver], Awaitable[Port]]) -> float:

@@ -1,5 +1,7 @@
 """Ports: serial, TCP and RFC 2217, opened by `open_port`, and modems on them by `open_modem`."""
 
+from collections.abc import Awaitable, Callable
+
 from gateway.errors import LineDown
 from gateway.transport.at import ModemSettings
 from gateway.transport.modem import ModemPort
@@ -41,6 +43,9 @@ async def open_port(
             raise ValueError("a simulator needs its stations: open_simulator")
 
 
+OpenBelow = Callable[[PortAddress, SerialSettings, Receiver], Awaitable[Port]]
+
+
 async def open_modem(
     where: ModemAddress,
     settings: SerialSettings,
@@ -48,13 +53,14 @@ async def open_modem(
     receiver: Receiver,
     *,
     answers: bool = False,
+    opens: OpenBelow = open_port,
 ) -> ModemPort:
     """Opens the port of a modem, and sets the modem up. As `open_port`.
 
-    `answers`: the modem takes incoming calls.
+    `answers`: the modem takes incoming calls. `opens` opens the port that the modem is at.
     """
     port = ModemPort(_name(where), modem, receiver, answers=answers)
-    await port.open(lambda below: open_port(where.port, settings, below))
+    await port.open(lambda below: opens(where.port, settings, below))
     return port
 
 
@@ -70,6 +76,7 @@ __all__ = [
     "ModemAddress",
     "ModemPort",
     "ModemSettings",
+    "OpenBelow",
     "Receiver",
     "Port",
     "PortAddress",

@@ -276,9 +276,9 @@ class AtModem:
                 self._rest()
             case State.ANSWERING if failed:  # the caller hung up
                 self._rest()
-            case State.ABORTING if failed or word == "OK" or word.startswith("CONNECT"):
+            case State.ABORTING if word.startswith("CONNECT"):
                 self._begin_hang_up(self._then, now)
-            case State.ESCAPING if word in ("OK", "NO CARRIER"):
+            case State.ABORTING | State.ESCAPING if failed or word == "OK":
                 self._command(HANG_UP, State.HANGING_UP, now + self._settings.command_timeout)
             case State.HANGING_UP if word in ("OK", "0"):
                 self._hung_up(now)

@@ -112,6 +112,9 @@ class PlainPlant:
     async def peek(self, device: str, text: str) -> Peeked:
         raise BadValue(f"{device} has no {text}")
 
+    def dialling(self, device: str) -> float:
+        return 0.0
+
     def is_fresh(self, tag: Tag, max_age: float) -> bool:
         return time.time_ns() - self.samples[tag.key].time < max_age * 1e9
 
