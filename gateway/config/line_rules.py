@@ -11,7 +11,7 @@ from gateway.protocols.driver import EchoConflict
 from gateway.protocols.listening import Listenable
 from gateway.protocols.unsolicited import Unsolicited
 from gateway.stations.registry import can_simulate
-from gateway.transport.at import ModemSettings
+from gateway.transport.modem_events import ModemSettings
 from gateway.transport.port import ModemAddress, SerialSettings, SimulatorAddress, TcpAddress
 
 DIALS_IDLE, ANSWERS_IDLE = 5.0, 60.0  # seconds without an exchange until a call is ended

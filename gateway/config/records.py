@@ -10,7 +10,7 @@ from gateway.config.sheet_tags import SheetUse
 from gateway.engine.device import DeviceSettings
 from gateway.planning.wire_timing import WireTiming
 from gateway.tags import Tag
-from gateway.transport.at import ModemSettings
+from gateway.transport.modem_events import ModemSettings
 from gateway.transport.port import PortAddress, SerialSettings, SimulatorAddress
 
 

@@ -208,7 +208,6 @@ class Line:
                 self._calls = Calls(self.engine, rules_of(port))
                 await serve_calls(self, port, self._calls)
             await self.serve(channel)
-            return "the line ended"
         except LineDown as error:
             known = str(error) == self.engine.record.trouble
             (log.debug if known else log.warning)("line down", line=name, why=str(error))
@@ -216,6 +215,7 @@ class Line:
         except Exception as error:  # an error in one line must not end the others
             log.exception("line failed", line=name)
             return f"internal error: {error!r}"
+        raise AssertionError("a port is served until it is lost")
 
     def begin(self, port: Port) -> Channel:
         """Begins to use an open port, or the next telephone call."""

@@ -3,8 +3,8 @@
 from collections.abc import Awaitable, Callable
 
 from gateway.errors import LineDown
-from gateway.transport.at import ModemSettings
 from gateway.transport.modem import ModemPort
+from gateway.transport.modem_events import ModemSettings
 from gateway.transport.port import (
     ModemAddress,
     Port,

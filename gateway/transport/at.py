@@ -5,8 +5,20 @@ commands are those of ITU-T V.250, which every modem since Hayes takes.
 """
 
 import re
-from dataclasses import dataclass
 from enum import Enum, auto
+
+from gateway.transport.modem_events import (
+    Broken,
+    Connected,
+    Ended,
+    Event,
+    Failed,
+    ModemSettings,
+    Ready,
+    Received,
+    Send,
+    SetDtr,
+)
 
 NEVER = float("inf")
 SETUP = "ATE0V1Q0"  # no echo; results, and as words
@@ -27,84 +39,6 @@ _LINE_END = re.compile(rb"[\r\n]")
 _MOST_KEPT = 256  # bytes of one line of the modem
 _AFTER = (SETUP, KEEP_SILENT)  # after the init strings, which may change them
 MOST_ESCAPES = 2  # in one hang-up
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ModemSettings:
-    """A modem and its calls. Times in seconds. Without `number` it only answers calls."""
-
-    number: str = ""
-    init: tuple[str, ...] = ("ATZ",)
-    dial_timeout: float = 60.0  # from the dial to the carrier
-    tries: int = 3  # calls that fail until the modem gives up
-    retry_pause: float = 10.0
-    idle: float = 5.0  # without an exchange, until the call is ended
-    guard: float = 1.0  # silence before and after +++
-    command_timeout: float = 5.0
-    hold: float = 0.1  # the longest time of the text NO CARRIER on the wire
-
-    @property
-    def dial_command(self) -> str:
-        """`ATDT` and the number, or `ATDP` where the number begins with P."""
-        tone = "" if self.number[:1] in ("T", "P") else "T"
-        return f"ATD{tone}{self.number}"
-
-
-@dataclass(frozen=True, slots=True)
-class Send:
-    """Bytes for the modem."""
-
-    data: bytes
-
-
-@dataclass(frozen=True, slots=True)
-class SetDtr:
-    """Switches DTR, where there is one."""
-
-    on: bool
-
-
-@dataclass(frozen=True, slots=True)
-class Ready:
-    """The modem takes commands, and no call is there."""
-
-
-@dataclass(frozen=True, slots=True)
-class Connected:
-    """The carrier is there. `text`: of the modem, such as CONNECT 9600."""
-
-    text: str
-
-
-@dataclass(frozen=True, slots=True)
-class Failed:
-    """The dial failed, in the words of the modem."""
-
-    why: str
-
-
-@dataclass(frozen=True, slots=True)
-class Received:
-    """Data of the call."""
-
-    data: bytes
-
-
-@dataclass(frozen=True, slots=True)
-class Ended:
-    """The call ended without our doing."""
-
-    why: str
-
-
-@dataclass(frozen=True, slots=True)
-class Broken:
-    """The modem does not obey: only a new opening of its port helps."""
-
-    why: str
-
-
-Event = Send | SetDtr | Ready | Connected | Failed | Received | Ended | Broken
 
 
 class State(Enum):
@@ -203,23 +137,39 @@ class AtModem:
         if now < self.due:
             return []
         self.due = NEVER
-        settings = self._settings
+        if self.state in (State.WAKING, State.PAUSING, State.STARTING):
+            self._tick_setup(now)
+        elif self.state in (State.DIALLING, State.ANSWERING, State.ABORTING, State.ONLINE):
+            self._tick_call(now)
+        else:
+            self._tick_hang_up(now)
+        return self._taken()
+
+    def _tick_setup(self, now: float) -> None:
         match self.state:
             case State.WAKING:
                 self._begin_hang_up(Ready(), now)  # it may be in a call of before
             case State.PAUSING:
-                self._command(self._commands[0], State.STARTING, now + settings.command_timeout)
-            case State.STARTING:
+                until = now + self._settings.command_timeout
+                self._command(self._commands[0], State.STARTING, until)
+            case _:
                 self._break(f"does not answer {self._place}")
-            case State.DIALLING | State.ANSWERING:
-                why = f"no carrier within {settings.dial_timeout:g} s"
-                self._then = Failed(why) if self.state is State.DIALLING else Ready()
-                self._events.append(Send(b"\r"))  # any character breaks off the dial
-                self.state, self.due = State.ABORTING, now + ABORT_WAIT
-            case State.ABORTING:
-                self._begin_hang_up(self._then, now)
+
+    def _tick_call(self, now: float) -> None:
+        match self.state:
             case State.ONLINE:
                 self._online(now)
+            case State.ABORTING:
+                self._begin_hang_up(self._then, now)
+            case state:
+                why = f"no carrier within {self._settings.dial_timeout:g} s"
+                self._then = Failed(why) if state is State.DIALLING else Ready()
+                self._events.append(Send(b"\r"))  # any character breaks off the dial
+                self.state, self.due = State.ABORTING, now + ABORT_WAIT
+
+    def _tick_hang_up(self, now: float) -> None:
+        settings = self._settings
+        match self.state:
             case State.DROPPING:
                 self._events.append(SetDtr(True))
                 self.state, self.due = State.RAISED, now + PAUSE
@@ -231,57 +181,67 @@ class AtModem:
                 self.state, self.due = State.ESCAPING, now + settings.guard + ESCAPE_WAIT
             case State.ESCAPING:
                 self._command(HANG_UP, State.HANGING_UP, now + settings.command_timeout)
-            case State.HANGING_UP:
-                if self._escapes < MOST_ESCAPES:
-                    self._guard(now)
-                elif self._waking:
-                    self._break("does not answer AT commands: check cable, power and baud rate")
-                else:
-                    self._break("does not hang up")
-        return self._taken()
+            case _ if self._escapes < MOST_ESCAPES:
+                self._guard(now)
+            case _ if self._waking:
+                self._break("does not answer AT commands: check cable, power and baud rate")
+            case _:
+                self._break("does not hang up")
 
     # Lines of the modem
 
     def _take(self, text: str, now: float) -> None:
         """Takes one line of the modem. An echo of a command is no result."""
-        word = text.upper()
-        failed = next((known for known in _REFUSALS if word.startswith(known)), "")
-        if word.startswith("NO DIAL TONE"):
-            failed = "NO DIALTONE"
+        word = text.upper().replace("NO DIAL TONE", "NO DIALTONE")
+        if word.startswith("CONNECT"):
+            self._take_connect(text, now)
+        elif word in ("OK", "0"):  # 0: OK of a modem whose results are numbers yet
+            self._take_ok(now)
+        elif word == "RING" and self.state is State.READY:
+            self._rang = now
+            if self._answers:
+                timeout = self._settings.dial_timeout
+                self._command(ANSWER, State.ANSWERING, now + timeout)
+        elif word.startswith(_REFUSALS):
+            self._take_refusal(text, now)
+
+    def _take_connect(self, text: str, now: float) -> None:
         match self.state:
-            case State.WAKING if word in ("OK", "0"):  # 0: OK, before V1 counts
+            case State.DIALLING | State.ANSWERING:
+                self._connected(text, now)
+            case State.READY if self._answers:
+                self._connected(text, now)
+            case State.READY:  # it took a call by itself: a number would go to a stranger as data
+                self._begin_hang_up(Ready(), now)
+            case State.ABORTING:
+                self._begin_hang_up(self._then, now)
+
+    def _take_ok(self, now: float) -> None:
+        match self.state:
+            case State.WAKING:
                 self._start(now)
-            case State.STARTING if word in ("OK", "0"):
+            case State.STARTING:
                 self._commands.pop(0)
                 self._next_command(now)
-            case State.STARTING if failed == "ERROR" and self._commands[0] == KEEP_SILENT:
+            case State.ABORTING | State.ESCAPING:
+                self._command(HANG_UP, State.HANGING_UP, now + self._settings.command_timeout)
+            case State.HANGING_UP:
+                self._hung_up(now)
+
+    def _take_refusal(self, text: str, now: float) -> None:
+        match self.state:
+            case State.STARTING if self._commands[0] == KEEP_SILENT:
                 self._commands.pop(0)  # a modem that never takes a call
                 self._next_command(now)
-            case State.STARTING if failed:
+            case State.STARTING:
                 self._break(f"answers {text} to {self._place}")
-            case State.READY if word == "RING":
-                self._rang = now
-                if self._answers:
-                    timeout = self._settings.dial_timeout
-                    self._command(ANSWER, State.ANSWERING, now + timeout)
-            case State.READY if word.startswith("CONNECT"):
-                if self._answers:
-                    self._connected(text, now)
-                else:  # it took a call by itself: a number would go to a stranger as data
-                    self._begin_hang_up(Ready(), now)
-            case State.DIALLING | State.ANSWERING if word.startswith("CONNECT"):
-                self._connected(text, now)
-            case State.DIALLING if failed:
+            case State.DIALLING:
                 self._events.append(Failed(text))
                 self._rest()
-            case State.ANSWERING if failed:  # the caller hung up
+            case State.ANSWERING:  # the caller hung up
                 self._rest()
-            case State.ABORTING if word.startswith("CONNECT"):
-                self._begin_hang_up(self._then, now)
-            case State.ABORTING | State.ESCAPING if failed or word == "OK":
+            case State.ABORTING | State.ESCAPING:
                 self._command(HANG_UP, State.HANGING_UP, now + self._settings.command_timeout)
-            case State.HANGING_UP if word in ("OK", "0"):
-                self._hung_up(now)
 
     @property
     def _place(self) -> str:

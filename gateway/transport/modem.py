@@ -9,9 +9,8 @@ import serialx
 import structlog
 
 from gateway.errors import CallEnded, LineDown
-from gateway.transport.at import (
-    NEVER,
-    AtModem,
+from gateway.transport.at import NEVER, AtModem, State
+from gateway.transport.modem_events import (
     Broken,
     Connected,
     Ended,
@@ -22,7 +21,6 @@ from gateway.transport.at import (
     Received,
     Send,
     SetDtr,
-    State,
 )
 from gateway.transport.port import Port, Receiver
 from gateway.transport.stream import StreamPort

@@ -4,10 +4,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gateway.transport.at import (
-    LOST,
-    NEVER,
-    AtModem,
+from gateway.transport.at import LOST, NEVER, AtModem, State
+from gateway.transport.modem_events import (
     Broken,
     Connected,
     Ended,
@@ -18,7 +16,6 @@ from gateway.transport.at import (
     Received,
     Send,
     SetDtr,
-    State,
 )
 from tests.transport.modem import ModemModel
 
