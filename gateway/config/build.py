@@ -143,7 +143,7 @@ class Builder:
         if line.serve:
             check_served_line(line, devices, path, self.mistakes)
         serial, wire = line_wire(line, devices, path, self.mistakes)
-        modem = modem_of(line, wire, path, self.mistakes)
+        modem = modem_of(line, raw.get("modem"), wire, path, self.mistakes)
         if modem is not None and line.serve:
             devices = [until_the_next_call(one, raw) for one in devices]
         return LineConfig(

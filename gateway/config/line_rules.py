@@ -164,9 +164,9 @@ def _check_network(
 
 
 def modem_of(
-    line: LineSection, wire: WireTiming, path: Path, mistakes: Mistakes
+    line: LineSection, raw: object, wire: WireTiming, path: Path, mistakes: Mistakes
 ) -> ModemSettings | None:
-    """Returns the modem of a line; None: it has none, or there are mistakes."""
+    """Returns the modem of a line; None: it has none. `raw`: the section, also with mistakes."""
     found, place = line.modem, (*path, "modem")
     if not isinstance(line.port, ModemAddress):
         if found is not None:
@@ -175,7 +175,8 @@ def modem_of(
     if line.listen_only:
         mistakes.add((*path, "listen_only"), "a modem has a call only if it dials or answers")
     number = None if found is None else found.number
-    if number is None and not line.serve:
+    named = isinstance(raw, dict) and "number" in raw
+    if not (named or line.serve):
         mistakes.add(
             place,
             'missing: write the number that it dials, such as modem: {number: "0,26204393"}; a '

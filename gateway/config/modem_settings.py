@@ -20,7 +20,7 @@ _LEFT_OUT = re.compile(r"[ ()./-]")
 def phone_number(text: object) -> str:
     if not isinstance(text, str):
         raise ConfigError(
-            f'write the number in quotes, as "{text}": a number without them loses a leading 0'
+            'write the number in quotes, such as "0,26204393": without them a leading 0 is lost'
         )
     if not _NUMBER.match(text):
         raise ConfigError(
