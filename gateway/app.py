@@ -370,7 +370,7 @@ class Gateway:
             engine = line.engine
             if (expected := self._forecasts.get(engine.name)) is None:
                 continue  # not planned yet
-            documents[f"lines/{engine.name}"] = line_document(engine, expected, now)
+            documents[f"lines/{engine.name}"] = line_document(engine, expected, line.calls, now)
         for name, (line, device) in self._places.items():
             polls = line.engine.schedule.polls(device)
             documents[f"devices/{name}"] = device_document(device, polls, now)

@@ -41,6 +41,9 @@ class Calls:
     def __init__(self, engine: Engine, rules: CallRules) -> None:
         self.connected = False
         self.failed = 0  # calls in a row
+        self.made = 0  # calls with a carrier
+        self.failures = 0  # tries of calls
+        self.last_failure = ""
         engine.schedule.dials = True
         self._engine = engine
         self._rules = rules
@@ -74,6 +77,7 @@ class Calls:
     def connect(self, now: float) -> list[Effect]:
         """Begins a call."""
         self.connected = True
+        self.made += 1
         self._active, self._exchanges = now, self._count()
         engine = self._engine
         effects = [] if engine.is_open else engine.opened(now)
@@ -128,6 +132,8 @@ class Calls:
             self._not_before = now
             return []
         self.failed += 1
+        self.failures += 1
+        self.last_failure = str(why)
         if self.failed < self._rules.tries:
             return engine.lost(why, now, time) if was_connected else []
         if self.failed > 1:

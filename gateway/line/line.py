@@ -71,7 +71,7 @@ class Line:
         )
         self._wall = wall
         self._random = random.Random(seed)  # noqa: S311  (jitter, not a secret)
-        self._calls: Calls | None = None  # while a modem is there
+        self.calls: Calls | None = None  # while a modem is there
         self._channel: Channel | None = None
         self._transaction: Transaction | None = None
         self._lost: LineDown | None = None
@@ -205,8 +205,8 @@ class Line:
             self.deliver(self.engine.opened(_now()))
             self.tried.set()
             if isinstance(port, CallPort):
-                self._calls = Calls(self.engine, rules_of(port))
-                await serve_calls(self, port, self._calls)
+                self.calls = Calls(self.engine, rules_of(port))
+                await serve_calls(self, port, self.calls)
             await self.serve(channel)
         except LineDown as error:
             known = str(error) == self.engine.record.trouble
@@ -243,7 +243,7 @@ class Line:
 
     async def _close(self) -> None:
         channel, self._channel = self._channel, None
-        self._transaction = self._calls = None
+        self._transaction = self.calls = None
         self.engine.schedule.dials = False
         if channel is not None:
             await channel.close()
@@ -257,7 +257,7 @@ class Line:
             job = engine.next(begun)
             if isinstance(job, Idle):
                 self._transaction = None
-                over = NEVER if self._calls is None else self._calls.over(begun)
+                over = NEVER if self.calls is None else self.calls.over(begun)
                 if over <= begun:
                     return
                 await self.idle(min(job.until, over))

@@ -70,5 +70,6 @@ def _line(line: ServedLine, now: float) -> Document:
             "slowest_write": 0.0,
         },
         "unasked_bytes": 0,
+        "calls": None,
         "expected": {"load": 0.0, "requests_per_second": 0.0, "cycle": 0.0, "worst_write": 0.0},
     }
