@@ -3,7 +3,7 @@
 import asyncio
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import NoReturn, Protocol, runtime_checkable
 
 from gateway.engine.calls import CallRules, Calls
 from gateway.engine.effects import Effect
@@ -63,11 +63,8 @@ def rules_of(port: CallPort) -> CallRules:
 class CallingLine(Protocol):
     """The line that the calls serve."""
 
-    @property
-    def is_lost(self) -> bool:
-        """True if the port of the modem is lost."""
-
-    def catch_up(self, now: float) -> None: ...
+    def catch_up(self, now: float) -> None:
+        """Raises `LineDown` when the port of the modem is lost."""
 
     def begin(self, port: Port) -> Channel: ...
 
@@ -80,10 +77,10 @@ class CallingLine(Protocol):
     def end_call(self, calls: Calls, why: CallEnded | None) -> None: ...
 
 
-async def serve_calls(line: CallingLine, port: CallPort, calls: Calls) -> None:
+async def serve_calls(line: CallingLine, port: CallPort, calls: Calls) -> NoReturn:
     """Serves one call after another, until the port of the modem is lost. Raises `LineDown`."""
     now = asyncio.get_running_loop().time
-    while not line.is_lost:
+    while True:
         line.catch_up(now())
         due = calls.due(now())
         if due > now():

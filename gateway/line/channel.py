@@ -217,3 +217,15 @@ class Channel:
     async def close(self) -> None:
         self.alarm.cancel()
         await self._port.close()
+
+
+def channels(
+    line: str,
+    wire: WireTiming,
+    echo: bool | None,
+    wire_log: WireLog,
+    may_not_send: Callable[[float, float], str],
+) -> Callable[[Port], Channel]:
+    """Returns a function that makes the channel of an open port. `echo`: of the file."""
+    known = Echo(line, echo)  # what is learned of the adapter stays
+    return lambda port: Channel(port, wire, wire_log, known, may_not_send=may_not_send)

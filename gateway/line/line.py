@@ -9,7 +9,6 @@ import random
 import time
 from collections.abc import Awaitable, Callable, Sequence
 from contextlib import suppress
-from functools import partial
 from typing import Any, Protocol
 
 import structlog
@@ -24,7 +23,7 @@ from gateway.engine.requests import WRITE_EXPIRY, Command, Outcome, Request, Wri
 from gateway.errors import CallEnded, GatewayError, LineDown
 from gateway.line.calling import CallPort, dialling, rules_of, serve_calls
 from gateway.line.changing import Changeable, WaitingChange
-from gateway.line.channel import NEVER, Channel, Echo, Expiry
+from gateway.line.channel import NEVER, Channel, Expiry, channels
 from gateway.line.duty import Duty
 from gateway.line.perform import perform
 from gateway.line.transaction import Transaction
@@ -62,13 +61,10 @@ class Line:
         """`echo`: the port receives its own bytes; None: not known. `wall`: ns since 1970."""
         self.engine = engine
         self._open_port = open_port
-        self.dialling = dialling(open_port)
         self._sink = sink
         self.wire_log = WireLog()
-        known, duty = Echo(engine.name, echo), duty or Duty()  # what is learned of an adapter stays
-        self._new_channel = partial(
-            Channel, wire=engine.wire, wire_log=self.wire_log, echo=known, may_not_send=duty.why_not
-        )
+        duty = duty or Duty()
+        self._new_channel = channels(engine.name, engine.wire, echo, self.wire_log, duty.why_not)
         self._wall = wall
         self._random = random.Random(seed)  # noqa: S311  (jitter, not a secret)
         self.calls: Calls | None = None  # while a modem is there
@@ -83,6 +79,10 @@ class Line:
 
     # Clients
 
+    @property
+    def dialling(self) -> float:
+        return dialling(self._open_port)
+
     def write(
         self, device: Device, tag: Tag, units: Sequence[int], within: float = WRITE_EXPIRY
     ) -> asyncio.Future[WriteResult]:
@@ -90,19 +90,20 @@ class Line:
 
         The future ends when the device has acknowledged, or raises `GatewayError`.
         """
-        return self._submit(Write(device, tag, units, _now(), within + self.dialling))
+        return self._submit(Write(device, tag, units, _now(), within))
 
     def command(
         self, device: Device, name: str, argument: str, within: float = WRITE_EXPIRY
     ) -> asyncio.Future[str]:
         """Sends a command of the driver, such as run or stop. As `write`."""
-        return self._submit(Command(device, name, argument, _now(), within + self.dialling))
+        return self._submit(Command(device, name, argument, _now(), within))
 
     def peek(self, device: Device, span: Span, within: float = WRITE_EXPIRY) -> asyncio.Future[str]:
         """Reads any addresses once. The future has the units, with spaces between. As `write`."""
-        return self._submit(Command(device, "peek", "", _now(), within + self.dialling, span))
+        return self._submit(Command(device, "peek", "", _now(), within, span))
 
     def _submit(self, request: Request) -> asyncio.Future[Any]:
+        request.within += self.dialling
         outcome = self._outcomes[request] = asyncio.get_running_loop().create_future()
         self.deliver(self.engine.submit(request, _now()))
         self._wake.set()
@@ -230,12 +231,10 @@ class Line:
             self._lost = None
         self.deliver(calls.end(why, _now(), self._wall(), working=working))
 
-    @property
-    def is_lost(self) -> bool:
-        return self._lost is not None
-
     def catch_up(self, now: float) -> None:
-        """Does what waits for the end of a transaction."""
+        """Does what waits for the end of a transaction. Raises `LineDown` when the port is lost."""
+        if self._lost is not None:
+            raise self._lost
         if self._waiting is not None and self.engine.is_idle:
             self._apply()
         if self.engine.deadline <= now:
@@ -251,9 +250,10 @@ class Line:
     async def serve(self, channel: Channel) -> None:
         """Serves the port until it is lost, or a telephone call until it is complete."""
         engine, now = self.engine, channel.now
-        while self._lost is None:
+        while True:
             begun = now()
-            self.catch_up(begun)
+            if self._lost is not None or self._waiting is not None or engine.deadline <= begun:
+                self.catch_up(begun)
             job = engine.next(begun)
             if isinstance(job, Idle):
                 self._transaction = None
@@ -277,7 +277,6 @@ class Line:
                 self.wire_log.performed(job, result, begun, now())
             traffic = transaction.traffic
             self.deliver(engine.conclude(job, result, traffic, now(), self._wall()))
-        raise self._lost
 
     async def _perform_together(self, polls: Sequence[Poll], channel: Channel) -> None:
         """Performs several polls at once in one transaction. Its traffic counts with the last."""

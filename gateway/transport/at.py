@@ -42,7 +42,7 @@ MOST_ESCAPES = 2  # in one hang-up
 
 
 class State(Enum):
-    """What the modem does, as far as known."""
+    """Present action of the modem, as far as known."""
 
     CLOSED = auto()
     WAKING = auto()  # the first SETUP was sent
