@@ -3,7 +3,7 @@
 import asyncio
 from collections.abc import Awaitable, Callable, Coroutine, Sequence
 from contextlib import suppress
-from typing import Any
+from typing import Any, Protocol
 
 import serialx
 import structlog
@@ -27,17 +27,26 @@ from gateway.transport.stream import StreamPort
 
 log = structlog.get_logger("gateway.line")
 LOOK = 0.25  # seconds between two looks at the signal CD
+LONGEST_ANSWER = 1.0  # seconds of a modem that hangs up while its port is closed
 
 
-class Signals:
-    """The signals DTR and CD of a serial port. A pseudo terminal and a network port have none."""
+class Signals(Protocol):
+    """The signals DTR and CD of a port."""
+
+    async def carrier(self) -> bool | None:
+        """Returns the signal CD; None: the port has none."""
+
+    async def set_dtr(self, on: bool) -> None: ...
+
+
+class SerialSignals:
+    """Those of a serial port. A pseudo terminal and a network port have none."""
 
     def __init__(self, port: Port) -> None:
         transport = port.transport if isinstance(port, StreamPort) else None
         self._serial = transport if isinstance(transport, serialx.SerialTransport) else None
 
     async def carrier(self) -> bool | None:
-        """Returns the signal CD; None: the port has none."""
         if self._serial is not None:
             with suppress(OSError, serialx.SerialException):
                 pins = await self._serial.get_modem_pins()
@@ -70,11 +79,15 @@ class ModemPort:
         self._carrier: bool | None = None  # between calls; False: the signal is alive
         self._loss: LineDown | None = None
 
-    async def open(self, opens: Callable[[Receiver], Awaitable[Port]]) -> None:
+    async def open(
+        self,
+        opens: Callable[[Receiver], Awaitable[Port]],
+        signals: Callable[[Port], Signals] = SerialSignals,
+    ) -> None:
         """Opens the port of the modem, and sets the modem up. Raises `LineDown`."""
         self._port = await opens(self)
         try:
-            self._signals = Signals(self._port)
+            self._signals = signals(self._port)
             self._carrier = await self._signals.carrier()
             self._modem.dtr = self._carrier is not None
             await self._ended(self._modem.open)
@@ -99,7 +112,12 @@ class ModemPort:
         self._port.write(data)
 
     async def close(self) -> None:
-        """Closes the port of the modem: DTR falls, and the call with it."""
+        """Closes the port of the modem: DTR falls, and the call with it. Else hangs up first."""
+        calling = self._modem.state in (State.ONLINE, State.DIALLING, State.ANSWERING)
+        if calling and not self._modem.dtr and self._loss is None:
+            with suppress(LineDown, TimeoutError):
+                async with asyncio.timeout(2 * self.modem.guard + LONGEST_ANSWER):
+                    await self.hang_up()
         port, self._port = self._port, None
         if self._timer is not None:
             self._timer.cancel()

@@ -1,6 +1,7 @@
 """The port of a modem: what it refuses, and how it reports a loss."""
 
 import asyncio
+from functools import partial
 
 import pytest
 
@@ -39,10 +40,10 @@ class Bench:
 
     async def open(self) -> ModemPort:
         return await open_modem(
-            WHERE, SerialSettings(), SETTINGS, self.receiver, opens=self._opened
+            WHERE, SerialSettings(), SETTINGS, self.receiver, opens=self.below_it
         )
 
-    async def _opened(self, _: PortAddress, __: SerialSettings, receiver: Receiver) -> Port:
+    async def below_it(self, _: PortAddress, __: SerialSettings, receiver: Receiver) -> Port:
         self.below, self.cable = receiver, Cable(self.model, receiver)
         return self.cable
 
@@ -126,3 +127,75 @@ def test_a_modem_is_at_any_real_port() -> None:
     for text in ("modem:simulator", "modem:", "modem:modem:/dev/ttyS0"):
         with pytest.raises(ValueError, match="port"):
             parse_port(text)
+
+
+class FakeSignals:
+    """The signals of a modem that follows them: CD in a call, no call without DTR."""
+
+    def __init__(self, model: ModemModel, *, always: bool = False) -> None:
+        """`always`: CD says nothing, as after AT&C0."""
+        self.dtr: list[bool] = []
+        self._model = model
+        self._always = always
+
+    async def carrier(self) -> bool | None:
+        return self._always or self._model.online
+
+    async def set_dtr(self, on: bool) -> None:
+        self.dtr.append(on)
+        if not on:
+            self._model.drop()
+
+
+async def opened(bench: Bench, signals: FakeSignals) -> ModemPort:
+    port = ModemPort("/dev/ttyS0", SETTINGS, bench.receiver, answers=False)
+    await port.open(partial(bench.below_it, WHERE.port, SerialSettings()), lambda _: signals)
+    return port
+
+
+@on_virtual_time
+async def test_the_signal_cd_ends_a_call_without_a_word_of_the_modem() -> None:
+    bench = Bench()
+    signals = FakeSignals(bench.model)
+    port = await opened(bench, signals)
+    await port.dial()
+    await asyncio.sleep(60)
+    assert bench.receiver.losses == []
+    bench.model.drop()  # it says nothing to the gateway
+    await asyncio.sleep(1)
+    assert str(bench.receiver.losses[0]) == "/dev/ttyS0: NO CARRIER (the signal CD is off)"
+    await port.close()
+
+
+@on_virtual_time
+async def test_a_signal_cd_that_is_always_on_says_nothing() -> None:
+    bench = Bench()
+    port = await opened(bench, FakeSignals(bench.model, always=True))
+    await port.dial()
+    bench.model.drop()
+    await asyncio.sleep(60)
+    assert bench.receiver.losses == []
+    await port.close()
+
+
+@on_virtual_time
+async def test_dtr_hangs_up_where_there_is_one() -> None:
+    bench = Bench()
+    signals = FakeSignals(bench.model)
+    port = await opened(bench, signals)
+    await port.dial()
+    await port.hang_up()
+    assert signals.dtr == [False, True]
+    assert "+++" not in bench.model.data.decode()
+    await port.dial()
+    await port.close()
+
+
+@on_virtual_time
+async def test_a_port_without_dtr_hangs_up_before_it_is_closed() -> None:
+    bench = Bench()
+    port = await bench.open()
+    await port.dial()
+    await port.close()
+    assert not bench.model.online
+    assert bench.model.commands[-1] == "ATH"
