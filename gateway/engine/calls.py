@@ -6,7 +6,7 @@ Synchronous and pure, like the engine. A line without a modem has no `Calls`.
 from dataclasses import dataclass
 
 from gateway.engine.device import Device
-from gateway.engine.effects import Effect
+from gateway.engine.effects import Effect, LogEvent
 from gateway.engine.engine import Engine
 from gateway.engine.health import State
 from gateway.engine.jobs import Poll
@@ -126,7 +126,6 @@ class Calls:
         """
         was_connected, self.connected = self.connected, False
         self._ended, self._not_before = now, now + self._rules.retry_pause
-        engine = self._engine
         if why is None or (was_connected and not working and not self._is_busy(now)):
             self.failed = 0
             self._not_before = now
@@ -135,11 +134,16 @@ class Calls:
         self.failures += 1
         self.last_failure = str(why)
         if self.failed < self._rules.tries:
-            return engine.lost(why, now, time) if was_connected else []
+            return self._lost(why, now, time) if was_connected else []
         if self.failed > 1:
             why = LineDown(f"{why} ({self.failed} calls in a row failed)")
         self.failed = 0
-        return engine.lost(why, now, time)
+        return self._lost(why, now, time)
+
+    def _lost(self, why: LineDown, now: float, time: int) -> list[Effect]:
+        fields: dict[str, object] = {"line": self._engine.name, "why": str(why)}
+        event = LogEvent("warning", "line down", fields)
+        return [*self._engine.lost(why, now, time), event]
 
 
 def _due(poll: Poll) -> float:

@@ -191,6 +191,7 @@ class ModemPort:
                 self._watch = self._start(self._watch_carrier())
                 self._end(None)
             case Failed(why):
+                log.info("call failed", port=self.name, modem=why)
                 self._end(CallEnded(f"{self.name}: {why}"))
             case Ready():
                 self._end(None)

@@ -217,3 +217,13 @@ async def test_a_modem_that_answers_nothing_is_a_line_that_is_down() -> None:
         far.model.deaf = False
         await asyncio.sleep(60)
         assert far.now["level"].value == 17
+
+
+@on_virtual_time
+async def test_a_read_on_demand_dials() -> None:
+    async with running(Telephone(ModemModel())) as far:
+        await asyncio.sleep(60)
+        far.plc.memory.write("D", 100, [18])
+        far.line.expedite(far.device, far.tag("level"))
+        await asyncio.sleep(5)
+        assert (far.now["level"].value, far.model.calls) == (18, 2)
