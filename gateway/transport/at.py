@@ -5,7 +5,6 @@ commands are those of ITU-T V.250, which every modem since Hayes takes.
 """
 
 import re
-from enum import Enum, auto
 
 from gateway.transport.modem_events import (
     Broken,
@@ -18,6 +17,7 @@ from gateway.transport.modem_events import (
     Received,
     Send,
     SetDtr,
+    State,
 )
 
 NEVER = float("inf")
@@ -41,25 +41,6 @@ _AFTER = (SETUP, KEEP_SILENT)  # after the init strings, which may change them
 MOST_ESCAPES = 2  # in one hang-up
 
 
-class State(Enum):
-    """Present action of the modem, as far as known."""
-
-    CLOSED = auto()
-    WAKING = auto()  # the first SETUP was sent
-    PAUSING = auto()  # before the next init string
-    STARTING = auto()  # an init string was sent
-    READY = auto()
-    DIALLING = auto()
-    ABORTING = auto()  # a dial took too long and was broken off
-    ANSWERING = auto()
-    ONLINE = auto()
-    DROPPING = auto()  # DTR is off
-    RAISED = auto()  # DTR is on again
-    GUARDING = auto()  # the silence before +++
-    ESCAPING = auto()  # +++ was sent
-    HANGING_UP = auto()  # ATH was sent
-
-
 class AtModem:
     """One modem. Call `tick` at `due`, `open` first, `dial` and `hang_up` when `Ready` came."""
 
@@ -74,6 +55,7 @@ class AtModem:
         self._held = b""  # data that may be the beginning of the modem's own text
         self._commands: list[str] = []  # to be sent before the modem is ready
         self._escapes = 0  # of this hang-up
+        self._gone = False  # the modem reports the end of the carrier
         self._then: Event = Ready()  # the event at the end of the hang-up
         self._heard = 0.0  # the last data of the call
         self._rang = -NEVER
@@ -181,6 +163,8 @@ class AtModem:
                 self.state, self.due = State.ESCAPING, now + settings.guard + ESCAPE_WAIT
             case State.ESCAPING:
                 self._command(HANG_UP, State.HANGING_UP, now + settings.command_timeout)
+            case _ if self._gone:
+                self._hung_up(now)
             case _ if self._escapes < MOST_ESCAPES:
                 self._guard(now)
             case _ if self._waking:
@@ -242,6 +226,8 @@ class AtModem:
                 self._rest()
             case State.ABORTING | State.ESCAPING:
                 self._command(HANG_UP, State.HANGING_UP, now + self._settings.command_timeout)
+            case State.HANGING_UP if text.upper() == "NO CARRIER":  # some modems say no OK after it
+                self._gone, self.due = True, now + 2 * PAUSE
 
     @property
     def _place(self) -> str:
@@ -323,7 +309,7 @@ class AtModem:
 
     def _begin_hang_up(self, then: Event, now: float) -> None:
         """`then` is reported when the modem has hung up."""
-        self._then, self._escapes, self._held = then, 0, b""
+        self._then, self._escapes, self._held, self._gone = then, 0, b"", False
         if self.dtr:
             self._events.append(SetDtr(False))
             self.state, self.due = State.DROPPING, now + DTR_TIME

@@ -9,7 +9,7 @@ import serialx
 import structlog
 
 from gateway.errors import CallEnded, LineDown
-from gateway.transport.at import NEVER, AtModem, State
+from gateway.transport.at import NEVER, AtModem
 from gateway.transport.modem_events import (
     Broken,
     Connected,
@@ -21,6 +21,7 @@ from gateway.transport.modem_events import (
     Received,
     Send,
     SetDtr,
+    State,
 )
 from gateway.transport.port import Port, Receiver
 from gateway.transport.stream import StreamPort

@@ -1,6 +1,7 @@
-"""The settings of a modem, and what its state machine reports."""
+"""The settings of a modem, the states of its state machine, and what this reports."""
 
 from dataclasses import dataclass
+from enum import Enum, auto
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -79,3 +80,22 @@ class Broken:
 
 
 Event = Send | SetDtr | Ready | Connected | Failed | Received | Ended | Broken
+
+
+class State(Enum):
+    """Present action of the modem, as far as known."""
+
+    CLOSED = auto()
+    WAKING = auto()  # the first SETUP was sent
+    PAUSING = auto()  # before the next init string
+    STARTING = auto()  # an init string was sent
+    READY = auto()
+    DIALLING = auto()
+    ABORTING = auto()  # a dial took too long and was broken off
+    ANSWERING = auto()
+    ONLINE = auto()
+    DROPPING = auto()  # DTR is off
+    RAISED = auto()  # DTR is on again
+    GUARDING = auto()  # the silence before +++
+    ESCAPING = auto()  # +++ was sent
+    HANGING_UP = auto()  # ATH was sent

@@ -23,6 +23,7 @@ class ModemModel:
     answers: Callable[[bytes], bytes] = lambda data: b""
     guard: float = 0.05
     errors: frozenset[str] = frozenset()  # commands that it answers ERROR
+    hung_up: str = ""  # its result of ATH, in place of OK
     deaf: bool = False  # it answers no command
     echo: bool = True
     online: bool = False
@@ -117,6 +118,8 @@ class ModemModel:
             self.echo = False
         if line == "ATH":
             self._in_call = False
+            if self.hung_up:
+                return self._word(self.hung_up)
         return self._word("OK")
 
     def _dial(self, now: float) -> bytes:

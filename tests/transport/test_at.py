@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gateway.transport.at import LOST, NEVER, AtModem, State
+from gateway.transport.at import LOST, NEVER, AtModem
 from gateway.transport.modem_events import (
     Broken,
     Connected,
@@ -16,6 +16,7 @@ from gateway.transport.modem_events import (
     Received,
     Send,
     SetDtr,
+    State,
 )
 from tests.transport.modem import ModemModel
 
@@ -165,6 +166,13 @@ def test_a_modem_that_does_not_hang_up_is_broken() -> None:
     bench.connect()
     bench.note(bench.modem.hang_up(bench.now))
     assert bench.run(60) == [Broken("the modem does not hang up")]
+
+
+def test_a_modem_may_report_the_end_of_the_carrier_alone() -> None:
+    bench = Bench(ModemModel(guard=1.0, after=1.0, hung_up="NO CARRIER"))
+    bench.connect()
+    bench.note(bench.modem.hang_up(bench.now))
+    assert bench.run(5) == [Ready()]
 
 
 def test_nothing_is_dialled_while_the_telephone_rings() -> None:
