@@ -15,9 +15,10 @@ from gateway.config.commands import check_command, every_command, speaker
 from gateway.engine.device import Device, DeviceSettings
 from gateway.engine.forecast import LineForecast, forecast
 from gateway.engine.requests import WRITE_EXPIRY, CommandResult, Peeked
-from gateway.errors import BadValue, Busy, ConfigError, Offline
+from gateway.errors import BadValue, Busy, ConfigError, GatewayError, Offline
 from gateway.line.build import OpenPort, line_of, opener
 from gateway.line.duty import Duty
+from gateway.line.groups import ended
 from gateway.line.line import Line
 from gateway.line.on_demand import OnDemand
 from gateway.line.serving import Serving
@@ -31,6 +32,7 @@ from gateway.tags import Reason, Sample, Tag, WriteResult, bad
 from gateway.tags.mirror import Mirror
 from gateway.tags.scan import Scan
 from gateway.tags.timestamps import rfc3339
+from gateway.transfers.forecast import transfer_forecasts, with_transfers
 from gateway.values import Value
 
 MOST_PEEKED = 256  # addresses of one peek
@@ -51,7 +53,7 @@ def forecasts(
         found.append(forecast(line.name, devices, line.wire))
         if report is not None:
             report("planning the requests", len(found) / len(config.lines))
-    return found
+    return with_transfers(found, transfer_forecasts(config, found))
 
 
 REMOVED = "removed from the file"
@@ -214,6 +216,10 @@ class Gateway:
         """Adds a document of another part to the status."""
         self._documents[path] = document
 
+    def drop_document(self, path: str) -> None:
+        """Removes a document of another part."""
+        self._documents.pop(path, None)
+
     def wire_logs(self) -> Mapping[str, WireLog]:
         polled = {line.engine.name: line.wire_log for line in self.lines}
         return polled | {line.name: line.wire_log for line in self.serving.lines}
@@ -230,10 +236,10 @@ class Gateway:
             self.alarms.judge(samples)
         if self.serving.remembering:
             self.serving.remember(samples)
-        if waiting := self._on_demand.waiting:
-            for sample in samples:
-                if sample.tag in waiting:
-                    self._on_demand.answer(sample)
+        if self._on_demand.arrived:
+            self._on_demand.note(samples)
+        if self._on_demand.waiting:
+            self._on_demand.answer_all(samples)
         if self.mirror.derives and (changed or self.mirror.pending):
             changed = self.mirror.follow(changed)
             if self.alarms.of_tags:
@@ -259,6 +265,11 @@ class Gateway:
     def tag(self, key: str) -> Tag | None:
         return self._tags.get(key)
 
+    def target(self, key: str) -> Tag | None:
+        """Finds a tag that a transfer writes: also one that no client sees."""
+        others = (tag for device in self._devices for tag in device.targets)
+        return self._tags.get(key) or next((tag for tag in others if tag.key == key), None)
+
     def sample(self, tag: Tag) -> Sample:
         try:
             return self.mirror[tag]
@@ -283,7 +294,9 @@ class Gateway:
         Raises `BadValue` before anything is sent, otherwise a `GatewayError`.
         """
         if self._tags.get(tag.key) is not tag:  # its scale or limits may be others now
-            raise Busy(f"the file was reloaded, and {tag.key} with it; not sent")
+            place = self._places.get(tag.device)
+            if place is None or tag not in place[1].settings.targets:
+                raise Busy(f"the file was reloaded, and {tag.key} with it; not sent")
         if self.serving.holds(tag):
             return await self.serving.write(tag, value)
         if tag.device not in self._places:
@@ -291,6 +304,28 @@ class Gateway:
         units = tag.encode(value)
         line, device = self._places[tag.device]
         return await line.write(device, tag, units, within)
+
+    async def write_group(
+        self,
+        values: Sequence[tuple[Tag, Value]],
+        within: float = WRITE_EXPIRY,
+        patience: float = WRITE_EXPIRY,
+    ) -> Sequence[WriteResult | GatewayError]:
+        """Writes tags of one device in their order; returns the outcome of each.
+
+        What has not ended after `patience` seconds is `Unclear`. Raises `GatewayError` when nothing
+        was sent.
+        """
+        name = values[0][0].device
+        if any(self._tags.get(tag.key) is not tag for tag, _ in values):
+            raise Busy(f"the file was reloaded, and {name} with it; not sent")
+        if self.serving.holds(values[0][0]):
+            return await self.serving.write_group(values)
+        if name not in self._places:
+            raise Offline(f"device {name} is disabled; nothing was sent")
+        units = [(tag, tag.encode(value)) for tag, value in values]
+        line, device = self._places[name]
+        return await ended(line.write_group(device, units, within), patience)
 
     def commands(self) -> Mapping[str, frozenset[str]]:
         return every_command(self.config)
@@ -344,6 +379,10 @@ class Gateway:
     def is_fresh(self, tag: Tag, max_age: float) -> bool:
         """True if the last read is younger than `max_age` seconds, or no read is possible now."""
         return self._on_demand.is_fresh(tag, max_age)
+
+    def age(self, tag: Tag) -> float:
+        """Returns the seconds since the last good read; infinite if there was none."""
+        return self._on_demand.age(tag)
 
     async def fresh(self, tag: Tag, max_age: float) -> Sample:
         """Returns the last sample if it `is_fresh`, otherwise that of the next read. Raises

@@ -4,6 +4,8 @@ GatewayError
 ├── ConfigError          fix the file; nothing has been sent
 ├── BadValue             refuse the write; nothing has been sent
 ├── Busy                 try again later; nothing has been sent
+│   ├── NotSent          a write of a group, after another one that was not done
+│   └── Superseded       a newer write of the same tag took its place: do not try again
 ├── Damaged              a part of the history file is lost; the rest can be read
 ├── Offline              the device is offline; nothing has been sent
 ├── LineDown             reopen the port; pending writes fail at once
@@ -32,6 +34,14 @@ class BadValue(GatewayError, ValueError):
 
 class Busy(GatewayError):
     """A request that could not be sent in time; nothing has been sent."""
+
+
+class NotSent(Busy):
+    """A write of a group that was not sent, because another one of it was not done."""
+
+
+class Superseded(Busy):
+    """A waiting write whose place a newer one of the same tag took; nothing has been sent."""
 
 
 class Damaged(GatewayError):

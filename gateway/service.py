@@ -26,6 +26,7 @@ from gateway.northbound.session import off_loop
 from gateway.reload import LiveReload, Reloader, RunningLines
 from gateway.supervisor import Supervisor
 from gateway.tags import Sample
+from gateway.transfers import Transfers
 
 log = structlog.get_logger("gateway")
 # Seconds. Python's usual 5 ms of the publishing thread would delay the lines.
@@ -116,6 +117,8 @@ async def _serve(
     alarm_file = AlarmFile(config.alarms.path, gateway.alarms)
     gateway.add_document("clock", clock.document)
     gateway.subscribe(northbound)
+    transfers = _transfers(config, gateway, northbound)
+    gateway.subscribe(transfers)
     if history is not None:  # clients may have missed what was published
         gateway.subscribe(_Recording(history))
         gateway.add_document("history", history.document)
@@ -141,7 +144,9 @@ async def _serve(
         ends = [zenoh, stopping, replaced, failed]
         for event in events:
             cleanup.callback(event.cancel)
-        live = LiveReload(reloader, gateway, northbound, running, plans, supervisor)
+        live = LiveReload(
+            reloader, gateway, northbound, running, plans, supervisor, transfers.renew
+        )
         await _first(exclusive, zenoh, stopping)
         if exclusive.done():  # otherwise another process may have this file and these lines
             if history is not None:
@@ -156,8 +161,10 @@ async def _serve(
             await _first(active, *ends)
             if active.done():
                 supervisor.says(reloader.says)
+                transfers.start()  # before the alarms are restored: it has some
                 await cleanup.enter_async_context(alarm_file.kept())
                 await _start_lines(gateway, plans, running, history, state_file, cleanup)
+                cleanup.push_async_callback(transfers.stop)  # before the lines
                 cleanup.push_async_callback(_end, [reload])  # before the lines: it starts some
         await _first(opened, *ends)
         if opened.done():
@@ -184,6 +191,11 @@ def _northbound(config: Config, gateway: Gateway, history: Historian | None) -> 
         writers=config.writers_file,
         group=group_settings(config),
     )
+
+
+def _transfers(config: Config, gateway: Gateway, northbound: Northbound) -> Transfers:
+    write, alarms = northbound.own_writes.write, config.alarms.transfers
+    return Transfers(gateway, write, config.transfers, alarms=alarms)
 
 
 def _web(

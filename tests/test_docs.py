@@ -58,7 +58,10 @@ FENCED = re.compile(r"^( *)```(\w+)\n(.*?)^\1```$", re.DOTALL | re.MULTILINE)
 # The blocks of this page are single devices: complete files are in examples/.
 OF_DEVICES = "no-protocol.md"
 # The pages whose Python programs run here against the example gateway.
-OF_PROGRAMS = ("read-values.md", "slow-links.md", "write-values.md", "browse.md")
+OF_PROGRAMS = (
+    *("read-values.md", "slow-links.md", "write-values.md", "write-groups.md"),
+    "browse.md",
+)
 # The tutorial's programs run in tests/e2e/test_story.py; the replay is a test of tests/cases; the
 # loop in architecture.md is pseudo code.
 RUN_ELSEWHERE = ("scada.md", "wire-log-to-test.md", "architecture.md")
@@ -135,16 +138,9 @@ def test_every_page_with_files_is_checked() -> None:
     counted = Counter(block.page for block in FILES)
     assert set(counted) == {
         *("/README.md", "configuration.md", "vigor.md", "computer-link.md", "modbus.md"),
-        *(
-            "first-plant.md",
-            "import.md",
-            "modem.md",
-            "peek.md",
-            "serve.md",
-            "shaping.md",
-            "systems.md",
-        ),
-        *("templates.md", "trace.md", "alarms.md"),
+        *("first-plant.md", "import.md", "peek.md", "serve.md", "shaping.md", "systems.md"),
+        *("modem.md", "transfers.md"),
+        *("templates.md", "trace.md", "alarms.md", "arrays.md"),
         *("tutorial-computer-link.md", "tutorial-modbus.md", "tutorial-vigor.md"),
     }
     assert sum(counted.values()) >= 11
@@ -216,6 +212,8 @@ def settings(heading: str) -> dict[str, str]:
     page = "configuration-protocols.md" if heading in PROTOCOLS else "configuration.md"
     if heading in ("alarm", "alarms"):
         page = "alarms.md"
+    if heading == "Settings":
+        page = "transfers.md"
     rows = table(page, heading, "setting")
     if heading == "A tag":
         rows += table("shaping.md", "Settings", "setting")
@@ -246,7 +244,7 @@ def properties(*names: str) -> set[str]:
     [
         *(("gateway", "GatewaySection"), ("zenoh", "ZenohSection"), ("tls", "TlsSection")),
         *(("writers", "WritersSection"), ("history", "HistorySection")),
-        *(("alarm", "AlarmSection"), ("alarms", "AlarmsSection")),
+        *(("alarm", "AlarmSection"), ("alarms", "AlarmsSection"), ("Settings", "Transfer")),
         *(("web", "WebSection"), ("A line", "Line"), ("A tag", "Tag"), ("write", "WriteSection")),
     ],
 )
@@ -529,6 +527,7 @@ def _example_keys() -> set[str]:
     return {
         *(key for tag in tags for key in (keys.value(tag), keys.set(tag), keys.meta(tag))),
         *(key for n in devices for key in (keys.device(n), keys.block(n), keys.peek(n))),
+        *map(keys.set, devices),
         *(keys.status(f"devices/{name}") for name in devices),
         *(keys.status(f"lines/{line.name}") for line in config.lines),
         *(keys.trace(line.name) for line in config.lines),
@@ -538,6 +537,7 @@ def _example_keys() -> set[str]:
             keys.status("alarms"),
             keys.alarm("**"),
             keys.status("status"),
+            keys.status("transfers/1"),
             keys.writes,
             keys.page,
         ),

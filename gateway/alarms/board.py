@@ -102,9 +102,14 @@ class Alarms:
                 self._remove(entry)
         self.of_tags = bool(self._by_tag)
 
-    def watch_only(self, keys: Collection[str]) -> None:
-        """Ends the alarms of other lines and devices."""
-        for entry in [entry for entry in self._watched if entry.key not in keys]:
+    @property
+    def watched(self) -> Collection[str]:
+        """The keys of the alarms that `watch` added."""
+        return [entry.key for entry in self._watched]
+
+    def unwatch(self, keys: Collection[str]) -> None:
+        """Ends alarms that `watch` added."""
+        for entry in [entry for entry in self._watched if entry.key in keys]:
             self._watched.remove(entry)
             self._remove(entry)
 

@@ -13,14 +13,17 @@ from gateway.tags import AlarmRule, Level
 # Seconds that a line is down before it is an alarm: an adapter that is plugged again, or a device
 # server that starts again, is back earlier.
 LINE_DELAY = 3.0
-LINE = "line:"  # begins the key of the alarm of a line; no device has a colon in its name
+# Begin the key of the alarm of a line or a transfer; no device has a colon in its name.
+LINE, TRANSFER = "line:", "transfer:"
 
 
 def watch(alarms: Alarms, lines: Iterable[Line], config: AlarmsConfig) -> None:
     """Adds the alarms of lines and of their devices, and ends those of others."""
     lines = [*lines]
     names = {device.name for line in lines for device in line.engine.devices}
-    alarms.watch_only(names | {f"{LINE}{line.engine.name}" for line in lines})
+    names |= {f"{LINE}{line.engine.name}" for line in lines}
+    known = (key for key in alarms.watched if not key.startswith(TRANSFER))
+    alarms.unwatch({key for key in known if key not in names})
     for line in lines:
         name = line.engine.name
         if config.lines:

@@ -21,6 +21,7 @@ from gateway.history.place import trouble
 from gateway.planning.planner import describe
 from gateway.planning.wire_timing import NETWORK_BAUD, WireTiming
 from gateway.tags.tag import CounterRule
+from gateway.transfers.forecast import TransferForecast, transfer_forecasts
 from gateway.web import exposure
 
 
@@ -55,6 +56,8 @@ def check(
     for line, forecast in modems:
         out.print(Text(modem_plan(line, forecast)))
         warnings += [] if forecast is None else modem_warnings(line, forecast)
+    if loaded.transfers:
+        out.print(_transfers(transfer_forecasts(loaded, lines)))
     for note in _notes(loaded):
         err.print(f"note: {note}")
     for warning in (*(line.advice() for line in lines if line.overloaded), *warnings):
@@ -185,6 +188,26 @@ def _blocks(line: LineForecast) -> Table:
 def seconds(time: float) -> str:
     """Formats a duration: `12.3 ms`, `1.43 s`."""
     return f"{time * 1000:.1f} ms" if time < 1 else f"{time:.2f} s"
+
+
+def _transfers(rows: Sequence[TransferForecast]) -> RenderableType:
+    """Renders the transfers: their share of the line that they write on is in its load."""
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    for column in ("  row", "from", "to", "when", "takes", "line", "load", "worst age"):
+        table.add_column(column)
+    for row in rows:
+        source, target = row.rule.text
+        table.add_row(
+            f"  {row.rule.number}",
+            Text(source),
+            Text(target),
+            row.rule.when,
+            seconds(row.writes.seconds),
+            Text(row.line),
+            f"{row.load:.1%}",
+            "" if row.worst_age is None else seconds(row.worst_age),
+        )
+    return Group(Text("transfers, if each value changes with each read:"), table, Text())
 
 
 def _speed(wire: WireTiming) -> str:

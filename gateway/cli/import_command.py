@@ -1,12 +1,12 @@
 """The `import` command: tags of a sheet into the configuration, all or none."""
 
-import shutil
 from dataclasses import fields
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from gateway.cli.import_transfers import BOM, backup_of, import_transfers, read_file, replace
 from gateway.cli.terminal import err
 from gateway.config import Config, ConfigErrors, SheetUse, load
 from gateway.config.messages import one_of
@@ -17,7 +17,6 @@ from gateway.sheets import devices_in, link_table, read_grid
 from gateway.tags import Tag
 
 _DERIVED = ("decode", "shape")
-_BOM = b"\xef\xbb\xbf"
 
 SheetPath = Annotated[
     Path, typer.Argument(metavar="SHEET", help="CSV, tab-separated text or .xlsx; with titles.")
@@ -32,8 +31,18 @@ def import_(
     device: Annotated[
         str | None, typer.Option(help="The device in that file (default: its only one)")
     ] = None,
+    transfers: Annotated[
+        str | None,
+        typer.Option(
+            metavar="DEVICE",
+            help="The rows of a PLC's communication table become transfers; DEVICE is that PLC.",
+        ),
+    ] = None,
 ) -> None:
     """Import the tags of a sheet into the configuration. With a mistake nothing is written."""
+    if transfers is not None:
+        import_transfers(sheet, into, transfers)
+        return
     grid = read_grid(read_file(sheet))
     named = [] if link_table.is_table(grid) else devices_in(grid)
     if into is None:
@@ -44,14 +53,6 @@ def import_(
         return
     for line in add_tags(sheet, into, [device] if device else named):
         print(line)
-
-
-def read_file(path: Path) -> bytes:
-    """Raises `ConfigError`."""
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise ConfigError(f"{path} cannot be read: {error.strerror}") from None
 
 
 def add_tags(sheet: Path, into: Path, devices: list[str], *, backup: bool = True) -> list[str]:
@@ -71,19 +72,27 @@ def add_tags(sheet: Path, into: Path, devices: list[str], *, backup: bool = True
         raise ConfigErrors([*error.messages, last], error.count) from None
     uses = [use for use in wanted.sheets if use.file == sheet.absolute()]
     missing = set(devices) - {use.device for use in uses}
-    text = before.removeprefix(_BOM).decode()
+    text = before.removeprefix(BOM).decode()
     for use in uses:
         comment = f"{len(use.raw)} tags from {sheet.name}"
         text = with_tags(str(into), text, use.device, use.raw, comment)
     if missing:
         with_tags(str(into), text, missing.pop(), {}, "")  # raises: names the devices of the file
-    after = (_BOM if before.startswith(_BOM) else b"") + text.encode()
+    after = (BOM if before.startswith(BOM) else b"") + text.encode()
     own = into.resolve()  # the file itself, not a link to it
-    _replace(own, before, after, wanted, _backup(own) if backup else None)
+
+    def check(new: Path) -> None:
+        if _meaning(load(new)) != _meaning(wanted):
+            raise ConfigError(
+                f"the tags cannot be inserted into {own.name} as it is written: "
+                "write `tags_from: <sheet>` into the device instead"
+            )
+
+    replace(own, before, after, check, backup_of(own) if backup else None)
     for use in uses:
         print_notes(sheet, use.notes)
     said = [_said(sheet, into, use) for use in uses]
-    return [*said, f"the file before is {_backup(into).name}"] if backup else said
+    return [*said, f"the file before is {backup_of(into).name}"] if backup else said
 
 
 def _said(sheet: Path, into: Path, use: SheetUse) -> str:
@@ -113,32 +122,6 @@ def _only_device(into: Path) -> list[str]:
     if len(names) != 1:
         raise ConfigError(f"name the device with --device: {into.name} has {', '.join(names)}")
     return names
-
-
-def _replace(into: Path, before: bytes, after: bytes, wanted: Config, backup: Path | None) -> None:
-    """Replaces the file at once, after the new text was read back and means what was wanted."""
-    new = into.with_name(f"{into.name}.new")
-    try:
-        new.write_bytes(after)
-        if _meaning(load(new)) != _meaning(wanted):
-            raise ConfigError(
-                f"the tags cannot be inserted into {into.name} as it is written: "
-                "write `tags_from: <sheet>` into the device instead"
-            )
-        shutil.copymode(into, new)
-        if into.read_bytes() != before:
-            raise ConfigError(f"{into.name} was changed meanwhile: import again")
-        if backup is not None:
-            shutil.copy2(into, backup)
-        new.replace(into)
-    except OSError as error:
-        raise ConfigError(f"{into} cannot be written: {error.strerror}") from None
-    finally:
-        new.unlink(missing_ok=True)
-
-
-def _backup(into: Path) -> Path:
-    return into.with_name(f"{into.name}.bak")
 
 
 def _meaning(config: Config) -> dict[str, tuple[object, ...]]:

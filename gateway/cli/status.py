@@ -23,6 +23,9 @@ from gateway.northbound.faults import Documents, below, faults, warnings
 EVERY = 1.0  # seconds between two views of --watch
 HOUR = "now(-1h)"
 _STYLES = {"up": "green", "open": "green", "silent": "red", "down": "red", "failing": "yellow"}
+_STYLES |= {"carried": "green", "waiting": "yellow", "stale": "red", "refused": "red"}
+_STYLES |= {"unclear": "red"}
+_LONGEST_VALUE = 40  # characters
 
 
 def status(
@@ -98,6 +101,7 @@ def view(documents: Documents, outcomes: list[dict[str, Any]] | None) -> Rendera
         Text(),
         _devices(documents),
         Text(),
+        *_transfers(documents),
         _services(documents, outcomes),
     ]
     for heading, style, found in (
@@ -151,6 +155,26 @@ def _devices(documents: Documents) -> Table:
             Text(_counts(document["refusals"])),
         )
     return table
+
+
+def _transfers(documents: Documents) -> list[RenderableType]:
+    """Returns the table of the transfers; nothing without any."""
+    rows = sorted(below("transfers/", documents), key=lambda row: int(row[0]))
+    table = _table("transfer", "from", "to", "state", "code", "age", "carried", "unclear", "value")
+    for number, document in rows:
+        age = document["age"]
+        table.add_row(
+            number,
+            Text(printable(document["from"])),
+            Text(printable(document["to"])),
+            _state(document["state"]),
+            document["code"] or "-",
+            "-" if age is None else f"{age:.1f} s",
+            str(document["carried"]),
+            str(document["unclear"]),
+            Text(printable(json.dumps(document["value"])[:_LONGEST_VALUE])),
+        )
+    return [table, Text()] if rows else []
 
 
 def _services(documents: Documents, outcomes: list[dict[str, Any]] | None) -> Table:

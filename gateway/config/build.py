@@ -7,6 +7,7 @@ from pathlib import Path as FilePath
 from typing import Any
 
 from gateway.config import parsers
+from gateway.config.array_rules import check_overlaps
 from gateway.config.computed_tags import check_totals, with_computed
 from gateway.config.device_tags import DeviceTags, mapping
 from gateway.config.line_rules import check_line, line_wire, modem_of
@@ -38,6 +39,7 @@ from gateway.config.served import (
 )
 from gateway.config.sheet_tags import SheetTags
 from gateway.config.tag_rules import inherit
+from gateway.config.transfers import TransferRows
 from gateway.config.validate import (
     driver_of,
     driver_settings,
@@ -67,6 +69,7 @@ class Builder:
     imports: Mapping[str, FilePath] = field(default_factory=dict)  # one more sheet of a device
     _devices: dict[str, str] = field(default_factory=dict)  # name -> its line
     _count: int = 0  # devices in the file
+    _intervals: dict[str, float] = field(default_factory=dict)  # by device: the default
     _tags: DeviceTags = field(init=False)
     _sheets: SheetTags = field(init=False)
 
@@ -93,6 +96,8 @@ class Builder:
         if top is not None and top.gateway.standby is not None:
             check_totals(lines, self.mistakes)
         check_sources(lines, self.mistakes)
+        rows = TransferRows(lines, self._intervals, self.mistakes)
+        lines, transfers = rows.build(data.get("transfers"))
         if top is None:
             return None
         check_retained(lines, self._state_file(top), top.gateway.standby, self.mistakes)
@@ -109,6 +114,7 @@ class Builder:
             web=self._web(top),
             alarms=self._alarms(top, lines),
             lines=tuple(lines),
+            transfers=transfers,
             watch=top.gateway.watch_config,
             sheets=tuple(self._sheets.used),
         )
@@ -170,6 +176,7 @@ class Builder:
         driver = self._driver(raw.get("protocol"), own, path)
         defaults = self._defaults(raw, path, outer)
         real, driver = driver, ServedView(driver) if serve and driver is not None else driver
+        self._intervals[name] = defaults.every
         tags = self._tags.build(name, raw.get("tags"), (*path, "tags"), defaults, driver)
         sheets = len(self._sheets.used)
         own_sheet = None if settings is None else settings.tags_from
@@ -185,6 +192,7 @@ class Builder:
             served, tags = device.build(tags)
         else:
             only_served(raw, path, self.mistakes)
+            check_overlaps(driver, tags, (*path, "tags"), self.mistakes)
         default = driver.timing
         timing = Timing(
             reply_timeout=_either(settings.reply_timeout, default.reply_timeout),
@@ -319,7 +327,9 @@ class Builder:
         path = None if found.path is None else self._written(found.path)
         if path is None and (self.state_folder is not None or _have_alarms(lines)):
             path = self._written(ALARM_FILE)
-        return AlarmsConfig(path=path, devices=found.devices, lines=found.lines)
+        return AlarmsConfig(
+            path=path, devices=found.devices, lines=found.lines, transfers=found.transfers
+        )
 
     def _web(self, top: FileSection) -> WebConfig | None:
         if top.web is None:

@@ -9,7 +9,7 @@ from gateway.engine.device import DeviceSettings
 from gateway.tags import Tag
 
 # Parts of a configuration that a reload takes over. All others need a restart.
-_TAKEN_OVER = {"lines", "sheets", "watch"}
+_TAKEN_OVER = {"lines", "sheets", "transfers", "watch"}
 # Settings of a tag that do not change the meaning of its value. After a change of any other one
 # the value begins again.
 _HARMLESS = {"every", "description", "deadband", "publish", "heartbeat", "history"}
@@ -79,6 +79,11 @@ class Difference:
     closed: Sequence[str]  # lines whose port is closed; a line in both is opened again
     opened: Sequence[LineConfig]
     computed: Computed
+
+    @property
+    def renewed(self) -> Mapping[Tag, Tag]:
+        """Old tags to those that go on with their values."""
+        return {old: new for one in self.devices.values() for old, new in one.renewed.items()}
 
     def __bool__(self) -> bool:
         computed = self.computed.started or self.computed.gone
@@ -175,7 +180,8 @@ def _change(old: DeviceSettings | None, new: DeviceSettings, *, same: bool) -> D
     """Compares one device, without its computed tags. `same`: it was on this line."""
     if old is None or not same:
         return DeviceChange(old, new)
-    known = {tag.name: tag for tag in old.wire_tags}
+    known = {tag.name: tag for tag in (*old.wire_tags, *old.targets)}
+    new = replace(new, targets=tuple(_equal(known.get(tag.name), tag) for tag in new.targets))
     tags = tuple(_equal(known.get(tag.name), tag) for tag in new.wire_tags)
     others = tuple(tag for tag in new.tags if tag.formula is not None)
     if tags == old.wire_tags and replace(new, tags=()) == replace(old, tags=()):
@@ -183,7 +189,8 @@ def _change(old: DeviceSettings | None, new: DeviceSettings, *, same: bool) -> D
     if not (old.enabled and new.enabled and _is_one_station(old, new)):
         # No value goes on, so no tag does.
         tags = tuple(tag.copy(tag.device, tag.name) for tag in tags)
-        return DeviceChange(old, replace(new, tags=(*tags, *others)))
+        targets = tuple(tag.copy(tag.device, tag.name) for tag in new.targets)
+        return DeviceChange(old, replace(new, tags=(*tags, *others), targets=targets))
     renewed = {
         before: tag
         for tag in tags

@@ -85,6 +85,10 @@ class Mistakes:
         """Adds the mistakes of another file, after those of this one."""
         self._others.append(other)
 
+    def sentences(self) -> list[str]:
+        """Returns the mistakes without their places."""
+        return [mistake.what for mistake in self._found]
+
     def __len__(self) -> int:
         return len(self._found) + sum(map(len, self._others))
 

@@ -168,6 +168,8 @@ class AlarmsSection(Section):
     """A device that does not reply is an alarm."""
     lines: bool = True
     """A line that is down is an alarm."""
+    transfers: bool = True
+    """A transfer that does not work is an alarm."""
 
 
 class WebSection(Section):
@@ -248,7 +250,8 @@ class TagDefaults(Section, ShapingDefaults):
     type: Annotated[
         ValueType | None, PlainValidator(parsers.value_type), WithJsonSchema(TYPE_SCHEMA)
     ] = None
-    """The type of the value; left out: bool for a bit, a whole number otherwise."""
+    """The type of the value, or of the elements of an array such as uint16[50]; left out: bool for
+    a bit, a whole number otherwise."""
     every: Interval = 1.0
     """The interval of reading."""
     scale: Annotated[Finite, AfterValidator(parsers.scale), WithJsonSchema(SCALE_SCHEMA)] = 1.0
@@ -400,3 +403,5 @@ class FileSection(Section):
     defaults: dict[str, Any] = {}
     lines: dict[str, Any]
     """The lines, by name."""
+    transfers: list[Any] = []
+    """Values that the gateway reads from one PLC and writes to another: docs/transfers.md."""

@@ -10,6 +10,7 @@ from gateway.config.sheet_tags import SheetUse
 from gateway.engine.device import DeviceSettings
 from gateway.planning.wire_timing import WireTiming
 from gateway.tags import Tag
+from gateway.tags.transfer import TransferRule
 from gateway.transport.modem_events import ModemSettings
 from gateway.transport.port import PortAddress, SerialSettings, SimulatorAddress
 
@@ -66,6 +67,7 @@ class AlarmsConfig:
     path: Path | None = None  # None: a restart forgets them
     devices: bool = True
     lines: bool = True
+    transfers: bool = True
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -124,6 +126,7 @@ class Config:
     web: WebConfig | None
     alarms: AlarmsConfig = AlarmsConfig()
     lines: tuple[LineConfig, ...]
+    transfers: tuple[TransferRule, ...] = ()
     watch: bool = False  # a changed file is reloaded by itself
     sheets: tuple[SheetUse, ...] = ()  # files that the tags of some devices come from
 

@@ -21,6 +21,7 @@ from gateway.config.setting_types import (
     NAME_PATTERN,
     TAG_NAME_PATTERN,
 )
+from gateway.config.transfer_settings import TransferSection
 from gateway.errors import ConfigError
 from gateway.protocols.registry import PROTOCOLS
 
@@ -85,6 +86,8 @@ def schema() -> dict[str, Any]:
     root["properties"]["templates"]["additionalProperties"] = _ref("Template")
     root["properties"]["lines"] |= _by_name("Line") | {"minProperties": 1}
     root["properties"]["defaults"] = _defaults("file")
+    shared["Transfer"] = TransferSection.model_json_schema()
+    root["properties"]["transfers"]["items"] = _ref("Transfer")
     line = shared["Line"]["properties"]
     line["devices"] |= _by_name("Device", _DEVICE_NAMES) | {"minProperties": 1}
     line["defaults"] = _defaults("line")

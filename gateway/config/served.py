@@ -270,12 +270,16 @@ def check_sources(lines: Sequence[LineConfig], mistakes: Mistakes) -> None:
         if source is None:
             text = f"there is no tag {row.source}: write device/tag, a tag of this file"
             mistakes.add(place, text)
-        elif _sort(source) != _sort(row.tag):
+        elif source.layout.type.count != row.tag.layout.type.count:
+            kinds = f"{row.source} is {source.layout.type}, and this is {row.tag.layout.type}"
+            mistakes.add(place, f"{kinds}: an array is shown as an array of the same length")
+        elif sort_of(source) != sort_of(row.tag):
             kinds = f"{row.source} is {source.layout.type}, and this is {row.tag.layout.type}"
             mistakes.add(place, f"{kinds}: a value is shown as bit, number or text, not as another")
 
 
-def _sort(tag: Tag) -> str:
+def sort_of(tag: Tag) -> str:
+    """Returns `number`, `bit` or `text`: a value of one is never carried to another."""
     kind = tag.layout.type
     return "number" if kind.is_number else "bit" if kind.kind is Kind.BOOL else "text"
 

@@ -48,6 +48,7 @@ class DeviceSettings:
     listen_only: bool = False  # another master asks it; nothing is ever sent
     enabled: bool = True
     tags: tuple[Tag, ...] = ()
+    targets: tuple[Tag, ...] = ()  # that only transfers write: no poll, no value
     served: Served | None = None  # it is a station of the gateway, for a master on its line
     wire_tags: tuple[Tag, ...] = field(init=False, repr=False)  # those with an address
 

@@ -2,10 +2,12 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 from gateway.engine.ages import load_of, polled_blocks, worst_ages
 from gateway.engine.device import Device
+from gateway.engine.long_writes import long_write
 from gateway.engine.probes import seen_within
 from gateway.engine.reply_shapes import MARK_LONGEST
 from gateway.planning.planner import Block, shortest_round
@@ -22,6 +24,13 @@ class BlockForecast:
     block: Block
     seconds: float
     worst_age: float
+
+
+class TimedWrites(NamedTuple):
+    """Writes of one tag: `often` in a second at most, each takes `seconds`."""
+
+    often: float
+    seconds: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +50,12 @@ class LineForecast:
     seen_at_worst: float  # the same while as many others reply as delay it most
     shortest: float  # the shortest interval that is possible for all tags
     unsolicited: tuple[tuple[Device, int], ...]  # devices with their number of unsolicited tags
+
+    def with_writes(self, writes: Sequence[TimedWrites]) -> "LineForecast":
+        """Returns the forecast with writes that the gateway sends by itself."""
+        more = sum(one.often * one.seconds for one in writes)
+        often = sum(one.often for one in writes)
+        return replace(self, load=self.load + more, requests=self.requests + often)
 
     @property
     def overloaded(self) -> bool:
@@ -114,13 +129,15 @@ def _round(device: Device) -> float:
 
 
 def _longest_write(device: Device) -> float:
-    return max((_write_seconds(device, tag) for tag in device.tags if tag.write), default=0.0)
+    return max((write_seconds(device, tag) for tag in device.tags if tag.write), default=0.0)
 
 
-def _write_seconds(device: Device, tag: Tag) -> float:
+def write_seconds(device: Device, tag: Tag) -> float:
     """Returns the seconds of all transactions of one write of the tag, with its reads."""
-    cost, back = device.driver.write_cost(tag.span), device.driver.cost(tag.span)
-    seconds = 0.0 if cost is None else device.seconds(cost)
+    driver, back = device.driver, device.driver.cost(tag.span)
+    long = long_write(driver, tag.span, tag.layout.type.count)
+    costs = [driver.write_cost(span) for span in ([tag.span] if long is None else long.spans)]
+    seconds = sum(device.seconds(cost) for cost in costs if cost is not None)
     if back is not None:
         reads = (tag.part is not None) + (tag.write is not None and tag.write.verify)
         seconds += reads * device.seconds(back)

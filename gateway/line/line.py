@@ -7,7 +7,7 @@ back; the engine's effects go to the clients, the sample sink and the log.
 import asyncio
 import random
 import time
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Sequence
 from contextlib import suppress
 from typing import Any, Protocol
 
@@ -18,14 +18,15 @@ from gateway.engine.changes import Changes
 from gateway.engine.device import Device, DeviceSettings
 from gateway.engine.effects import Effect, LogEvent, OnlineChange, Pause, RequestEnded, Samples
 from gateway.engine.engine import Engine
-from gateway.engine.jobs import Idle, Poll, Reopen, Settle, Traffic
-from gateway.engine.requests import WRITE_EXPIRY, Command, Outcome, Request, Write
+from gateway.engine.jobs import Idle, Poll, Reopen, Result, Settle, Traffic
+from gateway.engine.requests import WRITE_EXPIRY, Command, Group, Outcome, Request, Write
 from gateway.errors import CallEnded, GatewayError, LineDown
 from gateway.line.calling import CallPort, dialling, rules_of, serve_calls
 from gateway.line.changing import Changeable, WaitingChange
 from gateway.line.channel import NEVER, Channel, Expiry, channels
 from gateway.line.duty import Duty
 from gateway.line.perform import perform
+from gateway.line.together import perform_together
 from gateway.line.transaction import Transaction
 from gateway.line.wire_log import WireLog
 from gateway.protocols.driver import Span
@@ -91,6 +92,24 @@ class Line:
         The future ends when the device has acknowledged, or raises `GatewayError`.
         """
         return self._submit(Write(device, tag, units, _now(), within))
+
+    def write_group(
+        self,
+        device: Device,
+        values: Iterable[tuple[Tag, Sequence[int]]],
+        within: float = WRITE_EXPIRY,
+    ) -> list[asyncio.Future[WriteResult]]:
+        """Writes several tags in their order, as `write`. After the first that is not done the
+        others are not sent: they raise `NotSent`."""
+        now, group = _now(), Group()
+        within += self.dialling
+        writes = [Write(device, tag, units, now, within, group=group) for tag, units in values]
+        loop = asyncio.get_running_loop()
+        ends = [loop.create_future() for _ in writes]
+        self._outcomes.update(zip(writes, ends, strict=True))
+        self.deliver(self.engine.submit_group(writes, now))
+        self._wake.set()
+        return ends
 
     def command(
         self, device: Device, name: str, argument: str, within: float = WRITE_EXPIRY
@@ -270,7 +289,8 @@ class Line:
             else:
                 transaction = self._transaction = Transaction(channel, job.device, self._unmatched)
                 if isinstance(job, Poll) and job.device.window > 1:
-                    await self._perform_together((job, *engine.alongside(job, begun)), channel)
+                    polls = (job, *engine.alongside(job, begun))
+                    await perform_together(polls, transaction, channel, self._conclude)
                     continue
             result = await perform(job, transaction)
             if self.wire_log.active:
@@ -278,26 +298,8 @@ class Line:
             traffic = transaction.traffic
             self.deliver(engine.conclude(job, result, traffic, now(), self._wall()))
 
-    async def _perform_together(self, polls: Sequence[Poll], channel: Channel) -> None:
-        """Performs several polls at once in one transaction. Its traffic counts with the last."""
-        transaction, left = self._transaction, len(polls)
-        if transaction is None:
-            raise AssertionError("no transaction is open")
-
-        async def one(poll: Poll) -> None:
-            nonlocal left
-            begun = channel.now()
-            result = await perform(poll, transaction)
-            if self.wire_log.active:
-                self.wire_log.performed(poll, result, begun, channel.now())
-            left -= 1
-            traffic = Traffic()
-            if not left:
-                traffic, transaction.traffic = transaction.traffic, traffic
-            now, at = channel.now(), self._wall()
-            self.deliver(self.engine.conclude(poll, result, traffic, now, at))
-
-        await asyncio.gather(*map(one, polls))
+    def _conclude(self, poll: Poll, result: Result, traffic: Traffic) -> None:
+        self.deliver(self.engine.conclude(poll, result, traffic, _now(), self._wall()))
 
     async def idle(self, until: float) -> None:
         """Waits until then, or for a request or bytes."""

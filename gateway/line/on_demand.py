@@ -1,7 +1,8 @@
 """Reads on demand: clients that wait for a sample that is younger than the latest one."""
 
 import asyncio
-from collections.abc import Callable, Iterable
+import math
+from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
 from gateway.engine.device import Device
@@ -9,6 +10,7 @@ from gateway.engine.jobs import Poll
 from gateway.errors import Busy
 from gateway.line.line import Line
 from gateway.tags import Quality, Sample, Tag
+from gateway.tags.scan import Scan
 
 FRESH_WITHIN = 5.0  # seconds that a client waits for a read on demand
 
@@ -30,6 +32,8 @@ class OnDemand:
     ) -> None:
         """`place` returns line and state of an enabled device, `latest` the sample of a tag."""
         self.waiting: dict[Tag, list[_Reader]] = {}
+        # Tags that no poll reads and whose age is asked for: when their last sample arrived.
+        self.arrived: dict[Tag, float] = {}
         self._place = place
         self._latest = latest
 
@@ -47,6 +51,28 @@ class OnDemand:
         if poll.last.at is None or self._latest(tag).quality is Quality.BAD:
             return False
         return asyncio.get_running_loop().time() - poll.last.at < max_age
+
+    def age(self, tag: Tag) -> float:
+        """Returns the seconds since the last good read, in monotonic time; infinite without one.
+
+        The age of a value that no poll reads counts from its arrival, after the first call for it.
+        """
+        if tag.inputs:
+            return max(map(self.age, tag.inputs))
+        poll = self._poll(tag)
+        if poll is None:
+            at: float | None = self.arrived.setdefault(tag, -math.inf)
+        else:
+            at = poll.last.at
+        return math.inf if at is None else asyncio.get_running_loop().time() - at
+
+    def note(self, samples: Sequence[Sample]) -> None:
+        """Notes when values arrived that no poll reads."""
+        now = asyncio.get_running_loop().time()
+        tags = samples.tags if type(samples) is Scan else [sample.tag for sample in samples]
+        for tag in tags:
+            if tag in self.arrived:
+                self.arrived[tag] = now
 
     async def fresh(self, tag: Tag, max_age: float) -> Sample:
         """Returns the last sample if it `is_fresh`, otherwise that of the next read.
@@ -77,6 +103,11 @@ class OnDemand:
             if not self.waiting[tag]:
                 del self.waiting[tag]
 
+    def answer_all(self, samples: Sequence[Sample]) -> None:
+        for sample in samples:
+            if sample.tag in self.waiting:
+                self.answer(sample)
+
     def answer(self, sample: Sample) -> None:
         """Answers waiting clients. A read that started before the request does not satisfy it."""
         tag = sample.tag
@@ -92,6 +123,8 @@ class OnDemand:
     def changed(self, gone: Iterable[Tag]) -> None:
         """Ends the waiting for tags that a reload removed or changed; others are read again."""
         left = set(gone)
+        for tag in left:
+            self.arrived.pop(tag, None)
         for tag, readers in self.waiting.items():
             for reader in readers if tag in left else ():
                 if not reader.answer.done():

@@ -24,7 +24,7 @@ LONGEST_NAME = 100  # characters of an operator's name
 _LONGEST = 2000  # bytes of an acknowledgement
 _BATCH_SIZE = 500  # alarms in one turn of the loop
 _OF_BITS = {Level.ON: True, Level.OFF: False}
-_WATCHED = (Level.OFFLINE, Level.DOWN)
+_WATCHED = (Level.OFFLINE, Level.DOWN, Level.STOPPED)
 # The first alarms of a list: those that nobody has acknowledged.
 _ORDER = {State.ACTIVE: 0, State.RETURNED: 1, State.ACKNOWLEDGED: 2, State.NORMAL: 3}
 

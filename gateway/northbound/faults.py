@@ -43,6 +43,7 @@ def warnings(documents: Documents) -> Iterator[str]:
             yield f"line {line} is asked for {load:.1f} times what it carries: see `check`"
     for device, other in documents["status"]["refused_devices"].items():
         yield f"{device} is served by another gateway, {other}"
+    yield from _transfers(documents)
     reload = documents.get("reload", {})
     if reload.get("refused"):
         more = f" and {len(reload['why']) - 1} more" if len(reload["why"]) > 1 else ""
@@ -55,6 +56,13 @@ def warnings(documents: Documents) -> Iterator[str]:
         )
     if lost := documents.get("history", {}).get("lost"):
         yield f"history: {lost} samples were lost since the start"
+
+
+def _transfers(documents: Documents) -> Iterator[str]:
+    for number, document in below("transfers/", documents):
+        if document["state"] not in ("starting", "carried"):
+            row = f"transfer {number} ({document['from']} to {document['to']})"
+            yield f"{row} is {document['state']}: {document['why']}"
 
 
 def below(folder: str, documents: Documents) -> Iterator[tuple[str, Mapping[str, Any]]]:

@@ -22,7 +22,8 @@ from gateway.northbound.keys import Keys
 from gateway.northbound.link_monitor import LinkMonitor
 from gateway.northbound.losses import Losses
 from gateway.northbound.one_process import only_process
-from gateway.northbound.payload import Failure
+from gateway.northbound.own_writes import OwnWrites
+from gateway.northbound.payload import Failure, GroupResult
 from gateway.northbound.publisher import Publisher, ScanBatches
 from gateway.northbound.republish import Republisher
 from gateway.northbound.session import (
@@ -107,6 +108,7 @@ class Northbound:
             partial(self._publisher.document, self.keys.writes),
             None if history is None else history.record_write,
         )
+        self.own_writes = OwnWrites(self.keys, plant, audit)
         self._status = StatusPublisher(
             self.keys, self._collect_status, self._publisher, audit, status_every
         )
@@ -144,7 +146,9 @@ class Northbound:
         """Returns the status documents by path, at most `max_age` seconds old."""
         return await self._status.fields(max_age)
 
-    async def write(self, tag: str, data: bytes, by: str, arrived: float) -> WriteResult | Failure:
+    async def write(
+        self, tag: str, data: bytes, by: str, arrived: float
+    ) -> WriteResult | Failure | GroupResult:
         """Writes for the client `by`, whom another part of the gateway has admitted; `tag`:
         `device/name`; `data`: the payload as on Zenoh; `arrived`: by the loop's clock."""
         return await self._incoming.write(tag, data, by, arrived)

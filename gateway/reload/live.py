@@ -1,7 +1,7 @@
 """Reloads the file of a running gateway, whenever that is wanted."""
 
 import asyncio
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from gateway.app import Gateway
 from gateway.config import Config
@@ -12,6 +12,8 @@ from gateway.reload.lines import RunningLines
 from gateway.reload.reloader import Reloader
 from gateway.reload.renewal import Renewal
 from gateway.supervisor import Supervisor
+from gateway.tags import Tag
+from gateway.tags.transfer import TransferRule
 
 
 class LiveReload:
@@ -25,14 +27,16 @@ class LiveReload:
         lines: RunningLines,
         plans: Sequence[asyncio.Task[None]],
         supervisor: Supervisor,
+        renew: Callable[[Sequence[TransferRule], Mapping[Tag, Tag]], None],
     ) -> None:
-        """`plans` end when every line is planned."""
+        """`plans` end when every line is planned. `renew` takes over the transfers."""
         self._reloader = reloader
         self._gateway = gateway
         self._northbound = northbound
         self._lines = lines
         self._plans = plans
         self._supervisor = supervisor
+        self._renew = renew
 
     async def run(self) -> None:
         """Runs until cancelled. A gateway that is not active starts over with a good file."""
@@ -66,6 +70,7 @@ class LiveReload:
             await self._take_over(difference, file)
         else:
             gateway.configure(difference.config)
+        self._renew(difference.config.transfers, difference.renewed)
         self._reloader.accept(file, difference)
 
     async def _take_over(self, difference: Difference, file: Config) -> None:

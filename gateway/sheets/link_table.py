@@ -67,6 +67,30 @@ def of_station(grid: Grid, station: int) -> Grid:
     return Grid(rows, ".")
 
 
+class Transferred(NamedTuple):
+    """One row as ranges: `reads` from the station to the master, or writes the other way."""
+
+    row: int  # of the sheet
+    station: int
+    slave: str
+    master: str
+    reads: bool
+
+
+def transfers_in(grid: Grid) -> list[Transferred]:
+    """Returns the rows of a table; none for another sheet. Raises `ConfigError`."""
+    found = []
+    for copy in _copies(grid.rows):
+        slave, master = _range(copy, copy.slave), _range(copy, copy.master)
+        found.append(Transferred(copy.row, copy.station, slave, master, copy.command == "r"))
+    return found
+
+
+def _range(copy: _Copy, text: str) -> str:
+    first, *rest = _addresses(copy._replace(slave=text))
+    return f"{first}..{rest[-1]}" if rest else first
+
+
 def _layout(rows: Sequence[Row]) -> tuple[int, dict[str, int]] | None:
     """Returns the index of the titles, and the column of each; None for another sheet."""
     for index, row in enumerate(rows[:HEADER_ROWS]):

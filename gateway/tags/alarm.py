@@ -16,6 +16,7 @@ class Level(StrEnum):
     OFF = "off"
     OFFLINE = "offline"  # of a device
     DOWN = "down"  # of a line
+    STOPPED = "stopped"  # of a transfer
 
 
 BELOW = frozenset({Level.LOW, Level.LOW_LOW, Level.OFF})  # reached from above

@@ -97,6 +97,7 @@ def _metrics(documents: Documents, plant: Plant, *, ready: bool) -> Iterator[Met
     yield from _writes(documents["outcomes"])
     for name, field, text in _ZENOH:
         yield _one(name, text, {}, documents["zenoh"].get(field, 0))
+    yield from _transfers(documents)
     alarms = _family("alarms", "Alarms by state", "state")
     for state, count in documents["alarms"].items():
         alarms.add_metric([state], count)
@@ -116,7 +117,9 @@ def _metrics(documents: Documents, plant: Plant, *, ready: bool) -> Iterator[Met
 def _lines(documents: Documents) -> Iterator[Metric]:
     lines = [*below("lines/", documents)]
     up = _family("line_up", "1: the port is open", "line")
-    expected = _family("line_expected_load_ratio", "Load that check predicts; 1 is all", "line")
+    expected = _family(
+        "line_expected_load_ratio", "Load of the polls that check predicts; 1 is all", "line"
+    )
     for name, document in lines:
         up.add_metric([name], document["open"])
         expected.add_metric([name], document["expected"]["load"])
@@ -150,6 +153,20 @@ def _devices(documents: Documents, plant: Plant) -> Iterator[Metric]:
                 family.add_metric(place, document[field])
         yield family
     yield _qualities(plant, line_of)
+
+
+def _transfers(documents: Documents) -> Iterator[Metric]:
+    rows = [*below("transfers/", documents)]
+    labels = ("transfer", "from", "to")
+    works = _family("transfer_works", "1: the last value was carried", *labels)
+    ends = _family("transfer_writes_total", "Writes of transfers by outcome", *labels, "outcome")
+    for number, document in rows:
+        place = [number, document["from"], document["to"]]
+        works.add_metric(place, document["state"] == "carried")
+        for outcome in ("carried", "not_done", "refused", "unclear"):
+            ends.add_metric([*place, outcome], document[outcome])
+    if rows:
+        yield from (works, ends)
 
 
 def _qualities(plant: Plant, line_of: Mapping[str, str]) -> Metric:

@@ -94,7 +94,7 @@ def gateway_of(tags: list[Tag]) -> Any:
     """Returns a gateway with only what a scan meets."""
     gateway: Any = object.__new__(Gateway)
     gateway.alarms, gateway.mirror = Alarms(tags), Mirror(tags, 0)
-    gateway._on_demand, gateway._subscribers = SimpleNamespace(waiting={}), []
+    gateway._on_demand, gateway._subscribers = SimpleNamespace(waiting={}, arrived={}), []
     gateway.serving = Nothing()
     return gateway
 

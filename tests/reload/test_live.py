@@ -40,7 +40,7 @@ async def test_a_device_of_another_gateway_is_refused_and_nothing_changes(tmp_pa
     before = gateway.config
     reloader, lines, north = Reloader(path, before), RunningLines(), North()
     any_north: Any = north
-    live = LiveReload(reloader, gateway, any_north, lines, (), Supervisor({}))
+    live = LiveReload(reloader, gateway, any_north, lines, (), Supervisor({}), lambda *_: None)
     config = load(write(path, press=vigor(3), mixer=vigor(1)))
     await live._reload(config)  # its only caller waits for a signal
     assert gateway.config is before

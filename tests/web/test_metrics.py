@@ -58,3 +58,17 @@ async def test_values_are_counted_by_quality() -> None:
     assert found["plc_gateway_device_tags", "mixer", "hall", "good"] == 0
     assert found["plc_gateway_device_state", "oven", "hall", "silent"] == 1
     assert found["plc_gateway_device_failures_total", "mixer", "silence", "hall"] == 2
+
+
+async def test_transfers_are_counted_by_outcome() -> None:
+    ends = {"carried": 7, "not_done": 1, "refused": 0, "unclear": 2}
+    row = {"from": "a/x", "to": "b:D0..D9", "state": "unclear", "why": "no reply", **ends}
+    north = PlainNorth()
+    north.changed["transfers/2"] = row
+    found = await scraped(north)
+    place = ("a/x", "b:D0..D9")
+    assert found["plc_gateway_transfer_works", *place, "2"] == 0
+    writes = "plc_gateway_transfer_writes_total"
+    assert found[writes, "a/x", "unclear", "b:D0..D9", "2"] == 2
+    assert found[writes, "a/x", "carried", "b:D0..D9", "2"] == 7
+    assert "plc_gateway_transfer_works" not in {name for name, *_ in await scraped(PlainNorth())}

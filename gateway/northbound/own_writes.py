@@ -1,0 +1,50 @@
+"""Writes of the gateway itself, for its transfers: the rules and the audit of a client's write."""
+
+import asyncio
+import time
+
+from gateway.engine.requests import WRITE_EXPIRY
+from gateway.errors import Busy, GatewayError, Unclear
+from gateway.northbound import payload
+from gateway.northbound.audit import Audit
+from gateway.northbound.interfaces import Plant
+from gateway.northbound.keys import Keys
+from gateway.northbound.payload import Failure, Problem, WriteOutcome
+from gateway.northbound.writes import ANSWER_WITHIN
+from gateway.tags import Tag, WriteResult
+from gateway.values import Value
+
+
+class OwnWrites:
+    """Writes a value that needs no parsing. Each outcome is audited."""
+
+    def __init__(self, keys: Keys, plant: Plant, audit: Audit) -> None:
+        self._keys = keys
+        self._plant = plant
+        self._audit = audit
+
+    async def write(self, tag: Tag, value: Value, by: str, within: float) -> WriteResult:
+        """Returns when the device has acknowledged. After `within` seconds nothing is sent.
+
+        Raises `GatewayError`, as `Plant.write` does.
+        """
+        started, now = time.monotonic(), asyncio.get_running_loop().time()
+        ended: WriteResult | Failure = Failure(
+            Problem.UNCLEAR, "the gateway ended before the write"
+        )
+        try:
+            if why := self._plant.duty.why_not(now, now):
+                raise Busy(why)
+            async with asyncio.timeout(ANSWER_WITHIN):
+                ended = await self._plant.write(tag, value, min(within, WRITE_EXPIRY))
+        except TimeoutError:
+            error = Unclear(f"not acknowledged within {ANSWER_WITHIN:g} s: it may yet be done")
+            ended = payload.failure(error)
+            raise error from None
+        except GatewayError as error:
+            ended = payload.failure(error)
+            raise
+        finally:
+            took, key = time.monotonic() - started, self._keys.value(tag.key)
+            self._audit(WriteOutcome(key, value, ended, time.time_ns(), took, by))
+        return ended

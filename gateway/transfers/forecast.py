@@ -1,0 +1,63 @@
+"""Calculates what the transfers cost their lines, and how old a carried value can be."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from gateway.config import Config
+from gateway.engine.device import Device
+from gateway.engine.forecast import LineForecast, TimedWrites, write_seconds
+from gateway.tags.transfer import TransferRule, leaves
+
+
+@dataclass(frozen=True, slots=True)
+class TransferForecast:
+    """One row. Times in seconds."""
+
+    rule: TransferRule
+    line: str  # of the target; empty for a value that a master reads
+    writes: TimedWrites
+    worst_age: float | None  # of the value when the target has it; None: no poll reads the source
+
+    @property
+    def load(self) -> float:
+        """The share of the wire time of the line."""
+        return self.writes.often * self.writes.seconds
+
+
+def transfer_forecasts(config: Config, lines: Sequence[LineForecast]) -> list[TransferForecast]:
+    """Returns the rows of the file. `lines`: all polled lines."""
+    if not config.transfers:
+        return []
+    tags = {tag.key: tag for one in config.devices for tag in (*one.tags, *one.targets)}
+    polls = {tag: row for line in lines for row in line.blocks for tag in row.block.tags}
+    latest = {line.name: line.worst_write for line in lines}
+    places = {
+        device.name: (line.name, Device(device, line.wire, plan_now=False))
+        for line in config.lines
+        if line.name in latest
+        for device in line.devices
+        if device.enabled
+    }
+    found = []
+    for rule in config.transfers:
+        source, target = tags[rule.source], tags[rule.target]
+        line, device = places.get(target.device, ("", None))
+        seconds = 0.0 if device is None else write_seconds(device, target)
+        read = [polls[one] for one in leaves(source) if one in polls]
+        age = None
+        if read:
+            age = max(row.worst_age for row in read)
+            age += (rule.every or 0.0) + latest.get(line, 0.0)
+        changes = min((row.block.every for row in read), default=source.every)
+        often = 1 / (rule.every or changes)  # at most: it changes with each read
+        found.append(TransferForecast(rule, line, TimedWrites(often, seconds), age))
+    return found
+
+
+def with_transfers(
+    lines: Sequence[LineForecast], rows: Sequence[TransferForecast]
+) -> list[LineForecast]:
+    """Returns the lines with the writes of the rows."""
+    return [
+        line.with_writes([row.writes for row in rows if row.line == line.name]) for line in lines
+    ]
