@@ -10,7 +10,7 @@ from dataclasses import replace
 from gateway.config import Config, LineConfig
 from gateway.config.commands import check_command, line_of
 from gateway.engine.device import Device
-from gateway.engine.requests import CommandResult
+from gateway.engine.requests import WRITE_EXPIRY, CommandResult
 from gateway.engine.unsolicited import unsolicited_tags
 from gateway.errors import BadValue, LineDown
 from gateway.line import build
@@ -115,7 +115,7 @@ async def write(config: Config, tag: Tag, value: Value) -> WriteResult:
     device.poll_nothing()
     async with _running(line):
         await line.tried.wait()
-        return await line.write(device, tag, units)
+        return await line.write(device, tag, units, WRITE_EXPIRY + line.dialling)
 
 
 async def control(config: Config, device: str, command: str, argument: str) -> CommandResult:
@@ -129,7 +129,8 @@ async def control(config: Config, device: str, command: str, argument: str) -> C
         await line.tried.wait()
         loop = asyncio.get_running_loop()
         started = loop.time()
-        answer = await line.command(commanded, command, argument)
+        within = WRITE_EXPIRY + line.dialling
+        answer = await line.command(commanded, command, argument, within)
         return CommandResult(answer, time.time_ns(), loop.time() - started)
 
 

@@ -103,7 +103,6 @@ class Line:
         return self._submit(Command(device, "peek", "", _now(), within, span))
 
     def _submit(self, request: Request) -> asyncio.Future[Any]:
-        request.within += self.dialling
         outcome = self._outcomes[request] = asyncio.get_running_loop().create_future()
         self.deliver(self.engine.submit(request, _now()))
         self._wake.set()
