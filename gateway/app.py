@@ -364,10 +364,11 @@ class Gateway:
             raise BadValue(str(error)) from None
         loop = asyncio.get_running_loop()
         started, units = loop.time(), list[int]()
+        within = WRITE_EXPIRY + line.dialling
         for part in parts:
             if self._places.get(device) != (line, receiver):
                 raise Busy(f"the file was reloaded, and {device} with it; read it again")
-            units += map(int, (await line.peek(receiver, part)).split())
+            units += map(int, (await line.peek(receiver, part, within)).split())
         first = receiver.driver.spell(Address(area, numbers.start))
         return Peeked(first, units, self._wall(), loop.time() - started)
 

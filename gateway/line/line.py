@@ -102,7 +102,6 @@ class Line:
         """Writes several tags in their order, as `write`. After the first that is not done the
         others are not sent: they raise `NotSent`."""
         now, group = _now(), Group()
-        within += self.dialling
         writes = [Write(device, tag, units, now, within, group=group) for tag, units in values]
         loop = asyncio.get_running_loop()
         ends = [loop.create_future() for _ in writes]
@@ -122,7 +121,6 @@ class Line:
         return self._submit(Command(device, "peek", "", _now(), within, span))
 
     def _submit(self, request: Request) -> asyncio.Future[Any]:
-        request.within += self.dialling
         outcome = self._outcomes[request] = asyncio.get_running_loop().create_future()
         self.deliver(self.engine.submit(request, _now()))
         self._wake.set()

@@ -57,9 +57,10 @@ class Commands:
             by, within = self._acceptance.accept(key, data, sender)
             argument = _argument(data)
             device, command = self._target(key)
-            longest += self._plant.dialling(device)
+            dialling = self._plant.dialling(device)
+            longest += dialling
             async with asyncio.timeout(longest):
-                result = await self._plant.control(device, command, argument, within)
+                result = await self._plant.control(device, command, argument, within + dialling)
         except TimeoutError:
             reason = f"not answered within {longest:g} s: it may yet be done"
             result = Failure(Problem.UNCLEAR, reason)

@@ -131,6 +131,8 @@ class GroupWrites:
             return
         if self._waiting > MOST_WAITING:
             raise Busy(f"{MOST_WAITING} groups are waiting already")
-        ends = await self._plant.write_group(values, within, self._patience)
+        dialling = self._plant.dialling(values[0][0].device)
+        patience = self._patience + dialling
+        ends = await self._plant.write_group(values, within + dialling, patience)
         for one, end in zip(asked, ends, strict=True):
             one.result = payload.failure(end) if isinstance(end, GatewayError) else end

@@ -91,10 +91,11 @@ class Writes:
     async def _write_tag(self, tag: Tag, value: Value, within: float) -> WriteResult | Failure:
         if self._waiting > MOST_WAITING:
             raise Busy(f"{MOST_WAITING} writes are waiting already")
-        longest = ANSWER_WITHIN + self._plant.dialling(tag.device)
+        dialling = self._plant.dialling(tag.device)
+        longest = ANSWER_WITHIN + dialling
         try:
             async with asyncio.timeout(longest):
-                return await self._plant.write(tag, value, within)
+                return await self._plant.write(tag, value, within + dialling)
         except TimeoutError:
             why = f"not acknowledged within {longest:g} s: it may yet be done"
             return Failure(Problem.UNCLEAR, why)

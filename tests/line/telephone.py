@@ -8,6 +8,7 @@ from typing import Any
 
 from gateway.config import built
 from gateway.engine.device import Device
+from gateway.engine.requests import WRITE_EXPIRY
 from gateway.line.build import line_of
 from gateway.line.calling import ModemOpener
 from gateway.stations.vigor import VigorStation
@@ -111,7 +112,8 @@ class Telephone:
 
     def write(self, value: int) -> "asyncio.Future[WriteResult]":
         tag = self.tag("limit")
-        return self.line.write(self.device, tag, tag.encode(value))
+        within = WRITE_EXPIRY + self.line.dialling  # as northbound gives its clients
+        return self.line.write(self.device, tag, tag.encode(value), within)
 
 
 @asynccontextmanager
