@@ -35,6 +35,7 @@ bench: .venv/ready
 	$(BIN)/python -m benchmarks.overload
 	$(BIN)/python -m benchmarks.planning
 	$(BIN)/python -m benchmarks.start
+	$(BIN)/python -m benchmarks.commands
 	$(BIN)/python -m benchmarks.northbound
 
 # Reloads under load: memory, missed polls, what is left over.

@@ -26,8 +26,8 @@ from benchmarks.northbound import Device, Plant
 from gateway.config import ZenohConfig, ZenohMode
 from gateway.history import Historian
 from gateway.history.recent import MOST_RUNS
-from gateway.northbound import Northbound
-from gateway.northbound.session import configure
+from gateway.northbound.northbound import Northbound
+from gateway.northbound.session_settings import configure
 from gateway.service import THREAD_SWITCH
 from gateway.tags import good
 from tests.zenoh_peer import free_endpoint

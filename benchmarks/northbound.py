@@ -40,8 +40,8 @@ from gateway.engine.requests import CommandResult, Peeked
 from gateway.errors import GatewayError
 from gateway.line.duty import Duty
 from gateway.line.wire_log import WireLog
-from gateway.northbound import Northbound
-from gateway.northbound.session import configure
+from gateway.northbound.northbound import Northbound
+from gateway.northbound.session_settings import configure
 from gateway.protocols.driver import Address, Span, Unit
 from gateway.service import GC_THRESHOLDS, THREAD_SWITCH
 from gateway.tags import Sample, Tag, WriteResult, WriteRule, good

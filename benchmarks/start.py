@@ -60,8 +60,13 @@ class Taken(NamedTuple):
     memory: float
 
 
-def rows(sizes: Sizes, endpoint: str, *, alike: bool, first_port: int = 0) -> Iterator[str]:
-    """Yields the rows of the file. `first_port`: TCP port of the first line; 0: simulated."""
+def rows(
+    sizes: Sizes, endpoint: str, *, alike: bool, first_port: int = 0, alarms: bool = False
+) -> Iterator[str]:
+    """Yields the rows of the file. `first_port`: TCP port of the first line; 0: simulated.
+
+    `alarms`: every tag has one; that of the first tag of a device is raised in each period.
+    """
     chance = random.Random(1)
     yield from ("gateway: {name: large}", f"zenoh: {{listen: [{endpoint}]}}", "lines:")
     for line in range(sizes.lines):
@@ -73,7 +78,9 @@ def rows(sizes: Sizes, endpoint: str, *, alike: bool, first_port: int = 0) -> It
             number = 0 if alike else chance.randrange(3000)
             for tag in range(sizes.tags):
                 every = INTERVALS[tag % len(INTERVALS)]
-                yield f"          t{tag}: {{address: D{number}, type: uint16, every: {every}}}"
+                limit = f", alarm: {{high: {1000 if tag else 50}}}" if alarms else ""
+                settings = f"address: D{number}, type: uint16, every: {every}{limit}"
+                yield f"          t{tag}: {{{settings}}}"
                 number += 1 if alike else chance.choice(STEPS)
 
 

@@ -175,11 +175,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=20.0, help="of the plant, in each round")
     parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--alarms", action="store_true", help="every tag has an alarm")
     arguments = parser.parse_args()
     structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.ERROR))
     with tempfile.TemporaryDirectory() as folder:
         port, path = free_port(), Path(folder) / "plant.yaml"
-        text = "\n".join(rows(SIZES, free_endpoint(), alike=True))
+        text = "\n".join(rows(SIZES, free_endpoint(), alike=True, alarms=arguments.alarms))
         path.write_text(f'web: {{listen: "127.0.0.1:{port}"}}\n{text}\n')
         print(f"{SIZES.all_tags} tags on {SIZES.lines} lines", flush=True)
         compare(load(path), arguments.seconds, arguments.rounds)

@@ -21,7 +21,7 @@ from gateway.history.state_file import StateFile
 from gateway.line.arrival import ArrivalClock
 from gateway.line.duty import Duty
 from gateway.line.line import Line
-from gateway.northbound import Northbound, group_settings
+from gateway.northbound.northbound import Northbound, group_settings
 from gateway.northbound.session import off_loop
 from gateway.reload import LiveReload, Reloader, RunningLines
 from gateway.supervisor import Supervisor

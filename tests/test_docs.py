@@ -34,12 +34,12 @@ from gateway.config.yaml_file import read_yaml
 from gateway.engine.device import DeviceSettings
 from gateway.history import Historian
 from gateway.line.duty import Duty
-from gateway.northbound import GroupSettings, payload
+from gateway.northbound import payload
 from gateway.northbound.keys import Keys
 from gateway.northbound.meta import meta
 from gateway.northbound.payload import Problem
 from gateway.northbound.secrets import exposures
-from gateway.northbound.standby import Standby
+from gateway.northbound.standby import GroupSettings, Standby
 from gateway.protocols.registry import PROTOCOLS
 from gateway.tags import Reason, WriteResult, bad, good
 from tests.e2e.processes import ROOT, Program, plc_gateway, started, until

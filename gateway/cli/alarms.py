@@ -2,19 +2,17 @@
 
 import json
 import sys
-import time
 from collections.abc import Sequence
-from contextlib import nullcontext, suppress
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from rich.console import RenderableType
-from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from gateway.alarms.watched import LINE
-from gateway.cli.client import Client, connected, suggestion
+from gateway.cli.client import Client, reached, suggestion
+from gateway.cli.repeated import repeated
 from gateway.cli.terminal import (
     FAILED,
     USER_MISTAKE,
@@ -24,10 +22,8 @@ from gateway.cli.terminal import (
     out,
     printable,
 )
-from gateway.config import Config, load
-from gateway.errors import ConfigError, GatewayError
+from gateway.errors import ConfigError
 
-EVERY = 1.0  # seconds between two views of --watch
 _ORDER = ("active", "returned", "acknowledged", "normal")
 _STYLES = {"active": "red", "returned": "yellow", "acknowledged": "yellow"}
 _MISTAKES = ("bad-value", "unknown-tag")
@@ -51,15 +47,13 @@ def alarms(
     """Print the alarms that are not normal, from the running gateway, or acknowledge one."""
     if (ack is None) is not (by is None):
         raise ConfigError("--ack needs --by NAME, the operator that acknowledges, and --by --ack")
-    loaded = load(config)
-    if ack is not None and ack not in (known := _known(loaded)):
+    if ack is not None and ack not in (known := _known(config)):
         raise ConfigError(f"there is no alarm {ack} in {config}{suggestion(ack, known)}")
-    with connected(loaded, err.print) as client:
+    with reached(config, err.print) as client:
         if ack is not None and by is not None:
             _acknowledge(client, ack, by, as_json=as_json)
         elif watch and not as_json:
-            with suppress(KeyboardInterrupt):
-                _follow(client, every=every)
+            repeated(lambda: view(_alarms(client, every=every)))
         else:
             found = _alarms(client, every=every)
             if as_json:
@@ -68,8 +62,12 @@ def alarms(
                 out.print(view(found))
 
 
-def _known(config: Config) -> dict[str, None]:
+def _known(path: Path) -> dict[str, None]:
     """Returns the names of all alarms of the file."""
+    from gateway.alarms.watched import LINE  # with all protocols, as `load`
+    from gateway.config import load
+
+    config = load(path)
     tags = (tag.key for device in config.devices for tag in device.tags if tag.alarm is not None)
     devices = (device.name for device in config.devices)
     return dict.fromkeys([*tags, *devices, *(f"{LINE}{line.name}" for line in config.lines)])
@@ -94,21 +92,6 @@ def _acknowledge(client: Client, alarm: str, by: str, *, as_json: bool) -> None:
         known: Any = answer["acknowledged"]
         text = f"{alarm}: acknowledged by {known['by']} at {known['time']}, now {answer['state']}"
         print(printable(text))
-
-
-def _follow(client: Client, *, every: bool) -> None:
-    with Live(console=out, auto_refresh=False) if out.is_terminal else nullcontext() as live:
-        while True:
-            shown: RenderableType
-            try:
-                shown = view(_alarms(client, every=every))
-            except GatewayError as error:
-                shown = Text(printable(str(error)), style="red")
-            if live is None:
-                out.print(shown)
-            else:
-                live.update(shown, refresh=True)
-            time.sleep(EVERY)
 
 
 def view(found: Sequence[dict[str, Any]]) -> RenderableType:

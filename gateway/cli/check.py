@@ -9,7 +9,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from gateway import app, northbound
+from gateway import app
 from gateway.cli.modem_plan import modem_plan, modem_warnings
 from gateway.cli.progress import progress
 from gateway.cli.served_plan import served_plan
@@ -18,6 +18,7 @@ from gateway.config import Config, expanded_text, load, state_folder
 from gateway.engine.forecast import LineForecast
 from gateway.engine.listening import why_not_learned
 from gateway.history.place import trouble
+from gateway.northbound.northbound import check as zenoh_warnings
 from gateway.planning.planner import describe
 from gateway.planning.wire_timing import NETWORK_BAUD, WireTiming
 from gateway.tags.tag import CounterRule
@@ -45,7 +46,7 @@ def check(
         return
     with progress(err) as report:
         loaded = load(config, report)
-        warnings = northbound.check(loaded) + exposure.check(loaded)
+        warnings = zenoh_warnings(loaded) + exposure.check(loaded)
         lines = app.forecasts(loaded, report)
     few = sum(len(line.blocks) for line in lines) <= 100
     out.print(plan(lines, every_block=few if blocks is None else blocks))

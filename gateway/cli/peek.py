@@ -20,17 +20,16 @@ from gateway.cli.peek_table import Cell, change_text, table_of
 from gateway.cli.terminal import FAILED, end, err, out
 from gateway.config import Config, built, load, parsers
 from gateway.config.yaml_scalars import scalar
-from gateway.engine.device import Device, DeviceSettings
+from gateway.engine.device import Device
 from gateway.errors import ConfigError, GatewayError
-from gateway.protocols.driver import Address, AnyDriver, Span, Unit
+from gateway.protocols.driver import Address, AnyDriver, Unit
 from gateway.protocols.ranges import addresses
 from gateway.protocols.registry import PROTOCOLS
 from gateway.tags import Quality, Reason, Sample, Tag, good
-from gateway.values import Kind, Layout, ValueType
+from gateway.tags.unit_tag import unit_tag
 
 MOST = 1000  # addresses
 MARKED = 5.0  # seconds for which a change is marked
-_TYPES = {Unit.BIT: Kind.BOOL, Unit.WORD: Kind.UINT16, Unit.DWORD: Kind.UINT32}
 
 PortOption = Annotated[
     str | None, typer.Option(help="/dev/ttyUSB0, COM3, tcp://host:port, rfc2217://...")
@@ -213,8 +212,10 @@ def view_of(config: Config, text: str, every: float = 1.0) -> View:
     driver = device.driver
     area, numbers = addresses(driver, text, MOST)
     unit = driver.areas[area].unit
-    layout = Layout(ValueType(_TYPES[unit]))
-    tags = [_tag(device, Address(area, number), unit, layout, every) for number in numbers]
+    tags = [
+        unit_tag(device.name, driver, Address(area, number), f"{area}{number}", every)
+        for number in numbers
+    ]
     names = {
         number: tag.name
         for tag in reversed(device.tags)
@@ -224,19 +225,6 @@ def view_of(config: Config, text: str, every: float = 1.0) -> View:
     peeked = replace(device, tags=tuple(tags), enabled=True)
     lines = (replace(line, devices=(peeked,)),)
     return View(replace(config, lines=lines), tags, unit, driver, names)
-
-
-def _tag(device: DeviceSettings, address: Address, unit: Unit, layout: Layout, every: float) -> Tag:
-    return Tag(
-        device=device.name,
-        name=f"{address.area}{address.number}",
-        text=device.driver.spell(address),
-        address=address,
-        span=Span(address.area, address.number, 1),
-        unit_kind=unit,
-        layout=layout,
-        every=every,
-    )
 
 
 async def _poll(view: View, ask: Callable[[], list[Sample]]) -> None:

@@ -3,6 +3,7 @@
 import os
 import re
 import time
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 from typing import Self
@@ -18,10 +19,11 @@ class Recording:
     Raises `GatewayError` when the disk is full or fails. The last file ends with a whole line.
     """
 
-    def __init__(self, folder: Path, line: str, keep: int) -> None:
-        """`keep`: bytes of all files together."""
+    def __init__(self, folder: Path, line: str, keep: int, notes: Iterable[str] = ()) -> None:
+        """`keep`: bytes of all files together. `notes`: at the begin of each file."""
         self._folder = folder
         self._line = line
+        self._note = f"# line {line}\n" + "".join(f"# {note}\n" for note in notes)
         self._most = max(1, keep // FILES)
         self._file: int | None = None
         self._path = folder
@@ -75,7 +77,7 @@ class Recording:
             with suppress(FileExistsError):
                 self._file = os.open(self._path, flags, 0o640)
         self._size = 0
-        self._write(f"# line {self._line}\n".encode())
+        self._write(self._note.encode())
         for old in self._files()[:-FILES]:
             old.unlink(missing_ok=True)
 

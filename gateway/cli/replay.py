@@ -1,27 +1,26 @@
 """The `replay` command: what a recording tells, and if this version still reads it the same."""
 
 import json
-import re
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from gateway.cli.capture import Capture
+from gateway.cli.logs import LogFormat, LogLevel, set_up
+from gateway.cli.peek import SettingOption
+from gateway.cli.recorded_line import Log, line_of_file, line_of_protocols
+from gateway.cli.replay_serve import serve
 from gateway.cli.terminal import FAILED, printable
-from gateway.cli.trace import line_named
-from gateway.config import load
+from gateway.config import LineConfig
 from gateway.errors import ConfigError, GatewayError
 from gateway.line.exchanges import shown
+from gateway.line.recorded import timed
 from gateway.line.replay import Difference, Learned, Replay
-from gateway.line.wire_file import LoggedPiece, LoggedValue, entries
-from gateway.values import Value
-
-_OF_LINE = re.compile(r"# line (\S+)$")
-Entries = Iterator[LoggedPiece | LoggedValue]
+from gateway.line.wire_file import LoggedPiece, LoggedValue
 
 
 def replay(
@@ -29,29 +28,72 @@ def replay(
         list[Path], typer.Argument(metavar="LOG...", help="Files of a recording, or its folder.")
     ],
     config: Annotated[
-        Path, typer.Option("--config", metavar="FILE", help="The YAML file of the line.")
-    ],
+        Path | None, typer.Option("--config", metavar="FILE", help="The YAML file of the line.")
+    ] = None,
     line: Annotated[
         str | None, typer.Option("--line", help="The line; left out: that of the recording.")
     ] = None,
+    protocol: Annotated[
+        list[str] | None,
+        typer.Option(help="Without --config: vigor, modbus-rtu ...; left out: as noted."),
+    ] = None,
+    setting: SettingOption = None,
     check: Annotated[
         bool, typer.Option("--check", help="Only compare with the values in the recording.")
     ] = False,
     pcapng: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write the bytes for Wireshark instead.")
     ] = None,
+    as_plant: Annotated[
+        bool, typer.Option("--serve", help="Serve it as simulated PLCs, on a pty.")
+    ] = False,
+    tcp: Annotated[
+        str | None, typer.Option(metavar="HOST:PORT", help="Serve it on TCP instead.")
+    ] = None,
 ) -> None:
-    """Decode a recording: the values of each reply, with its time. Sends nothing."""
-    files = _files(logs)
-    of = line_named(load(config), line or _recorded_line(files))
-    if pcapng is not None:
+    """Decode a recording: the values of each reply, with its time. Sends nothing.
+
+    Without --config each address has its own name, as the PLC has it.
+    """
+    log = Log(logs, line)
+    if config is None:
+        of = line_of_protocols(log, protocol or [], setting or [])
+    elif protocol or setting:
+        raise ConfigError("with --config, its settings are used: leave out --protocol and --set")
+    else:
+        of = line_of_file(config, log)
+    if as_plant or tcp is not None:
+        set_up(LogFormat.TEXT, LogLevel.INFO)
+        serve(of, list(timed(log.entries())), tcp)
+    elif pcapng is not None:
         with Capture(pcapng, of) as capture:
-            for entry in _entries(files, line):
+            for entry in log.entries():
                 if isinstance(entry, LoggedPiece):
                     capture.add(entry.at or 0.0, entry.way, entry.data)
-        return
-    replayed = Replay(of)
-    for event in replayed.run(_entries(files, line)):
+    elif config is None:
+        _decode(of, log, check=check)
+    else:
+        _compare(of, log.entries(), check=check)
+
+
+def _decode(line: LineConfig, log: Log, *, check: bool) -> None:
+    if check:
+        raise ConfigError("--check needs --config: the names of the values are in the file")
+    events = (one for one in Replay(line).run(timed(log.entries())) if isinstance(one, Learned))
+    learned = False
+    for event in events:
+        learned = True
+        _print(event)
+    if not learned:
+        raise GatewayError(
+            "nothing was learned: no reply belongs to its request for certain. Is there another "
+            "protocol on the line too? Name each with --protocol"
+        )
+
+
+def _compare(line: LineConfig, log: Iterable[LoggedPiece | LoggedValue], *, check: bool) -> None:
+    replayed = Replay(line)
+    for event in replayed.run(log):
         if isinstance(event, Difference):
             at, tag, value = event.logged
             now = json.dumps(event.learned, ensure_ascii=False)
@@ -59,8 +101,7 @@ def replay(
                 f"{_clock(at)} {tag}: {json.dumps(value, ensure_ascii=False)} recorded, {now} now"
             )
         elif not check:
-            for text in _lines(event):
-                print(printable(text))
+            _print(event)
     checked = replayed.checked
     print(
         f"{checked.equal} values as recorded, {checked.different} others, "
@@ -73,33 +114,9 @@ def replay(
         raise GatewayError("nothing was compared: the recording has no values of this line")
 
 
-def _files(logs: Sequence[Path]) -> list[Path]:
-    found: list[Path] = []
-    for log in logs:
-        found += sorted(log.glob("*.log")) if log.is_dir() else [log]
-    if missing := [str(file) for file in found if not file.is_file()]:
-        raise ConfigError(f"there is no file {', '.join(missing)}")
-    if not found:
-        raise ConfigError(f"no file *.log in {', '.join(map(str, logs))}")
-    return found
-
-
-def _recorded_line(files: Sequence[Path]) -> str:
-    """Returns the line of the first note `# line hall-1`. Raises `ConfigError` for several."""
-    names = set()
-    for file in files:
-        with file.open(encoding="utf-8", errors="replace") as log:
-            if match := _OF_LINE.match(log.readline().rstrip()):
-                names.add(match[1])
-    if len(names) != 1:
-        raise ConfigError(f"name the line with --line: {', '.join(sorted(names)) or 'not noted'}")
-    return str(names.pop())
-
-
-def _entries(files: Sequence[Path], line: str | None) -> Entries:
-    for file in files:
-        with file.open(encoding="utf-8", errors="replace") as log:
-            yield from entries(log, line)
+def _print(event: Learned) -> None:
+    for text in _lines(event):
+        print(printable(text))
 
 
 def _lines(event: Learned) -> Iterator[str]:
@@ -110,10 +127,6 @@ def _lines(event: Learned) -> Iterator[str]:
     for sample in event.samples:
         if sample.value is None:
             yield f"{_clock(event.at)} {sample.tag.key}: bad, {sample.reason}: {sample.detail}"
-
-
-def _json(value: Value | None) -> str:
-    return json.dumps(value, ensure_ascii=False)
 
 
 def _clock(at: float) -> str:

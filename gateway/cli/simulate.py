@@ -46,11 +46,8 @@ async def serve(
     """
     if links is not None and not links.is_dir():
         raise ConfigError(f"--links {links}: there is no such folder: make it first")
-    stop = asyncio.Event()
-    loop = asyncio.get_running_loop()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        loop.add_signal_handler(number, stop.set)
-    host, port = (None, 0) if tcp is None else _address(tcp)
+    stop = stop_event()
+    host, port = (None, 0) if tcp is None else tcp_address(tcp)
     async with AsyncExitStack() as stack:
         for offset, line in enumerate(line for line in config.lines if not line.serve):
             place = None if host is None else (host, port + offset)
@@ -60,6 +57,15 @@ async def serve(
             say(f"line {line.name}: stations {stations} at {served.address}")
         say("Ctrl-C ends it.")
         await stop.wait()
+
+
+def stop_event() -> asyncio.Event:
+    """Returns an event that SIGTERM and SIGINT set."""
+    stop = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, stop.set)
+    return stop
 
 
 async def _serve(line: LineConfig, place: tuple[str, int] | None, links: Path | None) -> Served:
@@ -73,7 +79,7 @@ async def _serve(line: LineConfig, place: tuple[str, int] | None, links: Path | 
     return await serve_on_pty(stations, line.wire, link)
 
 
-def _address(text: str) -> tuple[str, int]:
+def tcp_address(text: str) -> tuple[str, int]:
     host, _, port = text.rpartition(":")
     if not host or not port.isdecimal() or not 1 <= int(port) <= 65535:
         raise ConfigError(f"--tcp {text}: write it as 127.0.0.1:4001")

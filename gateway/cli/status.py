@@ -2,25 +2,20 @@
 
 import json
 import sys
-import time
 from collections import Counter
 from collections.abc import Mapping
-from contextlib import nullcontext, suppress
 from typing import Annotated, Any
 
 import typer
 from rich.console import Group, RenderableType
-from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from gateway.cli.client import Client, connected
+from gateway.cli.client import reached
+from gateway.cli.repeated import repeated
 from gateway.cli.terminal import FAILED, AsJson, ConfigPath, err, out, printable
-from gateway.config import load
-from gateway.errors import GatewayError
 from gateway.northbound.faults import Documents, below, faults, warnings
 
-EVERY = 1.0  # seconds between two views of --watch
 HOUR = "now(-1h)"
 _STYLES = {"up": "green", "open": "green", "silent": "red", "down": "red", "failing": "yellow"}
 _STYLES |= {"carried": "green", "waiting": "yellow", "stale": "red", "refused": "red"}
@@ -36,11 +31,9 @@ def status(
     as_json: AsJson = False,
 ) -> None:
     """Print lines, devices, history and what is wrong, from the running gateway."""
-    loaded = load(config)
-    with connected(loaded, err.print) as client:
+    with reached(config, err.print) as client:
         if watch and not as_json:
-            with suppress(KeyboardInterrupt):
-                _follow(client)
+            repeated(lambda: view(client.documents(), client.outcomes(HOUR)))
             return
         documents = client.documents()
         if as_json:
@@ -61,7 +54,7 @@ def health(
     ] = False,
 ) -> None:
     """Print the status of the running gateway. Exit code 0 if it replies (for containers)."""
-    with connected(load(config), err.print) as client:
+    with reached(config, err.print) as client:
         if not strict:
             print(json.dumps(client.status()))
             return
@@ -72,22 +65,6 @@ def health(
             err.print(printable(sentence))
         if found:
             sys.exit(FAILED)
-
-
-def _follow(client: Client) -> None:
-    """Shows the view again every second, without end. A gateway that has gone is shown too."""
-    with Live(console=out, auto_refresh=False) if out.is_terminal else nullcontext() as live:
-        while True:
-            shown: RenderableType
-            try:
-                shown = view(client.documents(), client.outcomes(HOUR))
-            except GatewayError as error:
-                shown = Text(printable(str(error)), style="red")
-            if live is None:
-                out.print(shown)
-            else:
-                live.update(shown, refresh=True)
-            time.sleep(EVERY)
 
 
 def view(documents: Documents, outcomes: list[dict[str, Any]] | None) -> RenderableType:

@@ -55,7 +55,7 @@ def trace(
         client = stack.enter_context(connected(loaded, err.print))
         recording = None
         if record is not None:
-            recording = stack.enter_context(Recording(record, line, size))
+            recording = stack.enter_context(Recording(record, line, size, notes(found)))
             err.print(f"recording {line} into {recording.path}; Ctrl-C ends it")
         capture = None if pcapng is None else stack.enter_context(Capture(pcapng, found))
         stack.enter_context(suppress(KeyboardInterrupt))
@@ -76,6 +76,15 @@ def line_named(config: Config, name: str) -> LineConfig:
     if name not in lines:
         raise ConfigError(f"there is no line {name}: {meant(name, lines)}")
     return lines[name]
+
+
+def notes(line: LineConfig) -> list[str]:
+    """Returns the protocols of the line and its speed, for a replay without the file."""
+    drivers = [device.driver for device in line.devices]
+    found = [f"protocol {one}" for one in dict.fromkeys(driver.protocol for driver in drivers)]
+    if not any(driver.traits.over_network for driver in drivers):
+        found.append(f"wire {line.serial.baudrate} {line.serial.format}")
+    return found
 
 
 def shown(event: dict[str, Any]) -> str:

@@ -1,30 +1,33 @@
 """The configuration: one YAML file, checked as a whole, every mistake named with its line."""
 
-import gc
-import os
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
-from functools import partial
-from pathlib import Path
+from importlib import import_module
+from typing import TYPE_CHECKING
 
-from gateway.config.build import Builder
-from gateway.config.file_rules import check_files
-from gateway.config.messages import ConfigErrors, Mistakes, OptionPlaces
-from gateway.config.records import (
-    AlarmsConfig,
-    Config,
-    HistoryConfig,
-    LineConfig,
-    TlsConfig,
-    WebConfig,
-    ZenohConfig,
-    ZenohMode,
-)
-from gateway.config.schema import schema
-from gateway.config.sheet_tags import SheetUse
-from gateway.config.templates import expanded
-from gateway.config.yaml_dump import dumped
-from gateway.config.yaml_file import read_yaml
+if TYPE_CHECKING:
+    from gateway.config.json_schema import schema
+    from gateway.config.loading import built, expanded_text, load, state_folder
+    from gateway.config.messages import ConfigErrors
+    from gateway.config.records import AlarmsConfig, Config, HistoryConfig, LineConfig, WebConfig
+    from gateway.config.sheet_tags import SheetUse
+    from gateway.config.zenoh_records import TlsConfig, ZenohConfig, ZenohMode
+else:
+    # Each is imported when it is used: a client of a running gateway needs few of them.
+    _MODULES = {
+        "json_schema": ("schema",),
+        "loading": ("built", "expanded_text", "load", "state_folder"),
+        "messages": ("ConfigErrors",),
+        "records": ("AlarmsConfig", "Config", "HistoryConfig", "LineConfig", "WebConfig"),
+        "sheet_tags": ("SheetUse",),
+        "zenoh_records": ("TlsConfig", "ZenohConfig", "ZenohMode"),
+    }
+    _PLACES = {name: module for module, names in _MODULES.items() for name in names}
+
+    def __getattr__(name: str) -> object:
+        if name not in _PLACES:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        found = globals()[name] = getattr(import_module(f"{__name__}.{_PLACES[name]}"), name)
+        return found
+
 
 __all__ = [
     "AlarmsConfig",
@@ -43,71 +46,3 @@ __all__ = [
     "state_folder",
     "schema",
 ]
-
-STATE_VARIABLE = "STATE_DIRECTORY"  # systemd sets it, with one or more folders
-# Settings that are texts even where YAML sees a number: `7E1`, `40101`, `unit: 1`.
-_TEXTS = frozenset({"address", "description", "format", "name", "port", "prefix", "unit"})
-
-
-def load(
-    path: str | Path,
-    report: Callable[[str, float], None] | None = None,
-    imports: Mapping[str, Path] | None = None,
-) -> Config:
-    """Reads and checks the file. Paths in it are relative to its folder; those of files that the
-    gateway writes are relative to `state_folder()`, if there is one.
-
-    `report` receives the name of each step and the share of it that is done. `imports`: a sheet
-    with more tags, by device. Raises `ConfigErrors` with every mistake.
-    """
-    read = None if report is None else partial(report, f"reading {Path(path).name}")
-    checked = None if report is None else partial(report, "checking the tags")
-    with _without_gc():
-        file, mistakes = read_yaml(Path(path), _TEXTS, read)
-        builder = Builder(mistakes, Path(path).parent, state_folder(), checked, imports or {})
-        config = builder.config(expanded(file, mistakes, Path(path).parent))
-        if config is not None:
-            check_files(config, Path(path), mistakes)
-    mistakes.raise_all()
-    if config is None:
-        raise AssertionError(f"{path}: no configuration, and no mistake either")
-    return config
-
-
-def expanded_text(path: str | Path) -> str:
-    """Returns the file with every template expanded, as a file that has none. Raises
-    `ConfigErrors`."""
-    file, mistakes = read_yaml(Path(path), _TEXTS)
-    data = expanded(file, mistakes, Path(path).parent)
-    mistakes.raise_all()
-    return dumped(data)
-
-
-def built(data: Mapping[str, object], folder: Path | None = None) -> Config:
-    """Returns the configuration of data that is in no file. Raises `ConfigErrors`."""
-    mistakes = Mistakes(OptionPlaces())
-    config = Builder(mistakes, folder or Path()).config(data)
-    mistakes.raise_all()
-    if config is None:
-        raise AssertionError(f"{data}: no configuration, and no mistake either")
-    return config
-
-
-def state_folder() -> Path | None:
-    """Returns the folder for the files that the gateway writes: systemd's StateDirectory, or that
-    of a container. None: beside the configuration file."""
-    first = os.environ.get(STATE_VARIABLE, "").partition(":")[0]
-    return Path(first) if first else None
-
-
-@contextmanager
-def _without_gc() -> Iterator[None]:
-    """Disables the garbage collector: walking the growing tree again and again takes two thirds
-    of the time of a large file, and finds no garbage in it."""
-    enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if enabled:
-            gc.enable()

@@ -23,10 +23,7 @@ from gateway.config.records import (
     Config,
     HistoryConfig,
     LineConfig,
-    TlsConfig,
     WebConfig,
-    ZenohConfig,
-    ZenohMode,
 )
 from gateway.config.served import (
     ServedDevice,
@@ -37,6 +34,7 @@ from gateway.config.served import (
     only_served,
     until_the_next_call,
 )
+from gateway.config.session_files import existing_file, zenoh_config
 from gateway.config.sheet_tags import SheetTags
 from gateway.config.tag_rules import inherit
 from gateway.config.transfers import TransferRows
@@ -109,7 +107,7 @@ class Builder:
             standby_alone=top.gateway.standby_alone,
             secret_file=self._file(top.gateway.secret_file, ("gateway", "secret_file")),
             writers_file=self._file(top.writers.file, ("writers", "file")) if top.writers else None,
-            zenoh=self._zenoh(top),
+            zenoh=zenoh_config(top.zenoh, self.folder, self.mistakes),
             history=self._history(top),
             web=self._web(top),
             alarms=self._alarms(top, lines),
@@ -280,37 +278,8 @@ class Builder:
                 "history.db and state.json",
             )
 
-    def _zenoh(self, top: FileSection) -> ZenohConfig:
-        found, own = top.zenoh, ("zenoh",)
-        tls = found.tls
-        return ZenohConfig(
-            prefix=found.prefix,
-            mode=ZenohMode(found.mode),
-            listen=tuple(found.listen),
-            connect=tuple(found.connect),
-            config_file=self._file(found.config_file, (*own, "config_file")),
-            tls=None
-            if tls is None
-            else TlsConfig(
-                ca=self._file(tls.ca, (*own, "tls", "ca")),
-                certificate=self._file(tls.certificate, (*own, "tls", "certificate")),
-                key=self._file(tls.key, (*own, "tls", "key")),
-                mutual=tls.mutual,
-            ),
-            user=found.user,
-            password_file=self._file(found.password_file, (*own, "password_file")),
-            users_file=self._file(found.users_file, (*own, "users_file")),
-            refresh=found.refresh,
-        )
-
     def _file(self, name: FilePath | None, path: Path) -> FilePath | None:
-        """Returns the path of a file that must exist."""
-        if name is None:
-            return None
-        file = self.folder / name
-        if not file.is_file():
-            self.mistakes.add(path, f"there is no file {file}")
-        return file
+        return existing_file(name, self.folder, path, self.mistakes)
 
     def _written(self, name: FilePath) -> FilePath:
         """Returns the path of a file that the gateway writes."""

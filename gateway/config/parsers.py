@@ -13,7 +13,6 @@ from typing import Literal
 
 from gateway.config.messages import one_of, shown
 from gateway.errors import ConfigError
-from gateway.tags import Deadband, Form, Publish
 from gateway.transport.port import MODEM, PortAddress, SerialPath, parse_port
 from gateway.values import Order, ValueType, parse_type
 
@@ -22,7 +21,6 @@ _COMMA = re.compile(r"-?[0-9]+,[0-9]+ ?[A-Za-zµ%]*\Z")
 SECONDS = {"ms": 0.001, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
 _SIZE = re.compile(r"([0-9]+(?:\.[0-9]+)?) ?([kKMGT]B)\Z")
 BYTES = {"kB": 10**3, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
-_PERCENT = re.compile(r"([0-9]+(?:\.[0-9]+)?) ?%\Z")
 _HOST_NAME = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]*[A-Za-z0-9])?\Z")
 _WEB = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[^\[\]/:\s]+):([0-9]{1,5})\Z")
 _ENDPOINT = re.compile(r"[a-z][a-z0-9_-]*/[^\s/]\S*\Z")
@@ -85,20 +83,6 @@ def size(text: object) -> int:
     if octets < 10**6:
         raise ConfigError(f"{text} is too little: use at least 1MB")
     return octets
-
-
-def deadband(text: object) -> Deadband:
-    """Parses `0.5` (in the unit of the tag) or `2%` (of the last published value)."""
-    if isinstance(text, (int, float)) and not isinstance(text, bool):
-        if not 0 <= text < math.inf:
-            raise ConfigError(f"{shown(text)}: a deadband is 0 or more")
-        return Deadband(float(text))
-    match = _PERCENT.match(text) if isinstance(text, str) else None
-    if match is None:
-        raise ConfigError(f"{shown(text)} is no deadband: write 0.5 (in the unit of the tag) or 2%")
-    if float(match[1]) > 100:
-        raise ConfigError(f"{text}: more than 100% would publish almost nothing")
-    return Deadband(float(match[1]), percent=True)
 
 
 def name(text: object, *, slashes: bool = False) -> str:
@@ -251,18 +235,6 @@ def order(text: object) -> Order:
     if text not in list(Order):
         raise ConfigError(f"{shown(text)} is no order: use {one_of(Order)}")
     return Order(str(text))
-
-
-def publish(text: object) -> Publish:
-    if text not in list(Publish):
-        raise ConfigError(f"{shown(text)} is not known: use {one_of(Publish)}")
-    return Publish(str(text))
-
-
-def form(text: object) -> Form:
-    if text not in list(Form):
-        raise ConfigError(f"{shown(text)} is not known: use {one_of(Form)}")
-    return Form(str(text))
 
 
 def blocks(value: object) -> bool | Literal["only"]:

@@ -1,54 +1,18 @@
 """The checked and complete configuration: plain data for the rest of the gateway."""
 
-from collections.abc import Container
+from collections.abc import Container, Mapping
 from dataclasses import dataclass, replace
-from enum import StrEnum
 from ipaddress import ip_address
 from pathlib import Path
 
 from gateway.config.sheet_tags import SheetUse
+from gateway.config.zenoh_records import ZenohConfig
 from gateway.engine.device import DeviceSettings
 from gateway.planning.wire_timing import WireTiming
 from gateway.tags import Tag
 from gateway.tags.transfer import TransferRule
 from gateway.transport.modem_events import ModemSettings
 from gateway.transport.port import PortAddress, SerialSettings, SimulatorAddress
-
-
-class ZenohMode(StrEnum):
-    PEER = "peer"
-    CLIENT = "client"
-    ROUTER = "router"
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TlsConfig:
-    """Certificates (PEM files). `mutual`: both sides show one."""
-
-    ca: Path | None = None  # certificate authority to trust
-    certificate: Path | None = None
-    key: Path | None = None
-    mutual: bool = False
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ZenohConfig:
-    """The Zenoh session.
-
-    `config_file` is a Zenoh JSON5 file for everything else. `mode` always counts; `listen`,
-    `connect` and the others replace the settings of that file where they are given.
-    """
-
-    prefix: str = "plant"
-    mode: ZenohMode = ZenohMode.PEER
-    listen: tuple[str, ...] = ()
-    connect: tuple[str, ...] = ()
-    config_file: Path | None = None
-    tls: TlsConfig | None = None
-    user: str | None = None  # of this gateway, where it connects to
-    password_file: Path | None = None
-    users_file: Path | None = None  # for those who connect: a line `user:password` each
-    refresh: float = 600.0  # seconds in which every value is published at least once
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -133,6 +97,16 @@ class Config:
     @property
     def devices(self) -> tuple[DeviceSettings, ...]:
         return tuple(device for line in self.lines for device in line.devices)
+
+    @property
+    def dialling(self) -> Mapping[str, float]:
+        """The devices behind a modem: seconds that a request may wait for a telephone call."""
+        return {
+            device.name: line.modem.dial_timeout
+            for line in self.lines
+            if line.modem is not None
+            for device in line.devices
+        }
 
     @property
     def held_file(self) -> Path | None:

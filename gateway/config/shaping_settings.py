@@ -39,7 +39,7 @@ _BITS_SCHEMA = {
 }
 
 
-CONFIG = ConfigDict(arbitrary_types_allowed=True, use_attribute_docstrings=True)
+CONFIG = ConfigDict(arbitrary_types_allowed=True, defer_build=True)
 Numbered = Annotated[Names, PlainValidator(parsers.names), WithJsonSchema(_ENUM_SCHEMA)]
 Pair = Annotated[tuple[float, float], PlainValidator(parsers.pair), WithJsonSchema(_PAIR_SCHEMA)]
 

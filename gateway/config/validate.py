@@ -12,7 +12,7 @@ from pydantic_core import ErrorDetails
 from gateway.config import parsers
 from gateway.config.driver_settings import dataclasses_in, plain_settings
 from gateway.config.messages import Mistakes, Path, meant, one_of, shown
-from gateway.config.model import Section
+from gateway.config.session_model import Section
 from gateway.protocols.driver import AnyDriver
 from gateway.protocols.registry import PROTOCOLS, Protocol
 

@@ -4,7 +4,7 @@ A plain file has no anchors, tags, merges or mistakes: only mappings, lists and 
 `gateway.config.yaml_file` reads all other files, and finds the lines of mistakes.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any
 
 import yaml
@@ -41,6 +41,23 @@ def plain_data(
         return None
 
 
+def first_sections(
+    text: bytes, texts: frozenset[str], names: Collection[str]
+) -> dict[str, Any] | None:
+    """Returns the sections of a plain file up to the last of `names`; all where one lacks.
+
+    None for a file that is not plain up to there. What follows is not read.
+    """
+    if not yaml.__with_libyaml__:
+        return None
+    try:
+        stream = _Stream(yaml.CBaseLoader(text).get_event, texts, lambda _mark: None)
+        stream.until = frozenset(names)
+        return stream.document()
+    except (yaml.YAMLError, _NotPlainError):
+        return None
+
+
 class _Stream:
     """The events of one file. Equal texts and numbers become one object."""
 
@@ -52,6 +69,7 @@ class _Stream:
         self._report = report
         self._names: dict[str, str] = {}
         self._values: dict[str, object] = {}
+        self.until: frozenset[str] | None = None  # sections after which the file ends early
 
     def document(self) -> dict[str, Any]:
         event = self._event
@@ -59,6 +77,8 @@ class _Stream:
         if kinds != [yaml.StreamStartEvent, yaml.DocumentStartEvent, yaml.MappingStartEvent]:
             raise _NotPlainError
         data = self._mapping(1)
+        if self.until is not None and self.until <= data.keys():
+            return data
         if [type(event()), type(event())] != [yaml.DocumentEndEvent, yaml.StreamEndEvent]:
             raise _NotPlainError
         return data
@@ -77,6 +97,8 @@ class _Stream:
             if name in found or name == "<<":
                 raise _NotPlainError
             found[name] = self._value(event(), level, is_text=name in self._texts)
+            if level == 1 and self.until is not None and self.until <= found.keys():
+                return found
 
     def _value(self, event: Any, level: int, *, is_text: bool = False) -> Any:
         if event.anchor or type(event) is yaml.AliasEvent or event.tag or level == _DEEPEST:

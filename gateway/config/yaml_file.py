@@ -35,6 +35,9 @@ def _ascend(loader: Any) -> None:
     loader.depth -= 1
 
 
+# Settings that are texts even where YAML sees a number: `7E1`, `40101`, `unit: 1`.
+TEXTS = frozenset({"address", "description", "format", "name", "port", "prefix", "unit"})
+
 # libyaml is ten times faster; PyYAML's own reader is the fallback. This module finds the type of
 # a scalar, so PyYAML's own search for it (half of its time) is left out.
 _LOADER: Any = type(
@@ -193,7 +196,7 @@ def read_yaml(
     receives the share that is read.
     Raises `ConfigErrors` where the file cannot be read.
     """
-    file = YamlFile(str(path), _text(path), texts)
+    file = YamlFile(str(path), file_text(path), texts)
     mistakes = Mistakes(file)
     file.read(mistakes, report)
     return file, mistakes
@@ -216,7 +219,7 @@ def compose(name: str, text: str) -> yaml.MappingNode:
     return root
 
 
-def _text(path: FilePath) -> str:
+def file_text(path: FilePath) -> str:
     try:
         data = path.read_bytes()
     except FileNotFoundError:

@@ -13,7 +13,14 @@ from gateway.line.line import Line, SampleSink
 from gateway.simulator.plant import animate, station_for
 from gateway.simulator.port import open_simulator
 from gateway.stations.station import Station
-from gateway.transport import ModemAddress, Port, Receiver, SimulatorAddress, open_port
+from gateway.transport import (
+    ModemAddress,
+    Port,
+    Receiver,
+    SimulatorAddress,
+    open_port,
+    prepare,
+)
 from gateway.transport.listen_only import ListenOnlyPort
 
 OpenPort = Callable[[Receiver], Awaitable[Port]]
@@ -57,6 +64,7 @@ def opener(line: LineConfig) -> OpenPort:
     """Returns a function that opens the port of the line, or its simulated devices in memory."""
     if isinstance(line.port, SimulatorAddress):
         return SimulatedLine(line)
+    prepare(line.port)
     if isinstance(line.port, ModemAddress) and line.modem is not None:
         return ModemOpener(line.port, line.serial, line.modem)
     return lambda receiver: open_port(line.port, line.serial, receiver)

@@ -11,7 +11,6 @@ from gateway.errors import CallEnded
 from gateway.line.channel import Channel
 from gateway.transport import (
     ModemAddress,
-    ModemPort,
     ModemSettings,
     OpenBelow,
     Port,
@@ -45,7 +44,7 @@ class ModemOpener:
     modem: ModemSettings
     opens: OpenBelow = open_port
 
-    def __call__(self, receiver: Receiver) -> Awaitable[ModemPort]:
+    def __call__(self, receiver: Receiver) -> Awaitable[Port]:
         return open_modem(self.where, self.serial, self.modem, receiver, opens=self.opens)
 
 

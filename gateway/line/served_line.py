@@ -23,7 +23,15 @@ from gateway.serving.registers import Registers, Row, Served
 from gateway.serving.registry import answerer
 from gateway.serving.station import Presence, Station
 from gateway.tags import Sample
-from gateway.transport import ModemAddress, Port, Receiver, TcpAddress, open_modem, open_port
+from gateway.transport import (
+    ModemAddress,
+    Port,
+    Receiver,
+    TcpAddress,
+    open_modem,
+    open_port,
+    prepare,
+)
 from gateway.transport.listen import Listener
 
 log = structlog.get_logger("gateway.line")
@@ -70,6 +78,7 @@ class ServedLine:
         self.unsent = 0  # replies that later bytes have followed
         self._sink = sink
         self._open_port = open_port
+        prepare(config.port)
         self._wall = wall
         self._duty = duty or Duty()
         self.wire_log = WireLog()

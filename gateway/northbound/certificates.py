@@ -1,10 +1,8 @@
 """Certificates and keys, checked before Zenoh opens: it reports errors late and briefly."""
 
 import ssl
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
-
-import zenoh
 
 from gateway.config import TlsConfig
 from gateway.errors import ConfigError
@@ -22,19 +20,6 @@ def check_files(tls: TlsConfig) -> None:
         wrong = f"is no PEM key without a password, or not that of {tls.certificate}"
         with _as_config_error(f"zenoh.tls.key {tls.key}", wrong):
             context.load_cert_chain(tls.certificate, tls.key, password="")
-
-
-def check_listen(config: zenoh.Config, listen: Sequence[str]) -> None:
-    """Raises `ConfigError` for an endpoint that needs a certificate and has none."""
-    link = "transport/link/tls/listen_certificate"
-    if any(config.get_json(name) != "null" for name in (link, f"{link}_base64")):
-        return
-    for endpoint in listen:
-        if endpoint.startswith(("tls/", "quic/")) and "#" not in endpoint:
-            raise ConfigError(
-                f"zenoh listen {endpoint!r}: it needs a certificate: write beside `listen` "
-                "`tls: {certificate: gateway.pem, key: gateway.key}`"
-            )
 
 
 @contextmanager

@@ -26,14 +26,8 @@ from gateway.northbound.own_writes import OwnWrites
 from gateway.northbound.payload import Failure, GroupResult
 from gateway.northbound.publisher import Publisher, ScanBatches
 from gateway.northbound.republish import Republisher
-from gateway.northbound.session import (
-    CLOSE_WITHIN,
-    configure,
-    connect_endpoints,
-    drop_limit,
-    off_loop,
-    open_session,
-)
+from gateway.northbound.session import CLOSE_WITHIN, off_loop, open_session
+from gateway.northbound.session_settings import configure, connect_endpoints, drop_limit
 from gateway.northbound.standby import GroupSettings
 from gateway.northbound.status_publisher import StatusPublisher
 from gateway.northbound.tag_index import TagIndex

@@ -10,7 +10,8 @@ from contextlib import suppress
 
 import zenoh
 
-from gateway.northbound.session import as_client, off_loop, open_session
+from gateway.northbound.session import off_loop, open_session
+from gateway.northbound.session_settings import as_client
 
 _CLOSE_WITHIN = 0.3  # seconds; a router that hangs must not delay the end
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from gateway.app import Gateway
 from gateway.config import Config
 from gateway.config.changes import Difference, compare
-from gateway.northbound import Northbound
+from gateway.northbound.northbound import Northbound
 from gateway.northbound.session import off_loop
 from gateway.reload.lines import RunningLines
 from gateway.reload.reloader import Reloader

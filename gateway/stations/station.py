@@ -1,17 +1,22 @@
 """The contract of a simulated PLC, and its memory."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Protocol
+
+# Gets an area and numbers in it that a request names. Returns True where the PLC lacks them.
+Guard = Callable[[str, Sequence[int]], bool]
 
 
 class Memory:
     """The device memory of a PLC by area name; index = number - first number of the area.
 
-    `animate` makes a cell a function of time, until it is written.
+    `animate` makes a cell a function of time, until it is written. Where there is a `guard`, the
+    station asks it before it carries out a request.
     """
 
     def __init__(self, areas: Iterable[tuple[str, int, int]]) -> None:
         """`areas`: (name, first number, last number)."""
+        self.guard: Guard | None = None
         self._first: dict[str, int] = {}
         self._size: dict[str, int] = {}
         self._cells: dict[str, list[int]] = {}  # up to the last one that was written

@@ -3,7 +3,7 @@
 It finds devices by the address map of the manual (B-5-3), independent of the driver.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from functools import cache
 from typing import NamedTuple
 
@@ -144,7 +144,7 @@ class VigorStation:
         if place is None or place.area not in FORCED:
             return _OUT_OF_RANGE
         number = place.devices(byte)[bit]
-        if (place.area, number) in self.holes:
+        if self._lacks(place.area, (number,)):
             return _OUT_OF_RANGE
         self._memory.write(place.area, number, [value])
         return _DONE
@@ -159,10 +159,15 @@ class VigorStation:
             place = stretch(byte)
             if place is None:
                 return None
-            if self.holes and any((place.area, n) in self.holes for n in place.devices(byte)):
+            if self._lacks(place.area, place.devices(byte)):
                 return None
             places.append((place, byte))
         return places
+
+    def _lacks(self, area: str, numbers: Sequence[int]) -> bool:
+        if self.holes and any((area, number) in self.holes for number in numbers):
+            return True
+        return self._memory.guard is not None and self._memory.guard(area, numbers)
 
     def _peek(self, place: Stretch, byte: int, now: float) -> int:
         devices = place.devices(byte)

@@ -1,9 +1,10 @@
 """Ports: serial, TCP and RFC 2217, opened by `open_port`, and modems on them by `open_modem`."""
 
 from collections.abc import Awaitable, Callable
+from importlib import import_module
+from typing import TYPE_CHECKING
 
 from gateway.errors import LineDown
-from gateway.transport.modem import ModemPort
 from gateway.transport.modem_events import ModemSettings
 from gateway.transport.port import (
     ModemAddress,
@@ -17,9 +18,25 @@ from gateway.transport.port import (
     TcpAddress,
     parse_port,
 )
-from gateway.transport.rfc2217 import open_rfc2217
-from gateway.transport.serial_port import open_serial
-from gateway.transport.tcp import open_tcp
+
+if TYPE_CHECKING:
+    from gateway.transport.modem import ModemPort
+
+_OPENERS = {
+    SerialPath: "serial_port",
+    TcpAddress: "tcp",
+    Rfc2217Address: "rfc2217",
+    ModemAddress: "modem",
+}
+
+
+def prepare(where: PortAddress) -> None:
+    """Imports what opens the port. It takes as long as a reply, so it precedes the first line; a
+    process that opens no port does without."""
+    if module := _OPENERS.get(type(where)):
+        import_module(f"{__name__}.{module}")
+    if isinstance(where, ModemAddress):
+        prepare(where.port)
 
 
 async def open_port(
@@ -32,10 +49,16 @@ async def open_port(
     """
     match where:
         case SerialPath():
+            from gateway.transport.serial_port import open_serial
+
             return await open_serial(where, settings, receiver, timeout=timeout)
         case TcpAddress():
+            from gateway.transport.tcp import open_tcp
+
             return await open_tcp(where, receiver, timeout=timeout, baudrate=settings.baudrate)
         case Rfc2217Address():
+            from gateway.transport.rfc2217 import open_rfc2217
+
             return await open_rfc2217(where, settings, receiver, timeout=timeout)
         case ModemAddress():
             raise LineDown("a modem dials for a line of a file only")
@@ -54,11 +77,13 @@ async def open_modem(
     *,
     answers: bool = False,
     opens: OpenBelow = open_port,
-) -> ModemPort:
+) -> "ModemPort":
     """Opens the port of a modem, and sets the modem up. As `open_port`.
 
     `answers`: the modem takes incoming calls. `opens` opens the port that the modem is at.
     """
+    from gateway.transport.modem import ModemPort
+
     port = ModemPort(_name(where), modem, receiver, answers=answers)
     await port.open(lambda below: opens(where.port, settings, below))
     return port
@@ -74,7 +99,6 @@ def _name(where: ModemAddress) -> str:
 
 __all__ = [
     "ModemAddress",
-    "ModemPort",
     "ModemSettings",
     "OpenBelow",
     "Receiver",
@@ -88,4 +112,5 @@ __all__ = [
     "open_modem",
     "open_port",
     "parse_port",
+    "prepare",
 ]

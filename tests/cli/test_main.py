@@ -1,6 +1,8 @@
 """The commands as a whole: help, usage, version, exit codes. People see no traceback."""
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -10,7 +12,8 @@ from gateway.config import schema as config_schema
 from tests.cli.conftest import Command
 from tests.e2e.processes import Done, plc_gateway
 
-EXAMPLE = str(Path(__file__).parents[2] / "config.example.yaml")
+ROOT = Path(__file__).parents[2]
+EXAMPLE = str(ROOT / "config.example.yaml")
 COMMANDS = [
     *("run", "check", "read", "write", "control", "watch", "scan", "simulate"),
     *("status", "health", "schema", "version"),
@@ -111,6 +114,30 @@ def test_without_a_gateway_commands_end_with_1(config: Path, arguments: list[str
     assert "no gateway at tcp/127.0.0.1:" in done.err
     assert "start it with `plc-gateway run`, or use --direct" in done.err
     assert len(done.err.splitlines()) == 1
+
+
+def test_status_and_health_import_no_protocol(running: Path) -> None:
+    """A probe runs each few seconds, so it shall cost little: see benchmarks/commands.py."""
+    program = (
+        "import sys, atexit; from gateway.cli.main import main; "
+        f"sys.argv = ['plc-gateway', 'health', '--strict', {str(running)!r}]; "
+        "atexit.register(lambda: print([name for name in ('gateway.config.build', "
+        "'gateway.tags.tag', 'gateway.protocols.registry', 'asyncio', 'structlog', 'serialx', "
+        "'pymodbus', 'lark') if name in sys.modules])); main()"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.splitlines()[-1] == "[]"
+
+
+def test_a_mistake_elsewhere_in_the_file_does_not_hide_the_running_gateway(
+    running: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / "plant.yaml"
+    path.write_text(running.read_text().replace('"D500"', '"D50O"'))
+    assert plc_gateway("check", path).code == 2
+    assert plc_gateway("health", path).code == 0
 
 
 def test_health_prints_the_status(running: Path) -> None:

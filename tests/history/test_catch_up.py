@@ -17,9 +17,10 @@ from gateway.history import Historian
 from gateway.history.buckets import Bucket
 from gateway.history.course import Now
 from gateway.history.question import Question
-from gateway.northbound import Northbound, payload
+from gateway.northbound import payload
 from gateway.northbound.answers import HISTORY_LIMIT
 from gateway.northbound.interfaces import History
+from gateway.northbound.northbound import Northbound
 from gateway.northbound.payload import Failure, Problem, WriteOutcome
 from gateway.tags import Reason, Sample, Tag, WriteResult, bad, good
 from gateway.tags.recorded import Recorded, RecordedQuery

@@ -15,12 +15,12 @@ from gateway.simulator.serve import serve_on_tcp
 from gateway.stations.vigor import VigorStation
 from gateway.transport import (
     ModemAddress,
-    ModemPort,
     ModemSettings,
     SerialSettings,
     TcpAddress,
     open_modem,
 )
+from gateway.transport.modem import ModemPort
 from tests.conftest import forbidden
 from tests.e2e.processes import Program, free_port, listens, until
 from tests.e2e.station import WIRE

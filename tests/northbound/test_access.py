@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from gateway.config import ZenohConfig
-from gateway.northbound import Northbound
+from gateway.northbound.northbound import Northbound
 from tests.northbound.access import (
     PASSWORDS,
     ROUTER_RULES,

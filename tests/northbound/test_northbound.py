@@ -14,7 +14,7 @@ from gateway.errors import (
     ConfigError,
     GatewayError,
 )
-from gateway.northbound import Northbound
+from gateway.northbound.northbound import Northbound
 from tests.northbound.plant import (
     gateway_and_client,
     mixer,

@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 
 from gateway.config import ZenohConfig, ZenohMode
-from gateway.northbound import Northbound
 from gateway.northbound.keys import Keys
 from gateway.northbound.link_monitor import LinkMonitor
 from gateway.northbound.losses import Losses
+from gateway.northbound.northbound import Northbound
 from gateway.northbound.republish import Republisher
 from gateway.northbound.tag_index import TagIndex
 from gateway.tags import Reason, Sample, bad

@@ -12,7 +12,7 @@ import zenoh
 from gateway.config import TlsConfig, ZenohConfig
 from gateway.errors import ConfigError
 from gateway.northbound import secrets
-from gateway.northbound.session import configure
+from gateway.northbound.session_settings import configure
 from tests.e2e.processes import Program
 from tests.northbound.access import (
     GATEWAY_RULES,

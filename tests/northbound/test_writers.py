@@ -16,7 +16,7 @@ from gateway.errors import ConfigError
 from gateway.history.buckets import Bucket
 from gateway.history.course import Now
 from gateway.history.question import Question
-from gateway.northbound import Northbound
+from gateway.northbound.northbound import Northbound
 from gateway.northbound.signatures import sign
 from gateway.northbound.writers import EARLIEST, LATEST, NotAllowed, Repeated, Writers
 from gateway.tags import Sample, Tag

@@ -1050,7 +1050,7 @@ MUTANTS = (
     ),
     Mutant(
         "a whole batch takes 8 s at 64 kbit/s",
-        "northbound/session.py",
+        "northbound/session_settings.py",
         '    "transport/link/tx/batch_size": 8192,\n',
         "",
         "tests/attacks/test_slow_links.py",
@@ -1243,7 +1243,7 @@ MUTANTS = (
     ),
     Mutant(
         "silent connections keep new clients out",
-        "northbound/session.py",
+        "northbound/session_settings.py",
         '    "transport/unicast/accept_pending": 400,\n'
         '    "transport/unicast/accept_timeout": 3000,  # ms\n',
         "",
@@ -1572,7 +1572,7 @@ MUTANTS = (
     ),
     Mutant(
         "the state directory is ignored",
-        "config/__init__.py",
+        "config/loading.py",
         "    return Path(first) if first else None\n",
         "    return None\n",
         "tests/config/test_state_folder.py",
@@ -2788,5 +2788,19 @@ MUTANTS = (
         "            if place is None or tag not in place[1].settings.targets:\n",
         "            if place is None:\n",
         "tests/transfers/test_runner.py",
+    ),
+    Mutant(
+        "a served recording shows a value that may be of another request",
+        "line/recorded.py",
+        "            doubtful.pop((sample.tag.device, _unit(sample.tag.span)), None)\n",
+        "            pass\n",
+        "tests/line/test_recorded.py",
+    ),
+    Mutant(
+        "a served recording shows 0 for what it does not hold",
+        "simulator/recorded.py",
+        "        self.memory.guard = self._lacks\n",
+        "",
+        "tests/line/test_recorded.py",
     ),
 )

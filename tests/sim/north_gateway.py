@@ -7,7 +7,7 @@ from typing import Any
 from gateway.app import Gateway
 from gateway.config import Config, LineConfig
 from gateway.history import Historian
-from gateway.northbound import Northbound
+from gateway.northbound.northbound import Northbound
 from gateway.northbound.session import off_loop
 from gateway.tags import Sample
 from tests.sim.north_judge import Judge

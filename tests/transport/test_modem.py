@@ -8,7 +8,6 @@ import pytest
 from gateway.errors import CallEnded, LineDown
 from gateway.transport import (
     ModemAddress,
-    ModemPort,
     ModemSettings,
     Port,
     PortAddress,
@@ -19,6 +18,7 @@ from gateway.transport import (
     open_modem,
     parse_port,
 )
+from gateway.transport.modem import ModemPort
 from tests.e2e.pty_modem import PtyModem
 from tests.line.telephone import Cable
 from tests.sim.virtual import on_virtual_time

@@ -8,7 +8,7 @@ from gateway.cli.client.arguments import (
     wanted_keys,
 )
 from gateway.cli.client.client import Client
-from gateway.cli.client.connection import connected
+from gateway.cli.client.connection import connected, reached
 from gateway.cli.client.rows import Row
 
 __all__ = [
@@ -17,6 +17,7 @@ __all__ = [
     "connected",
     "matches",
     "parse_value",
+    "reached",
     "suggestion",
     "tags_by_key",
     "wanted_keys",

@@ -3,23 +3,27 @@
 import json
 import math
 from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
 import zenoh
 
-from gateway.config import Config
+from gateway.config.address import Address
 from gateway.config.messages import similar
 from gateway.errors import ConfigError
 from gateway.numerals import parse_decimal
-from gateway.tags import Tag
 from gateway.values import Value
 
+if TYPE_CHECKING:
+    from gateway.config import Config
+    from gateway.tags import Tag
 
-def tags_by_key(config: Config) -> dict[str, Tag]:
+
+def tags_by_key(config: "Config | Address") -> "dict[str, Tag]":
     """Returns all tags by `device/tag`."""
     return {tag.key: tag for device in config.devices for tag in device.tags}
 
 
-def wanted_keys(config: Config, names: list[str] | None) -> list[str]:
+def wanted_keys(config: "Config", names: list[str] | None) -> list[str]:
     """Returns key expressions for names of tags and devices and for wildcards.
 
     No names mean all tags. Raises `ConfigError` for a name that matches no tag.

@@ -6,21 +6,22 @@ from contextlib import AbstractContextManager, ExitStack, suppress
 from functools import partial
 from itertools import pairwise
 from queue import SimpleQueue
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import orjson
 import zenoh
 
 from gateway.cli.client.arguments import matches, tags_by_key
 from gateway.cli.client.rows import Row, document, raw, reason, without_gateway
-from gateway.cli.client.signing import signature
 from gateway.cli.client.tracing import traced
 from gateway.cli.client.value_pages import paged
-from gateway.config import Config
-from gateway.config.commands import TO_ALL
+from gateway.config.address import Address
 from gateway.errors import GatewayError
 from gateway.northbound.keys import Keys
 from gateway.values import Value
+
+if TYPE_CHECKING:
+    from gateway.config import Config
 
 REPLY_TIMEOUT = 10.0  # seconds
 _CHANGED = "does the gateway run with the current version of this file?"
@@ -37,7 +38,7 @@ class Client:
     def __init__(
         self,
         session: zenoh.Session,
-        config: Config,
+        config: "Config | Address",
         tell: Callable[[str], None],
         user: str | None = None,
     ) -> None:
@@ -47,12 +48,7 @@ class Client:
         self._tags = tags_by_key(config)
         self._only_blocks = [device for device in config.devices if device.blocks == "only"]
         # Seconds that a request may wait for a telephone call.
-        self._dialling = {
-            device.name: line.modem.dial_timeout
-            for line in config.lines
-            if line.modem is not None
-            for device in line.devices
-        }
+        self._dialling = config.dialling
         self._tell = tell
         self._user = user
         self._duplicated: set[str] = set()  # devices of several gateways, reported once
@@ -150,6 +146,8 @@ class Client:
 
     def control(self, line: str, device: str, command: str, argument: str) -> dict[str, object]:
         """Returns the outcome of a command: `answer ...` or `error ...`. Raises as `write`."""
+        from gateway.config.commands import TO_ALL  # it knows the protocols, which take 0.1 s
+
         if command == TO_ALL:
             status = self._keys.status("status")
             return self._request(self._keys.to_all(line), argument.encode(), status)
@@ -296,6 +294,8 @@ class Client:
         has given up. And Zenoh keeps messages in order, so after the reply the session knows
         whether a gateway may get the request.
         """
+        from gateway.cli.client.signing import signature  # with all about tags
+
         timeout = REPLY_TIMEOUT + dialling
         with self._session.declare_querier(key, timeout=timeout) as querier:
             served = any(reply.ok is not None for reply in self._query(documents))

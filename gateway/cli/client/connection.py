@@ -5,14 +5,20 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import zenoh
 
+from gateway import config as configuration
 from gateway.cli.client.client import Client
-from gateway.cli.client.diagnosis import connection_failure
-from gateway.config import Config, ZenohConfig, ZenohMode
+from gateway.config import ZenohConfig, ZenohMode
+from gateway.config.address import Address, address
 from gateway.errors import ConfigError, GatewayError
-from gateway.northbound.session import configure
+from gateway.northbound.session_settings import configure
+
+if TYPE_CHECKING:
+    from gateway.config import Config
 
 USER_VARIABLE = "PLC_GATEWAY_CLI_USER"
 PASSWORD_VARIABLE = "PLC_GATEWAY_CLI_PASSWORD"  # noqa: S105  (the name of a variable)
@@ -27,7 +33,22 @@ _OPEN: dict[str, object] = {
 
 
 @contextmanager
-def connected(config: Config, tell: Callable[[str], None]) -> Iterator[Client]:
+def reached(path: Path, tell: Callable[[str], None]) -> Iterator[Client]:
+    """Yields a client of the gateway of a file, and reads only the address in it.
+
+    The client has no tags: for status and alarms. Where it fails, the file is checked as a whole,
+    because a mistake in it may be the reason. Raises as `load` and `connected`.
+    """
+    try:
+        with connected(address(path) or configuration.load(path), tell) as client:
+            yield client
+    except GatewayError:
+        configuration.load(path)
+        raise
+
+
+@contextmanager
+def connected(config: "Config | Address", tell: Callable[[str], None]) -> Iterator[Client]:
     """Yields a client of the gateway that `config` describes. `tell` gets sentences for people.
 
     The client uses the user of the environment variables, or else the gateway's own. Raises
@@ -41,6 +62,8 @@ def connected(config: Config, tell: Callable[[str], None]) -> Iterator[Client]:
     try:
         session = zenoh.open(setup)
     except zenoh.ZError:
+        from gateway.cli.client.diagnosis import connection_failure  # its TLS takes 10 ms
+
         hint = f"set {USER_VARIABLE} and {PASSWORD_VARIABLE}"
         raise GatewayError(connection_failure(setup, endpoints, user, hint)) from None
     try:
@@ -50,7 +73,7 @@ def connected(config: Config, tell: Callable[[str], None]) -> Iterator[Client]:
             session.close()  # type: ignore[no-untyped-call]  # Zenoh's stub lacks it
 
 
-def _endpoints(config: Config) -> tuple[str, ...]:
+def _endpoints(config: "Config | Address") -> tuple[str, ...]:
     """Returns the endpoints to try, in order."""
     own = config.zenoh
     if own.mode == "client":

@@ -2,16 +2,17 @@
 
 import time
 from contextlib import suppress
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import orjson
 import zenoh
 
 from gateway.cli.client.arguments import parse_value
 from gateway.cli.terminal import printable
-from gateway.tags import Tag
-from gateway.tags.timestamps import rfc3339
 from gateway.values import Kind, Value
+
+if TYPE_CHECKING:
+    from gateway.tags import Tag
 
 
 class Row(NamedTuple):
@@ -23,11 +24,13 @@ class Row(NamedTuple):
 
 def without_gateway(tag: str) -> Row:
     """Returns the row of a tag after its gateway was lost."""
+    from gateway.tags.timestamps import rfc3339  # with all about tags
+
     now = rfc3339(time.time_ns())
     return Row(tag, {"value": None, "quality": "bad", "reason": "no-gateway", "time": now})
 
 
-def raw(tag: Tag, sample: zenoh.Sample, about: bytes) -> dict[str, object]:
+def raw(tag: "Tag", sample: zenoh.Sample, about: bytes) -> dict[str, object]:
     """Returns the document of a tag with `payload: raw` in the form of the other tags."""
     value: Value | None = None
     if sample.kind == zenoh.SampleKind.PUT:

@@ -8,7 +8,6 @@ import orjson
 import zenoh
 
 from gateway.errors import GatewayError
-from gateway.northbound.pages import LARGEST
 
 FIRST = 100  # values in the first page: 2 s at 64 kbit/s
 PAGE_WITHIN = 2.0  # seconds that the next page should take
@@ -21,6 +20,8 @@ def paged(query: Query, key: str) -> Iterator[zenoh.Sample]:
 
     Several gateways may reply, each in pages of its own.
     """
+    from gateway.northbound.pages import LARGEST  # with all about tags
+
     size, places = FIRST, dict[str, str]()
     unfinished: set[str] = set()
     while True:

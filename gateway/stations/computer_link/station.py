@@ -251,6 +251,9 @@ class ComputerLinkStation:
             raise No("06")
         if any(cell in self.holes for cell in cells):
             raise No("06")
+        guard, numbers = self._memory.guard, range(cells.first, cells.first + cells.size)
+        if guard is not None and guard(cells.area, numbers):
+            raise No("06")
         return cells
 
     # Actions

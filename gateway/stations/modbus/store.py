@@ -156,6 +156,9 @@ class Store:
 
     def _in_hole(self, part: Part) -> bool:
         first, size = _units(part)
+        guard = self.memory.guard
+        if guard is not None and guard(part.run.area, range(first, first + size)):
+            return True
         return any(
             area == part.run.area and first <= end and start < first + size
             for area, start, end in self._holes

@@ -1,20 +1,23 @@
 """The JSON schema of the file, for editors that complete and check."""
 
-from collections.abc import Mapping
+import ast
+import inspect
+from collections.abc import Iterator, Mapping
+from itertools import pairwise
 from typing import Any, get_type_hints
 
-from pydantic import TypeAdapter
+from pydantic import BaseModel, TypeAdapter
 
 from gateway.config.driver_settings import dataclasses_in, is_duration
 from gateway.config.model import (
     DeviceSection,
     FileSection,
     LineSection,
-    Section,
     TagDefaults,
     TagSection,
 )
 from gateway.config.parsers import BYTES, SECONDS
+from gateway.config.session_model import Section
 from gateway.config.setting_types import (
     DURATION_SCHEMA,
     INTERVAL_SCHEMA,
@@ -58,10 +61,10 @@ _TEMPLATE: dict[str, Any] = {
 
 def schema() -> dict[str, Any]:
     """Returns the schema. A device has one shape per protocol, each with the common settings."""
-    root = FileSection.model_json_schema()
+    root = _described(FileSection)
     shared: dict[str, Any] = root.setdefault("$defs", {})
     for name, part in _PARTS.items():
-        shared[name] = _hoisted(part.model_json_schema(), shared)
+        shared[name] = _hoisted(_described(part), shared)
     shared["Tag"]["anyOf"] = [{"required": [name]} for name in ("address", "computed")]
     del shared["Tag"]["required"]
     for protocol in PROTOCOLS:
@@ -97,6 +100,47 @@ def schema() -> dict[str, Any]:
     return {"$schema": "https://json-schema.org/draft/2020-12/schema"} | root
 
 
+def _described(kind: type[BaseModel]) -> dict[str, Any]:
+    """Returns the schema with the text below each field as its description.
+
+    pydantic can do this too, but at each start of the program, which takes 50 ms.
+    """
+    found = kind.model_json_schema()
+    kinds = {one.__name__: one for one in _with_subclasses(BaseModel)}
+    for name, part in {**found.get("$defs", {}), kind.__name__: found}.items():
+        if name in kinds:
+            for setting, text in _texts(kinds[name]).items():
+                if setting in part["properties"]:
+                    described = part["properties"][setting] | {"description": text}
+                    part["properties"][setting] = dict(sorted(described.items()))
+    return found
+
+
+def _with_subclasses(kind: type[BaseModel]) -> Iterator[type[BaseModel]]:
+    yield kind
+    for one in kind.__subclasses__():
+        yield from _with_subclasses(one)
+
+
+def _texts(kind: type[BaseModel]) -> dict[str, str]:
+    """Returns the texts below the fields, by the name in the file."""
+    found: dict[str, str] = {}
+    for one in reversed(kind.__mro__):
+        if not issubclass(one, BaseModel) or one is BaseModel:
+            continue
+        [tree] = ast.parse(inspect.getsource(one)).body
+        body = tree.body if isinstance(tree, ast.ClassDef) else []
+        for field, text in pairwise(body):
+            match field, text:
+                case (
+                    ast.AnnAssign(target=ast.Name(id=name)),
+                    ast.Expr(value=ast.Constant(value=str(words))),
+                ):
+                    alias = kind.model_fields[name].alias
+                    found[alias or name] = inspect.cleandoc(words)
+    return found
+
+
 def _device(protocol: str, shared: dict[str, Any]) -> dict[str, Any]:
     driver = PROTOCOLS[protocol].settings
     settings = _hoisted(TypeAdapter(driver).json_schema(), shared)["properties"]
@@ -107,7 +151,7 @@ def _device(protocol: str, shared: dict[str, Any]) -> dict[str, Any]:
     for inner in set(dataclasses_in(driver)):
         shared[inner.__name__] |= {"additionalProperties": False}
         _mend(inner, shared[inner.__name__]["properties"])
-    common = _hoisted(DeviceSection.model_json_schema(), shared)["properties"]
+    common = _hoisted(_described(DeviceSection), shared)["properties"]
     common["tags"] |= _by_name("Tag", TAG_NAME_PATTERN)
     common["defaults"] = _defaults("device")
     return {

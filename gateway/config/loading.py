@@ -1,0 +1,82 @@
+"""Loads the file: reads it, expands its templates, checks it as a whole."""
+
+import gc
+import os
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+
+from gateway.config.build import Builder
+from gateway.config.file_rules import check_files
+from gateway.config.messages import Mistakes, OptionPlaces
+from gateway.config.records import Config
+from gateway.config.templates import expanded
+from gateway.config.yaml_dump import dumped
+from gateway.config.yaml_file import TEXTS, read_yaml
+
+STATE_VARIABLE = "STATE_DIRECTORY"  # systemd sets it, with one or more folders
+
+
+def load(
+    path: str | Path,
+    report: Callable[[str, float], None] | None = None,
+    imports: Mapping[str, Path] | None = None,
+) -> Config:
+    """Reads and checks the file. Paths in it are relative to its folder; those of files that the
+    gateway writes are relative to `state_folder()`, if there is one.
+
+    `report` receives the name of each step and the share of it that is done. `imports`: a sheet
+    with more tags, by device. Raises `ConfigErrors` with every mistake.
+    """
+    read = None if report is None else partial(report, f"reading {Path(path).name}")
+    checked = None if report is None else partial(report, "checking the tags")
+    with _without_gc():
+        file, mistakes = read_yaml(Path(path), TEXTS, read)
+        builder = Builder(mistakes, Path(path).parent, state_folder(), checked, imports or {})
+        config = builder.config(expanded(file, mistakes, Path(path).parent))
+        if config is not None:
+            check_files(config, Path(path), mistakes)
+    mistakes.raise_all()
+    if config is None:
+        raise AssertionError(f"{path}: no configuration, and no mistake either")
+    return config
+
+
+def expanded_text(path: str | Path) -> str:
+    """Returns the file with every template expanded, as a file that has none. Raises
+    `ConfigErrors`."""
+    file, mistakes = read_yaml(Path(path), TEXTS)
+    data = expanded(file, mistakes, Path(path).parent)
+    mistakes.raise_all()
+    return dumped(data)
+
+
+def built(data: Mapping[str, object], folder: Path | None = None) -> Config:
+    """Returns the configuration of data that is in no file. Raises `ConfigErrors`."""
+    mistakes = Mistakes(OptionPlaces())
+    config = Builder(mistakes, folder or Path()).config(data)
+    mistakes.raise_all()
+    if config is None:
+        raise AssertionError(f"{data}: no configuration, and no mistake either")
+    return config
+
+
+def state_folder() -> Path | None:
+    """Returns the folder for the files that the gateway writes: systemd's StateDirectory, or that
+    of a container. None: beside the configuration file."""
+    first = os.environ.get(STATE_VARIABLE, "").partition(":")[0]
+    return Path(first) if first else None
+
+
+@contextmanager
+def _without_gc() -> Iterator[None]:
+    """Disables the garbage collector: walking the growing tree again and again takes two thirds
+    of the time of a large file, and finds no garbage in it."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
