@@ -1,5 +1,6 @@
 """Reads only the part of the file that a client needs to reach its gateway."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING

@@ -89,7 +89,7 @@ def schema() -> dict[str, Any]:
     root["properties"]["templates"]["additionalProperties"] = _ref("Template")
     root["properties"]["lines"] |= _by_name("Line") | {"minProperties": 1}
     root["properties"]["defaults"] = _defaults("file")
-    shared["Transfer"] = TransferSection.model_json_schema()
+    shared["Transfer"] = _described(TransferSection)
     root["properties"]["transfers"]["items"] = _ref("Transfer")
     line = shared["Line"]["properties"]
     line["devices"] |= _by_name("Device", _DEVICE_NAMES) | {"minProperties": 1}

@@ -48,9 +48,7 @@ _INIT_SCHEMA = {"type": "string", "pattern": _INIT_PATTERN}
 class ModemSection(BaseModel):
     """The modem at the port of a line, and its calls."""
 
-    model_config = ConfigDict(
-        extra="forbid", frozen=True, strict=True, use_attribute_docstrings=True
-    )
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, defer_build=True)
 
     number: Annotated[
         str | None,

@@ -6,7 +6,7 @@ from pydantic import AfterValidator, Field, PlainValidator, WithJsonSchema, mode
 
 from gateway.config import parsers
 from gateway.config.messages import shown
-from gateway.config.model import Section
+from gateway.config.session_model import Section
 from gateway.config.setting_types import SCALE_SCHEMA, Finite, Interval, Text
 from gateway.errors import ConfigError
 from gateway.values import Value

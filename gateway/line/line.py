@@ -261,6 +261,7 @@ class Line:
         channel, self._channel = self._channel, None
         self._transaction = self.calls = None
         self.engine.schedule.dials = False
+        self._expiry.alarm.cancel()  # its timer would keep an ended line alive
         if channel is not None:
             await channel.close()
 

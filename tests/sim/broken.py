@@ -1427,12 +1427,12 @@ MUTANTS = (
     Mutant(
         "a write that is told busy is done later",
         "northbound/writes.py",
-        "            return await self._plant.write(tag, value, within)\n",
-        "            task = asyncio.ensure_future(self._plant.write(tag, value, within))\n"
-        "            await asyncio.wait([task], timeout=1.0)\n"
-        "            if not task.done():\n"
-        '                raise Busy("it takes long")\n'
-        "            return task.result()\n",
+        "                return await self._plant.write(tag, value, within + dialling)\n",
+        "                task = asyncio.ensure_future(self._plant.write(tag, value, within))\n"
+        "                await asyncio.wait([task], timeout=1.0)\n"
+        "                if not task.done():\n"
+        '                    raise Busy("it takes long")\n'
+        "                return task.result()\n",
         "tests/sim/test_north.py",
         (7, 9),
         "north",
@@ -1441,9 +1441,9 @@ MUTANTS = (
     Mutant(
         "a write is acknowledged before the device has it",
         "northbound/writes.py",
-        "            return await self._plant.write(tag, value, within)\n",
-        "            self._late = asyncio.ensure_future(self._plant.write(tag, value, within))\n"
-        "            return WriteResult(value, time.time_ns(), took=0.0)\n",
+        "                return await self._plant.write(tag, value, within + dialling)\n",
+        "                self._late = asyncio.ensure_future(self._plant.write(tag, value, within))\n"
+        "                return WriteResult(value, time.time_ns(), took=0.0)\n",
         "tests/northbound/test_writes.py",
         (7,),
         "north",
@@ -2736,8 +2736,8 @@ MUTANTS = (
     Mutant(
         "a transfer is sent when its value is too old",
         "northbound/own_writes.py",
-        "min(within, WRITE_EXPIRY)",
-        "WRITE_EXPIRY",
+        "min(within, WRITE_EXPIRY + dialling)",
+        "WRITE_EXPIRY + dialling",
         "tests/transfers/test_runner.py",
     ),
     Mutant(
