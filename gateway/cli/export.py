@@ -13,6 +13,7 @@ import typer
 from gateway.cli.client import matches, wanted_keys
 from gateway.cli.terminal import ConfigPath, TagNames
 from gateway.config import load
+from gateway.config.transfer_ranges import is_range
 from gateway.errors import ConfigError
 from gateway.northbound.meta import meta_fields
 from gateway.protocols.driver import Unit
@@ -39,11 +40,12 @@ def export(
     """Export tags as a sheet: keys, types, units and limits, as `@meta` has them."""
     loaded = load(config)
     wanted = wanted_keys(loaded, tags)
+    ranges = {rule.source for rule in loaded.transfers if is_range(rule.text[0])}
     rows = [
         _row(loaded.zenoh.prefix, tag)
         for device in loaded.devices
         for tag in device.tags
-        if matches(tag.key, wanted)
+        if matches(tag.key, wanted) and tag.key not in ranges
     ]
     text = table(rows, decimal_comma=decimal_comma)
     if output is None:

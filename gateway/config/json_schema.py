@@ -30,6 +30,7 @@ from gateway.protocols.registry import PROTOCOLS
 
 _TIMES = (DURATION_SCHEMA["pattern"], INTERVAL_SCHEMA["pattern"])
 _PARTS: dict[str, type[Section]] = {"Line": LineSection, "Tag": TagSection, "Defaults": TagDefaults}
+_PARTS["Transfer"] = TransferSection
 _DEVICE_NAMES = rf"{NAME_PATTERN}|\{{"  # a repeated device has its number in the name: pump-{{n}}
 _NAMES_OF_TEMPLATES = {"type": "array", "items": {"type": "string"}}
 _USE: dict[str, Any] = {
@@ -89,7 +90,6 @@ def schema() -> dict[str, Any]:
     root["properties"]["templates"]["additionalProperties"] = _ref("Template")
     root["properties"]["lines"] |= _by_name("Line") | {"minProperties": 1}
     root["properties"]["defaults"] = _defaults("file")
-    shared["Transfer"] = _described(TransferSection)
     root["properties"]["transfers"]["items"] = _ref("Transfer")
     line = shared["Line"]["properties"]
     line["devices"] |= _by_name("Device", _DEVICE_NAMES) | {"minProperties": 1}

@@ -13,6 +13,7 @@ from gateway.config.transfer_settings import TransferSection
 from gateway.config.validate import section
 from gateway.engine.device import DeviceSettings
 from gateway.errors import BadValue
+from gateway.protocols.unsolicited import Unsolicited
 from gateway.tags import Tag
 from gateway.tags.transfer import TransferRule, leaves
 
@@ -35,6 +36,7 @@ class TransferRows:
         ranges = Ranges(self.lines, self.intervals, self.mistakes)
         finder = _Finder.of(self.lines, ranges, certain=not len(self.mistakes))
         found = [rule for place, row in enumerate(rows) if (rule := self._row(place, row, finder))]
+        self._check_repeats(found)
         self._check_loops([(rule, *finder.both(rule)) for rule in found])
         return ranges.added(), tuple(found)
 
@@ -66,6 +68,15 @@ class TransferRows:
             stale=own.stale or max(SHORTEST_STALE, INTERVALS * source.every),
             substitute=own.if_stale,
         )
+
+    def _check_repeats(self, rules: Sequence[TransferRule]) -> None:
+        """Notes rows that would write the same value a second time."""
+        first: dict[tuple[str, str], int] = {}
+        for rule in rules:
+            other = first.setdefault((rule.source, rule.target), rule.number)
+            if other != rule.number:
+                text = f"row {other} carries {rule.text[0]} to {rule.text[1]} already"
+                self.mistakes.add(("transfers", rule.number - 1), f"{text}: remove one of the rows")
 
     def _check_loops(self, rows: Sequence[tuple[TransferRule, Tag, Tag]]) -> None:
         """Notes loops: a row writes what another one, or the same one, reads."""
@@ -142,8 +153,9 @@ class _Finder:
             device = self.devices.get(one.device)
             if device is None or device.served is not None:
                 continue
-            area = device.driver.areas.get(one.span.area)
-            if area is not None and not area.readable:
+            driver = device.driver
+            arrives = isinstance(driver, Unsolicited) and driver.unsolicited_only(one.span)
+            if not (arrives or driver.areas[one.span.area].readable):
                 yield "from", f"{one.key} can only be written, so there is no value to carry"
 
     def unwritable(self, tag: Tag) -> Iterator[tuple[str, str]]:

@@ -1,6 +1,7 @@
 """Runs the transfers: each row is one task that waits for its source and writes to its target."""
 
 import asyncio
+import math
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
@@ -208,7 +209,8 @@ class Transfers:
                 one.row.ended(outcome, loop.time())
                 continue
             with suppress(TimeoutError):
-                async with asyncio.timeout_at(one.row.wake(loop.time())):
+                at = one.row.wake(loop.time())
+                async with asyncio.timeout_at(None if at == math.inf else at):
                     await one.wake.wait()
 
     def _reading(self, source: Tag) -> rows.Reading:
@@ -256,7 +258,7 @@ class Transfers:
             "why": why,
             "value": None if carried is None else carried.value,
             "time": None if carried is None else rfc3339(carried.time),
-            "age": round(reading.age, 3) if reading.age < float("inf") else None,
+            "age": round(reading.age, 3) if reading.age < math.inf else None,
             "carried": counts[End.DONE],
             "not_done": counts[End.NOT_DONE],
             "refused": counts[End.REFUSED],

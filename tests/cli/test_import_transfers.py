@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from gateway.cli.export import export
 from gateway.cli.import_transfers import import_transfers
 from gateway.config import load
 from gateway.errors import ConfigError
@@ -81,3 +82,16 @@ def test_a_mistake_changes_nothing(
         import_transfers(sheet, file, master)
     assert file.read_text() == before
     assert sorted(path.name for path in tmp_path.iterdir()) == ["plant.yaml", "table.csv"]
+
+
+def test_ranges_are_no_tags_of_an_exported_sheet(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sheet, file = written(tmp_path, LINK, VIGOR)
+    file.write_text(file.read_text().replace("station: 2", "station: 2, tags: {x: {address: D1}}"))
+    import_transfers(sheet, file, "plc")
+    capsys.readouterr()
+    export(file)
+    out = capsys.readouterr().out
+    assert "s2,x,D1" in out
+    assert "ranges/" not in out

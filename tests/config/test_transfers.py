@@ -92,6 +92,11 @@ def test_a_loop_is_refused_with_its_rows(rows: list[Any], loop: str) -> None:
     assert f"a loop: {loop}" in message
 
 
+def test_a_row_that_repeats_another_one_is_refused() -> None:
+    [message] = mistakes(row("a/speed", "b/copy"), row("a/speed", "b/copy", every="1s"))
+    assert "row 1 carries a/speed to b/copy already" in message
+
+
 def test_a_chain_is_no_loop() -> None:
     rows = row("a/speed", "b/copy"), row("b/copy", "a/limited"), row("a/limited", "b/word")
     assert len(config(*rows).transfers) == 3
@@ -191,6 +196,21 @@ def test_check_counts_the_writes_and_the_ages() -> None:
 
 def test_a_reload_takes_over_other_rows() -> None:
     assert needs_restart(config(), config(row("a/speed", "b/copy"))) == []
+
+
+def test_a_field_of_a_frame_is_carried_and_one_that_is_only_written_is_not() -> None:
+    frames: dict[str, Any] = {"protocol": "frames", "framing": {"ending": "CR"}}
+    weight = {"match": "(?P<weight>[0-9]+)", "fields": {"weight": {"type": "decimal"}}}
+    put = {"send": "S={value}", "value": {"type": "decimal", "format": "06.2f"}, "match": "OK"}
+    tags = {"weight": {"address": "weight"}, "limit": {"address": "limit", "write": True}}
+    scale = frames | {"listen": {"w": weight}, "write": {"limit": put}, "tags": tags}
+    line = {"port": "/dev/ttyS9", "devices": {"scale": scale}}
+    plc = {"protocol": "vigor", "station": 1, "tags": TAGS}
+    lines = {"a": line, "b": {"port": "simulator", "devices": {"plc": plc}}}
+    rows = [row("scale/weight", "plc/copy"), row("plc/speed", "scale/limit")]
+    assert len(built({"lines": lines, "transfers": rows}).transfers) == 2
+    with pytest.raises(ConfigErrors, match="scale/limit can only be written"):
+        built({"lines": lines, "transfers": [row("scale/limit", "plc/copy")]})
 
 
 def test_nothing_is_carried_to_a_line_that_only_listens() -> None:

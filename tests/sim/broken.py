@@ -2684,6 +2684,20 @@ MUTANTS = (
         "tests/engine/test_groups.py",
     ),
     Mutant(
+        "a served recording shows a value that may be of another request",
+        "line/recorded.py",
+        "            doubtful.pop((sample.tag.device, _unit(sample.tag.span)), None)\n",
+        "            pass\n",
+        "tests/line/test_recorded.py",
+    ),
+    Mutant(
+        "a served recording shows 0 for what it does not hold",
+        "simulator/recorded.py",
+        "        self.memory.guard = self._lacks\n",
+        "",
+        "tests/line/test_recorded.py",
+    ),
+    Mutant(
         "a transfer carries a value of too long ago",
         "transfers/row.py",
         "        if source.value is None or not source.age < self.rule.stale:\n"
@@ -2788,19 +2802,5 @@ MUTANTS = (
         "            if place is None or tag not in place[1].settings.targets:\n",
         "            if place is None:\n",
         "tests/transfers/test_runner.py",
-    ),
-    Mutant(
-        "a served recording shows a value that may be of another request",
-        "line/recorded.py",
-        "            doubtful.pop((sample.tag.device, _unit(sample.tag.span)), None)\n",
-        "            pass\n",
-        "tests/line/test_recorded.py",
-    ),
-    Mutant(
-        "a served recording shows 0 for what it does not hold",
-        "simulator/recorded.py",
-        "        self.memory.guard = self._lacks\n",
-        "",
-        "tests/line/test_recorded.py",
     ),
 )

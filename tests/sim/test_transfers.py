@@ -26,7 +26,7 @@ from tests.sim.virtual import now, on_virtual_time
 
 STALE, STEP = 4.0, 0.7  # seconds; the source counts the steps
 AGE = STALE + 0.5  # of a value that arrives: its write is on the wire meanwhile
-SECONDS, CALM = 150.0, 20.0
+SECONDS, CALM = 90.0, 12.0
 SUBSTITUTE = 60_000
 FILE: dict[str, Any] = {
     "zenoh": {"prefix": "plant"},
@@ -184,7 +184,7 @@ def check_values(written: Sequence[tuple[float, int]], source: Held) -> None:
         assert value == SUBSTITUTE or since <= at <= until + AGE, (at, value, since, until)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_chain_carries_nothing_bad_nothing_old_and_nothing_twice(seed: int) -> None:
     chains: list[Chain] = []
 
