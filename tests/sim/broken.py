@@ -1442,7 +1442,7 @@ MUTANTS = (
         "a write is acknowledged before the device has it",
         "northbound/writes.py",
         "                return await self._plant.write(tag, value, within + dialling)\n",
-        "                self._late = asyncio.ensure_future(self._plant.write(tag, value, within))\n"
+        "                self._late = asyncio.ensure_future(self._plant.write(tag, value, 5.0))\n"
         "                return WriteResult(value, time.time_ns(), took=0.0)\n",
         "tests/northbound/test_writes.py",
         (7,),
