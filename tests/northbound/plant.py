@@ -57,6 +57,8 @@ class PlainPlant:
         self.gate.set()
         self.written: list[tuple[str, Value]] = []
         self.read: list[str] = []
+        self.dial = 0.0  # seconds, of a telephone call
+        self.within = 0.0  # of the last write
         self.unread: set[str] = set()  # tags that the line does not read in time
         self.republished: list[Sample] = []
         self.known_commands: Mapping[str, frozenset[str]] = {}
@@ -81,6 +83,7 @@ class PlainPlant:
 
     async def write(self, tag: Tag, value: Value, within: float) -> WriteResult:
         tag.encode(value)
+        self.within = within
         await self.gate.wait()
         if value in self.endings:
             raise self.endings[value]
@@ -124,7 +127,7 @@ class PlainPlant:
         raise BadValue(f"{device} has no {text}")
 
     def dialling(self, device: str) -> float:
-        return 0.0
+        return self.dial
 
     def is_fresh(self, tag: Tag, max_age: float) -> bool:
         return time.time_ns() - self.samples[tag.key].time < max_age * 1e9
