@@ -114,6 +114,9 @@ class Plant:
     async def peek(self, device: str, text: str) -> Peeked:
         raise NotImplementedError
 
+    def dialling(self, device: str) -> float:
+        return 0.0
+
     def is_fresh(self, tag: Tag, max_age: float) -> bool:
         return False
 

@@ -364,12 +364,18 @@ class Gateway:
             raise BadValue(str(error)) from None
         loop = asyncio.get_running_loop()
         started, units = loop.time(), list[int]()
+        within = WRITE_EXPIRY + line.dialling
         for part in parts:
             if self._places.get(device) != (line, receiver):
                 raise Busy(f"the file was reloaded, and {device} with it; read it again")
-            units += map(int, (await line.peek(receiver, part)).split())
+            units += map(int, (await line.peek(receiver, part, within)).split())
         first = receiver.driver.spell(Address(area, numbers.start))
         return Peeked(first, units, self._wall(), loop.time() - started)
+
+    def dialling(self, device: str) -> float:
+        """Returns the seconds that a request may wait for a telephone call; 0: for none."""
+        place = self._places.get(device)
+        return 0.0 if place is None else place[0].dialling
 
     def is_fresh(self, tag: Tag, max_age: float) -> bool:
         """True if the last read is younger than `max_age` seconds, or no read is possible now."""
@@ -404,7 +410,7 @@ class Gateway:
             engine = line.engine
             if (expected := self._forecasts.get(engine.name)) is None:
                 continue  # not planned yet
-            documents[f"lines/{engine.name}"] = line_document(engine, expected, now)
+            documents[f"lines/{engine.name}"] = line_document(engine, expected, line.calls, now)
         for name, (line, device) in self._places.items():
             polls = line.engine.schedule.polls(device)
             documents[f"devices/{name}"] = device_document(device, polls, now)

@@ -9,6 +9,7 @@ GatewayError
 ├── Damaged              a part of the history file is lost; the rest can be read
 ├── Offline              the device is offline; nothing has been sent
 ├── LineDown             reopen the port; pending writes fail at once
+│   └── CallEnded        dial again later: the modem is there, the telephone call is not
 └── DeviceError          one device, one transaction
     ├── Refused          the device sent an error reply with its code: report it, do not repeat
     └── Unclear          the device may or may not have done it: repeat reads
@@ -53,6 +54,10 @@ class Offline(GatewayError):
 
 class LineDown(GatewayError):
     """A port that cannot be opened or was lost."""
+
+
+class CallEnded(LineDown):
+    """A telephone call that failed, or ended without our doing."""
 
 
 class DeviceError(GatewayError):

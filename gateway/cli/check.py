@@ -10,6 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from gateway import app
+from gateway.cli.modem_plan import modem_plan, modem_warnings
 from gateway.cli.progress import progress
 from gateway.cli.served_plan import served_plan
 from gateway.cli.terminal import FAILED, ConfigPath, err, out
@@ -51,6 +52,11 @@ def check(
     out.print(plan(lines, every_block=few if blocks is None else blocks))
     for part in _without_polls(loaded):
         out.print(part)
+    forecasts = {line.name: line for line in lines}
+    modems = [(line, forecasts.get(line.name)) for line in loaded.lines if line.modem is not None]
+    for line, forecast in modems:
+        out.print(Text(modem_plan(line, forecast)))
+        warnings += [] if forecast is None else modem_warnings(line, forecast)
     if loaded.transfers:
         out.print(_transfers(transfer_forecasts(loaded, lines)))
     for note in _notes(loaded):

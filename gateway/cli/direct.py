@@ -10,7 +10,7 @@ from dataclasses import replace
 from gateway.config import Config, LineConfig
 from gateway.config.commands import check_command, line_of
 from gateway.engine.device import Device
-from gateway.engine.requests import CommandResult
+from gateway.engine.requests import WRITE_EXPIRY, CommandResult
 from gateway.engine.unsolicited import unsolicited_tags
 from gateway.errors import BadValue, GatewayError, LineDown
 from gateway.line import build
@@ -108,7 +108,7 @@ async def write(config: Config, tag: Tag, value: Value) -> WriteResult:
     """Writes one tag. Raises `GatewayError`; `BadValue` only before anything is sent."""
     units = tag.encode(value)
     async with _writing(config, [tag]) as (line, device):
-        return await line.write(device, tag, units)
+        return await line.write(device, tag, units, WRITE_EXPIRY + line.dialling)
 
 
 async def write_group(
@@ -117,7 +117,8 @@ async def write_group(
     """Writes tags of one device in their order; returns the outcome of each. Raises as `write`."""
     units = [(tag, tag.encode(value)) for tag, value in values]
     async with _writing(config, [tag for tag, _ in values]) as (line, device):
-        return await ended(line.write_group(device, units), WRITE_WITHIN)
+        writes = line.write_group(device, units, WRITE_EXPIRY + line.dialling)
+        return await ended(writes, WRITE_WITHIN + line.dialling)
 
 
 @asynccontextmanager
@@ -148,7 +149,8 @@ async def control(config: Config, device: str, command: str, argument: str) -> C
         await line.tried.wait()
         loop = asyncio.get_running_loop()
         started = loop.time()
-        answer = await line.command(commanded, command, argument)
+        within = WRITE_EXPIRY + line.dialling
+        answer = await line.command(commanded, command, argument, within)
         return CommandResult(answer, time.time_ns(), loop.time() - started)
 
 

@@ -15,6 +15,7 @@ from gateway.protocols.driver import AnyDriver, ScanHints, Scannable
 from gateway.protocols.registry import PROTOCOLS
 from gateway.protocols.swapped import SWAPPED, KnownReplies, is_swapped
 from gateway.transport import (
+    ModemAddress,
     Port,
     Receiver,
     SerialSettings,
@@ -96,6 +97,8 @@ def planned(
     drivers = [driver for number in asked for driver, _ in variants(protocol, number)]
     if isinstance(where, SimulatorAddress):
         raise ConfigError("simulated PLCs need no scan: the file lists them")
+    if isinstance(where, ModemAddress):
+        raise ConfigError("scan cannot dial: connect the line by a cable")
     if drivers[0].traits.over_network and not isinstance(where, TcpAddress):
         raise ConfigError(f"{protocol} needs a port tcp://host:port")
     serial: list[SerialSettings | None] = [

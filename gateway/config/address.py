@@ -1,5 +1,6 @@
 """Reads only the part of the file that a client needs to reach its gateway."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -25,6 +26,11 @@ class Address:
     standby: str | None
     zenoh: ZenohConfig
     devices: "tuple[DeviceSettings, ...]" = ()
+
+    @property
+    def dialling(self) -> Mapping[str, float]:
+        """As in `Config`."""
+        return {}
 
 
 def address(path: Path) -> Address | None:

@@ -10,7 +10,7 @@ from gateway.config import parsers
 from gateway.config.array_rules import check_overlaps
 from gateway.config.computed_tags import check_totals, with_computed
 from gateway.config.device_tags import DeviceTags, mapping
-from gateway.config.line_rules import check_line, line_wire
+from gateway.config.line_rules import check_line, line_wire, modem_of
 from gateway.config.messages import Mistakes, Path, meant, shown
 from gateway.config.model import (
     DeviceSection,
@@ -32,6 +32,7 @@ from gateway.config.served import (
     check_served_line,
     check_sources,
     only_served,
+    until_the_next_call,
 )
 from gateway.config.session_files import existing_file, zenoh_config
 from gateway.config.sheet_tags import SheetTags
@@ -48,7 +49,7 @@ from gateway.engine.device import DeviceSettings
 from gateway.errors import ConfigError
 from gateway.protocols.driver import AnyDriver, Timing
 from gateway.protocols.registry import PROTOCOLS
-from gateway.transport.port import SerialPath
+from gateway.transport.port import ModemAddress, SerialPath
 
 STATE_FILE = FilePath("state.json")  # where there is a folder for it
 ALARM_FILE = FilePath("alarms.json")
@@ -146,12 +147,16 @@ class Builder:
         if line.serve:
             check_served_line(line, devices, path, self.mistakes)
         serial, wire = line_wire(line, devices, path, self.mistakes)
+        modem = modem_of(line, raw.get("modem"), wire, path, self.mistakes)
+        if modem is not None and line.serve:
+            devices = [until_the_next_call(one, raw) for one in devices]
         return LineConfig(
             name=name,
             port=line.port,
             serial=serial,
             wire=wire,
             echo=line.echo,
+            modem=modem,
             listen_only=line.listen_only,
             serve=line.serve,
             devices=tuple(replace(one, listen_only=line.listen_only) for one in devices),
@@ -245,7 +250,8 @@ class Builder:
         for line in lines:
             if line.simulated:
                 continue
-            known = realpath(line.port.path) if isinstance(line.port, SerialPath) else line.port
+            port = line.port.port if isinstance(line.port, ModemAddress) else line.port
+            known = realpath(port.path) if isinstance(port, SerialPath) else port
             other = ports.setdefault(known, line.name)
             if other != line.name:
                 self.mistakes.add(

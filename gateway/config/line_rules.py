@@ -4,13 +4,19 @@ from collections.abc import Sequence
 
 from gateway.config.messages import Mistakes, Path
 from gateway.config.model import LineSection
+from gateway.config.modem_settings import ModemSection
 from gateway.engine.device import DeviceSettings
 from gateway.planning.wire_timing import NETWORK_BAUD, WireTiming, character_bits
 from gateway.protocols.driver import EchoConflict
 from gateway.protocols.listening import Listenable
 from gateway.protocols.unsolicited import Unsolicited
 from gateway.stations.registry import can_simulate
-from gateway.transport.port import SerialSettings, SimulatorAddress, TcpAddress
+from gateway.transport.modem_events import ModemSettings
+from gateway.transport.port import ModemAddress, SerialSettings, SimulatorAddress, TcpAddress
+
+DIALS_IDLE, ANSWERS_IDLE = 5.0, 60.0  # seconds without an exchange until a call is ended
+_TEXT = 20  # characters, more than the modem's own text NO CARRIER with its line ends
+_LATE = 0.05  # seconds by which an adapter may delay a part of it
 
 
 def check_line(
@@ -155,6 +161,42 @@ def _check_network(
             f"{protocol} cannot share a line with {serial[0].name}, "
             f"which speaks {serial[0].driver.protocol}: give it a line of its own",
         )
+
+
+def modem_of(
+    line: LineSection, raw: object, wire: WireTiming, path: Path, mistakes: Mistakes
+) -> ModemSettings | None:
+    """Returns the modem of a line; None: it has none. `raw`: the section, also with mistakes."""
+    found, place = line.modem, (*path, "modem")
+    if not isinstance(line.port, ModemAddress):
+        if found is not None:
+            mistakes.add(place, "the port has no modem: write it as modem:/dev/ttyS0")
+        return None
+    if line.listen_only:
+        mistakes.add((*path, "listen_only"), "a modem has a call only if it dials or answers")
+    number = None if found is None else found.number
+    named = isinstance(raw, dict) and "number" in raw
+    if not (named or line.serve):
+        mistakes.add(
+            place,
+            'missing: write the number that it dials, such as modem: {number: "0,26204393"}; a '
+            "line that answers calls has `serve: true`",
+        )
+    elif number is not None and line.serve:
+        text = "a line with `serve: true` answers calls, it never dials: remove the number"
+        mistakes.add((*place, "number"), text)
+    found = found or ModemSection()
+    usual = ANSWERS_IDLE if line.serve else DIALS_IDLE
+    return ModemSettings(
+        number=number or "",
+        init=found.init,
+        dial_timeout=found.dial_timeout,
+        tries=found.tries,
+        retry_pause=found.retry_pause,
+        idle=usual if found.idle is None else found.idle,
+        guard=found.guard,
+        hold=_TEXT * wire.character + _LATE,
+    )
 
 
 def line_wire(

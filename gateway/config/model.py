@@ -19,6 +19,7 @@ from pydantic import Tag as Choice
 
 from gateway.config import parsers, tag_parsers
 from gateway.config.alarm_rules import check_alarm
+from gateway.config.modem_settings import ModemSection
 from gateway.config.session_model import GatewaySection, Section, ZenohSection
 from gateway.config.setting_types import (
     DEADBAND_SCHEMA,
@@ -275,7 +276,7 @@ class LineSection(Section):
     """One line and the devices on it."""
 
     port: Port
-    """A serial port, tcp://host:port, rfc2217://host:port, or simulator."""
+    """A serial port, tcp://host:port, rfc2217://host:port, modem:<one of these>, or simulator."""
     baudrate: Baudrate = None
     """Speed of the line, also behind a device server; left out: the default of the protocol."""
     format: Annotated[
@@ -288,6 +289,8 @@ class LineSection(Section):
     """true: the devices are stations of this gateway, and a master on the line asks them."""
     listen_only: bool = False
     """true: learns the values from another master's traffic, and sends nothing, ever."""
+    modem: ModemSection | None = None
+    """The modem of a port `modem:…`, and its calls: docs/modem.md."""
     defaults: dict[str, Any] = {}
     devices: dict[str, Any]
     """The devices on this line, by name."""

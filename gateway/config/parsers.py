@@ -13,7 +13,7 @@ from typing import Literal
 
 from gateway.config.messages import one_of, shown
 from gateway.errors import ConfigError
-from gateway.transport.port import PortAddress, SerialPath, parse_port
+from gateway.transport.port import MODEM, PortAddress, SerialPath, parse_port
 from gateway.values import Order, ValueType, parse_type
 
 _DURATION = re.compile(r"([0-9]+(?:\.[0-9]+)?) ?([A-Za-zµ]+)\Z")
@@ -192,6 +192,9 @@ def scale(factor: float) -> float:
 
 def port(text: object) -> PortAddress:
     text = _text(text)
+    if text.startswith(MODEM):
+        port(text.removeprefix(MODEM))
+        return parse_port(text)
     if match := _SERVER.match(text):
         host = match[1] or "host"
         raise ConfigError(f"{text} is no port: for a device server write tcp://{host}:{match[2]}")

@@ -1,6 +1,6 @@
 """The checked and complete configuration: plain data for the rest of the gateway."""
 
-from collections.abc import Container
+from collections.abc import Container, Mapping
 from dataclasses import dataclass, replace
 from ipaddress import ip_address
 from pathlib import Path
@@ -11,6 +11,7 @@ from gateway.engine.device import DeviceSettings
 from gateway.planning.wire_timing import WireTiming
 from gateway.tags import Tag
 from gateway.tags.transfer import TransferRule
+from gateway.transport.modem_events import ModemSettings
 from gateway.transport.port import PortAddress, SerialSettings, SimulatorAddress
 
 
@@ -61,6 +62,7 @@ class LineConfig:
     wire: WireTiming
     echo: bool | None  # the port receives its own requests; None: unknown
     serve: bool = False  # a master on the line asks, and the devices are stations of the gateway
+    modem: ModemSettings | None = None  # with a modem at the port
     listen_only: bool = False  # another master owns the wire: nothing is ever sent
     devices: tuple[DeviceSettings, ...]
 
@@ -95,6 +97,16 @@ class Config:
     @property
     def devices(self) -> tuple[DeviceSettings, ...]:
         return tuple(device for line in self.lines for device in line.devices)
+
+    @property
+    def dialling(self) -> Mapping[str, float]:
+        """The devices behind a modem: seconds that a request may wait for a telephone call."""
+        return {
+            device.name: line.modem.dial_timeout
+            for line in self.lines
+            if line.modem is not None
+            for device in line.devices
+        }
 
     @property
     def held_file(self) -> Path | None:

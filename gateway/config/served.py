@@ -1,5 +1,6 @@
 """Builds the stations of served lines: the role of each tag, and the addresses to write."""
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path as FilePath
@@ -223,6 +224,14 @@ def only_served(raw: Mapping[str, Any], path: Path, mistakes: Mistakes) -> None:
     for place in places:
         text = f"{place[-1]} is a setting of served lines: this line has no `serve: true`"
         mistakes.add((*path, *place), text)
+
+
+def until_the_next_call(device: DeviceSettings, line: Mapping[str, Any]) -> DeviceSettings:
+    """Returns a station behind a modem: without `stale_after` the values stay between calls."""
+    own = line.get("devices", {}).get(device.name)
+    if device.served is None or (isinstance(own, Mapping) and "stale_after" in own):
+        return device
+    return replace(device, served=replace(device.served, stale_after=math.inf))
 
 
 def check_served_line(

@@ -57,7 +57,14 @@ _PORT_SCHEMA = {
     # A network port, or a path: no other scheme, and no `host:port` without a scheme.
     "pattern": rf"^((tcp|rfc2217)://{_HOST}:[0-9]{{1,5}}"
     r"|(?![A-Za-z][A-Za-z0-9+.-]+://|([^/\\:\s]+:)?[0-9]+$)\S(.*\S)?)$",
-    "examples": ["/dev/ttyUSB0", "COM3", "tcp://10.0.0.7:4001", "rfc2217://host:port", "simulator"],
+    "examples": [
+        "/dev/ttyUSB0",
+        "COM3",
+        "tcp://10.0.0.7:4001",
+        "rfc2217://host:port",
+        "modem:/dev/ttyS0",
+        "simulator",
+    ],
 }
 
 Duration = Annotated[float, PlainValidator(parsers.duration), WithJsonSchema(DURATION_SCHEMA)]

@@ -6,7 +6,7 @@ from collections.abc import Collection, Mapping
 from functools import cache
 from typing import Any, TypeVar, get_args
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import BaseModel, TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
 
 from gateway.config import parsers
@@ -96,7 +96,7 @@ def _adapter(known: Protocol) -> TypeAdapter[Any]:
     return TypeAdapter(known.settings)
 
 
-def _known(kind: type[Section], place: Path) -> Collection[str]:
+def _known(kind: type[BaseModel], place: Path) -> Collection[str]:
     """Returns the settings at a place inside a section."""
     for chunk in place:
         inner = _inner(kind.model_fields[str(chunk)].annotation)
@@ -106,14 +106,14 @@ def _known(kind: type[Section], place: Path) -> Collection[str]:
     return settings_of(kind)
 
 
-def settings_of(kind: type[Section]) -> list[str]:
+def settings_of(kind: type[BaseModel]) -> list[str]:
     """Returns the names of the settings as the file writes them."""
     return [field.alias or name for name, field in kind.model_fields.items()]
 
 
-def _inner(annotation: Any) -> type[Section] | None:
+def _inner(annotation: Any) -> type[BaseModel] | None:
     if isinstance(annotation, type):
-        return annotation if issubclass(annotation, Section) else None
+        return annotation if issubclass(annotation, BaseModel) else None
     return next(filter(None, map(_inner, get_args(annotation))), None)
 
 

@@ -96,7 +96,8 @@ class Engine:
         if in_flight.job is not None:
             raise AssertionError(f"{in_flight.job!r} is not concluded")
         silence = self._conclusions.silence
-        if silence.noted and silence.due <= now and self._every_station_failed():
+        may_reopen = silence.noted and not self.schedule.dials
+        if may_reopen and silence.due <= now and self._every_station_failed():
             return silence.reopen(now)
         job: Transacted | Idle | None = None
         if self._unsolicited.speakers:
@@ -104,7 +105,7 @@ class Engine:
         if job is None:
             job = self.schedule.next(now)
         if isinstance(job, Idle):
-            return Idle(silence.due) if now < silence.due < job.until else job
+            return Idle(silence.due) if may_reopen and now < silence.due < job.until else job
         if isinstance(job, Poll):
             in_flight.open_polls = in_flight.together = 1
             in_flight.charged = None if job.expedited else job.device
@@ -212,10 +213,11 @@ class Engine:
             if why := why_not_commanded(device.driver, request.name, control=control):
                 self._effects.ended(request, BadValue(why))
                 return self._effects.take()
-        if not self.is_open:
+        dials = self.schedule.dials  # for a request at once
+        if not (self.is_open or dials):
             why = self.record.trouble or f"line {self.name} is not open"
             self._effects.ended(request, LineDown(why))
-        elif not self.schedule.reachable(device, now):
+        elif not (dials or self.schedule.reachable(device, now)):
             self._effects.ended(request, offline(device))
         elif not queue.submit(request):
             self._effects.ended(request, Busy(TOO_MANY.format(line=self.name)))
@@ -324,18 +326,18 @@ class Engine:
             device.restart(error)
             self._effects.online(device, False)
             self._effects.bad(device.tags, Reason.LINE_DOWN, time, why)
-        return self._close()
+        return self._close(f": {why}")
 
     def stopped(self, now: float) -> list[Effect]:
         """Ends every request, because the gateway stops."""
         self._conclusions.abandon(None, now)
         return self._close()
 
-    def _close(self) -> list[Effect]:
+    def _close(self, why: str = " went down") -> list[Effect]:
         self.is_open = False
         self._staleness.stop()
         for request in self.schedule.requests.withdraw():
-            self._effects.ended(request, LineDown(f"line {self.name} went down; not sent"))
+            self._effects.ended(request, LineDown(f"line {self.name}{why}; not sent"))
         self._set_deadline()
         return self._effects.take()
 

@@ -92,6 +92,10 @@ class Health:
         self.consecutive_failures = self.short_probes = 0
         self.needs_resync = self.answerable
 
+    def reconnected(self) -> None:
+        """Notes a new telephone call to an otherwise unchanged device."""
+        self.needs_resync = self.answerable
+
     def answered(self, *, resynced: bool = False) -> bool:
         """Notes a reply. Returns True if the device comes online.
 

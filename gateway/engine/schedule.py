@@ -47,6 +47,7 @@ class Schedule:
 
     def __init__(self, devices: Sequence[Device], now: float, seed: int = 0) -> None:
         self.devices = devices
+        self.dials = False  # a modem reaches the devices: docs/modem.md
         self.requests = RequestQueue()
         self.unanswered = Unanswered()
         # The share of its period by which each poll begins early.
@@ -128,6 +129,14 @@ class Schedule:
             poll.due = when
         self._queue.push_all(later)
 
+    def take_along(self, now: float) -> None:
+        """Makes all polls due that are due within half their interval, for one telephone call."""
+        polls = (poll for polls in self._polls.values() for poll in polls)
+        early = [poll for poll in polls if now < poll.due <= now + poll.block.every / 2]
+        for poll in early:
+            poll.due = now
+        self._queue.push_all(early)
+
     def _set_polls(self, device: Device, polls: list[Poll], new: list[Poll], now: float) -> None:
         for poll in new:
             self._hasten(poll, now)
@@ -174,6 +183,11 @@ class Schedule:
             readers = {tag: poll for poll in self._polls[device] for tag in poll.block.tags}
             self._readers[device] = readers
         return readers.get(tag)
+
+    @property
+    def is_expedited(self) -> bool:
+        """True if a client waits for a poll of an online device."""
+        return any(poll.live and poll.device.health.online for poll in self._queue.expedited)
 
     # The next job
 
@@ -285,7 +299,7 @@ class Schedule:
             device.record.count_overruns(behind)
             poll.counts.overruns += behind
         poll.due = (poll.asked if behind or poll.missed else poll.due) + every
-        if not poll.phased:
+        if not (poll.phased or self.dials):  # one call reads all that is due at a time
             poll.phased = True
             poll.due -= every * next(self._phases)
         if poll.last.at is None and block.span not in device.bad_addresses.bad:

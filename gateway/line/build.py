@@ -7,12 +7,20 @@ from dataclasses import replace
 from gateway.config import LineConfig
 from gateway.engine.device import Device, DeviceSettings
 from gateway.engine.engine import Engine
+from gateway.line.calling import ModemOpener
 from gateway.line.duty import Duty
 from gateway.line.line import Line, SampleSink
 from gateway.simulator.plant import animate, station_for
 from gateway.simulator.port import open_simulator
 from gateway.stations.station import Station
-from gateway.transport import Port, Receiver, SimulatorAddress, open_port, prepare
+from gateway.transport import (
+    ModemAddress,
+    Port,
+    Receiver,
+    SimulatorAddress,
+    open_port,
+    prepare,
+)
 from gateway.transport.listen_only import ListenOnlyPort
 
 OpenPort = Callable[[Receiver], Awaitable[Port]]
@@ -57,6 +65,8 @@ def opener(line: LineConfig) -> OpenPort:
     if isinstance(line.port, SimulatorAddress):
         return SimulatedLine(line)
     prepare(line.port)
+    if isinstance(line.port, ModemAddress) and line.modem is not None:
+        return ModemOpener(line.port, line.serial, line.modem)
     return lambda receiver: open_port(line.port, line.serial, receiver)
 
 

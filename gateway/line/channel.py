@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import Callable
+from dataclasses import dataclass, field
 
 import structlog
 
@@ -53,6 +54,14 @@ class Alarm:
         again = self._look()
         if again < NEVER:
             self.by(again, self._look)
+
+
+@dataclass(slots=True)
+class Expiry:
+    """Calls the line at the deadline of its engine."""
+
+    alarm: Alarm = field(default_factory=Alarm)
+    at: float = NEVER  # the deadline when the alarm was set last
 
 
 class Echo:
@@ -208,3 +217,15 @@ class Channel:
     async def close(self) -> None:
         self.alarm.cancel()
         await self._port.close()
+
+
+def channels(
+    line: str,
+    wire: WireTiming,
+    echo: bool | None,
+    wire_log: WireLog,
+    may_not_send: Callable[[float, float], str],
+) -> Callable[[Port], Channel]:
+    """Returns a function that makes the channel of an open port. `echo`: of the file."""
+    known = Echo(line, echo)  # what is learned of the adapter stays
+    return lambda port: Channel(port, wire, wire_log, known, may_not_send=may_not_send)

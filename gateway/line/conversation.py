@@ -3,7 +3,7 @@
 import asyncio
 from typing import Protocol
 
-from gateway.errors import LineDown
+from gateway.errors import CallEnded, LineDown
 from gateway.serving.answering import NOISE, Answerer, Heard
 from gateway.transport import Port
 
@@ -24,6 +24,8 @@ class Answered(Protocol):
     def take(self, heard: Heard, now: float) -> None: ...
 
     def ended(self) -> None: ...
+
+    def call_ended(self) -> None: ...
 
 
 class Conversation:
@@ -91,6 +93,10 @@ class Conversation:
             self._line.unsent += 1
 
     def lost(self, error: Exception) -> None:
+        if isinstance(error, CallEnded):  # the next call is another master's
+            self._begin_again()
+            self._line.call_ended()
+            return
         self.close()
         self.trouble = str(error)
         if not self._network:

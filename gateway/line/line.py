@@ -9,22 +9,24 @@ import random
 import time
 from collections.abc import Awaitable, Callable, Iterable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
-from typing import Any, NoReturn, Protocol
+from typing import Any, Protocol
 
 import structlog
 
+from gateway.engine.calls import Calls
 from gateway.engine.changes import Changes
 from gateway.engine.device import Device, DeviceSettings
 from gateway.engine.effects import Effect, LogEvent, OnlineChange, Pause, RequestEnded, Samples
 from gateway.engine.engine import Engine
-from gateway.engine.jobs import Idle, Poll, Reopen, Settle, Traffic
+from gateway.engine.jobs import Idle, Poll, Reopen, Result, Settle, Traffic
 from gateway.engine.requests import WRITE_EXPIRY, Command, Group, Outcome, Request, Write
-from gateway.errors import GatewayError, LineDown
+from gateway.errors import CallEnded, GatewayError, LineDown
+from gateway.line.calling import CallPort, dialling, rules_of, serve_calls
 from gateway.line.changing import Changeable, WaitingChange
-from gateway.line.channel import NEVER, Alarm, Channel, Echo
+from gateway.line.channel import NEVER, Channel, Expiry, channels
 from gateway.line.duty import Duty
 from gateway.line.perform import perform
+from gateway.line.together import perform_together
 from gateway.line.transaction import Transaction
 from gateway.line.wire_log import WireLog
 from gateway.protocols.driver import Span
@@ -41,14 +43,6 @@ class SampleSink(Protocol):
     def samples(self, samples: Sequence[Sample]) -> None: ...
 
     def online(self, device: Device, online: bool) -> None: ...
-
-
-@dataclass(slots=True)
-class _Expiry:
-    """Calls the line at the engine's deadline."""
-
-    alarm: Alarm = field(default_factory=Alarm)
-    at: float = NEVER  # the deadline when the alarm was set last
 
 
 class Line:
@@ -70,19 +64,25 @@ class Line:
         self._open_port = open_port
         self._sink = sink
         self.wire_log = WireLog()
-        self._new_channel = _channels(engine, echo, duty or Duty(), self.wire_log)
+        duty = duty or Duty()
+        self._new_channel = channels(engine.name, engine.wire, echo, self.wire_log, duty.why_not)
         self._wall = wall
         self._random = random.Random(seed)  # noqa: S311  (jitter, not a secret)
+        self.calls: Calls | None = None  # while a modem is there
         self._channel: Channel | None = None
         self._transaction: Transaction | None = None
         self._lost: LineDown | None = None
         self._outcomes: dict[Request, asyncio.Future[Any]] = {}
         self._wake = asyncio.Event()
-        self._expiry = _Expiry()
+        self._expiry = Expiry()
         self._waiting: WaitingChange | None = None
         self.tried = asyncio.Event()  # set once the port was opened, or could not be
 
     # Clients
+
+    @property
+    def dialling(self) -> float:
+        return dialling(self._open_port)
 
     def write(
         self, device: Device, tag: Tag, units: Sequence[int], within: float = WRITE_EXPIRY
@@ -106,7 +106,7 @@ class Line:
         loop = asyncio.get_running_loop()
         ends = [loop.create_future() for _ in writes]
         self._outcomes.update(zip(writes, ends, strict=True))
-        self._deliver(self.engine.submit_group(writes, now))
+        self.deliver(self.engine.submit_group(writes, now))
         self._wake.set()
         return ends
 
@@ -122,7 +122,7 @@ class Line:
 
     def _submit(self, request: Request) -> asyncio.Future[Any]:
         outcome = self._outcomes[request] = asyncio.get_running_loop().create_future()
-        self._deliver(self.engine.submit(request, _now()))
+        self.deliver(self.engine.submit(request, _now()))
         self._wake.set()
         return outcome
 
@@ -148,7 +148,7 @@ class Line:
     def _apply(self) -> None:
         waiting, self._waiting = self._waiting, None
         if waiting is not None:
-            self._deliver(self.engine.change(waiting.changes, _now()))
+            self.deliver(self.engine.change(waiting.changes, _now()))
             if isinstance(self._open_port, Changeable):
                 self._open_port.change(waiting.devices)
             waiting.applied()
@@ -177,7 +177,7 @@ class Line:
                 for effect in effects:
                     if isinstance(effect, Samples):
                         self.wire_log.learned(effect.samples)
-            self._deliver(effects)
+            self.deliver(effects)
             self._wake.set()
 
     def lost(self, error: Exception) -> None:
@@ -189,7 +189,7 @@ class Line:
         self._wake.set()
 
     def _unmatched(self, device: Device, frame: Any, echo: bool) -> None:
-        self._deliver(self.engine.unmatched(device, frame, _now(), self._wall(), echo=echo))
+        self.deliver(self.engine.unmatched(device, frame, _now(), self._wall(), echo=echo))
 
     # The task
 
@@ -202,10 +202,10 @@ class Line:
                 why = await self._open_and_serve()
                 if self.engine.is_open:
                     served = _now() - self.engine.record.since
-                self._deliver(self.engine.lost(LineDown(why), _now(), self._wall()))
+                self.deliver(self.engine.lost(LineDown(why), _now(), self._wall()))
                 self.tried.set()
             finally:
-                self._deliver(self.engine.stopped(_now()))
+                self.deliver(self.engine.stopped(_now()))
                 self._apply()
                 await self._close()  # last, because closing can be slow
             if served > REOPEN_LONGEST:
@@ -218,12 +218,14 @@ class Line:
         name, self._lost = self.engine.name, None
         try:
             port = await self._open_port(self)
-            self._channel = self._new_channel(port)
-            self._channel.unanswered = self.engine.schedule.unanswered
+            channel = self.begin(port)
             log.info("line open", line=name)
-            self._deliver(self.engine.opened(_now()))
+            self.deliver(self.engine.opened(_now()))
             self.tried.set()
-            await self._serve(self._channel)
+            if isinstance(port, CallPort):
+                self.calls = Calls(self.engine, rules_of(port))
+                await serve_calls(self, port, self.calls)
+            await self.serve(channel)
         except LineDown as error:
             known = str(error) == self.engine.record.trouble
             (log.debug if known else log.warning)("line down", line=name, why=str(error))
@@ -231,26 +233,52 @@ class Line:
         except Exception as error:  # an error in one line must not end the others
             log.exception("line failed", line=name)
             return f"internal error: {error!r}"
+        raise AssertionError("a port is served until it is lost")
+
+    def begin(self, port: Port) -> Channel:
+        """Begins to use an open port, or the next telephone call."""
+        channel = self._channel = self._new_channel(port)
+        channel.unanswered = self.engine.schedule.unanswered
+        return channel
+
+    def end_call(self, calls: Calls, why: CallEnded | None) -> None:
+        """Ends a telephone call, or a try of one. `why` None: it is complete."""
+        working, self._transaction = self._transaction is not None, None
+        if isinstance(self._lost, CallEnded):
+            self._lost = None
+        self.deliver(calls.end(why, _now(), self._wall(), working=working))
+
+    def catch_up(self, now: float) -> None:
+        """Does what waits for the end of a transaction. Raises `LineDown` when the port is lost."""
+        if self._lost is not None:
+            raise self._lost
+        if self._waiting is not None and self.engine.is_idle:
+            self._apply()
+        if self.engine.deadline <= now:
+            self._expire()
 
     async def _close(self) -> None:
         channel, self._channel = self._channel, None
-        self._transaction = None
+        self._transaction = self.calls = None
+        self.engine.schedule.dials = False
         self._expiry.alarm.cancel()  # its timer would keep an ended line alive
         if channel is not None:
             await channel.close()
 
-    async def _serve(self, channel: Channel) -> NoReturn:
+    async def serve(self, channel: Channel) -> None:
+        """Serves the port until it is lost, or a telephone call until it is complete."""
         engine, now = self.engine, channel.now
-        while self._lost is None:
+        while True:
             begun = now()
-            if self._waiting is not None and engine.is_idle:
-                self._apply()
-            if engine.deadline <= begun:
-                self._expire()
+            if self._lost is not None or self._waiting is not None or engine.deadline <= begun:
+                self.catch_up(begun)
             job = engine.next(begun)
             if isinstance(job, Idle):
                 self._transaction = None
-                await self._idle(job.until)
+                over = NEVER if self.calls is None else self.calls.over(begun)
+                if over <= begun:
+                    return
+                await self.idle(min(job.until, over))
                 continue
             if isinstance(job, Reopen):
                 raise LineDown(job.why)
@@ -260,37 +288,20 @@ class Line:
             else:
                 transaction = self._transaction = Transaction(channel, job.device, self._unmatched)
                 if isinstance(job, Poll) and job.device.window > 1:
-                    await self._perform_together((job, *engine.alongside(job, begun)), channel)
+                    polls = (job, *engine.alongside(job, begun))
+                    await perform_together(polls, transaction, channel, self._conclude)
                     continue
             result = await perform(job, transaction)
             if self.wire_log.active:
                 self.wire_log.performed(job, result, begun, now())
             traffic = transaction.traffic
-            self._deliver(engine.conclude(job, result, traffic, now(), self._wall()))
-        raise self._lost
+            self.deliver(engine.conclude(job, result, traffic, now(), self._wall()))
 
-    async def _perform_together(self, polls: Sequence[Poll], channel: Channel) -> None:
-        """Performs several polls at once in one transaction. Its traffic counts with the last."""
-        transaction, left = self._transaction, len(polls)
-        if transaction is None:
-            raise AssertionError("no transaction is open")
+    def _conclude(self, poll: Poll, result: Result, traffic: Traffic) -> None:
+        self.deliver(self.engine.conclude(poll, result, traffic, _now(), self._wall()))
 
-        async def one(poll: Poll) -> None:
-            nonlocal left
-            begun = channel.now()
-            result = await perform(poll, transaction)
-            if self.wire_log.active:
-                self.wire_log.performed(poll, result, begun, channel.now())
-            left -= 1
-            traffic = Traffic()
-            if not left:
-                traffic, transaction.traffic = transaction.traffic, traffic
-            now, at = channel.now(), self._wall()
-            self._deliver(self.engine.conclude(poll, result, traffic, now, at))
-
-        await asyncio.gather(*map(one, polls))
-
-    async def _idle(self, until: float) -> None:
+    async def idle(self, until: float) -> None:
+        """Waits until then, or for a request or bytes."""
         self._wake.clear()
         with suppress(TimeoutError):
             async with asyncio.timeout_at(None if until == NEVER else until):
@@ -298,7 +309,8 @@ class Line:
 
     # Effects
 
-    def _deliver(self, effects: Sequence[Effect]) -> None:
+    def deliver(self, effects: Sequence[Effect]) -> None:
+        """Passes effects of the engine on, and sets the alarm for its deadline."""
         for effect in effects:
             if type(effect) is Samples:  # before `match`, which is slower
                 self._sink.samples(effect.samples)
@@ -328,17 +340,9 @@ class Line:
 
     def _expire(self) -> float:
         """Lets the engine expire what is due. Returns its next deadline."""
-        self._deliver(self.engine.expire(_now(), self._wall()))
+        self.deliver(self.engine.expire(_now(), self._wall()))
         self._wake.set()
         return self.engine.deadline
-
-
-def _channels(
-    engine: Engine, echo: bool | None, duty: Duty, wire_log: WireLog
-) -> Callable[[Port], Channel]:
-    """Returns a function that makes the channel of an open port."""
-    known = Echo(engine.name, echo)  # what is learned of the adapter stays
-    return lambda port: Channel(port, engine.wire, wire_log, known, may_not_send=duty.why_not)
 
 
 def _now() -> float:

@@ -89,13 +89,15 @@ class OnDemand:
         reader = _Reader(asyncio.get_running_loop().create_future(), poll.asked)
         self.waiting.setdefault(tag, []).append(reader)
         self._expedite(tag)
+        place = self._place(tag.device)
+        longest = FRESH_WITHIN + (0.0 if place is None else place[0].dialling)
         try:
-            async with asyncio.timeout(FRESH_WITHIN):
+            async with asyncio.timeout(longest):
                 return await reader.answer
         except TimeoutError:
             if self._latest(tag).quality is Quality.BAD:  # an offline device sends no sample
                 return self._latest(tag)
-            raise Busy(f"{tag.key} could not be read within {FRESH_WITHIN:g} s") from None
+            raise Busy(f"{tag.key} could not be read within {longest:g} s") from None
         finally:
             self.waiting[tag].remove(reader)
             if not self.waiting[tag]:

@@ -23,7 +23,15 @@ from gateway.serving.registers import Registers, Row, Served
 from gateway.serving.registry import answerer
 from gateway.serving.station import Presence, Station
 from gateway.tags import Sample
-from gateway.transport import Port, Receiver, TcpAddress, open_port, prepare
+from gateway.transport import (
+    ModemAddress,
+    Port,
+    Receiver,
+    TcpAddress,
+    open_modem,
+    open_port,
+    prepare,
+)
 from gateway.transport.listen import Listener
 
 log = structlog.get_logger("gateway.line")
@@ -134,7 +142,10 @@ class ServedLine:
             raise LineDown(conversation.trouble)
 
     def _opener(self) -> OpenPort:
-        config = self.config
+        config, modem = self.config, self.config.modem
+        if isinstance(config.port, ModemAddress) and modem is not None:
+            where = config.port
+            return lambda to: open_modem(where, config.serial, modem, to, answers=True)
         return lambda receiver: open_port(config.port, config.serial, receiver)
 
     @property
@@ -224,6 +235,12 @@ class ServedLine:
     def _give(self, samples: Sequence[Sample]) -> None:
         if samples:
             self._sink.samples(samples)
+
+    def call_ended(self) -> None:
+        """Notes the end of a telephone call."""
+        for station in self.stations.values():
+            if station.call_ended():
+                self._sink.online(station, False)
 
     def ended(self) -> None:
         """Notes that the port is lost."""

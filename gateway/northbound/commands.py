@@ -52,14 +52,17 @@ class Commands:
         started = time.monotonic()
         refused: Failure | None = None  # instead of `result` in the audit
         result: CommandResult | Failure = Failure(Problem.UNCLEAR, "the gateway is ending")
+        longest = ANSWER_WITHIN
         try:
             by, within = self._acceptance.accept(key, data, sender)
             argument = _argument(data)
             device, command = self._target(key)
-            async with asyncio.timeout(ANSWER_WITHIN):
-                result = await self._plant.control(device, command, argument, within)
+            dialling = self._plant.dialling(device)
+            longest += dialling
+            async with asyncio.timeout(longest):
+                result = await self._plant.control(device, command, argument, within + dialling)
         except TimeoutError:
-            reason = f"not answered within {ANSWER_WITHIN:g} s: it may yet be done"
+            reason = f"not answered within {longest:g} s: it may yet be done"
             result = Failure(Problem.UNCLEAR, reason)
         except NotAllowed as error:
             result = Failure(Problem.NOT_ALLOWED, str(error))

@@ -134,6 +134,8 @@ class GroupWrites:
     ) -> None:
         if not values:
             return
-        ends = await self._plant.write_group(values, within, self._patience)
+        dialling = self._plant.dialling(values[0][0].device)
+        patience = self._patience + dialling
+        ends = await self._plant.write_group(values, within + dialling, patience)
         for one, end in zip(asked, ends, strict=True):
             one.result = payload.failure(end) if isinstance(end, GatewayError) else end

@@ -94,6 +94,9 @@ class Plant(Lines, Protocol):
         """Reads any addresses once, such as `D100..D119`. Raises `GatewayError`; `BadValue` before
         anything is sent."""
 
+    def dialling(self, device: str) -> float:
+        """Returns the seconds that a request may wait for a telephone call; 0: for none."""
+
     def is_fresh(self, tag: Tag, max_age: float) -> bool:
         """True if the current sample is younger than `max_age` seconds, or cannot be read now."""
 

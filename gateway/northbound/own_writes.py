@@ -29,16 +29,19 @@ class OwnWrites:
         Raises `GatewayError`, as `Plant.write` does.
         """
         started, now = time.monotonic(), asyncio.get_running_loop().time()
+        dialling = self._plant.dialling(tag.device)
         ended: WriteResult | Failure = Failure(
             Problem.UNCLEAR, "the gateway ended before the write"
         )
         try:
             if why := self._plant.duty.why_not(now, now):
                 raise Busy(why)
-            async with asyncio.timeout(ANSWER_WITHIN):
-                ended = await self._plant.write(tag, value, min(within, WRITE_EXPIRY))
+            async with asyncio.timeout(ANSWER_WITHIN + dialling):
+                within = min(within, WRITE_EXPIRY + dialling)
+                ended = await self._plant.write(tag, value, within)
         except TimeoutError:
-            error = Unclear(f"not acknowledged within {ANSWER_WITHIN:g} s: it may yet be done")
+            longest = ANSWER_WITHIN + dialling
+            error = Unclear(f"not acknowledged within {longest:g} s: it may yet be done")
             ended = payload.failure(error)
             raise error from None
         except GatewayError as error:

@@ -171,12 +171,14 @@ class Queries:
 
     async def _peek(self, query: zenoh.Query, parsed: ParsedKey) -> None:
         result: Peeked | Failure = _ENDING
+        device = parsed.target.rpartition("/")[2]
+        longest = ANSWER_WITHIN + self._plant.dialling(device)
         try:
             text = (_data(query) or b"").decode(errors="replace")[:_LONGEST_RANGE]
-            async with asyncio.timeout(ANSWER_WITHIN):
-                result = await self._plant.peek(parsed.target.rpartition("/")[2], text)
+            async with asyncio.timeout(longest):
+                result = await self._plant.peek(device, text)
         except TimeoutError:
-            result = Failure(Problem.BUSY, f"not read within {ANSWER_WITHIN:g} s")
+            result = Failure(Problem.BUSY, f"not read within {longest:g} s")
         except BadValue as error:
             result = Failure(Problem.BAD_QUERY, str(error))
         except GatewayError as error:
@@ -213,7 +215,8 @@ class Queries:
         age = max_age(age_text)
         if len(tags) > FRESH_LIMIT:
             raise BadValue(f"{len(tags)} tags are meant; max_age reads at most {FRESH_LIMIT}")
-        until = asyncio.get_running_loop().time() + ANSWER_WITHIN
+        dialling = max(self._plant.dialling(tag.device) for tag in tags)
+        until = asyncio.get_running_loop().time() + ANSWER_WITHIN + dialling
         left = dict.fromkeys(tags)
         while old := [tag for tag in left if not self._plant.is_fresh(tag, age)]:
             for tag in old:

@@ -1,6 +1,7 @@
 """The state of served lines and their stations, as documents like those of other lines."""
 
 from collections.abc import Iterable
+from math import isinf
 
 from gateway.line.served_line import ServedLine
 from gateway.northbound.status import Document
@@ -39,7 +40,7 @@ def _station(station: Station, now: float) -> Document:
         "overdue": 0,
         "retries": 0,
         "last_good": None if counts.last is None else round(now - counts.last, 3),
-        "stale_after": station.stale_after,
+        "stale_after": None if isinf(station.stale_after) else station.stale_after,
         "failures": {},
         "refusals": dict(counts.refusals),
         "refused_addresses": [],
@@ -69,5 +70,6 @@ def _line(line: ServedLine, now: float) -> Document:
             "slowest_write": 0.0,
         },
         "unasked_bytes": 0,
+        "calls": None,
         "expected": {"load": 0.0, "requests_per_second": 0.0, "cycle": 0.0, "worst_write": 0.0},
     }

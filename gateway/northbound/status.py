@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 
+from gateway.engine.calls import Calls
 from gateway.engine.device import Device
 from gateway.engine.engine import Engine
 from gateway.engine.forecast import LineForecast
@@ -75,7 +76,9 @@ def refused_sentence(device: Device, bad: BadRange) -> str:
     return f"{where} of {device.name}: {bad.how} since {rfc3339(bad.since)}"
 
 
-def line_document(engine: Engine, expected: LineForecast, now: float) -> Document:
+def line_document(
+    engine: Engine, expected: LineForecast, calls: Calls | None, now: float
+) -> Document:
     """One line: the forecast and the measured figures. `now` by the loop's clock."""
     record = engine.record
     open_for = now - record.since if engine.is_open else 0.0
@@ -105,4 +108,15 @@ def line_document(engine: Engine, expected: LineForecast, now: float) -> Documen
             "cycle": round(expected.cycle, 4),
             "worst_write": round(expected.worst_write, 4),
         },
+        "calls": None if calls is None else _calls(calls),
+    }
+
+
+def _calls(calls: Calls) -> Document:
+    """The telephone calls since the modem was opened."""
+    return {
+        "connected": calls.connected,
+        "made": calls.made,
+        "failed": calls.failures,
+        "last_failure": calls.last_failure,
     }

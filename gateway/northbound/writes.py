@@ -74,10 +74,6 @@ class Writes:
             else:
                 value = parse_write(data or b"")
                 result = await self._write_tag(target, value, within)
-        except TimeoutError:
-            result = Failure(
-                Problem.UNCLEAR, f"not acknowledged within {ANSWER_WITHIN:g} s: it may yet be done"
-            )
         except NotAllowed as error:
             result = Failure(Problem.NOT_ALLOWED, str(error))
         except Repeated as error:
@@ -92,11 +88,17 @@ class Writes:
             self._audit(WriteOutcome(value_key, value, refused or result, time.time_ns(), took, by))
         return result
 
-    async def _write_tag(self, tag: Tag, value: Value, within: float) -> WriteResult:
+    async def _write_tag(self, tag: Tag, value: Value, within: float) -> WriteResult | Failure:
         if self._waiting > MOST_WAITING:
             raise Busy(f"{MOST_WAITING} writes are waiting already")
-        async with asyncio.timeout(ANSWER_WITHIN):
-            return await self._plant.write(tag, value, within)
+        dialling = self._plant.dialling(tag.device)
+        longest = ANSWER_WITHIN + dialling
+        try:
+            async with asyncio.timeout(longest):
+                return await self._plant.write(tag, value, within + dialling)
+        except TimeoutError:
+            why = f"not acknowledged within {longest:g} s: it may yet be done"
+            return Failure(Problem.UNCLEAR, why)
 
     def _target(self, key: str) -> Tag | Failure:
         value_key = parse_key(key).target

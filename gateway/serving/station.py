@@ -17,7 +17,7 @@ NEVER = float("inf")
 class Presence(StrEnum):
     """The master, as the station sees it."""
 
-    STARTING = "starting"  # no request yet
+    STARTING = "starting"  # no request yet, or none since the last telephone call
     PRESENT = "up"
     SILENT = "silent"  # no request within `stale_after`
 
@@ -68,6 +68,11 @@ class Station:
         self.presence = Presence.PRESENT
         self._due = now + self.stale_after
         return [_sample(tag, value, at) for tag, value in done.written]
+
+    def call_ended(self) -> bool:
+        """Notes the end of a telephone call: the values stay. Returns True if the master goes."""
+        was, self.presence = self.presence, Presence.STARTING
+        return was is Presence.PRESENT
 
     def expire(self, now: float, at: int) -> Sequence[Sample]:
         """Returns bad samples of what the master writes, if it is silent from now on."""

@@ -1,8 +1,13 @@
-"""Ports: serial, TCP and RFC 2217, opened by `open_port`."""
+"""Ports: serial, TCP and RFC 2217, opened by `open_port`, and modems on them by `open_modem`."""
 
+from collections.abc import Awaitable, Callable
 from importlib import import_module
+from typing import TYPE_CHECKING
 
+from gateway.errors import LineDown
+from gateway.transport.modem_events import ModemSettings
 from gateway.transport.port import (
+    ModemAddress,
     Port,
     PortAddress,
     Receiver,
@@ -14,7 +19,15 @@ from gateway.transport.port import (
     parse_port,
 )
 
-_OPENERS = {SerialPath: "serial_port", TcpAddress: "tcp", Rfc2217Address: "rfc2217"}
+if TYPE_CHECKING:
+    from gateway.transport.modem import ModemPort
+
+_OPENERS = {
+    SerialPath: "serial_port",
+    TcpAddress: "tcp",
+    Rfc2217Address: "rfc2217",
+    ModemAddress: "modem",
+}
 
 
 def prepare(where: PortAddress) -> None:
@@ -22,6 +35,8 @@ def prepare(where: PortAddress) -> None:
     process that opens no port does without."""
     if module := _OPENERS.get(type(where)):
         import_module(f"{__name__}.{module}")
+    if isinstance(where, ModemAddress):
+        prepare(where.port)
 
 
 async def open_port(
@@ -45,11 +60,47 @@ async def open_port(
             from gateway.transport.rfc2217 import open_rfc2217
 
             return await open_rfc2217(where, settings, receiver, timeout=timeout)
+        case ModemAddress():
+            raise LineDown("a modem dials for a line of a file only")
         case SimulatorAddress():
             raise ValueError("a simulator needs its stations: open_simulator")
 
 
+OpenBelow = Callable[[PortAddress, SerialSettings, Receiver], Awaitable[Port]]
+
+
+async def open_modem(
+    where: ModemAddress,
+    settings: SerialSettings,
+    modem: ModemSettings,
+    receiver: Receiver,
+    *,
+    answers: bool = False,
+    opens: OpenBelow = open_port,
+) -> "ModemPort":
+    """Opens the port of a modem, and sets the modem up. As `open_port`.
+
+    `answers`: the modem takes incoming calls. `opens` opens the port that the modem is at.
+    """
+    from gateway.transport.modem import ModemPort
+
+    port = ModemPort(_name(where), modem, receiver, answers=answers)
+    await port.open(lambda below: opens(where.port, settings, below))
+    return port
+
+
+def _name(where: ModemAddress) -> str:
+    match where.port:
+        case SerialPath(path):
+            return path
+        case TcpAddress(host, port) | Rfc2217Address(host, port):
+            return f"{host}:{port}"
+
+
 __all__ = [
+    "ModemAddress",
+    "ModemSettings",
+    "OpenBelow",
     "Receiver",
     "Port",
     "PortAddress",
@@ -58,6 +109,7 @@ __all__ = [
     "SerialSettings",
     "SimulatorAddress",
     "TcpAddress",
+    "open_modem",
     "open_port",
     "parse_port",
     "prepare",

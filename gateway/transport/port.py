@@ -13,7 +13,10 @@ class Receiver(Protocol):
     def received(self, data: bytes) -> None: ...
 
     def lost(self, error: Exception) -> None:
-        """Reports the loss of the port: called once, never after `close`."""
+        """Reports the loss of the port: called once, never after `close`.
+
+        With `CallEnded` a modem reports the loss of one call.
+        """
 
 
 class Port(Protocol):
@@ -50,11 +53,18 @@ class Rfc2217Address:
 
 
 @dataclass(frozen=True, slots=True)
+class ModemAddress:
+    """A modem at a serial port or device server: `modem:/dev/ttyS0`."""
+
+    port: SerialPath | TcpAddress | Rfc2217Address
+
+
+@dataclass(frozen=True, slots=True)
 class SimulatorAddress:
     """The built-in simulated PLCs, in memory."""
 
 
-PortAddress = SerialPath | TcpAddress | Rfc2217Address | SimulatorAddress
+PortAddress = SerialPath | TcpAddress | Rfc2217Address | ModemAddress | SimulatorAddress
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +75,7 @@ class SerialSettings:
     format: str = "8N1"
 
 
+MODEM = "modem:"
 _URL = re.compile(r"(tcp|rfc2217)://(\[[0-9A-Fa-f:.%]+\]|[^\[\]/:\s]+):([0-9]{1,5})\Z")
 _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+://")
 
@@ -73,6 +84,11 @@ def parse_port(text: str) -> PortAddress:
     """Parses a port as the file writes it. Raises `ConfigError`."""
     if text == "simulator":
         return SimulatorAddress()
+    if text.startswith(MODEM):
+        below = parse_port(text.removeprefix(MODEM))
+        if isinstance(below, ModemAddress | SimulatorAddress):
+            raise ConfigError(f"{text!r} is not a modem: write its port, such as modem:/dev/ttyS0")
+        return ModemAddress(below)
     if match := _URL.match(text):
         scheme, host, port = match[1], match[2].strip("[]"), int(match[3])
         if not 1 <= port <= 65535:
@@ -81,6 +97,6 @@ def parse_port(text: str) -> PortAddress:
     if _SCHEME.match(text) or not text.strip() or text != text.strip():
         raise ConfigError(
             f"{text!r} is not a port: write a path such as /dev/ttyUSB0 or COM3, "
-            "tcp://host:port, rfc2217://host:port, or simulator"
+            "tcp://host:port, rfc2217://host:port, modem:/dev/ttyS0, or simulator"
         )
     return SerialPath(text)

@@ -75,6 +75,11 @@ class StreamPort(asyncio.Protocol):
             raise self._loss
         self._is_open = True
 
+    @property
+    def transport(self) -> asyncio.Transport | None:
+        """The transport, for the signals of a serial port."""
+        return self._transport
+
     def write(self, data: bytes) -> None:
         transport = self._transport
         if transport is None or transport.is_closing():

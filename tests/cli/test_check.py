@@ -134,3 +134,25 @@ def test_check_fails_where_the_gateway_cannot_write(
     monkeypatch.setenv("STATE_DIRECTORY", str(state))
     assert command("check", path).code == 0
     assert list(state.rglob("*")) == [state / "below"]
+
+
+@pytest.mark.parametrize(
+    ("every", "warning"),
+    [
+        ("8s", "line far never hangs up: its shortest interval is 8 s"),
+        ("30s", "line far dials all the time: its shortest interval is 30 s"),
+        ("15min", ""),
+    ],
+)
+def test_check_counts_telephone_calls(
+    command: Command, tmp_path: Path, every: str, warning: str
+) -> None:
+    far = vigor_line("modem:/dev/ttyS0", {"level": {"address": "D100", "every": every}})
+    far["devices"]["mixer"]["reply_timeout"] = "3s"
+    lines = {"far": {**far, "modem": {"number": "26204393"}}}
+    done = command("check", write_config(tmp_path / "c.yaml", free_endpoint(), lines))
+    text = " ".join(done.out.split())
+    assert "line far dials 26204393: a call takes up to 67 s" in text
+    assert "the values turn bad after 207 s (3 tries)" in text
+    assert warning in done.err
+    assert ("warning" in done.err) is bool(warning)

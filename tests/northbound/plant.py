@@ -57,6 +57,8 @@ class PlainPlant:
         self.gate.set()
         self.written: list[tuple[str, Value]] = []
         self.read: list[str] = []
+        self.dial = 0.0  # seconds, of a telephone call
+        self.within = 0.0  # of the last write
         self.unread: set[str] = set()  # tags that the line does not read in time
         self.republished: list[Sample] = []
         self.known_commands: Mapping[str, frozenset[str]] = {}
@@ -81,6 +83,7 @@ class PlainPlant:
 
     async def write(self, tag: Tag, value: Value, within: float) -> WriteResult:
         tag.encode(value)
+        self.within = within
         await self.gate.wait()
         if value in self.endings:
             raise self.endings[value]
@@ -122,6 +125,9 @@ class PlainPlant:
 
     async def peek(self, device: str, text: str) -> Peeked:
         raise BadValue(f"{device} has no {text}")
+
+    def dialling(self, device: str) -> float:
+        return self.dial
 
     def is_fresh(self, tag: Tag, max_age: float) -> bool:
         return time.time_ns() - self.samples[tag.key].time < max_age * 1e9

@@ -15,8 +15,14 @@ from gateway.errors import (
     NoReply,
     Refused,
 )
+from gateway.line.duty import Duty
 from gateway.northbound import inbox
-from gateway.northbound.writes import MOST_WAITING
+from gateway.northbound.acceptance import Acceptance, Sender
+from gateway.northbound.audit import Audit
+from gateway.northbound.keys import Keys
+from gateway.northbound.own_writes import OwnWrites
+from gateway.northbound.tag_index import TagIndex
+from gateway.northbound.writes import MOST_WAITING, Writes
 from tests.northbound.plant import (
     gateway_and_client,
     mixer,
@@ -203,3 +209,20 @@ async def test_a_write_to_a_device_of_another_gateway_gets_no_reply_even_when_bu
         assert northbound.counters()["refused"] == 1
     assert plant.written == []
     assert plant.commanded == []
+
+
+@pytest.mark.parametrize("dial", [0.0, 60.0])
+async def test_a_write_may_wait_for_a_telephone_call(dial: float) -> None:
+    plant = mixer()
+    plant.dial = dial
+    index = TagIndex(Keys("plant", "demo"), plant.devices())
+    writes = Writes(plant, index, lambda _: None, Acceptance(Duty(), None))
+    arrived = asyncio.get_running_loop().time()
+    await writes.write("plant/mixer/recipe/@set", b"7", Sender(arrived=arrived))
+    assert plant.written == [("mixer/recipe", 7)]
+    assert dial + 4 < plant.within <= dial + 5
+    own = OwnWrites(Keys("plant", "demo"), plant, Audit(lambda _: None))
+    tag = plant.tag("mixer/recipe")
+    assert tag is not None
+    await own.write(tag, 8, "transfer", within=2.0)
+    assert plant.within == 2.0  # its value is too old after that, whatever the line

@@ -630,7 +630,7 @@ MUTANTS = (
     Mutant(
         "a hung session is never reopened",
         "engine/engine.py",
-        "        if silence.noted and silence.due <= now and self._every_station_failed():\n",
+        "        if may_reopen and silence.due <= now and self._every_station_failed():\n",
         "        if False:\n",
         "tests/engine/test_line_silence.py tests/attacks/test_hung_session.py",
     ),
@@ -1427,12 +1427,12 @@ MUTANTS = (
     Mutant(
         "a write that is told busy is done later",
         "northbound/writes.py",
-        "            return await self._plant.write(tag, value, within)\n",
-        "            task = asyncio.ensure_future(self._plant.write(tag, value, within))\n"
-        "            await asyncio.wait([task], timeout=1.0)\n"
-        "            if not task.done():\n"
-        '                raise Busy("it takes long")\n'
-        "            return task.result()\n",
+        "                return await self._plant.write(tag, value, within + dialling)\n",
+        "                task = asyncio.ensure_future(self._plant.write(tag, value, within))\n"
+        "                await asyncio.wait([task], timeout=1.0)\n"
+        "                if not task.done():\n"
+        '                    raise Busy("it takes long")\n'
+        "                return task.result()\n",
         "tests/sim/test_north.py",
         (7, 9),
         "north",
@@ -1441,9 +1441,9 @@ MUTANTS = (
     Mutant(
         "a write is acknowledged before the device has it",
         "northbound/writes.py",
-        "            return await self._plant.write(tag, value, within)\n",
-        "            self._late = asyncio.ensure_future(self._plant.write(tag, value, within))\n"
-        "            return WriteResult(value, time.time_ns(), took=0.0)\n",
+        "                return await self._plant.write(tag, value, within + dialling)\n",
+        "                self._late = asyncio.ensure_future(self._plant.write(tag, value, 5.0))\n"
+        "                return WriteResult(value, time.time_ns(), took=0.0)\n",
         "tests/northbound/test_writes.py",
         (7,),
         "north",
@@ -2455,8 +2455,8 @@ MUTANTS = (
     Mutant(
         "devices change during a transaction",
         "line/line.py",
-        "            if self._waiting is not None and engine.is_idle:\n",
-        "            if self._waiting is not None:\n",
+        "        if self._waiting is not None and self.engine.is_idle:\n",
+        "        if self._waiting is not None:\n",
         "tests/line/test_line_change.py",
     ),
     Mutant(
@@ -2486,6 +2486,69 @@ MUTANTS = (
         "        changed = needs_restart(self.current, config)\n",
         "        changed: list[str] = []\n",
         "tests/reload/test_live.py",
+    ),
+    Mutant(
+        "a frame is completed by the modem's own text",
+        "transport/at.py",
+        "        kept = _suffix(data)\n",
+        "        kept = 0\n",
+        "tests/transport/test_at.py",
+    ),
+    Mutant(
+        "data goes to a modem without a call",
+        "transport/modem.py",
+        "        if self._port is None or self._modem.state is not State.ONLINE:\n",
+        "        if self._port is None:\n",
+        "tests/transport/test_modem.py",
+    ),
+    Mutant(
+        "a dial answers an incoming call",
+        "transport/at.py",
+        "        elif now < self._rang + RING_TIME:  # ATD would take that call\n",
+        "        elif False:\n",
+        "tests/transport/test_at.py",
+    ),
+    Mutant(
+        "a call of before is not hung up",
+        "transport/at.py",
+        "                self._begin_hang_up(Ready(), now)  # it may be in a call of before\n",
+        '                self._break("does not answer")\n',
+        "tests/transport/test_at.py",
+    ),
+    Mutant(
+        "a call begins without a resync",
+        "engine/calls.py",
+        "            device.health.reconnected()\n",
+        "            pass\n",
+        "tests/line/test_calling.py",
+    ),
+    Mutant(
+        "values stay good when all calls fail",
+        "engine/calls.py",
+        "        if self.failed < self._rules.tries:\n",
+        "        if True:\n",
+        "tests/line/test_calling.py",
+    ),
+    Mutant(
+        "a call that breaks in a frame counts as complete",
+        "engine/calls.py",
+        "not working and not self._is_busy(now)):",
+        "True):",
+        "tests/line/test_calling.py",
+    ),
+    Mutant(
+        "a broken call is dialled without end",
+        "engine/calls.py",
+        "        return max(wanted, self._not_before)\n",
+        "        return now\n",
+        "tests/line/test_calling.py",
+    ),
+    Mutant(
+        "a reply goes to the next caller",
+        "line/conversation.py",
+        "            self._begin_again()\n            self._line.call_ended()\n",
+        "            self._line.call_ended()\n",
+        "tests/line/test_answered_calls.py",
     ),
     Mutant(
         "a group goes on after a tag that was not done",
@@ -2694,8 +2757,8 @@ MUTANTS = (
     Mutant(
         "a transfer is sent when its value is too old",
         "northbound/own_writes.py",
-        "min(within, WRITE_EXPIRY)",
-        "WRITE_EXPIRY",
+        "min(within, WRITE_EXPIRY + dialling)",
+        "WRITE_EXPIRY + dialling",
         "tests/transfers/test_runner.py",
     ),
     Mutant(

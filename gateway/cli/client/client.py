@@ -47,6 +47,8 @@ class Client:
         self._has_standby = config.standby is not None
         self._tags = tags_by_key(config)
         self._only_blocks = [device for device in config.devices if device.blocks == "only"]
+        # Seconds that a request may wait for a telephone call.
+        self._dialling = config.dialling
         self._tell = tell
         self._user = user
         self._duplicated: set[str] = set()  # devices of several gateways, reported once
@@ -139,7 +141,8 @@ class Client:
         """
         # Not orjson: it refuses integers beyond 64 bits, which a float tag accepts.
         device = tag.partition("/")[0]
-        return self._request(self._keys.set(tag), json.dumps(value).encode(), self._tags_of(device))
+        data, dialling = json.dumps(value).encode(), self._dialling.get(device, 0.0)
+        return self._request(self._keys.set(tag), data, self._tags_of(device), dialling)
 
     def control(self, line: str, device: str, command: str, argument: str) -> dict[str, object]:
         """Returns the outcome of a command: `answer ...` or `error ...`. Raises as `write`."""
@@ -149,11 +152,13 @@ class Client:
             status = self._keys.status("status")
             return self._request(self._keys.to_all(line), argument.encode(), status)
         key = self._keys.command(device, command)
-        return self._request(key, argument.encode(), self._tags_of(device))
+        dialling = self._dialling.get(device, 0.0)
+        return self._request(key, argument.encode(), self._tags_of(device), dialling)
 
     def peek(self, device: str, text: str) -> dict[str, object]:
         """Returns `address`, `units` and `time`, or `error ...`. Raises as `write`."""
-        return self._request(self._keys.peek(device), text.encode(), self._tags_of(device))
+        key, dialling = self._keys.peek(device), self._dialling.get(device, 0.0)
+        return self._request(key, text.encode(), self._tags_of(device), dialling)
 
     def _tags_of(self, device: str) -> str:
         """One description of a device: only its gateway replies."""
@@ -278,7 +283,9 @@ class Client:
         except zenoh.ZError as error:
             raise GatewayError(f"{selector}: {error}") from None
 
-    def _request(self, key: str, payload: bytes, documents: str) -> dict[str, object]:
+    def _request(
+        self, key: str, payload: bytes, documents: str, dialling: float = 0.0
+    ) -> dict[str, object]:
         """Sends a write or a command if a gateway accepts it. Returns the decoded reply.
 
         A query for `documents` comes first: only the gateway of the receiver replies to it. Every
@@ -289,7 +296,8 @@ class Client:
         """
         from gateway.cli.client.signing import signature  # with all about tags
 
-        with self._session.declare_querier(key, timeout=REPLY_TIMEOUT) as querier:
+        timeout = REPLY_TIMEOUT + dialling
+        with self._session.declare_querier(key, timeout=timeout) as querier:
             served = any(reply.ok is not None for reply in self._query(documents))
             if not (served and querier.matching_status.matching):  # type: ignore[attr-defined]
                 may = f"may {self._user} do this, and " if self._user else ""

@@ -1,0 +1,70 @@
+"""The part of `check` about lines with a modem: the duration and the number of calls."""
+
+from collections.abc import Iterator
+
+from gateway.config import LineConfig
+from gateway.engine.forecast import LineForecast
+from gateway.transport import ModemSettings
+
+LATE = 1.5  # seconds by which a telephone line with error correction delays a reply
+HOUR = 3600.0
+
+
+def modem_plan(line: LineConfig, forecast: LineForecast | None) -> str:
+    """Describes the calls of a line with a modem. Without `forecast` it answers calls."""
+    modem = line.modem
+    if modem is None:
+        return ""
+    if forecast is None:
+        idle = f"{modem.idle:g} s without a byte"
+        return f"line {line.name} answers calls, and hangs up after {idle}"
+    call, tries = call_seconds(modem, forecast), modem.tries
+    worst = tries * (modem.dial_timeout + hang_up_seconds(modem)) + (tries - 1) * modem.retry_pause
+    every = shortest(forecast)
+    calls = f", at most {HOUR / every:.3g} calls an hour" if every else ""
+    return (
+        f"line {line.name} dials {modem.number}: a call takes up to {call:.0f} s "
+        f"({modem.dial_timeout:g} s to the carrier, {forecast.cycle:.1f} s for all requests, "
+        f"{modem.idle:g} s idle, {hang_up_seconds(modem):.1f} s to hang up){calls}\n"
+        f"  the times above count in a call; a write waits up to {modem.dial_timeout:g} s for it\n"
+        f"  without a carrier the values turn bad after {worst:.0f} s ({tries} tries)"
+    )
+
+
+def modem_warnings(line: LineConfig, forecast: LineForecast) -> Iterator[str]:
+    """Yields a sentence for each setting that does not suit a telephone line."""
+    modem, every = line.modem, shortest(forecast)
+    if modem is None:
+        return
+    if every and every <= 2 * modem.idle:
+        yield (
+            f"line {line.name} never hangs up: its shortest interval is {every:g} s, "
+            f"and a call ends after {modem.idle:g} s without an exchange (`idle`)"
+        )
+    elif every and every < (call := call_seconds(modem, forecast)):
+        yield (
+            f"line {line.name} dials all the time: its shortest interval is {every:g} s, and a "
+            f"call takes up to {call:.0f} s"
+        )
+    for device in line.devices:
+        timeout = device.timing.reply_timeout
+        if device.enabled and timeout < LATE:
+            yield (
+                f"{device.name} has {timeout:g} s to reply, and a telephone line delays replies "
+                "by up to a second: write reply_timeout: 3s"
+            )
+
+
+def shortest(forecast: LineForecast) -> float:
+    """Returns the shortest interval of the line; 0: nothing is polled."""
+    return min((one.block.every for one in forecast.blocks), default=0.0)
+
+
+def call_seconds(modem: ModemSettings, forecast: LineForecast) -> float:
+    """Returns the longest duration of a call that reads everything."""
+    return modem.dial_timeout + forecast.cycle + modem.idle + hang_up_seconds(modem)
+
+
+def hang_up_seconds(modem: ModemSettings) -> float:
+    """Returns the usual time of a hang-up by +++, without the signal DTR."""
+    return 2 * modem.guard

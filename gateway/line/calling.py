@@ -1,0 +1,97 @@
+"""The telephone calls of a line with a modem: dials, serves the call, and hangs up."""
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from typing import NoReturn, Protocol, runtime_checkable
+
+from gateway.engine.calls import CallRules, Calls
+from gateway.engine.effects import Effect
+from gateway.errors import CallEnded
+from gateway.line.channel import Channel
+from gateway.transport import (
+    ModemAddress,
+    ModemSettings,
+    OpenBelow,
+    Port,
+    Receiver,
+    open_modem,
+    open_port,
+)
+from gateway.transport.port import SerialSettings
+
+
+@runtime_checkable
+class CallPort(Port, Protocol):
+    """The port of a modem, also between calls."""
+
+    @property
+    def modem(self) -> ModemSettings: ...
+
+    async def dial(self) -> None:
+        """Returns when the carrier is there. Raises `CallEnded`, and `LineDown`."""
+
+    async def hang_up(self) -> None:
+        """Returns when the modem has hung up. Raises `LineDown`."""
+
+
+@dataclass(frozen=True, slots=True)
+class ModemOpener:
+    """Opens the port of a modem that dials."""
+
+    where: ModemAddress
+    serial: SerialSettings
+    modem: ModemSettings
+    opens: OpenBelow = open_port
+
+    def __call__(self, receiver: Receiver) -> Awaitable[Port]:
+        return open_modem(self.where, self.serial, self.modem, receiver, opens=self.opens)
+
+
+def dialling(opener: Callable[[Receiver], Awaitable[Port]]) -> float:
+    """Returns the seconds that a request may wait for a telephone call; 0: there is no modem."""
+    return opener.modem.dial_timeout if isinstance(opener, ModemOpener) else 0.0
+
+
+def rules_of(port: CallPort) -> CallRules:
+    """Returns the rules of its calls."""
+    modem = port.modem
+    return CallRules(tries=modem.tries, retry_pause=modem.retry_pause, idle=modem.idle)
+
+
+class CallingLine(Protocol):
+    """The line that the calls serve."""
+
+    def catch_up(self, now: float) -> None:
+        """Raises `LineDown` when the port of the modem is lost."""
+
+    def begin(self, port: Port) -> Channel: ...
+
+    def deliver(self, effects: list[Effect]) -> None: ...
+
+    async def idle(self, until: float) -> None: ...
+
+    async def serve(self, channel: Channel) -> None: ...
+
+    def end_call(self, calls: Calls, why: CallEnded | None) -> None: ...
+
+
+async def serve_calls(line: CallingLine, port: CallPort, calls: Calls) -> NoReturn:
+    """Serves one call after another, until the port of the modem is lost. Raises `LineDown`."""
+    now = asyncio.get_running_loop().time
+    while True:
+        line.catch_up(now())
+        due = calls.due(now())
+        if due > now():
+            await line.idle(due)
+            continue
+        ended: CallEnded | None = None
+        try:
+            await port.dial()
+            channel = line.begin(port)
+            line.deliver(calls.connect(now()))
+            await line.serve(channel)
+        except CallEnded as error:
+            ended = error
+        await port.hang_up()
+        line.end_call(calls, ended)
