@@ -1,6 +1,5 @@
 """The `write` command: writes one tag and prints the outcome."""
 
-import asyncio
 import json
 import sys
 from typing import Annotated
@@ -8,9 +7,7 @@ from typing import Annotated
 import orjson
 import typer
 
-from gateway.cli import direct
 from gateway.cli.client import connected, parse_value, suggestion, tags_by_key
-from gateway.cli.logs import LogFormat, LogLevel, set_up
 from gateway.cli.tables import value_text
 from gateway.cli.terminal import FAILED, USER_MISTAKE, AsJson, ConfigPath, Direct, err, printable
 from gateway.config import Config, load
@@ -49,7 +46,6 @@ def write(
     except BadValue as error:
         raise BadValue(f"{tag}: {error}") from None
     if without_gateway:
-        set_up(LogFormat.TEXT, LogLevel.ERROR)
         answer = _write_directly(loaded, target, parsed)
     else:
         with connected(loaded, err.print) as client:
@@ -79,8 +75,10 @@ def _parsed(text: str, tag: Tag) -> Value:
 
 def _write_directly(config: Config, tag: Tag, value: Value) -> dict[str, object]:
     """Writes without a gateway. Returns the outcome in the words of a gateway."""
+    from gateway.cli import direct
+
     try:
-        encoded = payload.outcome(asyncio.run(direct.write(config, tag, value)))
+        encoded = payload.outcome(direct.run(direct.write(config, tag, value)))
     except GatewayError as error:
         encoded = payload.outcome(payload.failure(error))
     answer: dict[str, object] = orjson.loads(encoded)
