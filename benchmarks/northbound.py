@@ -37,6 +37,7 @@ import zenoh
 from gateway.alarms import Alarms
 from gateway.config import ZenohConfig, ZenohMode
 from gateway.engine.requests import CommandResult, Peeked
+from gateway.errors import GatewayError
 from gateway.line.duty import Duty
 from gateway.line.wire_log import WireLog
 from gateway.northbound.northbound import Northbound
@@ -90,6 +91,11 @@ class Plant:
     async def write(self, tag: Tag, value: Value, within: float) -> WriteResult:
         tag.encode(value)
         return WriteResult(value, time.time_ns(), took=0.0)
+
+    async def write_group(
+        self, values: Sequence[tuple[Tag, Value]], within: float, patience: float
+    ) -> Sequence[WriteResult | GatewayError]:
+        return [await self.write(tag, value, within) for tag, value in values]
 
     def mark_published(self, samples: Sequence[Sample]) -> None:
         self.mirror.mark_published(samples)

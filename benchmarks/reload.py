@@ -139,7 +139,9 @@ def memory(pid: int) -> float:
 def main() -> None:
     parser = argparse.ArgumentParser(description="reloads under load")
     parser.add_argument("--reloads", type=int, default=200)
-    count = parser.parse_args().reloads
+    parser.add_argument("--rounds", type=int, default=5)
+    given = parser.parse_args()
+    in_round = given.reloads // given.rounds
     chance, endpoint = random.Random(1), free_endpoint()
     with tempfile.TemporaryDirectory() as folder:
         file, data = Path(folder) / "c.yaml", plant(endpoint)
@@ -152,15 +154,18 @@ def main() -> None:
             missed = client.missed()
             time.sleep(5.0)
             took = []
-            for n in range(1, count + 1):
-                change(data, chance)
+            for n in range(1, in_round * given.rounds + 1):
+                if n % in_round:
+                    change(data, chance)
+                else:
+                    data = plant(endpoint)
                 file.write_text(json.dumps(data))
                 begun = time.monotonic()
                 os.kill(program.pid, signal.SIGHUP)
                 while client.reloads() < n:
                     time.sleep(0.02)
                 took.append(time.monotonic() - begun)
-                if n % max(1, count // 10) == 0:
+                if n % in_round == 0:
                     print(f"{n:4} reloads: {memory(program.pid):.0f} MB", flush=True)
             time.sleep(3.0)
             report(client, data, took, missed)

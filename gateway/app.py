@@ -15,9 +15,10 @@ from gateway.config.commands import check_command, every_command, speaker
 from gateway.engine.device import Device, DeviceSettings
 from gateway.engine.forecast import LineForecast, forecast
 from gateway.engine.requests import WRITE_EXPIRY, CommandResult, Peeked
-from gateway.errors import BadValue, Busy, ConfigError, Offline
+from gateway.errors import BadValue, Busy, ConfigError, GatewayError, Offline
 from gateway.line.build import OpenPort, line_of, opener
 from gateway.line.duty import Duty
+from gateway.line.groups import ended
 from gateway.line.line import Line
 from gateway.line.on_demand import OnDemand
 from gateway.line.serving import Serving
@@ -291,6 +292,28 @@ class Gateway:
         units = tag.encode(value)
         line, device = self._places[tag.device]
         return await line.write(device, tag, units, within)
+
+    async def write_group(
+        self,
+        values: Sequence[tuple[Tag, Value]],
+        within: float = WRITE_EXPIRY,
+        patience: float = WRITE_EXPIRY,
+    ) -> Sequence[WriteResult | GatewayError]:
+        """Writes tags of one device in their order; returns the outcome of each.
+
+        What has not ended after `patience` seconds is `Unclear`. Raises `GatewayError` when nothing
+        was sent.
+        """
+        name = values[0][0].device
+        if any(self._tags.get(tag.key) is not tag for tag, _ in values):
+            raise Busy(f"the file was reloaded, and {name} with it; not sent")
+        if self.serving.holds(values[0][0]):
+            return await self.serving.write_group(values)
+        if name not in self._places:
+            raise Offline(f"device {name} is disabled; nothing was sent")
+        units = [(tag, tag.encode(value)) for tag, value in values]
+        line, device = self._places[name]
+        return await ended(line.write_group(device, units, within), patience)
 
     def commands(self) -> Mapping[str, frozenset[str]]:
         return every_command(self.config)

@@ -4,6 +4,7 @@ GatewayError
 ├── ConfigError          fix the file; nothing has been sent
 ├── BadValue             refuse the write; nothing has been sent
 ├── Busy                 try again later; nothing has been sent
+│   └── NotSent          a write of a group, after another one that was not done
 ├── Damaged              a part of the history file is lost; the rest can be read
 ├── Offline              the device is offline; nothing has been sent
 ├── LineDown             reopen the port; pending writes fail at once
@@ -31,6 +32,10 @@ class BadValue(GatewayError, ValueError):
 
 class Busy(GatewayError):
     """A request that could not be sent in time; nothing has been sent."""
+
+
+class NotSent(Busy):
+    """A write of a group that was not sent, because another one of it was not done."""
 
 
 class Damaged(GatewayError):

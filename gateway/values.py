@@ -1,4 +1,4 @@
-"""Conversion between words and values: types, word and byte order, BCD, strings.
+"""Conversion between words and values: types, word and byte order, BCD, strings, arrays.
 
 Words are unsigned 16-bit integers in the order of their addresses. Each conversion is built
 once, with the configuration, as a plain function.
@@ -8,18 +8,18 @@ import math
 import re
 import struct
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from operator import index
 
 from gateway.errors import BadValue, ConfigError
-from gateway.numerals import real, shortest, whole
+from gateway.numerals import Scalar, real, shortest, whole
 
-Value = bool | int | float | str
+Value = Scalar | tuple[Scalar, ...]  # several: of an array
 Words = Sequence[int]
-FromWords = Callable[[Words], Value | None]
-FromWord = Callable[[int], Value | None]
-ToWords = Callable[[Value], list[int]]
+FromWords = Callable[[Words], Scalar | None]
+FromWord = Callable[[int], Scalar | None]
+ToWords = Callable[[Scalar], list[int]]
 
 
 class Kind(StrEnum):
@@ -84,24 +84,36 @@ _FLOATS = (Kind.FLOAT32, Kind.FLOAT64)
 _BCD = (Kind.BCD16, Kind.BCD32)
 BYTES = (Kind.INT8, Kind.UINT8)
 LONGEST_STRING = 250
+LONGEST_ARRAY = 2000  # elements: as many bits as one request of Modbus reads
 
 
 @dataclass(frozen=True, slots=True)
 class ValueType:
-    """A tag's type as the file writes it; `length` counts the characters of a string."""
+    """A tag's type as the file writes it.
+
+    `length` counts the characters of a string, `count` the elements of an array; 0: no array.
+    """
 
     kind: Kind
     length: int = 0
+    count: int = 0
 
     @property
     def words(self) -> int:
-        """The number of 16-bit words of a value."""
-        return (self.length + 1) // 2 if self.kind is Kind.STRING else _WORDS[self.kind]
+        """The number of 16-bit words of a value, of all elements of an array."""
+        if self.kind is Kind.STRING:
+            return (self.length + 1) // 2
+        return _WORDS[self.kind] * (self.count or 1)
 
     @property
     def bits(self) -> int:
         """The number of bits of a number."""
-        return 8 if self.kind in BYTES else 16 * self.words
+        return 8 if self.kind in BYTES else 16 * _WORDS[self.kind]
+
+    @property
+    def element(self) -> "ValueType":
+        """The type of one element of an array; the type itself if it is no array."""
+        return replace(self, count=0) if self.count else self
 
     def holds(self, number: int) -> bool:
         """Returns True if a number of this type can be `number`."""
@@ -120,23 +132,33 @@ class ValueType:
         return self.kind in _FLOATS
 
     def __str__(self) -> str:
-        return f"string[{self.length}]" if self.kind is Kind.STRING else self.kind.value
+        size = self.length or self.count
+        return f"{self.kind}[{size}]" if size else self.kind.value
 
 
-_STRING = re.compile(r"string\[([0-9]{1,4})\]\Z")
+_SIZED = re.compile(r"([a-z0-9]+)\[([0-9]{1,4})\]\Z")
 
 
 def parse_type(text: str) -> ValueType:
-    """Returns the type for `int16`, `float32`, `string[16]` ... Raises `ConfigError`."""
-    if match := _STRING.match(text):
-        length = int(match[1])
-        if not 1 <= length <= LONGEST_STRING:
+    """Returns the type for `int16`, `uint16[50]`, `string[16]` ... Raises `ConfigError`."""
+    match = _SIZED.match(text)
+    name, size = (match[1], int(match[2])) if match else (text, 0)
+    if match and name == Kind.STRING:
+        if not 1 <= size <= LONGEST_STRING:
             raise ConfigError(f"{text}: a string has 1 to {LONGEST_STRING} characters")
-        return ValueType(Kind.STRING, length)
+        return ValueType(Kind.STRING, size)
     known = [kind.value for kind in Kind if kind is not Kind.STRING]
-    if text not in known:
-        raise ConfigError(f"{text!r} is not a type: use {', '.join(known)} or string[n]")
-    return ValueType(Kind(text))
+    if name not in known:
+        raise ConfigError(
+            f"{text!r} is not a type: use {', '.join(known)} or string[n], or an array such as "
+            "uint16[50]"
+        )
+    kind = Kind(name)
+    if match and kind in BYTES:
+        raise ConfigError(f"{text}: an array has whole words or bits: use uint16[n] or int16[n]")
+    if match and not 1 <= size <= LONGEST_ARRAY:
+        raise ConfigError(f"{text}: an array has 1 to {LONGEST_ARRAY} elements")
+    return ValueType(kind, count=size)
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,9 +173,14 @@ class Layout:
     byte_order: Order = Order.HIGH_FIRST
     byte: Byte = Byte.LOW  # for 8 bits
 
+    @property
+    def element(self) -> "Layout":
+        """The layout of one element of an array."""
+        return replace(self, type=self.type.element)
+
 
 def from_words(layout: Layout) -> FromWords:
-    """Returns the function that turns `layout.type.words` words into the value.
+    """Returns the function that turns the words of one value into the value.
 
     That function returns None for words without a value: a float that is NaN or infinite, BCD
     with a digit above 9.
@@ -175,7 +202,7 @@ def from_words(layout: Layout) -> FromWords:
     if kind is Kind.FLOAT64:
         return lambda words: _finite(unpack(_octets(_ordered(words, layout)))[0])
 
-    def number(words: Words) -> Value | None:
+    def number(words: Words) -> Scalar | None:
         value: int = unpack(_octets(_ordered(words, layout)))[0]
         return value
 
@@ -209,9 +236,9 @@ def to_words(layout: Layout) -> ToWords:
         digits = 4 * layout.type.words
         return lambda value: _ordered(_to_bcd(whole(value), digits), layout)
     pack = struct.Struct(_STRUCT[kind]).pack
-    convert: Callable[[Value], int | float] = real if kind in _FLOATS else whole
+    convert: Callable[[Scalar], int | float] = real if kind in _FLOATS else whole
 
-    def encode(value: Value) -> list[int]:
+    def encode(value: Scalar) -> list[int]:
         number = convert(value)
         try:
             raw = pack(number)
@@ -253,7 +280,7 @@ def _text(octets: bytes) -> str:
     return octets.split(b"\0", 1)[0].decode("latin-1")
 
 
-def _string_words(value: Value, layout: Layout) -> list[int]:
+def _string_words(value: Scalar, layout: Layout) -> list[int]:
     if not isinstance(value, str):
         raise BadValue(f"{value!r} is not text")
     length = layout.type.length
@@ -270,7 +297,7 @@ def _string_words(value: Value, layout: Layout) -> list[int]:
     return list(struct.unpack(f"{prefix}{layout.type.words}H", octets))
 
 
-def _boolean(value: Value) -> bool:
+def _boolean(value: Scalar) -> bool:
     if isinstance(value, str) or value not in (0, 1):
         raise BadValue(f"{value!r} is neither true nor false")
     return bool(value)

@@ -58,7 +58,10 @@ FENCED = re.compile(r"^( *)```(\w+)\n(.*?)^\1```$", re.DOTALL | re.MULTILINE)
 # The blocks of this page are single devices: complete files are in examples/.
 OF_DEVICES = "no-protocol.md"
 # The pages whose Python programs run here against the example gateway.
-OF_PROGRAMS = ("read-values.md", "slow-links.md", "write-values.md", "browse.md")
+OF_PROGRAMS = (
+    *("read-values.md", "slow-links.md", "write-values.md", "write-groups.md"),
+    "browse.md",
+)
 # The tutorial's programs run in tests/e2e/test_story.py; the replay is a test of tests/cases; the
 # loop in architecture.md is pseudo code.
 RUN_ELSEWHERE = ("scada.md", "wire-log-to-test.md", "architecture.md")
@@ -136,7 +139,7 @@ def test_every_page_with_files_is_checked() -> None:
     assert set(counted) == {
         *("/README.md", "configuration.md", "vigor.md", "computer-link.md", "modbus.md"),
         *("first-plant.md", "import.md", "peek.md", "serve.md", "shaping.md", "systems.md"),
-        *("templates.md", "trace.md", "alarms.md"),
+        *("templates.md", "trace.md", "alarms.md", "arrays.md"),
         *("tutorial-computer-link.md", "tutorial-modbus.md", "tutorial-vigor.md"),
     }
     assert sum(counted.values()) >= 11
@@ -521,6 +524,7 @@ def _example_keys() -> set[str]:
     return {
         *(key for tag in tags for key in (keys.value(tag), keys.set(tag), keys.meta(tag))),
         *(key for n in devices for key in (keys.device(n), keys.block(n), keys.peek(n))),
+        *map(keys.set, devices),
         *(keys.status(f"devices/{name}") for name in devices),
         *(keys.status(f"lines/{line.name}") for line in config.lines),
         *(keys.trace(line.name) for line in config.lines),

@@ -8,11 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gateway.errors import BadValue, ConfigError
+from gateway.numerals import Scalar
 from gateway.values import (
     Kind,
     Layout,
     Order,
-    Value,
     ValueType,
     from_words,
     parse_type,
@@ -63,7 +63,7 @@ def test_invalid_types_are_refused(text: str) -> None:
         parse_type(text)
 
 
-WORKED: list[tuple[Layout, list[int], Value]] = [
+WORKED: list[tuple[Layout, list[int], Scalar]] = [
     (layout("bool"), [1], True),
     (layout("bool"), [0], False),
     (layout("int16"), [0x7FFF], 32767),
@@ -97,7 +97,7 @@ WORKED: list[tuple[Layout, list[int], Value]] = [
 
 
 @pytest.mark.parametrize(("how", "words", "value"), WORKED, ids=lambda x: str(x)[:60])
-def test_worked_values_both_ways(how: Layout, words: list[int], value: Value) -> None:
+def test_worked_values_both_ways(how: Layout, words: list[int], value: Scalar) -> None:
     read = from_words(how)(words)
     assert read == value
     assert type(read) is type(value)
@@ -193,7 +193,7 @@ def test_values_one_beyond_the_bounds_are_refused(kind: Kind) -> None:
 
 @pytest.mark.parametrize("kind", list(INTEGERS))
 @pytest.mark.parametrize("value", [0.5, math.nan, math.inf, True, False, "1", ""])
-def test_values_without_a_whole_number_are_refused(kind: Kind, value: Value) -> None:
+def test_values_without_a_whole_number_are_refused(kind: Kind, value: Scalar) -> None:
     with pytest.raises(BadValue):
         to_words(Layout(ValueType(kind)))(value)
 
@@ -204,7 +204,7 @@ def test_a_float_that_is_whole_is_a_whole_number() -> None:
 
 @pytest.mark.parametrize("kind", ["float32", "float64"])
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 10**400, True, "1.5"])
-def test_values_without_a_finite_number_are_refused(kind: str, value: Value) -> None:
+def test_values_without_a_finite_number_are_refused(kind: str, value: Scalar) -> None:
     with pytest.raises(BadValue):
         to_words(layout(kind))(value)
 
@@ -215,18 +215,18 @@ def test_values_too_large_for_float32_are_refused() -> None:
 
 
 @pytest.mark.parametrize("value", [2, -1, 0.5, math.nan, "true", "1"])
-def test_values_other_than_true_and_false_are_refused(value: Value) -> None:
+def test_values_other_than_true_and_false_are_refused(value: Scalar) -> None:
     with pytest.raises(BadValue, match="neither true nor false"):
         to_words(layout("bool"))(value)
 
 
 @pytest.mark.parametrize("value", [0, 1, 0.0, 1.0, True, False])
-def test_zero_and_one_are_booleans(value: Value) -> None:
+def test_zero_and_one_are_booleans(value: Scalar) -> None:
     assert to_words(layout("bool"))(value) == [int(value)]
 
 
 @pytest.mark.parametrize("value", ["ABCDE", "€", "A\0", 5, True])
-def test_values_other_than_four_characters_are_refused(value: Value) -> None:
+def test_values_other_than_four_characters_are_refused(value: Scalar) -> None:
     with pytest.raises(BadValue):
         to_words(layout("string[4]"))(value)
 

@@ -45,8 +45,13 @@ def is_value(known: Any) -> bool:
         return False
     if known["quality"] == "bad":
         return value is None and isinstance(reason, str)
-    is_number = isinstance(value, int | float) and abs(value) <= sys.float_info.max  # no NaN
-    return known["quality"] == "good" and (is_number or isinstance(value, str))
+    if isinstance(value, list):  # of an array
+        return known["quality"] == "good" and all(map(is_number, value))
+    return known["quality"] == "good" and (is_number(value) or isinstance(value, str))
+
+
+def is_number(value: object) -> bool:
+    return isinstance(value, int | float) and abs(value) <= sys.float_info.max  # no NaN
 
 
 class Plant:

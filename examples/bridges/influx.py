@@ -9,9 +9,11 @@ go to the standard output, for Telegraf's `inputs.execd`.
 
     plc,device=mixer,name=speed value=12.5,good=true 1763640000123456000
     plc,device=mixer,name=name text="AB",good=true 1763640000123456000
+    plc,device=mixer,name=recipe value_0=1.0,value_1=5.0,good=true 1763640000123456000
     plc,device=mixer,name=speed good=false,reason="no-reply" 1763640003500000000
     plc_bridge lost=120i,refused=0i 1763640010000000000
 
+* An array has a field for each element, `value_0`, `value_1` ...
 * Numbers and bits (0, 1) are in `value`, texts and the names of an `enum` in `text`. Beyond 2^53 a
   number is exact in `text` only.
 * The time is that of the sample. A value that becomes good again without a new sample has the time
@@ -47,6 +49,8 @@ def line_of(key: str, known: Known) -> str:
     value = known["value"]
     if known["quality"] != "good":
         fields = f"good=false,reason={quoted(known.get('reason', ''))}"
+    elif isinstance(value, list):
+        fields = ",".join(f"value_{n}={float(one)!r}" for n, one in enumerate(value)) + ",good=true"
     elif isinstance(value, str):
         fields = f"text={quoted(value)},good=true"
     else:

@@ -5,6 +5,7 @@
 
 * Address space: Objects / plant / a folder for each device (and for each `/` of a tag) / a variable
   for each tag: `ns=2;s=mixer/speed`, with data type, description, unit, and the limits of a write.
+  An array has one dimension; a write has all of its elements.
 * Values: time and quality of the gateway as source time stamp and status code (`STATUS` in
   opcua_values.py).
 * Writes, with `--writes`: Good only after the device has acknowledged. BadTimeout: unknown, it may
@@ -133,6 +134,7 @@ class Bridge(AttributeService):
             (ua.AttributeIds.AccessLevel, ua.Variant(access, ua.VariantType.Byte)),
             (ua.AttributeIds.UserAccessLevel, ua.Variant(access, ua.VariantType.Byte)),
             (ua.AttributeIds.Historizing, ua.Variant(bool(meta["history"]))),
+            *_dimensions(meta.get("length")),
             (ua.AttributeIds.Description, ua.Variant(ua.LocalizedText(meta["description"]))),
         ):
             await node.write_attribute(attribute, ua.DataValue(value))
@@ -169,13 +171,24 @@ class Bridge(AttributeService):
             return Code.BadNotWritable
         if item.Value.StatusCode is not None and item.Value.StatusCode.value != Code.Good:
             return Code.BadWriteNotSupported
-        if variant is None or variant.VariantType != self._types[key] or variant.is_array:
+        if variant is None or variant.VariantType != self._types[key]:
+            return Code.BadTypeMismatch
+        if variant.is_array != bool(self.plant.tags[key].get("length")):
             return Code.BadTypeMismatch
         outcome = await self.plant.write(key, variant.Value)
         say(f"{key} = {variant.Value}: {outcome['outcome']} {outcome.get('reason', '')}")
         if outcome["outcome"] == "written":
             return Code.Good
         return NOT_DONE.get(outcome["outcome"], Code.BadTimeout)
+
+
+def _dimensions(length: int | None) -> list[tuple[ua.AttributeIds, ua.Variant]]:
+    """Returns the attributes of an array."""
+    if length is None:
+        return []
+    sizes = ua.Variant([length], ua.VariantType.UInt32, is_array=True)
+    rank = ua.Variant(ua.ValueRank.OneDimension.value, ua.VariantType.Int32)
+    return [(ua.AttributeIds.ValueRank, rank), (ua.AttributeIds.ArrayDimensions, sizes)]
 
 
 async def main() -> None:

@@ -44,7 +44,7 @@ MOST_SAMPLES = 10_000  # in one answer; the client gets the rest with the contin
 
 
 def type_of(meta: Known) -> ua.VariantType:
-    return TYPES.get(meta["type"], Type.String)
+    return TYPES.get(meta["type"].partition("[")[0], Type.String)
 
 
 def data_value(known: Known, kind: ua.VariantType) -> ua.DataValue:
@@ -64,10 +64,15 @@ def variant_of(value: object, kind: ua.VariantType) -> ua.Variant | None:
     """Returns None if the type cannot hold the value."""
     if kind in (Type.Float, Type.Double) and type(value) is int:
         value = float(value)
-    expected = {Type.Boolean: bool, Type.String: str, Type.Float: float, Type.Double: float}
-    if type(value) is not expected.get(kind, int):
-        return None
-    variant = ua.Variant(value, kind)
+    if isinstance(value, list):
+        if any(variant_of(one, kind) is None for one in value):
+            return None
+        variant = ua.Variant(value, kind, is_array=True)
+    else:
+        expected = {Type.Boolean: bool, Type.String: str, Type.Float: float, Type.Double: float}
+        if type(value) is not expected.get(kind, int):
+            return None
+        variant = ua.Variant(value, kind)
     try:
         variant_to_binary(variant)
     except (ua.UaError, struct.error, OverflowError):

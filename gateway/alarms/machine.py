@@ -147,7 +147,7 @@ class Alarm:
     def judge(self, value: Value, now: float, time: int) -> Event | None:
         """Applies a good value. Call `elapse` with the same time before it."""
         self.good, self.value = True, value
-        if isinstance(value, str):
+        if isinstance(value, (str, tuple)):
             return None
         for condition in self._conditions:
             condition.judge(value, now)

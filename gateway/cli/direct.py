@@ -17,8 +17,9 @@ from gateway.config.commands import check_command, line_of
 from gateway.engine.device import Device
 from gateway.engine.requests import CommandResult
 from gateway.engine.unsolicited import unsolicited_tags
-from gateway.errors import BadValue, LineDown
+from gateway.errors import BadValue, GatewayError, LineDown
 from gateway.line import build
+from gateway.line.groups import ended
 from gateway.line.line import Line, SampleSink
 from gateway.tags import Reason, Sample, Tag, WriteResult, bad
 from gateway.tags.mirror import Mirror
@@ -27,6 +28,7 @@ from gateway.values import Value
 T = TypeVar("T")
 SERVED = "is on a served line: only the running gateway has it, without --direct"
 LISTEN_FOR = 5.0  # seconds, for unsolicited frames
+WRITE_WITHIN = 30.0  # seconds for several tags
 
 
 class _Once:
@@ -117,17 +119,34 @@ async def follow(config: Config, sink: SampleSink) -> None:
 async def write(config: Config, tag: Tag, value: Value) -> WriteResult:
     """Writes one tag. Raises `GatewayError`; `BadValue` only before anything is sent."""
     units = tag.encode(value)
-    (line_config,) = (line for line in config.lines if tag in line.tags)
+    async with _writing(config, [tag]) as (line, device):
+        return await line.write(device, tag, units)
+
+
+async def write_group(
+    config: Config, values: Sequence[tuple[Tag, Value]]
+) -> list[WriteResult | GatewayError]:
+    """Writes tags of one device in their order; returns the outcome of each. Raises as `write`."""
+    units = [(tag, tag.encode(value)) for tag, value in values]
+    async with _writing(config, [tag for tag, _ in values]) as (line, device):
+        return await ended(line.write_group(device, units), WRITE_WITHIN)
+
+
+@asynccontextmanager
+async def _writing(config: Config, tags: Sequence[Tag]) -> AsyncIterator[tuple[Line, Device]]:
+    """Opens the line of the tags, which are of one device, and polls nothing."""
+    first = tags[0]
+    (line_config,) = (line for line in config.lines if first in line.tags)
     if line_config.serve:
-        raise BadValue(f"{tag.key} {SERVED}")
-    if not any(device.enabled for device in line_config.devices if device.name == tag.device):
-        raise BadValue(f"device {tag.device} is disabled")
-    line = _line(line_config, {tag.device}, [tag], _Once())
+        raise BadValue(f"{first.key} {SERVED}")
+    if not any(device.enabled for device in line_config.devices if device.name == first.device):
+        raise BadValue(f"device {first.device} is disabled")
+    line = _line(line_config, {first.device}, tags, _Once())
     (device,) = line.engine.devices
     device.poll_nothing()
     async with _running(line):
         await line.tried.wait()
-        return await line.write(device, tag, units)
+        yield line, device
 
 
 async def control(config: Config, device: str, command: str, argument: str) -> CommandResult:

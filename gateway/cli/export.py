@@ -22,7 +22,7 @@ from gateway.values import BYTES, Kind
 
 _FIRST = ("Device", "Name", "Address", "Type", "Unit", "Scale", "Offset", "Every", "R/W")
 _OWN = {"type", "raw_type", "address", "unit", "scale", "offset", "every", "write", "deadband"}
-_OWN |= {"clamp", "enum", "counter"}
+_OWN |= {"clamp", "enum", "counter", "length"}
 _TIMES = {"every", "heartbeat", "debounce"}
 
 
@@ -134,7 +134,7 @@ def _order(tag: Tag) -> Mapping[str, object]:
     if kind.kind in BYTES:
         return {"Byte": tag.layout.byte.value}
     found = {"Byte order": tag.layout.byte_order.value}
-    if kind.is_number and kind.words > 1:
+    if kind.is_number and kind.element.words > 1:
         found["Word order"] = tag.layout.word_order.value
     return found
 

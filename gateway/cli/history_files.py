@@ -1,6 +1,7 @@
 """Files of exported history: CSV for every program, Parquet for data tools."""
 
 import csv
+import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import islice
@@ -47,6 +48,8 @@ def _cell(value: Value | None, is_time: bool, comma: bool) -> object:
             return rfc3339(value)
         case float():
             return repr(value).replace(".", ",") if comma else repr(value)
+        case tuple():
+            return json.dumps(value)
     return value
 
 
@@ -124,13 +127,15 @@ def _parquet_writer(columns: Sequence[Column]) -> Callable[[Path, Rows], int]:
 
 
 def _number(value: Value | None) -> float | None:
-    return None if value is None or isinstance(value, str) else float(value)
+    return None if value is None or isinstance(value, (str, tuple)) else float(value)
 
 
 def _text(value: Value | None) -> str | None:
-    """Returns what is no exact float: texts, and long whole numbers."""
+    """Returns what is no exact float: texts, long whole numbers, and arrays as JSON."""
     if isinstance(value, int) and abs(value) > _EXACT:
         return str(value)
+    if isinstance(value, tuple):
+        return json.dumps(value)
     return value if isinstance(value, str) else None
 
 

@@ -202,7 +202,7 @@ class View:
 def _raw(sample: Sample | None) -> int | None:
     if sample is None or sample.quality is not Quality.GOOD:
         return None
-    return int(sample.value or 0)
+    return int(sample.value) if isinstance(sample.value, int) else 0
 
 
 def view_of(config: Config, text: str, every: float = 1.0) -> View:

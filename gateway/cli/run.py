@@ -98,7 +98,7 @@ def next_steps(config: Config, path: Path, command: str) -> str:
         lines.append(f"  {command} read {file} {tags[0].key}")
     simulated = (tag for line in config.lines if line.simulated for tag in line.tags)
     for tag in simulated:  # a proposed write must move no machine
-        if tag.write is not None:
+        if tag.write is not None and tag.element is None:
             lines.append(f"  {command} write {file} {tag.key} {_example(tag)}")
             break
     lines.append("Ctrl-C ends it.")

@@ -85,4 +85,6 @@ def value_text(value: object) -> str:
     """Returns a value as JSON and YAML write it, without control characters."""
     if isinstance(value, bool):
         return {True: "true", False: "false"}[value]
+    if isinstance(value, (list, tuple)):
+        return printable(json.dumps(value))
     return printable(str(value))

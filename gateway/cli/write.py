@@ -1,7 +1,10 @@
-"""The `write` command: writes one tag and prints the outcome."""
+"""The `write` command: writes one tag, or several of a device, and prints the outcome."""
 
 import json
 import sys
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Annotated
 
 import orjson
@@ -23,42 +26,120 @@ _USER_MISTAKES = {Problem.BAD_VALUE, Problem.NOT_WRITABLE, Problem.UNKNOWN_TAG}
 
 def write(
     config: ConfigPath,
-    tag: Annotated[str, typer.Argument(metavar="TAG", help="device/tag")],
-    value: Annotated[
-        str, typer.Argument(metavar="VALUE", help="JSON: true, 12.5, AB; on and off for bits")
+    tag: Annotated[str, typer.Argument(metavar="TAG", help="device/tag; a device for several")],
+    values: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="VALUE",
+            help="JSON: true, 12.5, AB; on and off for bits. Of a device: tag=value ...",
+        ),
     ],
     without_gateway: Direct = False,
     as_json: AsJson = False,
 ) -> None:
-    """Write one tag and print the reply of the PLC."""
+    """Write one tag, or several tags of a device, and print the reply of the PLC."""
     loaded = load(config)
     known = tags_by_key(loaded)
-    target = known.get(tag)
+    if any(device.name == tag for device in loaded.devices):
+        group = _group(config, known, tag, values)
+        answer = _write_group(loaded, tag, group, known, directly=without_gateway)
+        lines = _group_lines(tag, answer)
+    else:
+        if len(values) > 1:
+            raise ConfigError(f"{tag} takes one value; for several tags name their device")
+        value = _value(config, known, tag, values[0])
+        answer = _write_one(loaded, known[tag], value, directly=without_gateway)
+        lines = [(tag, answer)]
+    if as_json:
+        print(json.dumps(answer))
+    else:
+        served = {one.name for one in loaded.devices if one.served}
+        for key, end in lines:
+            if "error" in end:
+                err.print(outcome(key, end), style="red")
+            else:
+                print(outcome(key, end, held=key.partition("/")[0] in served))
+    if "error" in answer:
+        sys.exit(error_code(answer))
+
+
+def _group(
+    config: Path, known: Mapping[str, Tag], device: str, texts: Sequence[str]
+) -> dict[str, Value]:
+    """Returns the values by tag. Raises `ConfigError` with every mistake."""
+    group, mistakes = dict[str, Value](), list[str]()
+    for text in texts:
+        name, is_pair, value = text.partition("=")
+        if not is_pair:
+            mistakes.append(f"{text} is no tag=value, as in {device} recipe/a=1 recipe/b=2")
+        elif name in group:
+            mistakes.append(f"{device}/{name} is named twice")
+        else:
+            try:
+                group[name] = _value(config, known, f"{device}/{name}", value)
+            except (ConfigError, BadValue) as error:
+                mistakes.append(str(error))
+    if mistakes:
+        raise ConfigError("\n".join(mistakes))
+    return group
+
+
+def _value(config: Path, known: Mapping[str, Tag], name: str, text: str) -> Value:
+    """Returns the value that the text means for the tag. Raises `ConfigError`, `BadValue`."""
+    target = known.get(name)
     if target is None:
-        raise ConfigError(f"there is no tag {tag} in {config}{suggestion(tag, known)}")
+        raise ConfigError(f"there is no tag {name} in {config}{suggestion(name, known)}")
     if target.write is None:
         if target.inputs:
-            raise ConfigError(f"{tag} cannot be written: its value follows from other reads")
-        raise ConfigError(f"{tag} cannot be written: it has no `write: true` in {config}")
-    parsed = _parsed(value, target)
+            raise ConfigError(f"{name} cannot be written: its value follows from other reads")
+        raise ConfigError(f"{name} cannot be written: it has no `write: true` in {config}")
+    parsed = _parsed(text, target)
     try:
         target.encode(parsed)
     except BadValue as error:
-        raise BadValue(f"{tag}: {error}") from None
-    if without_gateway:
-        answer = _write_directly(loaded, target, parsed)
-    else:
-        with connected(loaded, err.print) as client:
-            answer = client.write(tag, parsed)
-    if as_json:
-        print(json.dumps(answer))
-    elif "error" in answer:
-        err.print(outcome(tag, answer), style="red")
-    else:
-        held = any(one.served for one in loaded.devices if one.name == target.device)
-        print(outcome(tag, answer, held=held))
-    if "error" in answer:
-        sys.exit(error_code(answer))
+        raise BadValue(f"{name}: {error}") from None
+    return parsed
+
+
+def _write_one(config: Config, tag: Tag, value: Value, *, directly: bool) -> dict[str, object]:
+    if directly:
+        return _write_directly(config, tag, value)
+    with connected(config, err.print) as client:
+        return client.write(tag.key, value)
+
+
+def _write_group(
+    config: Config,
+    device: str,
+    values: Mapping[str, Value],
+    known: Mapping[str, Tag],
+    *,
+    directly: bool,
+) -> dict[str, object]:
+    if not directly:
+        with connected(config, err.print) as client:
+            return client.write(device, dict(values))
+    from gateway.cli import direct
+
+    tags = [(known[f"{device}/{name}"], value) for name, value in values.items()]
+    started = time.monotonic()
+    try:
+        ends = direct.run(direct.write_group(config, tags))
+    except GatewayError as error:
+        return _decoded(payload.outcome(payload.failure(error)))
+    results = {
+        name: payload.failure(end) if isinstance(end, GatewayError) else end
+        for name, end in zip(values, ends, strict=True)
+    }
+    return _decoded(payload.outcome(payload.GroupResult(results, time.monotonic() - started)))
+
+
+def _group_lines(device: str, answer: dict[str, object]) -> list[tuple[str, dict[str, object]]]:
+    """Returns each tag with its outcome, or the one of the whole."""
+    tags = answer.get("tags")
+    if not isinstance(tags, dict):
+        return [(device, answer)]
+    return [(f"{device}/{name}", end) for name, end in tags.items()]
 
 
 def _parsed(text: str, tag: Tag) -> Value:
@@ -66,7 +147,7 @@ def _parsed(text: str, tag: Tag) -> Value:
     if tag.names is not None and text in tag.names.by_number.values():
         return text  # `on` is a name here
     kind, parsed = tag.layout.type.kind, parse_value(text)
-    if kind is Kind.BOOL and text.lower() in _SWITCH:
+    if kind is Kind.BOOL and text.lower() in _SWITCH and tag.element is None:
         return _SWITCH[text.lower()]
     if kind is Kind.STRING and not isinstance(parsed, str):
         return text  # 12 is a text for this tag
@@ -78,9 +159,12 @@ def _write_directly(config: Config, tag: Tag, value: Value) -> dict[str, object]
     from gateway.cli import direct
 
     try:
-        encoded = payload.outcome(direct.run(direct.write(config, tag, value)))
+        return _decoded(payload.outcome(direct.run(direct.write(config, tag, value))))
     except GatewayError as error:
-        encoded = payload.outcome(payload.failure(error))
+        return _decoded(payload.outcome(payload.failure(error)))
+
+
+def _decoded(encoded: bytes) -> dict[str, object]:
     answer: dict[str, object] = orjson.loads(encoded)
     return answer
 

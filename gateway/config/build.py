@@ -7,6 +7,7 @@ from pathlib import Path as FilePath
 from typing import Any
 
 from gateway.config import parsers
+from gateway.config.array_rules import check_overlaps
 from gateway.config.computed_tags import check_totals, with_computed
 from gateway.config.device_tags import DeviceTags, mapping
 from gateway.config.line_rules import check_line, line_wire
@@ -178,6 +179,7 @@ class Builder:
             served, tags = device.build(tags)
         else:
             only_served(raw, path, self.mistakes)
+            check_overlaps(driver, tags, (*path, "tags"), self.mistakes)
         default = driver.timing
         timing = Timing(
             reply_timeout=_either(settings.reply_timeout, default.reply_timeout),

@@ -106,6 +106,8 @@ class _Maker:
         tag = self.names.tags.get(key) or self.make(self.names.sources[key], way)
         if tag is not None and tag.layout.type.kind is Kind.STRING:
             raise ConfigError(f"{key} is a text: only numbers and bits can be calculated")
+        if tag is not None and tag.layout.type.count:
+            raise ConfigError(f"{key} is an array: only single numbers and bits can be calculated")
         return tag
 
     def _tag(self, source: ComputedSource, parsed: "Parsed", inputs: list[Tag]) -> Tag:

@@ -26,7 +26,7 @@ def kept_tag(
         return tag
     if counter:
         return _counted(tag, counter if isinstance(counter, CounterSection) else CounterSection())
-    fits = kind.kind is Kind.BOOL and tag.write is None and not tag.event
+    fits = kind == ValueType(Kind.BOOL) and tag.write is None and not tag.event
     if settings.debounce and fits:
         raw = _raw(tag)
         kept = replace(tag, kept=settings.debounce, inputs=(raw,), shape=None)

@@ -156,7 +156,8 @@ class TagDefaults(Section, ShapingDefaults):
     type: Annotated[
         ValueType | None, PlainValidator(parsers.value_type), WithJsonSchema(TYPE_SCHEMA)
     ] = None
-    """The type of the value; left out: bool for a bit, a whole number otherwise."""
+    """The type of the value, or of the elements of an array such as uint16[50]; left out: bool for
+    a bit, a whole number otherwise."""
     every: Interval = 1.0
     """The interval of reading."""
     scale: Annotated[Finite, AfterValidator(parsers.scale), WithJsonSchema(SCALE_SCHEMA)] = 1.0

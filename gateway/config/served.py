@@ -261,6 +261,9 @@ def check_sources(lines: Sequence[LineConfig], mistakes: Mistakes) -> None:
         if source is None:
             text = f"there is no tag {row.source}: write device/tag, a tag of this file"
             mistakes.add(place, text)
+        elif source.layout.type.count != row.tag.layout.type.count:
+            kinds = f"{row.source} is {source.layout.type}, and this is {row.tag.layout.type}"
+            mistakes.add(place, f"{kinds}: an array is shown as an array of the same length")
         elif _sort(source) != _sort(row.tag):
             kinds = f"{row.source} is {source.layout.type}, and this is {row.tag.layout.type}"
             mistakes.add(place, f"{kinds}: a value is shown as bit, number or text, not as another")

@@ -7,7 +7,7 @@ from pydantic import AfterValidator, Field, PlainValidator, WithJsonSchema, Wrap
 
 from gateway.config import parsers
 from gateway.transport.port import PortAddress
-from gateway.values import Kind, Order
+from gateway.values import BYTES, Kind, Order
 
 DURATION_SCHEMA: dict[str, Any] = {
     "type": "string",
@@ -30,10 +30,12 @@ FORMAT_SCHEMA = {
     ]
 }
 _KINDS = [kind.value for kind in Kind if kind is not Kind.STRING]
+_ARRAYS = "|".join(kind for kind in _KINDS if kind not in BYTES)
 TYPE_SCHEMA = {
     "anyOf": [
         {"type": "string", "enum": _KINDS},
         {"type": "string", "pattern": r"^string\[0*([1-9][0-9]?|1[0-9]{2}|2[0-4][0-9]|250)\]$"},
+        {"type": "string", "pattern": rf"^({_ARRAYS})\[0*([1-9][0-9]{{0,2}}|1[0-9]{{3}}|2000)\]$"},
     ]
 }
 DEADBAND_SCHEMA = {

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from gateway.config.alarm_rules import alarm_misfits, alarm_rule
+from gateway.config.array_rules import array_misfits, most_that_fits
 from gateway.config.kept_rules import kept_tag
 from gateway.config.messages import Mistakes, Path
 from gateway.config.model import ComputedSection, TagDefaults, TagSection, WriteSection
@@ -13,6 +14,7 @@ from gateway.protocols.driver import Address, AnyDriver, Area, Span, Unit
 from gateway.tags import Tag, WriteRule
 from gateway.values import BYTES, Byte, Kind, Layout, Order, ValueType
 
+_SIZES = {Unit.BIT: "bits", Unit.WORD: "words", Unit.DWORD: "values of 32 bits"}
 _WIDE = (Kind.INT32, Kind.UINT32, Kind.FLOAT32, Kind.BCD32)
 
 
@@ -171,10 +173,13 @@ def _type_misfit(kind: ValueType, area: Area, address: Address, driver: AnyDrive
     spelt = driver.spell(address)
     if area.unit is Unit.BIT or address.bit is not None:
         what = "is a bit" if address.bit is None else "is one bit of a word"
-        return None if kind.kind is Kind.BOOL else f"{spelt} {what}: it can only be bool"
+        fits = kind.kind is Kind.BOOL and not (kind.count and address.bit is not None)
+        return None if fits else f"{spelt} {what}: it can only be bool"
     if area.unit is Unit.DWORD:
         wide = ", ".join(_WIDE)
         return None if kind.kind in _WIDE else f"{spelt} has 32 bits, no {kind}: use one of {wide}"
+    if kind.kind is Kind.BOOL and kind.count:
+        return f"{spelt} is a word: a {kind} is an array of bits; for words write uint16[n]"
     if kind.kind is Kind.BOOL:
         bit = driver.spell(address._replace(bit=0))
         return f"{spelt} is a word: for one of its bits write {bit}, or name a type for the word"
@@ -193,11 +198,13 @@ def _misfits(
     area = driver.areas[span.area]
     first = driver.spell(Address(area.name, span.start))
     cost = driver.cost(span) if area.readable else driver.write_cost(span)
+    size = f"{span.size} {_SIZES[area.unit]}"
     if span.start + span.size - 1 > area.last:
         last = driver.spell(Address(area.name, area.last))
-        yield "address", f"a {kind} at {first} takes {span.size} words, but the last is {last}"
+        yield "address", f"a {kind} at {first} takes {size}, but the last is {last}"
     elif cost is None:
-        yield "type", f"a {kind} is {span.size} words, more than one request can carry"
+        most = most_that_fits(driver, span, kind, write=not area.readable) if kind.count else ""
+        yield "type", f"a {kind} is {size}, more than one request can carry{most}"
     if not area.readable and write is None:
         yield "write", f"{first} is never read at station {driver.station}: it needs write: true"
     if not area.readable and (address.bit is not None or kind.kind in BYTES):
@@ -219,7 +226,7 @@ def _unsuited(
     if area.unit is Unit.DWORD:
         for setting in filter(source.sets, ("word_order", "byte_order")):
             yield setting, f"{first} has 32 bits by nature: it needs no {setting}"
-    elif source.sets("word_order") and not (kind.is_number and kind.words > 1):
+    elif source.sets("word_order") and not (kind.is_number and kind.element.words > 1):
         yield "word_order", f"{spelt} is {kind}: only numbers of 32 or 64 bits have a word_order"
     if kind.kind in BYTES and source.sets("byte_order"):
         yield "byte_order", f"{spelt} is one byte: write byte: low or byte: high"
@@ -233,7 +240,9 @@ def only_for_numbers(source: TagSource, kind: ValueType) -> Iterator[tuple[str, 
     if not kind.is_number:
         for setting in filter(source.sets, ("scale", "offset", "deadband")):
             yield setting, f"a {kind} has no {setting}: only numbers have"
-    if source.own.alarm is not None:
+    if kind.count:
+        yield from array_misfits(source.own, kind)
+    elif source.own.alarm is not None:
         yield from alarm_misfits(source.own.alarm, kind)
 
 
@@ -255,7 +264,9 @@ def _write(
         if own:
             mistakes.add(path, f"{spelt} is read-only: {area.name} cannot be written")
         return None
-    if area.readable and driver.cost(span) is not None and driver.write_cost(span) is None:
+    # A long array is written with several requests, each of whole elements.
+    least = span._replace(size=span.size // kind.count) if kind.count else span
+    if area.readable and driver.cost(span) is not None and driver.write_cost(least) is None:
         if own:
             mistakes.add(path, f"{spelt} cannot be written with one request")
         return None
@@ -290,6 +301,6 @@ def check_bounds(source: TagSource, tag: Tag, mistakes: Mistakes) -> None:
         if bound is None:
             continue
         try:
-            tag.encode(int(bound) if bound == int(bound) else bound)
+            (tag.element or tag).encode(int(bound) if bound == int(bound) else bound)
         except BadValue as error:
             mistakes.add((*source.path, "write", setting), str(error))

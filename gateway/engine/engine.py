@@ -37,15 +37,12 @@ from gateway.engine.shorter_silences import ShorterSilences
 from gateway.engine.staleness import NEVER, Staleness
 from gateway.engine.stray import Stray
 from gateway.engine.unsolicited import UnsolicitedFrames
-from gateway.errors import (
-    BadValue,
-    Busy,
-    LineDown,
-)
+from gateway.errors import BadValue, Busy, LineDown
 from gateway.planning.wire_timing import WireTiming
 from gateway.tags import Reason, Tag
 
 GAP = 0.02  # seconds without a byte that end a run of noise
+TOO_MANY = "line {line}: too many requests are waiting; not sent"
 
 
 class Engine:
@@ -112,8 +109,8 @@ class Engine:
             in_flight.open_polls = in_flight.together = 1
             in_flight.charged = None if job.expedited else job.device
         else:
-            if type(job) is Write and (others := self.schedule.requests.companions(job)):
-                job = WriteTogether(job.device, [job, *others])
+            if type(job) is Write and (shared := self.schedule.requests.companions(job)):
+                job = WriteTogether(job.device, shared.writes, shared.run)
             if job.device.shapes is not None:
                 resync_around(job, job.device.shapes, now)
             in_flight.charged = job.device if isinstance(job, Probe) else None
@@ -221,9 +218,16 @@ class Engine:
         elif not self.schedule.reachable(device, now):
             self._effects.ended(request, offline(device))
         elif not queue.submit(request):
-            why = f"line {self.name}: too many requests are waiting; not sent"
-            self._effects.ended(request, Busy(why))
+            self._effects.ended(request, Busy(TOO_MANY.format(line=self.name)))
         self._set_deadline()
+        return self._effects.take()
+
+    def submit_group(self, writes: Sequence[Write], now: float) -> list[Effect]:
+        """Queues the writes of one group, or refuses them all."""
+        if self.schedule.requests.has_room(len(writes)):
+            return [effect for write in writes for effect in self.submit(write, now)]
+        for write in writes:
+            self._effects.ended(write, Busy(TOO_MANY.format(line=self.name)))
         return self._effects.take()
 
     def expedite(self, device: Device, tag: Tag) -> None:

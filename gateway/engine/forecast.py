@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from gateway.engine.ages import load_of, polled_blocks, worst_ages
 from gateway.engine.device import Device
+from gateway.engine.long_writes import long_write
 from gateway.engine.probes import seen_within
 from gateway.engine.reply_shapes import MARK_LONGEST
 from gateway.planning.planner import Block, shortest_round
@@ -119,8 +120,10 @@ def _longest_write(device: Device) -> float:
 
 def _write_seconds(device: Device, tag: Tag) -> float:
     """Returns the seconds of all transactions of one write of the tag, with its reads."""
-    cost, back = device.driver.write_cost(tag.span), device.driver.cost(tag.span)
-    seconds = 0.0 if cost is None else device.seconds(cost)
+    driver, back = device.driver, device.driver.cost(tag.span)
+    long = long_write(driver, tag.span, tag.layout.type.count)
+    costs = [driver.write_cost(span) for span in ([tag.span] if long is None else long.spans)]
+    seconds = sum(device.seconds(cost) for cost in costs if cost is not None)
     if back is not None:
         reads = (tag.part is not None) + (tag.write is not None and tag.write.verify)
         seconds += reads * device.seconds(back)

@@ -10,6 +10,7 @@ from gateway.engine.health import PAUSE_FIRST, PAUSE_LONGEST, State
 from gateway.engine.records import PollRecord
 from gateway.engine.reply_shapes import ReplyShapes
 from gateway.engine.requests import Command, Request, Resyncs, Write
+from gateway.engine.runs import needs_read, together
 from gateway.errors import BadValue, Busy, DeviceError, LineDown, Refused, Unclear
 from gateway.planning.planner import Block
 from gateway.protocols.driver import Span, UnnumberedReplies
@@ -88,10 +89,15 @@ class Probe:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WriteTogether:
-    """A job: several writes to one device in one request."""
+    """A job: several writes to one device in one request.
+
+    `run`: the addresses that they fill, of which parts of words are read first, and tags with
+    `verify` read back. None: scattered addresses.
+    """
 
     device: Device
     writes: Sequence[Write]
+    run: Span | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,6 +107,7 @@ class ReadBack:
     device: Device
     writes: Sequence[Write]
     refused: Refused
+    run: Span | None = None  # as in `WriteTogether`
 
     @property
     def error(self) -> Unclear:
@@ -110,10 +117,11 @@ class ReadBack:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Confirm:
-    """A job: resync, then read back the tag of an unclear write."""
+    """A job: resync, then read back the tag of an unclear write, or the run of several."""
 
     device: Device
-    write: Write
+    writes: Sequence[Write]
+    run: Span
     error: DeviceError  # the unclear end
     outstanding: Span | None
     token: int
@@ -211,9 +219,9 @@ def requests_of(job: Job) -> Sequence[Request]:
     match job:
         case Write() | Command():
             return (job,)
-        case WriteTogether(writes=writes) | ReadBack(writes=writes):
+        case WriteTogether(writes=writes) | ReadBack(writes=writes) | Confirm(writes=writes):
             return writes
-        case Confirm(write=write) | Repeat(write=write):
+        case Repeat(write=write):
             return (write,)
         case Settle(after=after):
             return requests_of(after)
@@ -227,9 +235,11 @@ def span_of(job: Unfinished) -> Span | None:
             return job.span
         case Write(tag=tag):
             return tag.span
-        case WriteTogether(writes=[first, *_]) | ReadBack(writes=[first, *_]):
-            return first.tag.span
-        case Confirm(write=write) | Repeat(write=write):
+        case WriteTogether(writes=[first, *_], run=run) | ReadBack(writes=[first, *_], run=run):
+            return run or first.tag.span
+        case Confirm(run=run):
+            return run
+        case Repeat(write=write):
             return write.tag.span
     return None
 
@@ -242,16 +252,22 @@ def resync_around(job: Transacted, shapes: ReplyShapes, now: float) -> None:
     match job:
         case Write() | WriteTogether():
             write = job if isinstance(job, Write) else job.writes[0]
-            before, after = shapes.written(write.tag, write.units, now)
+            span, units, reads = write.tag.span, write.units, write.tag.part is not None
+            if isinstance(job, WriteTogether) and job.run is not None:
+                span, reads = job.run, needs_read(job.writes)
+                units = together(span, job.writes, [0] * span.size)
+            before, after = shapes.written(span, units, reads, now)
             write.resyncs = Resyncs(token() if before else None, token() if after else None)
+            if (long := write.long) is not None and not shapes.tells_apart(long, units):
+                long.tokens = [token() for _ in long.spans]
             return
         case Command():
             before = not job.broadcast and shapes.may_be_extra(None, now)
             job.resyncs = Resyncs(before=token() if before else None)
         case Probe(outstanding=outstanding, token=marked):
             last = driver.resync_shape(outstanding, marked, device.probe_spans)
-        case Confirm(write=write):
-            last = driver.reply_shape(write.tag.span)
+        case Confirm(run=run):
+            last = driver.reply_shape(run)
     shapes.sent(last, now)
 
 
@@ -282,13 +298,13 @@ class Sent:
     """A write was acknowledged, or sent to stations that never acknowledge."""
 
     acknowledged: bool = True
-    held: Sequence[int] | None = None  # the units read back; None: without `verify`
+    held: Sequence[int] | None = None  # of the tag or run, read back; None: without `verify`
     refused_back: DeviceError | None = None  # reading back was refused
 
 
 @dataclass(frozen=True, slots=True)
 class HeldTogether:
-    """The units of several tags, read back one by one. None: the tag cannot be read."""
+    """The units of several tags that were read back. None: the tag cannot be read."""
 
     units: Sequence[Sequence[int] | Refused | None]
 

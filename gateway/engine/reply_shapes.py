@@ -8,6 +8,7 @@ addresses more. An extra reply then arrives as a stray frame.
 
 from collections.abc import Hashable, Sequence
 
+from gateway.engine.long_writes import LongWrite
 from gateway.engine.longer_reads import MOST_CHOICES, LongerReads
 from gateway.planning.bad_addresses import BadAddresses
 from gateway.planning.planner import Block
@@ -90,21 +91,32 @@ class ReplyShapes:
             self._prove(now)
         self.last = shape
 
-    def written(self, tag: Tag, units: Sequence[int], now: float) -> tuple[bool, bool]:
+    def written(
+        self, span: Span, units: Sequence[int], reads: bool, now: float
+    ) -> tuple[bool, bool]:
         """Notes a write. Returns True where a resync must precede it, and follow it.
 
         It precedes where the write begins with a read whose reply may be an extra one. It follows
-        where the acknowledgement may be an extra one.
+        where the acknowledgement may be an extra one. `reads`: the span is read before, because
+        parts of its words are written.
         """
-        replies = self._driver.write_shapes(tag.span, units)
-        if tag.part is not None:  # the word is read first
-            replies = (self._driver.reply_shape(tag.span), None)
+        replies = self._driver.write_shapes(span, units)
+        if reads:
+            replies = (self._driver.reply_shape(span), None)
         before, after = False, self.may_be_extra(replies[-1], now)
         for shape in replies[:-1]:
             before = now - self._used.get(shape, -NEVER) < self.quiet
             self._used[shape] = now
         self._sent(replies[-1], now)
         return before, after
+
+    def tells_apart(self, long: LongWrite, units: Sequence[int]) -> bool:
+        """Returns True if no acknowledgement of these requests can be taken for another."""
+        shapes, at = set[Hashable](), 0
+        for span in long.spans:
+            shapes.add(self._driver.write_shapes(span, units[at : at + span.size])[-1])
+            at += span.size
+        return None not in shapes and len(shapes) == len(long.spans)
 
     def may_be_extra(self, shape: Hashable, now: float) -> bool:
         """Returns True if an earlier reply to a write, or a refusal, may arrive once more.

@@ -6,7 +6,9 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from gateway.engine.device import Device
-from gateway.errors import GatewayError
+from gateway.engine.long_writes import LongWrite, long_write
+from gateway.engine.runs import run_of
+from gateway.errors import GatewayError, NotSent
 from gateway.protocols.driver import AnyDriver, Controllable, ScatteredWriter, Span
 from gateway.tags import Tag, WriteResult
 from gateway.values import Value
@@ -46,6 +48,14 @@ NO_RESYNCS = Resyncs()
 
 
 @dataclass(slots=True, eq=False)
+class Group:
+    """Writes of one client to one device. They are sent in their order; after the first that is
+    not done none is sent."""
+
+    failed: str = ""  # the tag of the first that was not done
+
+
+@dataclass(slots=True, eq=False)
 class Write:
     """A value for a tag. Times in seconds of the line's clock."""
 
@@ -56,11 +66,16 @@ class Write:
     within: float = WRITE_EXPIRY
     alone: bool = False  # refused together with others before any was done: now sent alone
     resyncs: Resyncs = NO_RESYNCS
+    group: Group | None = None
     value: Value = field(init=False)  # as the device will hold it, rounded to its steps
+    long: LongWrite | None = field(init=False, default=None)  # None: one request is enough
 
     def __post_init__(self) -> None:
         value = self.tag.from_units(self.units)
         self.value = False if value is None else value
+        if self.tag.span.size > 1:
+            elements = len(value) if isinstance(value, tuple) else 0
+            self.long = long_write(self.device.driver, self.tag.span, elements)
 
     @property
     def expires(self) -> float:
@@ -76,8 +91,8 @@ class Write:
 
     @property
     def latest(self) -> bool:
-        """True if only the last of several waiting writes is sent."""
-        return self.tag.write is not None and self.tag.write.latest
+        """True if only the last of several waiting writes is sent. In a group each is sent."""
+        return self.group is None and self.tag.write is not None and self.tag.write.latest
 
     def holds(self, units: Sequence[int]) -> bool:
         """Returns True if `units`, as read back, are the written value."""
@@ -121,18 +136,9 @@ class Command:
 Request = Write | Command
 
 
-def can_share(writes: Sequence[Write]) -> bool:
-    """Returns True if all these writes to one device fit in one request.
-
-    A known bad address goes alone: the device would refuse the others with it.
-    """
-    device = writes[0].device
-    driver, spans = device.driver, [write.tag.span for write in writes]
-    if not isinstance(driver, ScatteredWriter) or not all(write.plain for write in writes):
-        return False
-    if any(bad.overlaps(span) for bad in device.bad_addresses.bad for span in spans):
-        return False
-    return driver.scattered_write_cost(spans) is not None
+def after_failed(group: Group) -> NotSent:
+    """Returns the outcome of the writes that follow one that was not done."""
+    return NotSent(f"not sent, because {group.failed} before it failed")
 
 
 def why_not_commanded(driver: AnyDriver, command: str, *, control: bool) -> str:
@@ -143,6 +149,30 @@ def why_not_commanded(driver: AnyDriver, command: str, *, control: bool) -> str:
     if command not in known:
         return f"{command!r} is none of its commands: {', '.join(sorted(known))}"
     return "" if control else "`control: true` is missing in the file"
+
+
+class Companions(NamedTuple):
+    """Writes that share one request. `run`: the addresses that they fill; None: scattered."""
+
+    writes: Sequence[Write]
+    run: Span | None
+
+
+def _scattered(writes: Sequence[Write]) -> int:
+    """Returns how many of the first writes to one device fit in one request with several spans.
+
+    A known bad address goes alone: the device would refuse the others with it.
+    """
+    device = writes[0].device
+    driver, bad, spans = device.driver, device.bad_addresses.bad, list[Span]()
+    if isinstance(driver, ScatteredWriter):
+        for write in writes:
+            spans.append(write.tag.span)
+            if not write.plain or any(one.overlaps(spans[-1]) for one in bad):
+                return len(spans) - 1
+            if driver.scattered_write_cost(spans) is None:
+                return len(spans) - 1
+    return len(spans)
 
 
 class RequestQueue:
@@ -174,20 +204,40 @@ class RequestQueue:
         """Takes out the waiting writes that `write` replaces, if its tag has `latest`."""
         if not write.latest:
             return []
-        return self._out(lambda other: isinstance(other, Write) and other.tag is write.tag)
 
-    def companions(self, write: Write) -> list[Write]:
-        """Takes out the next writes to the device that fit in one request with this one."""
-        found: list[Write] = []
+        def replaced(other: Request) -> bool:
+            return isinstance(other, Write) and other.tag is write.tag and other.group is None
+
+        return self._out(replaced)
+
+    def companions(self, write: Write) -> Companions | None:
+        """Takes out the next writes to the device that share one request with this one; None: none.
+
+        Scattered addresses share one where the driver writes several spans at once. A run shares
+        one in a group only: a refused value of one client must not leave others in doubt.
+        """
+        if not self.waiting:
+            return None
+        group = write.group
+        if group is None and not isinstance(write.device.driver, ScatteredWriter):
+            return None
+        writes = [write]
         for request in self.waiting:
             if request.device is not write.device:
                 continue
-            if not isinstance(request, Write) or not can_share([write, *found, request]):
+            if not isinstance(request, Write) or request.group is not group:
                 break
-            found.append(request)
-        if found:
-            self._out(lambda request: request in found)
-        return found
+            writes.append(request)
+        if len(writes) == 1:
+            return None
+        count, run = (1, None) if group is None else run_of(writes)
+        if (scattered := _scattered(writes)) > count:
+            count, run = scattered, None
+        if count == 1:
+            return None
+        others = set(writes[1:count])
+        self._out(lambda request: request in others)
+        return Companions(writes[:count], run)
 
     def each_alone(self, writes: Sequence[Write]) -> None:
         """Puts back writes of which none was done: now one by one."""
@@ -198,6 +248,17 @@ class RequestQueue:
     def withdraw(self, device: Device | None = None) -> list[Request]:
         """Takes out all waiting requests, or those to one device."""
         return self._out(lambda request: device is None or request.device is device)
+
+    def of_group(self, group: Group) -> list[Write]:
+        """Takes out the waiting writes of a group."""
+        found = [one for one in self.waiting if isinstance(one, Write) and one.group is group]
+        if found:
+            members = set(found)
+            self._out(lambda request: request in members)
+        return found
+
+    def has_room(self, count: int) -> bool:
+        return len(self.waiting) + count <= MOST_WAITING
 
     def expired(self, now: float) -> list[Request]:
         """Takes out the requests that have waited too long."""

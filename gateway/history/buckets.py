@@ -11,9 +11,11 @@ from typing import NamedTuple
 
 from gateway.errors import BadValue
 from gateway.history.timerange import EARLIEST, TimeRange
+from gateway.numerals import Scalar
 from gateway.values import Value
 
 MOST_BUCKETS = 10_000  # of one tag, in one answer
+_WITHOUT_MEAN = (str, tuple)  # texts and arrays
 NOT_RECORDED = "not-recorded"  # nothing is known: before the first sample, or no gateway ran
 
 # From `time` on (ns since 1970) the value is valid; None: there is none, for the reason.
@@ -24,7 +26,7 @@ class Bucket(NamedTuple):
     """One bucket. Times are ns since 1970; `end` is the end of its part in the asked period.
 
     `known`: ns with a valid value. The four values are of this time; None if there was none, and
-    the first three are None for texts too. `good` and `bad` count samples.
+    the first three are None for texts and arrays too. `good` and `bad` count samples.
     """
 
     time: int
@@ -33,8 +35,8 @@ class Bucket(NamedTuple):
     known: int
     good: int
     bad: int
-    min: Value | None
-    max: Value | None
+    min: Scalar | None
+    max: Scalar | None
     mean: float | None
     last: Value | None
     reason: str | None  # of the last gap
@@ -68,8 +70,8 @@ class _Open:
         self.time = time
         self.start = start
         self.known = self.good = self.bad = 0
-        self.min: Value | None = None
-        self.max: Value | None = None
+        self.min: Scalar | None = None
+        self.max: Scalar | None = None
         self.mean = 0.0
         self.last: Value | None = None
         self.reason: str | None = None
@@ -79,7 +81,7 @@ class _Open:
         """The value is valid from now on."""
         self.has_begun = True
         self.last = value
-        if isinstance(value, str):
+        if isinstance(value, (str, tuple)):
             self.mean = math.nan
         elif self.min is None or self.max is None:
             self.min = self.max = value
@@ -106,7 +108,7 @@ class _Open:
             self.enter(value)
         self.known += duration
         # A running mean: a sum of large numbers would overflow.
-        if value.__class__ is not str:
+        if value.__class__ not in _WITHOUT_MEAN:
             self.mean += (value - self.mean) * (duration / self.known)  # type: ignore[operator]
 
     def closed(self, end: int) -> Bucket:
@@ -125,11 +127,11 @@ class _Open:
         )
 
     def _mean(self) -> float | None:
-        """Rounding does not lead out of the range of the values. A text has no mean."""
+        """Rounding does not lead out of the range of the values. Texts and arrays have no mean."""
         if self.min is None or self.max is None or math.isnan(self.mean):
             return None
         if not self.known:  # a sample at the last moment
-            return float(self.last or 0)
+            return float(self.last or 0)  # type: ignore[arg-type]  # a number
         return min(max(self.mean, float(self.min)), float(self.max))
 
 

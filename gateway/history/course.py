@@ -17,7 +17,7 @@ from gateway.history.buckets import MOST_BUCKETS, NOT_RECORDED, Bucket, Step, bu
 from gateway.history.damage import Damage
 from gateway.history.reader import Reader
 from gateway.history.recent import Identity, Recent, SortedRun
-from gateway.history.rows import Stored, step
+from gateway.history.rows import step
 from gateway.history.search import StoredRuns
 from gateway.history.timerange import EARLIEST, LATEST, TimeRange
 from gateway.tags import Quality, Reason, Sample, Tag
@@ -216,8 +216,7 @@ def _in_memory(steps: list[Step]) -> _Part:
 
 def _step_of(sample: Sample) -> Step:
     reason = None if sample.quality is Quality.GOOD else sample.reason or ""
-    stored: Stored = sample.value
-    return step(sample.time, stored, None, None if reason is None else str(reason))
+    return step(sample.time, sample.value, None, None if reason is None else str(reason))
 
 
 def _merged(parts: Sequence[_Part]) -> Iterator[Step]:

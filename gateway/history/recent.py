@@ -14,6 +14,7 @@ from typing import NamedTuple
 from gateway.tags import Sample
 
 MOST_RUNS = 8  # in memory; while the disk fails, the oldest is dropped for a new one
+ELEMENTS = 2  # of an array: they take about as much room as a sample
 
 
 class Identity(NamedTuple):
@@ -54,6 +55,7 @@ class Run:
     """Samples in the order of arrival. The event loop appends; the history thread does the rest."""
 
     started: float  # seconds of the monotonic clock
+    longest: int  # samples; fewer with arrays
     samples: list[Sample] = field(default_factory=list)
     by_tag: dict[str, list[Sample]] = field(default_factory=dict)
     closed: bool = False  # no sample is added any more
@@ -100,7 +102,7 @@ class Recent:
         self._clock = clock
         self._lock = threading.Lock()
         self._closed: list[Run] = []
-        self._newest = Run(clock())  # always open for the next sample
+        self._newest = Run(clock(), longest)  # always open for the next sample
 
     # -- event loop --
 
@@ -112,8 +114,10 @@ class Recent:
                 tag = sample.tag
                 if not tag.history:
                     continue
-                if len(run.samples) >= self._longest:
+                if len(run.samples) >= run.longest:
                     run = self._begin()
+                if tag.element is not None:
+                    run.longest -= tag.layout.type.count // ELEMENTS
                 run.samples.append(sample)
                 run.by_tag.setdefault(tag.key, []).append(sample)
                 self.recorded += 1
@@ -230,5 +234,5 @@ class Recent:
             oldest = self._closed.pop(0)
             oldest.dropped = True
             self.lost += len(oldest.samples) - oldest.stored
-        self._newest = Run(self._clock())
+        self._newest = Run(self._clock(), self._longest)
         return self._newest

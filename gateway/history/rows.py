@@ -8,6 +8,8 @@ import math
 from enum import IntEnum
 from typing import NamedTuple
 
+import orjson
+
 from gateway.tags import Quality, Reason, Sample, Tag
 from gateway.values import Value
 
@@ -21,6 +23,7 @@ class Kind(IntEnum):
     LONG = 1  # a whole number beyond 64 bits with sign, written in decimal
     NOT_A_NUMBER = 2  # SQLite would store NULL
     ODD_TEXT = 3  # text with surrogates, which is no valid UTF-8, as bytes
+    LIST = 4  # an array, written as JSON
 
 
 class Row(NamedTuple):
@@ -46,7 +49,7 @@ def from_row(tag: Tag, time: int, stored: Stored, kind: int | None, bad: str | N
 
 
 def step(
-    time: int, stored: Stored, kind: int | None, bad: str | None
+    time: int, stored: Stored | Value, kind: int | None, bad: str | None
 ) -> tuple[int, Value | None, str | None]:
     """Returns the time, the value, and the reason why there is none."""
     if bad is not None:
@@ -80,11 +83,13 @@ def _stored(value: Value | None) -> tuple[Stored, int | None]:
             except UnicodeEncodeError:
                 return value.encode("utf-8", "surrogatepass"), Kind.ODD_TEXT
             return value, None
+        case tuple():
+            return orjson.dumps(value).decode(), Kind.LIST
         case None:
             return None, None
 
 
-def _value(stored: Stored, kind: int | None) -> Value | None:
+def _value(stored: Stored | Value, kind: int | None) -> Value | None:
     match kind, stored:
         case None, int() | float() | str():
             return stored
@@ -96,5 +101,7 @@ def _value(stored: Stored, kind: int | None) -> Value | None:
             return math.nan
         case Kind.ODD_TEXT, bytes():
             return stored.decode("utf-8", "surrogatepass")
+        case Kind.LIST, str():
+            return tuple(orjson.loads(stored))
         case _:
             return None

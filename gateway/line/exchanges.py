@@ -19,6 +19,7 @@ from gateway.engine.requests import Command, Write
 from gateway.line.wire_log import Performed
 from gateway.planning.planner import Block, describe
 from gateway.tags import Sample
+from gateway.values import Value
 
 _VERBS = {
     Write: "write",
@@ -27,7 +28,7 @@ _VERBS = {
     Confirm: "confirm",
     Repeat: "repeat",
 }
-_SHOWN = 4  # values of a read
+_MOST = 4  # values of a read, elements of an array
 
 
 class Exchange(NamedTuple):
@@ -69,9 +70,19 @@ def samples_of(performed: Performed) -> Sequence[Sample]:
     return _samples(job.block, cast("Sequence[Any]", result))
 
 
+def _text(value: Value | None) -> str:
+    """Returns a value, or the first elements of an array: `[1, 2, 3, 4 and 46 more]`."""
+    if not isinstance(value, tuple):
+        return str(value)
+    more = f" and {len(value) - _MOST} more" if len(value) > _MOST else ""
+    return f"[{', '.join(map(str, value[:_MOST]))}{more}]"
+
+
 def shown(samples: Sequence[Sample]) -> str:
     """Returns the first values as `speed 12.5, level 3 and 4 more`."""
-    first = [f"{one.tag.name} {one.value}" for one in samples[:_SHOWN] if one.value is not None]
+    first = [
+        f"{one.tag.name} {_text(one.value)}" for one in samples[:_MOST] if one.value is not None
+    ]
     more = len(samples) - len(first)
     return ", ".join(first) + (f" and {more} more" if more else "")
 
@@ -89,7 +100,7 @@ def _what(job: Transacted) -> tuple[str, str]:
         case Command(name=name):
             return "write", f"command {name}"
     writes = ", ".join(
-        f"{one.tag.name} = {one.value}" for one in requests_of(job) if isinstance(one, Write)
+        f"{one.tag.name} = {_text(one.value)}" for one in requests_of(job) if isinstance(one, Write)
     )
     return "write", f"{_VERBS[type(job)]} {writes}"
 

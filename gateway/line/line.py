@@ -7,7 +7,7 @@ back; the engine's effects go to the clients, the sample sink and the log.
 import asyncio
 import random
 import time
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any, NoReturn, Protocol
@@ -19,7 +19,7 @@ from gateway.engine.device import Device, DeviceSettings
 from gateway.engine.effects import Effect, LogEvent, OnlineChange, Pause, RequestEnded, Samples
 from gateway.engine.engine import Engine
 from gateway.engine.jobs import Idle, Poll, Reopen, Settle, Traffic
-from gateway.engine.requests import WRITE_EXPIRY, Command, Outcome, Request, Write
+from gateway.engine.requests import WRITE_EXPIRY, Command, Group, Outcome, Request, Write
 from gateway.errors import GatewayError, LineDown
 from gateway.line.changing import Changeable, WaitingChange
 from gateway.line.channel import NEVER, Alarm, Channel, Echo
@@ -92,6 +92,23 @@ class Line:
         The future ends when the device has acknowledged, or raises `GatewayError`.
         """
         return self._submit(Write(device, tag, units, _now(), within))
+
+    def write_group(
+        self,
+        device: Device,
+        values: Iterable[tuple[Tag, Sequence[int]]],
+        within: float = WRITE_EXPIRY,
+    ) -> list[asyncio.Future[WriteResult]]:
+        """Writes several tags in their order, as `write`. After the first that is not done the
+        others are not sent: they raise `NotSent`."""
+        now, group = _now(), Group()
+        writes = [Write(device, tag, units, now, within, group=group) for tag, units in values]
+        loop = asyncio.get_running_loop()
+        ends = [loop.create_future() for _ in writes]
+        self._outcomes.update(zip(writes, ends, strict=True))
+        self._deliver(self.engine.submit_group(writes, now))
+        self._wake.set()
+        return ends
 
     def command(
         self, device: Device, name: str, argument: str, within: float = WRITE_EXPIRY
@@ -218,6 +235,7 @@ class Line:
     async def _close(self) -> None:
         channel, self._channel = self._channel, None
         self._transaction = None
+        self._expiry.alarm.cancel()  # its timer would keep an ended line alive
         if channel is not None:
             await channel.close()
 

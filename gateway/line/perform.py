@@ -1,6 +1,7 @@
 """Performs one job on an open transaction: calls the driver, and decides nothing."""
 
 from collections.abc import Awaitable, Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -20,7 +21,9 @@ from gateway.engine.jobs import (
     Transacted,
     WriteTogether,
 )
+from gateway.engine.long_writes import LongWrite
 from gateway.engine.requests import Command, Write
+from gateway.engine.runs import needs_read, own_units, together, verified
 from gateway.errors import (
     BadValue,
     Busy,
@@ -33,7 +36,7 @@ from gateway.errors import (
 )
 from gateway.line.transaction import Transaction
 from gateway.planning.planner import Block
-from gateway.protocols.driver import Controllable, Monitor, ScatteredWriter, Span, Talk
+from gateway.protocols.driver import AnyDriver, Controllable, Monitor, ScatteredWriter, Span, Talk
 
 T = TypeVar("T")
 TWO_REPLIES = "two replies arrived, and the first may be that to an earlier write"
@@ -87,6 +90,8 @@ async def _perform(job: Transacted, transaction: Transaction) -> Result:
             return Resynced(await driver.resync(talk, outstanding, token, spans))
         case Write() | Repeat():
             return await _write(job.write if isinstance(job, Repeat) else job, transaction)
+        case WriteTogether(run=Span() as run):
+            return await _write_run(job, run, transaction)
         case WriteTogether(writes=writes) if isinstance(driver, ScatteredWriter):
             parts = [(write.tag.span, write.units) for write in writes]
             sending = driver.write_scattered(transaction, parts)
@@ -157,7 +162,11 @@ async def _write(write: Write, talk: Transaction) -> Sent:
     if tag.part is not None:
         (word,) = await driver.read(talk, tag.span)
         units = [tag.part.into(word, write.units[0])]
-    acknowledged = await _only_reply(driver.write(talk, tag.span, units), write, talk)
+    if write.long is None:
+        sending = driver.write(talk, tag.span, units)
+    else:
+        sending = _one_by_one(write, write.long, talk)
+    acknowledged = await _only_reply(sending, write, talk)
     if not acknowledged or tag.write is None or not tag.write.verify:
         return Sent(acknowledged)
     try:
@@ -166,8 +175,58 @@ async def _write(write: Write, talk: Transaction) -> Sent:
         return Sent(refused_back=error)
 
 
-async def _only_reply(sending: Awaitable[bool], write: Write, talk: Transaction) -> bool:
-    """Sends a write, then the resync that it needs. Raises `Unclear` if two replies arrived."""
+async def _one_by_one(write: Write, long: LongWrite, talk: Transaction) -> bool:
+    """Sends the requests of a long write, and notes how far it comes."""
+    driver, at = write.device.driver, 0
+    for number, span in enumerate(long.spans):
+        long.asked = max(long.asked, number + 1)
+        try:
+            await driver.write(talk, span, write.units[at : at + span.size])
+        except Busy:
+            long.asked = max(long.done, number)
+            raise
+        if long.tokens:
+            await _prove_only_reply(write, span, long.tokens[number], talk)
+        long.done = max(long.done, number + 1)
+        at += span.size
+    return True
+
+
+async def _write_run(job: WriteTogether, run: Span, talk: Transaction) -> Sent:
+    """Writes a run of several writes, and reads it back once if a tag has `verify`."""
+    driver, first = job.device.settings.driver, job.writes[0]
+    held: Sequence[int] = [0] * run.size
+    if first.resyncs.before is not None:
+        await driver.resync(talk, run, first.resyncs.before, job.device.probe_spans)
+    if needs_read(job.writes):
+        held = await _read_before(driver, run, talk)
+    sending = driver.write(talk, run, together(run, job.writes, held))
+    acknowledged = await _only_reply(sending, first, talk, run)
+    if not acknowledged or not any(verified(write.tag) for write in job.writes):
+        return Sent(acknowledged)
+    try:
+        return Sent(held=await driver.read(talk, run))
+    except Refused as error:
+        return Sent(refused_back=error)
+
+
+async def _read_before(driver: AnyDriver, run: Span, talk: Transaction) -> Sequence[int]:
+    """Reads the words of a run. A refusal of this read shows that nothing was written."""
+    try:
+        return await driver.read(talk, run)
+    except Refused as error:
+        raise Refused(
+            str(error), code=error.code, refusal=error.refusal, unexecuted=True
+        ) from error
+
+
+async def _only_reply(
+    sending: Awaitable[bool], write: Write, talk: Transaction, run: Span | None = None
+) -> bool:
+    """Sends a write, then the resync that it needs. Raises `Unclear` if two replies arrived.
+
+    `write`: the first of several; `run`: their addresses.
+    """
     refused: Refused | None = None
     talk.guard(write.submitted)
     try:
@@ -177,22 +236,35 @@ async def _only_reply(sending: Awaitable[bool], write: Write, talk: Transaction)
     finally:
         talk.guard(None)
     if write.resyncs.after is not None:
-        try:
-            await _resync_after(write, write.resyncs.after, talk)
-        except Refused as error:
-            raise Unclear(TWO_REPLIES) from error
-        if talk.traffic.extra:
-            raise Unclear(TWO_REPLIES)
+        await _prove_only_reply(write, run or write.tag.span, write.resyncs.after, talk)
     if refused is not None:
         raise refused
     return acknowledged
 
 
-async def _resync_after(write: Write, token: int, talk: Transaction) -> None:
+async def _prove_only_reply(write: Write, span: Span, token: int, talk: Transaction) -> None:
+    """Sends the resync after a write. Raises `Unclear` if another reply than its own arrived."""
+    try:
+        await _resync_after(write, span, token, talk)
+        proven = not talk.traffic.extra
+    except Refused as error:
+        _doubt(write)
+        raise Unclear(TWO_REPLIES) from error
+    if not proven:
+        _doubt(write)
+        raise Unclear(TWO_REPLIES)
+
+
+def _doubt(write: Write) -> None:
+    if write.long is not None:
+        write.long.doubt()
+
+
+async def _resync_after(write: Write, span: Span, token: int, talk: Transaction) -> None:
     """Sends the resync. If the device lacks its addresses, those of the last read follow."""
     device = write.device
     try:
-        await device.driver.resync(talk, write.tag.span, token, device.probe_spans)
+        await device.driver.resync(talk, span, token, device.probe_spans)
     except Refused:
         if device.last_read is None:
             raise
@@ -200,7 +272,12 @@ async def _resync_after(write: Write, token: int, talk: Transaction) -> None:
 
 
 async def _read_back(job: ReadBack, talk: Talk[Any]) -> HeldTogether:
-    driver = job.device.driver
+    """Reads the run with one request. If it is refused, the tags follow one by one."""
+    driver, run = job.device.driver, job.run
+    if run is not None and driver.cost(run) is not None:
+        with suppress(Refused):
+            whole = await driver.read(talk, run)
+            return HeldTogether([own_units(write, run, whole) for write in job.writes])
     held: list[Sequence[int] | Refused | None] = []
     for span in (write.tag.span for write in job.writes):
         try:
@@ -211,11 +288,11 @@ async def _read_back(job: ReadBack, talk: Talk[Any]) -> HeldTogether:
 
 
 async def _confirm(job: Confirm, talk: Talk[Any]) -> Sent:
-    driver, tag = job.device.driver, job.write.tag
+    driver = job.device.driver
     try:
         await driver.resync(talk, job.outstanding, job.token, job.device.probe_spans)
     except Refused as error:
         raise Unclear(f"its resync was refused too: {error}") from error
-    if tag.write is None or not tag.write.verify:
+    if not any(verified(write.tag) for write in job.writes):
         return Sent()
-    return Sent(held=await driver.read(talk, tag.span))
+    return Sent(held=await driver.read(talk, job.run))

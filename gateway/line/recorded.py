@@ -75,7 +75,7 @@ def courses(line: LineConfig, log: Iterable[LoggedPiece]) -> Mapping[str, Course
         if len(bad) < len(samples):
             settle()
         for sample in samples:
-            if sample.value is not None:
+            if isinstance(sample.value, int):  # a bit or a word
                 unit = _unit(sample.tag.span)
                 change = Change(event.at, unit, int(sample.value))
                 doubtful[sample.tag.device, unit] = change

@@ -76,21 +76,33 @@ class Serving:
 
         Raises `BadValue` and `Busy` before anything changed.
         """
+        [result] = await self.write_group([(tag, value)])
+        return result
+
+    async def write_group(self, values: Sequence[tuple[Tag, Value]]) -> list[WriteResult]:
+        """Holds several values, all at once, as `write`."""
         loop = asyncio.get_running_loop()
-        started, row = loop.time(), self._rows[tag]
-        if row.tag.write is None:
-            raise BadValue(f"{tag.key} is written by the master")
-        real = tag.from_units(tag.encode(value))
-        if real is None:
-            raise BadValue(f"{value!r} cannot be read back after the write")
+        started, held = loop.time(), dict[Tag, Value]()
+        for tag, value in values:
+            if tag not in self._rows or self._rows[tag].tag.write is None:
+                raise BadValue(f"{tag.key} is written by the master")
+            real = tag.from_units(tag.encode(value))
+            if real is None:
+                raise BadValue(f"{value!r} cannot be read back after the write")
+            held[tag] = real
         async with self._saving:  # writes keep their order
-            if row.retain and self._file is not None:
-                changed = self._retained | {tag: real}
+            retained = {tag: real for tag, real in held.items() if self._rows[tag].retain}
+            if retained and self._file is not None:
+                changed = self._retained | retained
                 await asyncio.to_thread(self._file.save, changed)
                 self._retained = changed
             at = self._wall()
-            self._sink.samples([good(tag, real, at)])
-        return WriteResult(real, at, loop.time() - started, verified=row.tag.write.verify)
+            self._sink.samples([good(tag, real, at) for tag, real in held.items()])
+        took = loop.time() - started
+        return [
+            WriteResult(real, at, took, verified=tag.write is not None and tag.write.verify)
+            for tag, real in held.items()
+        ]
 
     def restore(self) -> None:
         """Publishes the held values of before the start."""

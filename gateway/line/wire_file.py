@@ -11,6 +11,8 @@ from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from typing import Any, NamedTuple
 
+from gateway.values import Value
+
 _PIECE = re.compile(
     r"(?:^|\s)(?:(?P<at>\d+\.\d+)|(?P<line>[^\s<>]+)) (?P<way>[<>]) "
     r"(?P<data>[0-9a-f]{2}(?: [0-9a-f]{2})*)$"
@@ -31,7 +33,7 @@ class LoggedValue(NamedTuple):
 
     at: float
     tag: str  # device/tag
-    value: bool | float | str | None
+    value: Value | None
 
 
 def entries(lines: Iterable[str], line: str | None = None) -> Iterator[LoggedPiece | LoggedValue]:
@@ -48,7 +50,9 @@ def entries(lines: Iterable[str], line: str | None = None) -> Iterator[LoggedPie
                 yield LoggedPiece(at, match["way"], bytes.fromhex(match["data"]))
         elif (found := _VALUE.match(text)) is not None:
             with suppress(ValueError):  # no JSON: another note
-                yield LoggedValue(float(found[1]), found[2], json.loads(found[3]))
+                value = json.loads(found[3])
+                value = tuple(value) if isinstance(value, list) else value
+                yield LoggedValue(float(found[1]), found[2], value)
 
 
 def event_lines(event: dict[str, Any]) -> str:

@@ -13,7 +13,7 @@ from gateway.northbound.commands import Commands
 from gateway.northbound.inbox import Inbox
 from gateway.northbound.interfaces import History, Plant
 from gateway.northbound.keys import Keys
-from gateway.northbound.payload import Failure
+from gateway.northbound.payload import Failure, GroupResult
 from gateway.northbound.queries import Queries, StatusDocuments
 from gateway.northbound.replies import Replies
 from gateway.northbound.tag_index import TagIndex
@@ -64,7 +64,9 @@ class Incoming:
         """Counts of writes and commands by outcome, and their times."""
         return self._audit.counts.document()
 
-    async def write(self, tag: str, data: bytes, by: str, arrived: float) -> WriteResult | Failure:
+    async def write(
+        self, tag: str, data: bytes, by: str, arrived: float
+    ) -> WriteResult | Failure | GroupResult:
         """Writes for a client that another part of the gateway has admitted as `by`. `data` is the
         payload as on Zenoh; `arrived`: by the loop's clock."""
         return await self._admitted.write(self._keys.set(tag), data, Sender(by, None, arrived))

@@ -5,6 +5,7 @@ from typing import Literal, Protocol
 
 from gateway.alarms import Alarms
 from gateway.engine.requests import CommandResult, Peeked
+from gateway.errors import GatewayError
 from gateway.history.buckets import Bucket
 from gateway.history.course import Now
 from gateway.history.question import Question
@@ -68,6 +69,14 @@ class Plant(Lines, Protocol):
         """Returns when the device has acknowledged. Raises `GatewayError`; `Busy` and `BadValue`
         only when nothing was sent: after `within` seconds nothing is sent any more. Cancelled when
         the client no longer waits."""
+
+    async def write_group(
+        self, values: Sequence[tuple[Tag, Value]], within: float, patience: float
+    ) -> Sequence[WriteResult | GatewayError]:
+        """Writes tags of one device in their order. Returns the outcome of each, at the latest
+        after `patience` seconds: what has not ended then is `Unclear`. After the first that is not
+        done the others are `NotSent`. Raises `GatewayError` when nothing was sent; `within` as in
+        `write`."""
 
     def commands(self) -> Mapping[str, frozenset[str]]:
         """By device: the commands of its protocol, allowed or not."""

@@ -18,6 +18,7 @@ def meta_fields(tag: Tag) -> dict[str, object]:
     return {
         "type": tag.value_type,
         "raw_type": str((tag if tag.kept is None else tag.inputs[0]).layout.type),
+        "length": tag.layout.type.count or None,
         "address": tag.text,
         "unit": tag.unit,
         "description": tag.description,

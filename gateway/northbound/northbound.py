@@ -22,7 +22,7 @@ from gateway.northbound.keys import Keys
 from gateway.northbound.link_monitor import LinkMonitor
 from gateway.northbound.losses import Losses
 from gateway.northbound.one_process import only_process
-from gateway.northbound.payload import Failure
+from gateway.northbound.payload import Failure, GroupResult
 from gateway.northbound.publisher import Publisher, ScanBatches
 from gateway.northbound.republish import Republisher
 from gateway.northbound.session import CLOSE_WITHIN, off_loop, open_session
@@ -138,7 +138,9 @@ class Northbound:
         """Returns the status documents by path, at most `max_age` seconds old."""
         return await self._status.fields(max_age)
 
-    async def write(self, tag: str, data: bytes, by: str, arrived: float) -> WriteResult | Failure:
+    async def write(
+        self, tag: str, data: bytes, by: str, arrived: float
+    ) -> WriteResult | Failure | GroupResult:
         """Writes for the client `by`, whom another part of the gateway has admitted; `tag`:
         `device/name`; `data`: the payload as on Zenoh; `arrived`: by the loop's clock."""
         return await self._incoming.write(tag, data, by, arrived)

@@ -1,4 +1,4 @@
-"""Samples, descriptions and outcomes <-> the JSON that travels on Zenoh.
+"""Samples, descriptions and outcomes -> the JSON that travels on Zenoh.
 
 A value is `{"value": 12.5, "quality": "good", "time": "2026-11-20T12:00:00.123456Z"}`. An unknown
 value has `"value": null, "quality": "bad"` and a `reason`, in some cases with a sentence for people
@@ -6,25 +6,32 @@ in `detail`. A value with a name has it in `text`. Integers stay JSON integers w
 beyond 2**53 a reader in JavaScript must parse them itself.
 """
 
-import json
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import lru_cache
-from typing import Never
 
 import orjson
 
 from gateway.engine.requests import CommandResult
-from gateway.errors import BadValue, Busy, Damaged, GatewayError, LineDown, Offline, Refused
-from gateway.numerals import parse_decimal
+from gateway.errors import (
+    BadValue,
+    Busy,
+    Damaged,
+    GatewayError,
+    LineDown,
+    NotSent,
+    Offline,
+    Refused,
+)
+from gateway.numerals import Scalar
 from gateway.tags import Quality, Reason, Sample, WriteResult
 from gateway.tags.timestamps import rfc3339
 from gateway.values import Value
 
-LONGEST_WRITE = 64 * 1024  # bytes; a tag holds 250 characters at most
 LONGEST_REASON = 300
+LOGGED_ELEMENTS = 128  # of a longer array the record has the beginning, as text
 _GOOD = Quality.GOOD  # looking up a member of an enumeration takes 0.2 µs
 
 
@@ -39,6 +46,8 @@ class Problem(StrEnum):
     NO_REPLY = "no-reply"  # the device is silent; nothing was sent
     BUSY = "busy"  # too many requests are waiting; nothing was done
     UNKNOWN_TAG = "unknown-tag"
+    NOT_SENT = "not-sent"  # a tag of a group: another one was wrong, or not done before it
+    INCOMPLETE = "incomplete"  # of a group: some tags were written, and others were not
     NOT_ALLOWED = "not-allowed"  # the client's signature is missing, wrong or too old
     NOTHING_TO_ACKNOWLEDGE = "nothing-to-acknowledge"  # the alarm is normal, or was raised again
     BAD_QUERY = "bad-query"  # a read with parameters that cannot be parsed
@@ -53,6 +62,34 @@ class Failure:
     problem: Problem
     reason: str
     code: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class GroupResult:
+    """The outcome of each tag of a group, by name in their order; `took` in seconds."""
+
+    tags: Mapping[str, WriteResult | Failure]
+    took: float
+
+    @property
+    def failure(self) -> Failure | None:
+        """The first tag that was not written, for the whole; None: all were.
+
+        Its own error only where certainly no tag was written.
+        """
+        failed = {name: end for name, end in self.tags.items() if isinstance(end, Failure)}
+        if not failed:
+            return None
+        causes = {n: end for n, end in failed.items() if end.problem is not Problem.NOT_SENT}
+        first = next(iter((causes or failed).values()))
+        problem, done = first.problem, len(self.tags) - len(failed)
+        if any(end.problem is Problem.UNCLEAR for end in failed.values()):
+            problem = Problem.UNCLEAR
+        elif done:
+            problem = Problem.INCOMPLETE
+        reasons = "; ".join(f"{name}: {end.reason}" for name, end in causes.items())
+        count = f"{done} of {len(self.tags)} tags were written"
+        return Failure(problem, f"{count}: {reasons}" if causes else count, first.code)
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +115,8 @@ def failure(error: GatewayError) -> Failure:
     unclear."""
     reason = str(error) or type(error).__name__
     match error:
+        case NotSent():
+            return Failure(Problem.NOT_SENT, reason)
         case BadValue():
             return Failure(Problem.BAD_VALUE, reason)
         case Refused(code=code):
@@ -139,9 +178,21 @@ def block(samples: Iterable[Sample]) -> bytes:
     return orjson.dumps({sample.tag.name: sample_fields(sample) for sample in samples})
 
 
-def outcome(result: WriteResult | Failure) -> bytes:
-    """The reply to one write, or the error reply to any query."""
-    return orjson.dumps(_result(result))
+def outcome(result: WriteResult | Failure | GroupResult) -> bytes:
+    """The reply to one write or to a group, or the error reply to any query."""
+    if not isinstance(result, GroupResult):
+        return orjson.dumps(_result(result))
+    failed = result.failure
+    whole = {} if failed is None else _result(failed)
+    tags = {short(name): _result(end) for name, end in result.tags.items()}
+    return orjson.dumps({**whole, "tags": tags, "took": round(result.took, 6)})
+
+
+def failed(result: WriteResult | Failure | GroupResult) -> Failure | None:
+    """Returns the failure of a write, or of a group; None: all was written."""
+    if isinstance(result, GroupResult):
+        return result.failure
+    return result if isinstance(result, Failure) else None
 
 
 def write_outcome(ended: WriteOutcome) -> bytes:
@@ -215,8 +266,15 @@ def _result(result: WriteResult | Failure) -> dict[str, Value | None]:
             return {"error": problem.value, "code": code, "reason": short(reason)}
 
 
-def loggable(requested: Value | None) -> Value | None:
+def loggable(requested: Value | None) -> Scalar | list[Scalar] | None:
     """Limits a requested value to a printable size; orjson writes at most 64 bits."""
+    if isinstance(requested, tuple):
+        found = list(map(_loggable, requested))
+        return found if len(found) <= LOGGED_ELEMENTS else short(orjson.dumps(found).decode())
+    return None if requested is None else _loggable(requested)
+
+
+def _loggable(requested: Scalar) -> Scalar:
     match requested:
         case str():
             return short(requested)
@@ -230,67 +288,3 @@ def short(text: str) -> str:
     """Limits a text from a client to a printable length, and to valid UTF-8."""
     text = text if len(text) <= LONGEST_REASON else f"{text[:LONGEST_REASON]}…"
     return text.encode("utf-8", "replace").decode()
-
-
-# -- in ----------------------------------------------------------------------------------------
-
-
-def parse_write(payload: bytes) -> Value:
-    """Returns the value of a write: a JSON scalar, or `{"value": scalar}`. Raises `BadValue`."""
-    if not payload.strip():
-        raise BadValue("the payload is empty: send a JSON value such as 12.5")
-    if len(payload) > LONGEST_WRITE:
-        raise BadValue(f"the payload has {len(payload)} bytes, more than {LONGEST_WRITE}")
-    try:
-        # Not orjson: it turns integers beyond 64 bits into floats, which then may fit.
-        found = json.loads(
-            payload.decode(),
-            parse_constant=_no_number,
-            parse_float=_finite,
-            object_pairs_hook=_only_value,
-        )
-    except UnicodeDecodeError:
-        raise BadValue("the payload is no UTF-8 text") from None
-    except json.JSONDecodeError as error:
-        raise BadValue(f"the payload is no JSON: {error}") from None
-    except RecursionError:
-        raise BadValue("the payload is nested too deeply") from None
-    except BadValue:
-        raise
-    except ValueError:  # an integer of more than 4300 digits
-        raise BadValue("the number in the payload is too long") from None
-    return _scalar(found.value if isinstance(found, _Wrapped) else found)
-
-
-@dataclass(frozen=True, slots=True)
-class _Wrapped:
-    value: object
-
-
-def _only_value(pairs: list[tuple[str, object]]) -> _Wrapped:
-    if [key for key, _ in pairs] != ["value"]:
-        raise BadValue('an object must hold "value" once, and nothing else')
-    return _Wrapped(pairs[0][1])
-
-
-def _no_number(text: str) -> Never:
-    raise BadValue(f"{text} is no number in JSON")
-
-
-def _finite(text: str) -> int | float:
-    number = parse_decimal(text)
-    if not math.isfinite(number):
-        raise BadValue("the number in the payload is too large")
-    return number
-
-
-def _scalar(found: object) -> Value:
-    match found:
-        case bool() | int() | float():
-            return found
-        case str():
-            if any("\ud800" <= character <= "\udfff" for character in found):
-                raise BadValue("the text holds half a surrogate pair")
-            return found
-        case _:
-            raise BadValue('send one JSON value: true, 12.5, "AB", or {"value": 12.5}')

@@ -22,7 +22,7 @@ from gateway.northbound.answers import Answer, AnswerPool, QueryCounters
 from gateway.northbound.commands import Commands
 from gateway.northbound.interfaces import Plant
 from gateway.northbound.keys import Family, ParsedKey, max_age, parse_key
-from gateway.northbound.payload import Failure, Problem
+from gateway.northbound.payload import Failure, GroupResult, Problem
 from gateway.northbound.replies import Replies
 from gateway.northbound.tag_index import TagIndex
 from gateway.northbound.writes import ANSWER_WITHIN, Writes
@@ -154,7 +154,7 @@ class Queries:
                 await self._peek(query, parsed)
 
     async def _set(self, query: zenoh.Query, at: float) -> None:
-        result: WriteResult | Failure = _ENDING
+        result: WriteResult | Failure | GroupResult = _ENDING
         key, by = str(query.key_expr), sender(query, at)
         try:
             result = await self._writes.write(key, _data(query), by)

@@ -18,7 +18,7 @@ from gateway.northbound.alarms import alarm_fields
 from gateway.northbound.interfaces import History, Plant
 from gateway.northbound.keys import Family, Keys, ParsedKey
 from gateway.northbound.meta import meta
-from gateway.northbound.payload import Failure, Problem
+from gateway.northbound.payload import Failure, GroupResult, Problem
 from gateway.northbound.tag_index import TagIndex
 from gateway.northbound.turns import Pause, Rank, Turns
 from gateway.tags import Sample, Tag, WriteResult
@@ -302,9 +302,9 @@ class Replies:
         data = orjson.dumps({**result._asdict(), "time": rfc3339(result.time)})
         self._reply(query, str(query.key_expr), data, self._stamp())
 
-    def outcome(self, result: WriteResult | Failure, query: zenoh.Query) -> None:
+    def outcome(self, result: WriteResult | Failure | GroupResult, query: zenoh.Query) -> None:
         data = payload.outcome(result)
-        if isinstance(result, Failure):
+        if payload.failed(result) is not None:
             query.reply_err(data, encoding=zenoh.Encoding.APPLICATION_JSON)
         else:
             self._reply(query, str(query.key_expr), data, self._stamp())

@@ -45,6 +45,10 @@ class TagIndex:
     def tag_at(self, value_key: str) -> Tag | None:
         return self._by_key.get(value_key)
 
+    def is_device(self, key: str) -> bool:
+        """True for the key of one of our devices: no tag, no wildcard."""
+        return self._keys.tag(key) in self.names
+
     def owns(self, key: str) -> bool:
         """True if `key` lies under one of our devices or under our status keys.
 

@@ -14,9 +14,11 @@ import zenoh
 from gateway.errors import Busy, GatewayError
 from gateway.northbound import payload
 from gateway.northbound.acceptance import Acceptance, Sender, sender
+from gateway.northbound.group_writes import GroupWrites
 from gateway.northbound.interfaces import Plant
 from gateway.northbound.keys import parse_key
-from gateway.northbound.payload import Failure, Problem, WriteOutcome
+from gateway.northbound.parsing import parse_write
+from gateway.northbound.payload import Failure, GroupResult, Problem, WriteOutcome
 from gateway.northbound.tag_index import TagIndex
 from gateway.northbound.writers import NotAllowed, Repeated
 from gateway.tags import Tag, WriteResult
@@ -44,10 +46,18 @@ class Writes:
         self._index = index
         self._audit = audit
         self._acceptance = acceptance
+        self._groups = GroupWrites(plant, index, audit, acceptance, ANSWER_WITHIN)
         self._waiting = 0
 
-    async def write(self, key: str, data: bytes | None, sender: Sender) -> WriteResult | Failure:
-        """`key` is the `@set` key as received, wildcards included; `data` its payload."""
+    async def write(
+        self, key: str, data: bytes | None, sender: Sender
+    ) -> WriteResult | Failure | GroupResult:
+        """`key` is the `@set` key as received, wildcards included; `data` its payload.
+
+        The key of a device writes several of its tags.
+        """
+        if self._index.is_device(device := parse_key(key).target):
+            return await self._groups.write(key, device, data, sender)
         by = sender.session
         started = time.monotonic()
         value: Value | None = None
@@ -62,7 +72,7 @@ class Writes:
             if isinstance(target, Failure):
                 result = target
             else:
-                value = payload.parse_write(data or b"")
+                value = parse_write(data or b"")
                 result = await self._write_tag(target, value, within)
         except TimeoutError:
             result = Failure(

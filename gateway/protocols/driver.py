@@ -232,6 +232,14 @@ class ScatteredWriter(Protocol[F]):
 
 
 @runtime_checkable
+class WritesAround(Protocol):
+    """A driver whose writes of some spans also write addresses around them, as just read."""
+
+    def writes_around(self, span: Span) -> bool:
+        """Returns True if a write of the span writes more than the span."""
+
+
+@runtime_checkable
 class Monitor(Protocol[F]):
     """A driver whose device stores a list of addresses and reads it cheaply (BM/MB, WM/MN).
 

@@ -7,17 +7,18 @@ the `Garbled` that hides it; a write sends the bytes of the value.
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
+from gateway.numerals import Scalar
 from gateway.protocols.driver import Address
-from gateway.values import Value, ValueType
+from gateway.values import ValueType
 
 
 class Shape(Protocol):
     """The encoding of a value in its frame."""
 
-    def put(self, value: Value) -> bytes:
+    def put(self, value: Scalar) -> bytes:
         """Returns its bytes. Raises `BadValue`."""
 
-    def take(self, raw: bytes) -> Value:
+    def take(self, raw: bytes) -> Scalar:
         """Returns the value of these bytes. Raises `Garbled`."""
 
 

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 from gateway.errors import Garbled
+from gateway.numerals import Scalar
 from gateway.protocols.driver import Span
-from gateway.values import Value
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,7 +22,7 @@ class UnsolicitedFrame:
     """
 
     message: str
-    values: Mapping[str, Value | Garbled]
+    values: Mapping[str, Scalar | Garbled]
     reply: Any = None
 
 

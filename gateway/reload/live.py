@@ -1,6 +1,7 @@
 """Reloads the file of a running gateway, whenever that is wanted."""
 
 import asyncio
+import gc
 from collections.abc import Sequence
 
 from gateway.app import Gateway
@@ -78,3 +79,12 @@ class LiveReload:
         gone = [tag for change in difference.devices.values() for tag in change.gone]
         await northbound.change(index, [*gone, *difference.computed.gone])
         await northbound.claim(names)
+        _collect()
+
+
+def _collect() -> None:
+    """Frees the objects of ended lines and devices: they refer to each other, and collections of
+    all objects are rare. Takes 10 ms with 50,000 tags."""
+    gc.unfreeze()
+    gc.collect()
+    gc.freeze()  # as after the start: later collections skip the tags

@@ -215,6 +215,8 @@ def _encoded(tag: Tag, sample: Sample | None) -> list[int] | None:
     try:
         if whole and isinstance(value, float):
             value = round(value)
+        elif whole and isinstance(value, tuple):
+            value = tuple(round(one) if isinstance(one, float) else one for one in value)
         return tag.encode(value)
     except (BadValue, OverflowError, ValueError):
         return None

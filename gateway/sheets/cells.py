@@ -62,6 +62,11 @@ _TYPES = {
 }
 _KINDS = {spelling: kind for kind, row in _TYPES.items() for spelling in row.split()}
 _STRING = re.compile(r"(?:string|text|char|字串|字符串)\[?([0-9]*)\]?\Z")
+# `WORD[50]`, and `ARRAY[0..49] OF WORD` as IEC 61131 writes it
+_ARRAY = re.compile(
+    r"(?:array\[(?P<first>[0-9]{1,5})\.\.(?P<last>[0-9]{1,5})\]of)?"
+    r"(?P<kind>[^\[]+)(?(first)|\[(?P<count>[0-9]{1,5})\])\Z"
+)
 _ORDERS = {
     **dict.fromkeys(("low first", "low", "little", "little endian"), "low_first"),
     **dict.fromkeys(("high first", "high", "big", "big endian"), "high_first"),
@@ -136,6 +141,9 @@ def kind(text: str, length: str) -> str | None:
         if not count:
             raise ConfigError(f"{text} has no length: write {text}[16], or add a column Length")
         return f"string[{count}]"
+    if (match := _ARRAY.match(plain)) and match["kind"] in _KINDS:
+        first, last, count = match["first"], match["last"], match["count"]
+        return f"{_KINDS[match['kind']]}[{count or int(last) - int(first) + 1}]"
     return _KINDS.get(plain, text) or None
 
 

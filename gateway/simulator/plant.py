@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 from gateway.errors import BadValue
@@ -28,6 +28,12 @@ def animate(station: Station, tags: Iterable[Tag]) -> None:
 
 def _animate(memory: Memory, tag: Tag, number: int) -> None:
     area, start, size = tag.span
+    if (first := tag.element) is not None:
+        step = first.span.size
+        for place in range(size // step):
+            span = first.span._replace(start=start + place * step)
+            _animate(memory, replace(first, span=span), number + place)
+        return
     if not memory.holds(area, start, size):
         return
     if tag.part is not None:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from decimal import Context, Decimal, DivisionByZero, InvalidOperation, Overflow
 
-from gateway.values import Value
+from gateway.numerals import Scalar
 
 # A part of a formula: it is calculated from the values of the inputs, in their order.
 Term = Callable[[Sequence[Decimal]], Decimal]
@@ -34,7 +34,7 @@ class Formula:
     term: Term = field(compare=False)  # the text says it all
     whole: bool
 
-    def value(self, inputs: Sequence[Value]) -> Value:
+    def value(self, inputs: Sequence[Scalar]) -> Scalar:
         """Returns the result for the values of the inputs; bits count 0 and 1.
 
         Raises `ArithmeticError` with a sentence where there is none.
@@ -53,5 +53,5 @@ class Formula:
         return number
 
 
-def _decimal(value: Value) -> Decimal:
+def _decimal(value: Scalar) -> Decimal:
     return Decimal(repr(value)) if isinstance(value, float) else Decimal(int(value))

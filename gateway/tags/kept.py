@@ -4,7 +4,7 @@ Each has settings, and a memory that changes with every read. Times are those of
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from gateway.tags.sample import Quality, Reason, Sample, bad, good
 from gateway.tags.tag import Tag
@@ -64,7 +64,8 @@ class Counted:
         """Notes that reads are missing."""
         self.gap = True
 
-    def read(self, value: Value, time: int) -> Value:
+    def read(self, value: Any, time: int) -> Value:
+        """`value`: a whole number; the configuration refuses other types."""
         count = int(value) % self.modulus
         last, total = self.state or CounterState(count, count)
         step = (count - last) % self.modulus

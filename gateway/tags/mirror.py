@@ -3,11 +3,13 @@
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import compress, count
 from operator import ne
+from typing import Any
 
 from gateway.tags import Publish, Quality, Reason, Sample, Tag, bad
 from gateway.tags.computed import Dependents, computed
 from gateway.tags.kept import Counted, CounterState, kept, memory_of
 from gateway.tags.scan import Latest, Samples, Scan
+from gateway.values import Value
 
 
 class Mirror:
@@ -244,16 +246,20 @@ def _is_due(last: Sample | None, sample: Sample) -> bool:
         return True
     if tag.heartbeat is not None and not 0 <= sample.time - last.time < tag.heartbeat * 1e9:
         return True  # also after the clock was set back: the interval is then unknown
-    return _changed(tag, last, sample)
+    return _changed(tag, last.value, sample.value)
 
 
-def _changed(tag: Tag, last: Sample, sample: Sample) -> bool:
-    old, new = last.value, sample.value
+def _changed(tag: Tag, old: Value | None, new: Value | None) -> bool:
     if tag.deadband is None or old is None or new is None:
         return old != new
-    if isinstance(old, (bool, str)) or isinstance(new, (bool, str)):
-        return old != new
+    if isinstance(old, (bool, str, tuple)) or isinstance(new, (bool, str, tuple)):
+        return old != new and (tag.element is None or _one_changed(tag.element, old, new))
     band = tag.deadband.amount
     if tag.deadband.percent:
         band = abs(old) * band / 100
     return old != new and abs(new - old) >= band
+
+
+def _one_changed(element: Tag, old: Any, new: Any) -> bool:
+    """Returns True if an element of an array moved by the deadband."""
+    return any(_changed(element, *pair) for pair in zip(old, new, strict=True))

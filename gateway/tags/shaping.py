@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 from gateway.errors import BadValue
+from gateway.numerals import Scalar
 from gateway.tags.scaling import Ends
-from gateway.values import Value
 
 
 class Bounds(NamedTuple):
@@ -30,13 +30,13 @@ class Shaping:
         """The same without rounding and limits: the value that the device really holds."""
         return replace(self, decimals=None, clamp=None)
 
-    def rounded(self, value: Value) -> Value:
+    def rounded(self, value: Scalar) -> Scalar:
         """Returns a value to write with as many decimals as a read shows."""
         if self.decimals is None or not isinstance(value, float):
             return value
         return round(value, self.decimals)
 
-    def check(self, value: Value) -> None:
+    def check(self, value: Scalar) -> None:
         """Raises `BadValue` for a value that no read would show, because of the clamp."""
         if self.clamp is None or isinstance(value, (bool, str)):
             return
@@ -46,7 +46,7 @@ class Shaping:
 
 
 PLAIN = Shaping()
-Convert = Callable[[Value], Value | None]
+Convert = Callable[[Scalar], Scalar | None]
 
 
 def shaped(shaping: Shaping) -> Convert | None:
@@ -59,7 +59,7 @@ def shaped(shaping: Shaping) -> Convert | None:
     low = -float("inf") if clamp.low is None else clamp.low
     high = float("inf") if clamp.high is None else clamp.high
 
-    def limited(value: Value) -> Value:
+    def limited(value: Scalar) -> Scalar:
         if decimals is not None:
             value = _rounded(value, decimals)
         if isinstance(value, str):
@@ -72,7 +72,7 @@ def shaped(shaping: Shaping) -> Convert | None:
     return limited
 
 
-def _rounded(value: Value, decimals: int) -> Value:
+def _rounded(value: Scalar, decimals: int) -> Scalar:
     # `+ 0.0`: -0.04 is shown as 0.0, not as -0.0.
     return round(value, decimals) + 0.0 if isinstance(value, float) else value
 
@@ -83,7 +83,7 @@ class Names:
 
     by_number: Mapping[int, str]
 
-    def number(self, value: Value) -> Value:
+    def number(self, value: Scalar) -> Scalar:
         """Returns the number of a value to write, or of its name. Raises `BadValue`."""
         if isinstance(value, str):
             for number, name in self.by_number.items():
@@ -94,7 +94,7 @@ class Names:
             raise BadValue(f"{value} has no name: use {self}")
         return value
 
-    def text(self, value: Value | None) -> str | None:
+    def text(self, value: object) -> str | None:
         """Returns the name of a value that was read; None: it has no name."""
         return self.by_number.get(value) if isinstance(value, int) else None
 

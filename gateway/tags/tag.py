@@ -1,17 +1,19 @@
 """Tags: their addresses and rules, and the conversion between units and values."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Any, NamedTuple
 
 from gateway.errors import BadValue, Garbled
+from gateway.numerals import Scalar
 from gateway.protocols.driver import Address, Span, Unit
 from gateway.protocols.typed_fields import Shape
 from gateway.tags.alarm import AlarmRule
 from gateway.tags.decoding import (
     Decode,
     Part,
+    array_decoder,
     decoder,
     field_decoder,
     part_of,
@@ -65,7 +67,10 @@ class CounterRule(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Tag:
-    """One value of one device: its address, type, interval and rules."""
+    """One value of one device: its address, type, interval and rules.
+
+    The value of an array is a tuple; all rules of values are those of each element.
+    """
 
     device: str
     name: str
@@ -98,15 +103,23 @@ class Tag:
     # of another tag's value: this tag is not read itself.
     inputs: tuple["Tag", ...] = ()
     part: Part | None = field(init=False, repr=False)  # of its word; None: whole words
+    element: "Tag | None" = field(init=False, repr=False)  # the first one of an array
     # From the unit of the span to the value, or from its units if it has several.
     convert: Decode = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         part = None if self.shape is not None else part_of(self.layout, self.address.bit)
         object.__setattr__(self, "part", part)
+        object.__setattr__(self, "element", self._first() if self.layout.type.count else None)
         object.__setattr__(self, "convert", self._decoder(self.shaping))
 
+    def _first(self) -> "Tag":
+        size = self.span.size // self.layout.type.count
+        return replace(self, layout=self.layout.element, span=self.span._replace(size=size))
+
     def _decoder(self, shaping: Shaping | None) -> Decode:
+        if self.element is not None:
+            return array_decoder(self.element.convert, self.element.span.size)
         if self.formula is not None:
             return with_shaping(self.formula.value, shaping)
         if self.kept is not None:
@@ -137,7 +150,7 @@ class Tag:
     @property
     def single(self) -> bool:
         """True if `convert` takes one unit."""
-        return self.shape is not None or self.span.size == 1
+        return self.shape is not None or (self.span.size == 1 and not self.layout.type.count)
 
     def decode(self, units: Sequence[Any]) -> Value | None:
         """Returns the value of the units of the span; None: they hold none."""
@@ -159,13 +172,35 @@ class Tag:
     @property
     def value_type(self) -> str:
         """The type of the value, which a scale can make another one than that of the device."""
-        return type_of(self.layout.type, self._line)
+        kind = self.layout.type
+        of_one = type_of(kind.element, self._line)
+        return f"{of_one}[{kind.count}]" if kind.count else of_one
 
     def encode(self, value: Value) -> list[int]:
-        """Returns the units to write for `value`. Raises `BadValue`.
+        """Returns the units to write for `value`, of all elements of an array. Raises `BadValue`.
 
         A tag that is a part of a word gives that part alone: [0] or [1] for a bit.
         """
+        if self.element is not None:
+            return self._elements(self.element, value)
+        if isinstance(value, tuple):
+            raise BadValue(f"{self.name} has one value: send no list")
+        return self._one(value)
+
+    def _elements(self, element: "Tag", values: Value) -> list[int]:
+        kind, units = self.layout.type, list[int]()
+        if not isinstance(values, tuple):
+            raise BadValue(f"{values!r} is no list: {self.name} is {kind}")
+        if len(values) != kind.count:
+            raise BadValue(f"a list of {len(values)} is written to {kind}: send {kind.count}")
+        for place, value in enumerate(values):
+            try:
+                units += element.encode(value)
+            except BadValue as error:
+                raise BadValue(f"element {place}: {error}") from None
+        return units
+
+    def _one(self, value: Scalar) -> list[int]:
         if isinstance(value, int) and value.bit_length() > _MOST_BITS:
             raise BadValue("the number is too large")
         if self.names is not None:
@@ -184,7 +219,7 @@ class Tag:
             self._check_limits(real, f"{value} (the device holds {real})")
         return units
 
-    def _shaped(self, shaping: Shaping, value: Value) -> Value:
+    def _shaped(self, shaping: Shaping, value: Scalar) -> Scalar:
         """Returns the value before scaling, as a read would show it. Checks the limits again."""
         rounded = shaping.rounded(value)
         self._check_limits(rounded, f"{value} (rounded to {rounded})")
@@ -193,7 +228,7 @@ class Tag:
             return not rounded
         return rounded
 
-    def _octets(self, shape: Shape, value: Value) -> list[int]:
+    def _octets(self, shape: Shape, value: Scalar) -> list[int]:
         """Returns the bytes of the value. Checks the limits again, as digits may round it."""
         octets = list(shape.put(self._unscaled(value)))
         real = self.held(octets)
@@ -208,7 +243,7 @@ class Tag:
         return self._line is not None and not self.layout.type.is_float
 
     def _check_limits(self, value: Value, description: str) -> None:
-        if self.write is None or isinstance(value, (bool, str)):
+        if self.write is None or isinstance(value, (bool, str, tuple)):
             return
         if self.write.min is not None and value < self.write.min:
             raise BadValue(f"{description} is below the least value {_short(self.write.min)}")
@@ -235,7 +270,7 @@ class Tag:
         """Returns whole units for those of `encode`, which has only a part of a word."""
         return units if self.part is None else [self.part.into(0, units[0])]
 
-    def _unscaled(self, value: Value) -> Value:
+    def _unscaled(self, value: Scalar) -> Scalar:
         line = self._line
         if line is None or isinstance(value, (bool, str)):
             return value

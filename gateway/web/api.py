@@ -21,7 +21,7 @@ from gateway.northbound import buckets, past, payload
 from gateway.northbound.faults import below, faults, warnings
 from gateway.northbound.interfaces import History
 from gateway.northbound.meta import meta_fields
-from gateway.northbound.payload import Failure, Problem
+from gateway.northbound.payload import Problem
 from gateway.northbound.session import off_loop
 from gateway.tags import Tag
 from gateway.web.guard import BY, answer
@@ -47,6 +47,7 @@ _STATUS = {
     Problem.NO_REPLY: 503,
     Problem.BUSY: 503,
     Problem.UNCLEAR: 504,
+    Problem.INCOMPLETE: 502,
 }
 
 
@@ -172,7 +173,8 @@ class Api:
             return answer(408, f"the body did not arrive within {BODY_WITHIN:g} s")
         # The server does not cancel this when the client leaves: the write may be on the wire.
         result = await self._north.write(key, data, f"web {request[BY]}", arrived)
-        status = _STATUS.get(result.problem, 500) if isinstance(result, Failure) else 200
+        failed = payload.failed(result)
+        status = 200 if failed is None else _STATUS.get(failed.problem, 500)
         return raw(payload.outcome(result), status)
 
 

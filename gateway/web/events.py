@@ -6,6 +6,7 @@ nothing for `SLOW` seconds is dropped.
 """
 
 import asyncio
+import json
 import time
 from collections import deque
 from collections.abc import Mapping, Sequence
@@ -187,7 +188,10 @@ class Page:
             self._sent[tag] = sample
             fields = payload.sample_fields(sample)
             known = fields["value"]
-            text = known if isinstance(known, str) else orjson.dumps(known).decode()
+            if isinstance(known, tuple):
+                text = json.dumps(known)  # with spaces: a browser breaks the line there
+            else:
+                text = known if isinstance(known, str) else orjson.dumps(known).decode()
             if name := fields.get("text"):
                 text = f"{name} ({text})"
             good = fields["quality"] == Quality.GOOD

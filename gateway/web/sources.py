@@ -6,7 +6,7 @@ from typing import Any, Protocol
 
 from gateway.alarms import Alarms
 from gateway.northbound.interfaces import Device, History, Lines
-from gateway.northbound.payload import Failure
+from gateway.northbound.payload import Failure, GroupResult
 from gateway.tags import Sample, Tag, WriteResult
 
 Documents = Mapping[str, Mapping[str, Any]]  # by path: `status`, `lines/hall-1`, `devices/mixer`
@@ -33,7 +33,9 @@ class North(Protocol):
     async def documents(self, max_age: float) -> Documents:
         """Returns the status documents by path, at most `max_age` seconds old."""
 
-    async def write(self, tag: str, data: bytes, by: str, arrived: float) -> WriteResult | Failure:
+    async def write(
+        self, tag: str, data: bytes, by: str, arrived: float
+    ) -> WriteResult | Failure | GroupResult:
         """Writes for the client `by`. `arrived`: by the loop's clock."""
 
     def acknowledge(self, alarm: str, data: bytes, by: str, arrived: float) -> bytes | Failure:

@@ -33,6 +33,7 @@ TAGS = {
     "speed": {"address": "D10", "unit": "rpm", "history": True},
     "level": {"address": "D11", "type": "uint32"},
     "recipe": {"address": "D500", "write": {"min": 1, "max": 40, "verify": True}},
+    "steps": {"address": "D510", "type": "uint16[40]", "history": True, "write": True},
 }
 
 
@@ -156,6 +157,15 @@ document.getElementById("acknowledge-form").requestSubmit()
 """
 
 
+WRITE_STEPS = f"""
+window.confirm = () => true;
+const text = JSON.stringify([...Array(40).keys()].map((n) => 60000 + n));
+for (const [id, value] of Object.entries({{token: "{TOKEN}", tag: "mixer/steps", value: text}}))
+  document.getElementById(`write-${{id}}`).value = value;
+document.getElementById("write-form").requestSubmit()
+"""
+
+
 async def test_the_page_is_live_and_turns_grey_at_once_when_the_gateway_ends(
     page: Page, tmp_path: Path
 ) -> None:
@@ -174,12 +184,20 @@ async def test_the_page_is_live_and_turns_grey_at_once_when_the_gateway_ends(
         await tab.value('document.querySelector("[data-device=mixer]").focus()')
         await tab.press("Enter")
         await tab.until(
-            f'{QUALITIES}.join() === "good,good,good" && document.body.className === ""'
+            f'{QUALITIES}.join() === "good,good,good,good" && document.body.className === ""'
         )
         assert (await tab.value(VALUES))[2].isdigit()
         await tab.until(
             '/^[1-9]\\d* exchanges/.test(document.querySelector("#wire-sum").innerText)'
         )
+        await tab.value(WRITE_STEPS)
+        await tab.until(
+            'document.querySelector("#write-result").textContent.includes("60039]: acknowledged")'
+        )
+        await tab.until(f'{VALUES}[3].startsWith("[60000, 60001,")')
+        assert (await tab.value(VALUES))[3].endswith(", 60027, …")  # the rest is in its title
+        trends = "document.querySelectorAll('#values button').length"
+        assert await tab.value(trends) == 1  # of the speed: a list has none
         for width, height in ((1200, 900), (390, 800)):
             await tab.look(width, height, dark=width < 600)
             wide = await tab.value("document.documentElement.scrollWidth")
@@ -187,5 +205,5 @@ async def test_the_page_is_live_and_turns_grey_at_once_when_the_gateway_ends(
         assert tab.errors == []
         page.program.end(signal.SIGKILL)
         await tab.until('document.body.className === "stale"')
-        assert await tab.value(QUALITIES) == 3 * ["not live"]
+        assert await tab.value(QUALITIES) == 4 * ["not live"]
         assert "not live since" in await tab.value('document.querySelector("#live").innerText')

@@ -23,6 +23,7 @@ TAGS: dict[str, dict[str, Any]] = {
     "mixer/speed": {"type": "float64"},
     "mixer/total": {"type": "int64"},
     "mixer/name": {"type": "string[8]"},
+    "mixer/steps": {"type": "float32[2]", "length": 2},
 }
 
 
@@ -93,6 +94,9 @@ def test_influxdb_has_every_value_once_and_no_good_one_that_is_not(
             assert text == 'A "B"\\'
             [[_, text]] = influx.query("SELECT text FROM plc WHERE \"name\"='total'")
             assert text == str(2**53 + 1)
+            gateway.put("mixer/steps", [1, 2.5])
+            steps = "SELECT value_0, value_1 FROM plc WHERE \"name\"='steps'"
+            until(lambda: [row[1:] for row in influx.query(steps)] == [[1.0, 2.5]], "the array")
 
             first.end(signal.SIGKILL)
             until(lambda: influx.speeds() == [12.5, None], "the value is bad")

@@ -95,6 +95,8 @@ def test_a_client_of_the_broker_sees_no_good_value_that_is_not(
                 seen.says("plant/mixer/speed", '"value": null', '"bad"', '"no-reply"')
                 gateway.put("mixer/raw", 77)
                 seen.says("plant/mixer/raw", '"value": 77', '"good"')
+                gateway.put("mixer/raw", [1, 2.5])
+                seen.says("plant/mixer/raw", '"value": [1, 2.5]', '"good"')
                 until(lambda: _is_seen(gateway, seen), "events arrive")
                 for code in ("A1", "A1", "B2"):  # an event is no last value
                     gateway.put("scanner/code", code)

@@ -18,6 +18,7 @@ TAGS: dict[str, dict[str, Any]] = {
     "mixer/recipe": {"write": {"min": 1, "max": 40, "verify": False}},
     "mixer/alarms/door": {"type": "bool"},
     "mixer/name": {"type": "string[8]"},
+    "mixer/steps": {"type": "uint16[3]", "length": 3, "write": {"verify": False}},
 }
 
 
@@ -75,11 +76,19 @@ def test_an_opc_ua_client_sees_no_good_value_and_no_write_that_is_not(plant: Pla
     until(lambda: plant.status("mixer/name") == "Good", "the name is read")
     assert plant.status("mixer/recipe") == "BadTypeMismatch"
 
+    gateway.put("mixer/steps", [1, 2, 65535])
+    until(lambda: plant.status("mixer/steps") == "Good", "the array is read")
+    steps = plant.ask("read", node("mixer/steps"))
+    assert (steps["value"], steps["type"]) == ([1, 2, 65535], "UInt16")
+
     # Nothing is written but by the gateway.
     write = ("write", node("mixer/recipe"), "Int16")
     assert plant.ask(*write, 7) == "Good"
     assert plant.ask("write", node("mixer/speed"), "Double", 1) == "BadNotWritable"
     assert plant.ask("write", node("mixer/recipe"), "Double", 1) == "BadTypeMismatch"
+    assert plant.ask("write", node("mixer/recipe"), "Int16", "[7]") == "BadTypeMismatch"
+    assert plant.ask("write", node("mixer/steps"), "UInt16", 7) == "BadTypeMismatch"
+    assert plant.ask("write", node("mixer/steps"), "UInt16", "[3,2,1]") == "Good"
     for outcome, code in {
         "refused": "BadInvalidState",
         "line-down": "BadNotConnected",
@@ -89,14 +98,14 @@ def test_an_opc_ua_client_sees_no_good_value_and_no_write_that_is_not(plant: Pla
     }.items():
         gateway.answer = outcome
         assert plant.ask(*write, 8) == code
-    assert [value for _, value in gateway.written] == [7, 8, 8, 8, 8, 8]
+    assert [value for _, value in gateway.written] == [7, [3, 2, 1], 8, 8, 8, 8, 8]
     assert plant.status("mixer/recipe") == "BadTypeMismatch"
 
     # The client reads on while its write waits.
     gateway.answer = "held"
     gateway.put("mixer/speed", 13.5)
     plant.ask("start", *write[1:], 9)
-    gateway.until_written(7)
+    gateway.until_written(8)
     assert plant.ask("read", node("mixer/speed"))["value"] == 13.5
     gateway.close()
     assert plant.ask("written") == "BadTimeout"

@@ -22,6 +22,7 @@ time,tag,value,quality,reason
 2026-11-21T12:00:15.000000Z,mixer/name,"A, B",good,
 2026-11-21T12:00:20.000000Z,mixer/speed,18446744073709551615,good,
 2026-11-21T12:00:25.000000Z,mixer/name,,bad,no-reply
+2026-11-21T12:00:25.000000Z,mixer/steps,"[1, 2.5]",good,
 """
 BUCKETS = """\
 time;tag;quality;mean;last;good;bad;known;reason
@@ -30,6 +31,8 @@ time;tag;quality;mean;last;good;bad;known;reason
 not-recorded
 2026-11-21T12:00:00.000000Z;mixer/name;partial;;A, B;1;0;5,0;not-recorded
 2026-11-21T12:00:20.000000Z;mixer/name;partial;;A, B;0;1;5,0;no-reply
+2026-11-21T12:00:00.000000Z;mixer/steps;bad;;;0;0;0,0;not-recorded
+2026-11-21T12:00:20.000000Z;mixer/steps;partial;;[1, 2.5];1;0;0,0;not-recorded
 """
 
 
@@ -44,12 +47,17 @@ def config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         good(speed, 2**64 - 1, NOON + 20 * SECOND),
         bad(name, Reason.NO_REPLY, NOON + 25 * SECOND),
         good(other, 1, NOON + 25 * SECOND),  # not in the configuration
+        good(tag("steps"), (1, 2.5), NOON + 25 * SECOND),
     ]
     with closing(HistoryFile(tmp_path / "history.db", 10**8)) as file:
         file.store(1, 0, samples[:2])
         file.sort(1, NOON)
         file.store(2, 0, samples[2:])  # as a killed gateway leaves it
-    tags = {"speed": {"address": "D10"}, "name": {"address": "D600", "type": "string[8]"}}
+    tags = {
+        "speed": {"address": "D10"},
+        "name": {"address": "D600", "type": "string[8]"},
+        "steps": {"address": "D20", "type": "float32[2]"},
+    }
     lines = {"hall": vigor_line("simulator", tags)}
     where = {"path": str(tmp_path / "history.db")}
     return write_config(tmp_path / "plant.yaml", "tcp/127.0.0.1:0", lines, history=where)
@@ -90,6 +98,7 @@ def test_parquet_has_the_same_rows(config: Path, command: Command, tmp_path: Pat
         ("mixer/name", None, "A, B", "good"),
         ("mixer/speed", 2.0**64, "18446744073709551615", "good"),
         ("mixer/name", None, None, "bad"),
+        ("mixer/steps", None, "[1, 2.5]", "good"),
     ]
     assert rows[0]["time"].isoformat() == "2026-11-21T12:00:00+00:00"
 

@@ -13,6 +13,7 @@ from tests.cli.conftest import Command
 from tests.e2e.processes import Done, plc_gateway
 
 ROOT = Path(__file__).parents[2]
+EXAMPLE = str(ROOT / "config.example.yaml")
 COMMANDS = [
     *("run", "check", "read", "write", "control", "watch", "scan", "simulate"),
     *("status", "health", "schema", "version"),
@@ -42,6 +43,10 @@ def test_every_command_helps(command: Command, name: str) -> None:
         (["read", "a.yaml", "--fast"], "No such option"),
         (["run", "a.yaml", "--log-format", "xml"], "xml"),
         (["write", "a.yaml", "mixer/trim"], "Missing argument 'VALUE'"),
+        (["write", EXAMPLE, "mixer/run", "on", "off"], "takes one value; for several tags name"),
+        (["write", EXAMPLE, "mixer", "run"], "run is no tag=value, as in mixer recipe/a=1"),
+        (["write", EXAMPLE, "mixer", "run=on", "run=off"], "mixer/run is named twice"),
+        (["write", EXAMPLE, "mixer", "recipe=41", "run=2", "x=1"], "there is no tag mixer/x"),
     ],
 )
 def test_wrong_usage_ends_with_2(command: Command, arguments: list[str], says: str) -> None:

@@ -55,11 +55,12 @@ def test_an_event_of_a_trace_is_read_again() -> None:
         "what": "read D100",
         "result": "speed 12.5",
         "failed": False,
-        "values": {"mixer/speed": 12.5},
+        "values": {"mixer/speed": 12.5, "mixer/steps": (1, 2.5)},
     }
     text = event_lines({"time": 4.9, "way": "<", "bytes": "06 30"}) + event_lines(exchange)
     text += event_lines({**exchange, "failed": True, "result": "heard < 06 30"})
     assert list(entries(text.splitlines())) == [
         LoggedPiece(4.9, "<", b"\x06\x30"),
         LoggedValue(5.02, "mixer/speed", 12.5),
+        LoggedValue(5.02, "mixer/steps", (1, 2.5)),
     ]

@@ -592,7 +592,8 @@ TAGS = [
     bad(
         "unknown type",
         tags("a: {address: D1, type: int, write: {max: 70000}}"),
-        f"8: {M}.tags.a.type: 'int' is not a type: use {TYPES} or string[n]",
+        f"8: {M}.tags.a.type: 'int' is not a type: use {TYPES} or string[n], or "
+        "an array such as uint16[50]",
     ),
     bad(
         "string too long",

@@ -35,6 +35,11 @@ HOLDING = {"address": "holding:5"}
         (HOLDING, {}, "nothing gives it a value: write `source: device/tag`"),
         ({**HOLDING, "source": "mixer/sped"}, {}, "there is no tag mixer/sped"),
         ({**HOLDING, "source": "mixer/run"}, {}, "mixer/run is bool, and this is uint16"),
+        (
+            {**HOLDING, "source": "mixer/speed", "type": "int16[2]"},
+            {},
+            "this is int16[2]: an array is shown as an array of the same length",
+        ),
         ({**HOLDING, "source": "mixer/speed", "write": True}, {}, "leave out `write`"),
         (
             {**HOLDING, "source": "mixer/speed"},

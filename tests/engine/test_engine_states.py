@@ -35,16 +35,19 @@ from gateway.engine.jobs import (
     WriteTogether,
     requests_of,
 )
-from gateway.engine.requests import Command, Request, Write
+from gateway.engine.requests import Command, Group, Request, Write
+from gateway.engine.runs import together, verified
 from gateway.errors import (
     BadValue,
     Garbled,
+    GatewayError,
     LineDown,
     NoReply,
     Refusal,
     Refused,
     Unsteady,
 )
+from gateway.protocols.driver import Span
 from gateway.protocols.modbus import ModbusRtu
 from gateway.protocols.vigor import Vigor
 from gateway.tags import Quality, WriteRule
@@ -109,18 +112,37 @@ def possible(job: Transacted) -> list[Result]:
             return ["done", BadValue("argument"), *FAILED]
         case Answer():
             return [None, Garbled("noise")]
-        case WriteTogether():
-            return [Sent(), *FAILED]
+        case WriteTogether(writes=writes, run=run):
+            return [Sent(), *FAILED] if run is None else possible_of_run(writes, run)
         case ReadBack(writes=writes):
             held = [list(write.units) for write in writes]
             refused = Refused("no such address", code="06", refusal=Refusal.ADDRESS)
             return [HeldTogether(held), HeldTogether([refused] * len(held)), *UNCLEAR]
+        case Confirm(writes=[_, _, *_] as writes, run=run):
+            return [Sent(held=units_of(writes, run)), Sent(held=[12345] * run.size), *FAILED]
         case Write() | Confirm() | Repeat():
             return possible_of_write(job)
 
 
+def units_of(writes: Sequence[Write], run: Span) -> list[int]:
+    return together(run, writes, [0] * run.size)
+
+
+def possible_of_run(writes: Sequence[Write], run: Span) -> list[Result]:
+    if not any(verified(write.tag) for write in writes):
+        return [Sent(), *FAILED]
+    results: list[Result] = [Sent(held=units_of(writes, run)), Sent(held=[12345] * run.size)]
+    return [*results, Sent(refused_back=REFUSED[0]), *FAILED]
+
+
 def possible_of_write(job: Write | Confirm | Repeat) -> list[Result]:
-    write = job if isinstance(job, Write) else job.write
+    match job:
+        case Confirm(writes=writes):
+            [write] = writes
+        case Repeat():
+            write = job.write
+        case _:
+            write = job
     if job.device.broadcast:
         return [Sent(acknowledged=False), Sent(), *UNCLEAR]
     if write.tag.write is None or not write.tag.write.verify:
@@ -142,6 +164,8 @@ class Machine(RuleBasedStateMachine):
         self.submitted = list[Request]()
         self.ended = set[Request]()
         self.in_flight: list[Transacted] = []
+        self.groups: dict[Group, list[Write]] = {}
+        self.failed = set[Group]()  # one of its writes was not done
         self.open()
 
     @property
@@ -161,10 +185,12 @@ class Machine(RuleBasedStateMachine):
             self.states[one] = one.state
         for effect in effects:
             match effect:
-                case RequestEnded(request):
+                case RequestEnded(request, outcome):
                     assert request in self.submitted
                     assert request not in self.ended, "a request has one outcome"
                     self.ended.add(request)
+                    if isinstance(request, Write) and isinstance(outcome, GatewayError):
+                        self.failed |= {one for one in self.groups if one is request.group}
                 case OnlineChange(device, online):
                     self.online[device] = online
                 case Samples(samples):
@@ -191,6 +217,8 @@ class Machine(RuleBasedStateMachine):
             for request in requests_of(job):
                 assert request.expires > self.now, "no request is sent after its expiry"
         assert all(request not in self.ended for request in requests_of(job))
+        if isinstance(job, Write | WriteTogether):
+            self.in_order([one for one in requests_of(job) if isinstance(one, Write)])
         if waited[job.device]:
             assert isinstance(job, RESYNC)
         if isinstance(job, Poll):
@@ -200,6 +228,14 @@ class Machine(RuleBasedStateMachine):
         if isinstance(job, Probe):
             assert not job.device.broadcast
         return job
+
+    def in_order(self, writes: Sequence[Write]) -> None:
+        for write in writes:
+            if write.group is not None:
+                assert write.group not in self.failed, "the rest of a group is not sent"
+                members = self.groups[write.group]
+                before = members[: members.index(write)]
+                assert all(one in self.ended or one in writes for one in before)
 
     def expire(self) -> None:
         self.note(self.engine.expire(self.now, self.time))
@@ -242,6 +278,8 @@ class Machine(RuleBasedStateMachine):
         for _ in range(20):
             for _ in range(chance.choice([0, 0, 0, 1, 3])):
                 self.write(chance.randrange(100), chance.randrange(2))
+            if chance.random() < 0.2:
+                self.group(chance.randrange(5), chance.randrange(100))
             if chance.random() < 0.05:
                 self.command(4, "stop")
             if not self.in_flight:
@@ -279,6 +317,15 @@ class Machine(RuleBasedStateMachine):
         pairs = [(device, tag) for device in self.devices for tag in device.tags]
         device, tag = pairs[which % len(pairs)]
         self._submit(Write(device, tag, tag.encode(value), self.now))
+
+    @rule(which=st.integers(0, 4), seed=st.integers(0, 99))
+    def group(self, which: int, seed: int) -> None:
+        device, group, chance = self.devices[which], Group(), random.Random(seed)
+        tags = chance.sample(device.tags, chance.randrange(1, len(device.tags) + 1))
+        writes = [Write(device, tag, tag.encode(1), self.now, group=group) for tag in tags]
+        self.groups[group] = writes
+        self.submitted += writes
+        self.note(self.engine.submit_group(writes, self.now))
 
     @rule(which=st.integers(0, 4), name=st.sampled_from(["stop", "model", "fly"]))
     def command(self, which: int, name: str) -> None:

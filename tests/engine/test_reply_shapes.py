@@ -165,7 +165,7 @@ def test_writes_of_many_values_are_not_remembered_one_by_one() -> None:
     shapes = reply_shapes(driver, [tag], BadAddresses(driver.cost))
     assert shapes is not None
     for value in range(100):
-        shapes.written(tag, [value], float(value))
+        shapes.written(tag.span, [value], False, float(value))
     assert len(shapes._used) == 0
 
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from gateway.config import ConfigErrors, load
 from gateway.errors import BadValue, GatewayError
-from gateway.northbound.payload import parse_write
+from gateway.northbound.parsing import parse_write
 from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.driver import AnyDriver, Span
 from gateway.protocols.modbus import ModbusAscii, ModbusRtu, ModbusTcp

@@ -153,6 +153,16 @@ def test_texts_have_a_last_value_only_and_booleans_a_share_of_time() -> None:
         "B",
         "good",
     )
+    [array] = buckets([(0, (1, 2), None), (5, (3, 4), None)], 10, TimeRange(0, 9), 10)
+    assert (array.min, array.max, array.mean, array.last, array.good) == (
+        None,
+        None,
+        None,
+        (3, 4),
+        2,
+    )
+    [other] = buckets([(0, 5, None), (5, (3, 4), None)], 10, TimeRange(0, 9), 10)  # another type
+    assert (other.mean, other.last, other.known) == (None, (3, 4), 10)
     [bit] = buckets([(0, True, None), (4, False, None)], 10, TimeRange(0, 9), 10)
     assert (bit.min, bit.max, bit.mean, bit.last) == (False, True, 0.4, False)
     huge = [(0, 1.7e308, None), (5, -1.7e308, None)]

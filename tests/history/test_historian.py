@@ -5,6 +5,7 @@ import math
 import random
 import threading
 import tracemalloc
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +14,11 @@ import pytest
 from gateway.errors import BadValue, Busy
 from gateway.history import Historian
 from gateway.history.reader import Reader
+from gateway.history.recent import Recent
 from gateway.history.sections import FullRow
+from gateway.protocols.driver import Span
 from gateway.tags import Reason, bad, good
-from gateway.values import Value
+from gateway.values import Layout, Value, parse_type
 from tests.history.recorded import (
     DOOR,
     EVERYTHING,
@@ -35,6 +38,7 @@ from tests.history_writer import tag, until
 
 def test_samples_of_all_types_survive_a_restart(tmp_path: Path) -> None:
     recorded: list[Value] = [True, False, 1, -5, 2**64 - 1, 0.1, math.inf, "", "Füllstand", "A\0B"]
+    recorded += [(1, -2), (0.1, 2.0), (True, False)]
     samples = [good(SPEED, value, NOON + n) for n, value in enumerate(recorded)]
     samples.append(bad(SPEED, Reason.NO_REPLY, NOON + 100))
     with history(tmp_path / "h.db") as historian:
@@ -44,6 +48,16 @@ def test_samples_of_all_types_survive_a_restart(tmp_path: Path) -> None:
         again = list(historian.samples(SPEED, EVERYTHING, None))
     assert again == samples
     assert [type(sample.value) for sample in again] == [type(sample.value) for sample in samples]
+
+
+def test_arrays_make_a_run_shorter() -> None:
+    """A run has to fit memory and `max_size`, however long its values are."""
+    steps = replace(tag("steps"), layout=Layout(parse_type("int16[8]")), span=Span("D", 100, 8))
+    recent = Recent(longest=10, oldest=60.0)
+    recent.add(good(steps, (n,) * 8, NOON + n) for n in range(5))
+    assert [len(run.samples) for run in recent.runs()] == [2, 2, 1]
+    recent.add(good(SPEED, n, NOON + 10 + n) for n in range(12))
+    assert [len(run.samples) for run in recent.runs()] == [2, 2, 6, 7]
 
 
 def test_a_recorded_sample_is_found_before_it_is_stored(tmp_path: Path) -> None:

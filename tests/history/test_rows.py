@@ -19,6 +19,9 @@ any_value = st.one_of(
     st.sampled_from([2**63 - 1, 2**63, 2**64 - 1, -(2**63)]),
     st.floats(),
     st.text(st.characters(exclude_categories=())),
+    st.lists(st.integers(-(2**63), 2**64 - 1)).map(tuple),
+    st.lists(st.floats(allow_nan=False, allow_infinity=False)).map(tuple),
+    st.lists(st.booleans()).map(tuple),
 )
 
 

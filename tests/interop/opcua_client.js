@@ -5,7 +5,7 @@
 //     browse i=85                 the nodes below: their ids
 //     read ns=2;s=mixer/speed     value, type, status, source time
 //     meta ns=2;s=mixer/speed     data type, access level, description, unit and range
-//     write ns=2;s=mixer/recipe Int16 7      the status code
+//     write ns=2;s=mixer/recipe Int16 7      the status code; `[1,2]` for an array
 //     start …  /  written         the same write in the background; waits for its status code
 //     history ns=2;s=mixer/speed SECONDS COUNT [back|last]   of the last seconds; `back`: the newest
 //                                            first; `last`: the newest first, without a start
@@ -16,9 +16,12 @@ const readline = require("node:readline");
 const ua = require("node-opcua-client");
 const { OPCUACertificateManager } = require("node-opcua-certificate-manager");
 
+const ARRAY = { arrayType: ua.VariantArrayType.Array };
+
 function shown(value) {
+    const known = value.value ? value.value.value : null;
     return {
-        value: value.value ? value.value.value : null,
+        value: ArrayBuffer.isView(known) ? [...known] : known,
         type: value.value ? ua.DataType[value.value.dataType] : null,
         status: value.statusCode.name,
         time: value.sourceTimestamp,
@@ -51,7 +54,7 @@ async function write(session, nodeId, type, text) {
     const code = await session.write({
         nodeId,
         attributeId: ua.AttributeIds.Value,
-        value: { value: { dataType, value } },
+        value: { value: { dataType, value, ...(Array.isArray(value) ? ARRAY : {}) } },
     });
     return code.name;
 }

@@ -132,6 +132,31 @@ async def _write_and_read(line: Plant, device: Device, text: str, value: int) ->
     await until(lambda: line.now[tag].value == value)
 
 
+async def _write_group(line: Plant, device: Device, texts: list[str], function: int) -> None:
+    """Fifty registers, or twenty bits, are one request: function 16, or 15."""
+    tags = [next(tag for tag in device.tags if tag.text == text) for text in texts]
+    bits = texts[0].startswith("coil")
+    values = [n % 2 == 0 if bits else 3 * n for n in range(len(tags))]
+    begin = len(line.bench.sent)
+    pairs = zip(tags, values, strict=True)
+    async with asyncio.timeout(10):
+        ends = line.line.write_group(device, [(tag, tag.encode(value)) for tag, value in pairs])
+        results = await asyncio.gather(*ends)
+    assert all(result.verified for result in results)
+    assert [result.value for result in results] == values
+    sent = [data for _, data in line.bench.sent[begin:]]
+    assert [found for data in sent if (found := _function(device, data)) > 4] == [function]
+
+
+def _function(device: Device, data: bytes) -> int:
+    match device.driver:
+        case ModbusTcp():
+            return data[7]
+        case ModbusAscii():
+            return int(data[3:5], 16)
+    return data[1]
+
+
 async def until(happened: Callable[[], bool]) -> None:
     async with asyncio.timeout(10):
         while not happened():
@@ -157,6 +182,8 @@ async def test_a_whole_line_with(name: str, request: pytest.FixtureRequest, tmp_
             }
             for text, value in (("holding:100", 0xBEEF), ("coil:4", True), ("coil:3", False)):
                 await _write_and_read(line, device, text, value)
+            await _write_group(line, device, [f"holding:{n}" for n in range(149, 99, -1)], 16)
+            await _write_group(line, device, [f"coil:{n}" for n in range(20)], 15)
         assert device.record.failures == {}
         assert device.record.exchanges > 10  # how many polls fit in depends on the machine
 

@@ -212,7 +212,7 @@ def test_a_confirmation_resyncs_before_it_reads_back(verify: bool) -> None:
     plc = Plc()
     plc.station.memory.write("D", 5, [42])
     write = plc.write("D5", [42], WriteRule(repeat=True, verify=verify))
-    result = plc.perform(Confirm(plc.device, write, LOST, write.tag.span, 7))
+    result = plc.perform(Confirm(plc.device, (write,), write.tag.span, LOST, write.tag.span, 7))
     assert result == (Sent(held=[42]) if verify else Sent())
     assert plc.commands == (["TT", "WR"] if verify else ["TT"])
 
@@ -224,7 +224,7 @@ def test_a_confirmation_whose_resync_is_refused_stays_unclear() -> None:
         lambda data, now: [b"\x1501FF06"] if data[5:7] == b"TT" else hear(data, now)
     )
     write = plc.write("D5", [42], WriteRule(verify=True))
-    result = plc.perform(Confirm(plc.device, write, LOST, write.tag.span, 7))
+    result = plc.perform(Confirm(plc.device, (write,), write.tag.span, LOST, write.tag.span, 7))
     assert isinstance(result, Unclear)
     assert "WR" not in plc.commands
 
@@ -286,7 +286,7 @@ def jobs(plc: Plc) -> list[Transacted]:
         write,
         WriteTogether(plc.device, [write, plc.write("D500", [43])]),
         Repeat(plc.device, write, LOST),
-        Confirm(plc.device, write, LOST, write.tag.span, 7),
+        Confirm(plc.device, (write,), write.tag.span, LOST, write.tag.span, 7),
         Probe(plc.device, None, 7),
         Command(plc.device, "loopback", "ABC", 0.0),
     ]

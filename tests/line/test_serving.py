@@ -11,14 +11,16 @@ from gateway.app import Gateway
 from gateway.cli import direct
 from gateway.config import built
 from gateway.errors import BadValue, Busy
-from gateway.tags import Quality, Reason, Tag
+from gateway.tags import Quality, Reason, Tag, WriteResult
 from gateway.transport import TcpAddress, listen
+from gateway.values import Value
 from tests.interop.peers import free_port
 
 TAGS = {
     "limit": {"address": "holding:1", "write": {"max": 50}, "retain": True},
     "name": {"address": "holding:10", "type": "string[4]", "write": True},
     "order": {"address": "holding:100"},
+    "steps": {"address": "holding:20", "type": "int16[3]", "write": True, "retain": True},
 }
 
 
@@ -39,9 +41,11 @@ async def test_a_held_value_is_on_the_disk_before_it_is_acknowledged(tmp_path: P
     first = gateway(tmp_path)
     assert (await first.write(tag(first, "limit"), 42)).value == 42
     assert (await first.write(tag(first, "name"), "AB")).value == "AB"
+    assert (await first.write(tag(first, "steps"), (1, -2, 3))).value == (1, -2, 3)
     again = gateway(tmp_path)
     again.serving.restore()
     assert again.sample(tag(again, "limit")).value == 42
+    assert again.sample(tag(again, "steps")).value == (1, -2, 3)
     assert again.sample(tag(again, "name")).quality is Quality.BAD  # without `retain`
 
 
@@ -55,6 +59,19 @@ async def test_a_value_that_cannot_be_kept_is_refused_and_not_shown(tmp_path: Pa
     assert one.sample(tag(one, "limit")).value == 42
     with pytest.raises(BadValue):
         await one.write(tag(one, "limit"), 51)
+
+
+async def test_several_held_values_change_all_at_once_or_none(tmp_path: Path) -> None:
+    one = gateway(tmp_path)
+    values: list[tuple[Tag, Value]] = [(tag(one, "limit"), 42), (tag(one, "name"), "AB")]
+    ends = await one.write_group(values)
+    assert [end.value for end in ends if isinstance(end, WriteResult)] == [42, "AB"]
+    assert one.sample(values[0][0]).time == one.sample(values[1][0]).time
+    with pytest.raises(BadValue, match="greatest value 50"):
+        await one.write_group([(tag(one, "name"), "CD"), (tag(one, "limit"), 51)])
+    with pytest.raises(BadValue, match="written by the master"):
+        await one.write_group([(tag(one, "name"), "CD"), (tag(one, "order"), 1)])
+    assert one.sample(tag(one, "name")).value == "AB"
 
 
 async def test_a_damaged_file_of_held_values_is_moved_aside(tmp_path: Path) -> None:

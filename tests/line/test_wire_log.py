@@ -1,6 +1,9 @@
 """The wire log: its listeners, and no cost while it is off."""
 
+from gateway.line.exchanges import shown
 from gateway.line.wire_log import Event, Piece, WireLog
+from gateway.tags import good
+from tests.history_writer import tag
 
 
 def test_without_a_listener_the_wire_log_is_off() -> None:
@@ -29,3 +32,8 @@ def test_every_listener_gets_the_bytes_until_it_is_forgotten() -> None:
     wire_log.forget(second.append)
     assert not wire_log.active
     assert (first, second) == ([Piece(">", b"1")], [Piece(">", b"2")])
+
+
+def test_an_exchange_shows_the_first_elements_of_an_array() -> None:
+    long, short = good(tag("steps"), (1, 2, 3, 4, 5, 6), 0), good(tag("run"), (True, False), 0)
+    assert shown([long, short]) == "steps [1, 2, 3, 4 and 2 more], run [True, False]"

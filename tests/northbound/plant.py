@@ -10,10 +10,7 @@ from typing import Any, Literal
 from gateway.alarms import Alarms
 from gateway.config import ZenohConfig
 from gateway.engine.requests import CommandResult, Peeked
-from gateway.errors import (
-    BadValue,
-    Busy,
-)
+from gateway.errors import BadValue, Busy, GatewayError, NotSent
 from gateway.line.duty import Duty
 from gateway.line.wire_log import WireLog
 from gateway.northbound.northbound import Northbound
@@ -89,6 +86,20 @@ class PlainPlant:
             raise self.endings[value]
         self.written.append((tag.key, value))
         return WriteResult(value, time.time_ns(), verified=True, took=0.031)
+
+    async def write_group(
+        self, values: Sequence[tuple[Tag, Value]], within: float, patience: float
+    ) -> Sequence[WriteResult | GatewayError]:
+        ends = list[WriteResult | GatewayError]()
+        for tag, value in values:
+            if any(isinstance(end, GatewayError) for end in ends):
+                ends.append(NotSent("not sent, because one before it failed"))
+                continue
+            try:
+                ends.append(await self.write(tag, value, within))
+            except GatewayError as error:
+                ends.append(error)
+        return ends
 
     def mark_published(self, samples: Sequence[Sample]) -> None:
         self.republished += samples

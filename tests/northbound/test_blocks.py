@@ -15,7 +15,11 @@ from tests.northbound.test_payload import NOON, tag
         st.tuples(
             st.text("aä–_", min_size=1, max_size=80),
             st.one_of(
-                st.text(max_size=250), st.integers(-(2**63), 2**63), st.floats(), st.booleans()
+                st.text(max_size=250),
+                st.integers(-(2**63), 2**63),
+                st.floats(),
+                st.booleans(),
+                st.lists(st.floats(allow_nan=False, allow_infinity=False), max_size=50).map(tuple),
             ),
             st.text(max_size=400),
         ),

@@ -20,6 +20,7 @@ from gateway.errors import (
 )
 from gateway.northbound import payload
 from gateway.northbound.meta import meta
+from gateway.northbound.parsing import parse_write
 from gateway.northbound.payload import Failure, Problem, WriteOutcome
 from gateway.protocols.driver import Address, Span, Unit
 from gateway.tags import Deadband, Reason, Tag, WriteResult, WriteRule, bad, good
@@ -126,9 +127,28 @@ def test_meta_holds_type_address_interval_and_limits() -> None:
     ],
 )
 def test_a_write_is_a_scalar_or_an_object_with_the_value(sent: bytes, value: Value) -> None:
-    found = payload.parse_write(sent)
+    found = parse_write(sent)
     assert found == value
     assert type(found) is type(value)
+
+
+@pytest.mark.parametrize("sent", [b'[true, 1, 1.0, "A"]', b'{"value": [true, 1, 1.0, "A"]}'])
+def test_a_write_of_an_array_is_a_list(sent: bytes) -> None:
+    found = parse_write(sent)
+    assert found == (True, 1, 1.0, "A")
+    assert list(map(type, found)) == [bool, int, float, str]
+    assert json.loads(payload.outcome(WriteResult(found, NOON, 0.03)))["value"] == [
+        True,
+        1,
+        1.0,
+        "A",
+    ]
+
+
+def test_the_audit_of_a_list_has_a_printable_size() -> None:
+    assert payload.loggable((2**70, 1.5)) == ["1180591620717411303424", 1.5]
+    assert payload.loggable((1,) * 128) == [1] * 128
+    assert payload.loggable((True,) * 129) == f"[{'true,' * 59}true…"
 
 
 @pytest.mark.parametrize(
@@ -137,7 +157,11 @@ def test_a_write_is_a_scalar_or_an_object_with_the_value(sent: bytes, value: Val
         b"",
         b" \n",
         b"null",
-        b"[1]",
+        b"[[1]]",
+        b"[null]",
+        b'[{"value": 1}]',
+        b"[1, NaN]",
+        b"[" + b"0," * 2000 + b"0]",
         b"{}",
         b'{"value": null}',
         b'{"value": {"value": 1}}',
@@ -162,17 +186,17 @@ def test_a_write_is_a_scalar_or_an_object_with_the_value(sent: bytes, value: Val
 )
 def test_any_other_payload_is_a_bad_value(sent: bytes) -> None:
     with pytest.raises(BadValue):
-        payload.parse_write(sent)
+        parse_write(sent)
 
 
 @given(st.binary(max_size=64))
 @settings(max_examples=300)
 def test_any_bytes_are_a_value_or_a_bad_value(sent: bytes) -> None:
     try:
-        found = payload.parse_write(sent)
+        found = parse_write(sent)
     except BadValue:
         return
-    assert isinstance(found, (bool, int, float, str))
+    assert isinstance(found, (bool, int, float, str, tuple))
 
 
 @pytest.mark.parametrize(

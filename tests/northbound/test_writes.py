@@ -83,7 +83,7 @@ async def test_every_refused_write_has_its_error_word() -> None:
             (recipe, b"7" + b" " * 70_000, "bad-value", None),
             ("plant/mixer/speed/@set", b"7", "not-writable", None),
             ("plant/mixer/nothing/@set", b"7", "unknown-tag", None),
-            ("plant/mixer/@set", b"7", "unknown-tag", None),
+            ("plant/mixer/@set", b"7", "bad-value", None),  # no object
             ("plant/mixer/*/@set", b"7", "unknown-tag", None),
             ("plant/mixer/**/@set", b"7", "unknown-tag", None),
         ):

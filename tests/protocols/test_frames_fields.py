@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gateway.errors import BadValue, ConfigError, Garbled
+from gateway.numerals import Scalar
 from gateway.protocols.frames import Field
-from gateway.values import Value
 from tests.vectors import vectors
 
 BY_ID = {v.id: v for v in vectors("noproto-vb1com", "noproto-k120s", "vigor")}
@@ -96,7 +96,7 @@ def test_a_decimal_comes_back_as_it_was_put(whole: int, hundredths: int) -> None
         (Field(type="text", encoding="latin-1"), "Ä", b"\xc4"),
     ],
 )
-def test_values_are_written_in_their_format(field: Field, value: Value, raw: bytes) -> None:
+def test_values_are_written_in_their_format(field: Field, value: Scalar, raw: bytes) -> None:
     assert field.put(value) == raw
 
 
@@ -122,7 +122,7 @@ def test_values_are_written_in_their_format(field: Field, value: Value, raw: byt
         (Field(type="text"), "A\rRESET"),
     ],
 )
-def test_a_value_that_cannot_be_written_in_full_is_refused(field: Field, value: Value) -> None:
+def test_a_value_that_cannot_be_written_in_full_is_refused(field: Field, value: Scalar) -> None:
     with pytest.raises(BadValue):
         field.put(value)
 

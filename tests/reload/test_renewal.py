@@ -3,6 +3,7 @@
 import asyncio
 import gc
 import random
+import weakref
 from collections import Counter
 from itertools import pairwise
 from typing import Any
@@ -305,3 +306,14 @@ async def test_many_reloads_leave_nothing() -> None:
         assert set(engine.schedule._polls) == set(engine.devices)  # private: a leak shows nowhere
         assert len(mirror._published) == len(keys)
         await plant.until_good(*keys)
+
+
+@on_virtual_time
+async def test_no_timer_keeps_an_ended_line() -> None:
+    async with running(file(hall=MIXER, yard={"press": vigor(1)})) as plant:
+        await plant.until_good("mixer/level")
+        ended = weakref.ref(plant.gateway.lines[0])
+        await plant.reload(lambda data: data["lines"]["hall"].update(baudrate=9600))
+        await asyncio.sleep(0.1)  # its time-outs are longer
+        gc.collect()
+        assert ended() is None

@@ -19,6 +19,7 @@ SOURCES = {
     "run": {"address": "M5"},
     "gear": {"address": "D130"},
     "name": {"address": "D120", "type": "string[8]"},
+    "steps": {"address": "D140", "type": "float32[2]"},
 }
 MIXER = {"protocol": "vigor", "station": 1, "tags": SOURCES}
 

@@ -188,3 +188,22 @@ def test_any_bytes_write_nothing_outside_accept(pieces: list[bytes], pdu: bytes)
     inside = {"setpoint", "ramp", "door", "start"}
     assert all(event.keys() <= inside for event in made.written)
     assert ask(bench(), "03 0000 0001") == "03 02 04 d2"
+
+
+def test_a_master_reads_and_writes_arrays() -> None:
+    tags = {
+        "steps": {"address": "holding:20", "type": "int16[2]", "source": "mixer/steps"},
+        "order": {"address": "holding:100", "type": "uint16[3]"},
+    }
+    made = Bench("tcp://127.0.0.1:5020", {"hmi": {**HMI, "tags": tags}})
+    assert ask(made, "03 0014 0002") == "83 04"
+    made.values["mixer/steps"] = (1.4, -2.6)
+    assert ask(made, "03 0014 0002") == "03 04 00 01 ff fd"
+    assert ask(made, "03 0015 0001") == "03 02 ff fd"
+    assert ask(made, "10 0064 0003 06 0001 0002 ffff") == "10 00 64 00 03"
+    assert made.written == [{"order": (1, 2, 65535)}]
+    # Some of its words would join parts of two arrays.
+    assert ask(made, "10 0064 0002 04 0003 0004") == "90 02"
+    assert ask(made, "06 0065 0009") == "86 02"
+    assert made.written == [{"order": (1, 2, 65535)}]
+    assert ask(made, "03 0064 0003") == "03 06 00 01 00 02 ff ff"

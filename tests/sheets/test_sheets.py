@@ -277,6 +277,13 @@ def test_other_texts_are_no_numbers(text: str) -> None:
         ("LReal", "float64"),
         ("Bit", "bool"),
         ("STRING(16)", "string[16]"),
+        ("uint16[50]", "uint16[50]"),
+        ("WORD[50]", "uint16[50]"),
+        ("REAL(8)", "float32[8]"),
+        ("ARRAY[0..49] OF INT", "int16[50]"),
+        ("Array [1..30] of Bool", "bool[30]"),
+        ("float[single precision]", "float32"),
+        ("THING[3]", "THING[3]"),
         ("string", "string[8]"),
         ("Default", None),
         ("INT33", "INT33"),  # the configuration refuses it with the list of types

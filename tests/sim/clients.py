@@ -4,7 +4,7 @@ import asyncio
 import random
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from gateway.engine.device import Device
 from gateway.errors import BadValue, Busy, GatewayError, LineDown, Offline, Refused
@@ -24,6 +24,15 @@ NOT_SENT = (Busy, Offline, LineDown)
 _QUIET = ("deaf", "reboot", "vanish", "flicker", "hung", *DELAYING)
 
 
+class Asked(NamedTuple):
+    """One write of a client: when, how many frames it took, what the PLC held before."""
+
+    since: float
+    sent: int
+    beside_others: bool
+    held: Value | None
+
+
 @dataclass(eq=False)
 class Client:
     """A client of one device. `rarity`: the factor by which its requests are rarer."""
@@ -33,6 +42,8 @@ class Client:
     bus: Bus
     chance: random.Random
     rarity: float
+    # Writes several tags in groups, in place of one by one.
+    groups: Callable[["Client", list[tuple[Tag, Value]]], Awaitable[None]] | None = None
 
     @property
     def number(self) -> int:
@@ -75,7 +86,10 @@ class Client:
                     bits = 32 if tag.span.size == 2 else 16
                     value = (number * 40_503) % (1 << bits)
                 writes.append((tag, value))
-            await self._write(writes)
+            if self.groups is not None and not self.device.broadcast:
+                await self.groups(self, writes)
+            else:
+                await self._write(writes)
 
     async def _write(self, writes: list[tuple[Tag, Value]]) -> None:
         """Writes several tags at once: in one frame, or one by one after a refusal."""
@@ -95,14 +109,27 @@ class Client:
     async def _write_one(self, tag: Tag, value: Value, beside_others: bool) -> None:
         judge, bus, station = self.judge, self.bus, self.judge.stations[tag.device]
         frames, since = bus.writes[self.number], judge.now
-        known = _times(station, tag)
+        known = times(station, tag)
         held = tag.decode(station.holds(tag))
         outcome = await self._outcome(tag, value)
         sent = bus.writes[self.number] - frames
         bus.note("outcome", tag.key, value, type(outcome).__name__, sent)
         judge.story.counts[f"write {type(outcome).__name__}"] += 1
+        obeyed = times(station, tag) - known
+        asked = Asked(since, sent, beside_others, held)
+        await self.judge_end(tag, value, outcome, asked, obeyed)
+
+    async def judge_end(
+        self,
+        tag: Tag,
+        value: Value,
+        outcome: WriteResult | GatewayError,
+        asked: Asked,
+        obeyed: int,
+    ) -> None:
+        judge, bus, station = self.judge, self.bus, self.judge.stations[tag.device]
+        since, sent, beside_others, held = asked
         holds = tag.decode(station.holds(tag)) == value
-        obeyed = _times(station, tag) - known
         most = 2 if tag.write is not None and tag.write.repeat else 1
         match outcome:
             case WriteResult(acknowledged=False):
@@ -289,9 +316,13 @@ def _alike(one: Device, other: Device) -> bool:
     return False
 
 
-def _times(station: Troubled, tag: Tag) -> int:
+def times(station: Troubled, tag: Tag) -> int:
     """Returns the number of times of writes to the tag: some PLCs write it byte by byte."""
-    return len({at for at, _ in station.written.get((tag.span.area, tag.span.start), ())})
+    return len(all_times(station, tag))
+
+
+def all_times(station: Troubled, tag: Tag) -> set[float]:
+    return {at for at, _ in station.written.get((tag.span.area, tag.span.start), ())}
 
 
 def _switched(station: Troubled) -> int:

@@ -9,7 +9,7 @@ from typing import Any
 from tests.sim.episodes import Episode, disappearances, line_episodes
 from tests.sim.hostile import bridges, hostile_episodes, hostile_manners
 from tests.sim.manners import Manners
-from tests.sim.more import add_to, net_line, raw_line, rule
+from tests.sim.more import add_neighbours, add_to, net_line, raw_line, rule
 
 PROTOCOLS = ("vigor", "computer-link", "modbus-rtu", "modbus-ascii")
 # How often tags are read: `busy` fills the wires, `lean` leaves time for many hours.
@@ -20,6 +20,7 @@ PACES = {
     "tardy": ("500ms", "1s"),
     "storm": ("500ms", "1s", "2s"),  # ten times as many faults
     "lean": ("20s", "30s", "60s", "60s"),
+    "groups": ("500ms", "1s", "2s"),  # clients write several tags at once, some side by side
     "hostile": ("200ms", "200ms", "500ms", "1s"),  # other parties on the line, and no other fault
 }
 
@@ -65,6 +66,7 @@ def draw(seed: int, seconds: float, pace: str = "busy") -> Drawn:
             chunks[name] = more.choice((0, 1, 1, 16))
             zeros[name] = more.random() < 0.5
             episodes += line_episodes(name, lines[name], more, seconds, haste, pace)
+    add_neighbours(lines, missing, seed, pace)
     if pace in ("busy", "lean", "storm"):
         for name, line in lines.items():
             for device, settings in line["devices"].items():

@@ -195,6 +195,40 @@ def _neighbour(every: str, chance: random.Random) -> dict[str, Any]:
     }
 
 
+def add_neighbours(
+    lines: dict[str, Any], missing: dict[str, frozenset[int]], seed: int, pace: str
+) -> None:
+    """Adds tags that can be written, beside those that can: groups fill runs with them.
+
+    Some devices lack a word in the middle.
+    """
+    if pace != "groups":
+        return
+    chance = random.Random(f"groups {seed}")
+    for line in lines.values():
+        for name, device in line["devices"].items():
+            tags = device["tags"]
+            if "w1" not in tags or device["protocol"] == "frames":
+                continue
+            area, first = _split(tags["w0"]["address"])
+            words = {"g0": first + 1, "g4": first + 4, "g5": first + 5, "g6": first + 11}
+            for tag, number in words.items():
+                tags[tag] = {"address": f"{area}{number}", "type": "uint16", "write": rule(chance)}
+            for tag, bit in (("g7", 0), ("g8", 15)):
+                tags[tag] = {"address": f"{area}{first + 10}.{bit}", "write": rule(chance)}
+            area, point = _split(tags["w2"]["address"])
+            for number in range(point - point % 8, point - point % 8 + 8):
+                if number != point:
+                    tags[f"b{number}"] = {"address": f"{area}{number}", "write": rule(chance)}
+            if chance.random() < 0.2:
+                missing[name] = missing.get(name, frozenset()) | {first + 4}
+
+
+def _split(address: str) -> tuple[str, int]:
+    digits = len(address) - len(address.rstrip("0123456789"))
+    return address[:-digits], int(address[-digits:])
+
+
 def rule(chance: random.Random) -> dict[str, Any]:
     """Draws the rule for writes that end unclear."""
     return {"verify": chance.random() < 0.4, "repeat": chance.random() < 0.3}

@@ -13,6 +13,7 @@ from tests.sim.north_judge import BEGIN, GATEWAY, STORED, Attempt, Judge, micros
 from tests.sim.north_peers import Answer, Client
 
 PAGE = f"{GATEWAY}/page"
+GROUPS = "north-groups"  # a pace: the writer also writes several tags at once
 PATIENCE = 30.0  # seconds for an answer
 ERRORS = {"busy", "bad-query", "damaged", "unclear"}
 
@@ -187,18 +188,50 @@ class Person:
         async with asyncio.TaskGroup() as tasks:
             while True:
                 await self._pause()
+                if self.judge.story.pace == GROUPS:
+                    tasks.create_task(self._write_group(self.chance.choice(writable).device))
                 burst = self.chance.choice((1, 1, 1, 2, 12, 60))
                 for _ in range(burst):
                     tasks.create_task(self._write(self.chance.choice(writable)))
 
     def _write(self, tag: Tag) -> Coroutine[None, None, None]:
-        self._values += 1
-        value = self._values % 60_000 + 1
         dated, by_put = self.chance.random() < 0.3, self.chance.random() < 0.2
         made = self.judge.now if dated else None
-        attempt = Attempt(tag.key, value, made, by_put)
-        self.judge.attempts[tag.key, value] = attempt
-        return self._send(attempt)
+        return self._send(self._attempt(tag, made, by_put))
+
+    def _attempt(self, tag: Tag, made: float | None, by_put: bool) -> Attempt:
+        self._values += 1
+        attempt = Attempt(tag.key, self._values % 60_000 + 1, made, by_put)
+        self.judge.attempts[tag.key, attempt.value] = attempt
+        return attempt
+
+    async def _write_group(self, device: str) -> None:
+        """Writes the tags of a device that can be written, in any order, by query or by put."""
+        tags = [tag for tag in self.tags if tag.device == device and tag.write is not None]
+        self.chance.shuffle(tags)
+        by_put = self.chance.random() < 0.2
+        group = {tag.name: self._attempt(tag, None, by_put) for tag in tags}
+
+        def arrived() -> None:
+            for attempt in group.values():
+                attempt.arrived = self.judge.now
+
+        key = f"plant/{device}/@set"
+        payload = json.dumps({name: attempt.value for name, attempt in group.items()}).encode()
+        self.judge.story.counts["groups"] += 1
+        if by_put:
+            self.client.put(key, payload, arrived, None)
+            return
+        answer = await self.client.get(key, 10.0, payload=payload, arrived=arrived)
+        documents = [*answer.failures, *(document for _, document in answer.values)]
+        if not documents:
+            self.judge.story.counts["told nothing"] += 1
+            return
+        [document] = documents
+        ends = document.get("tags", dict.fromkeys(group, document))
+        for name, attempt in group.items():
+            self.judge.told(attempt, ends[name].get("error", "written"))
+        self.judge.in_order([*group.values()], done="error" not in document)
 
     async def _send(self, attempt: Attempt) -> None:
         def arrived() -> None:

@@ -19,7 +19,7 @@ REPAIRED = ROUNDS[-1] + 8.0  # seconds after the last loss that the gateway can 
 DELAYED = 1.0  # seconds in the queues of a link that is not full
 ON_WIRE = 0.2  # seconds from the last check of a write to its execution
 STORED = 1.0  # seconds until a sample is in the file
-NOT_DONE = ("busy", "line-down", "no-reply", "bad-value", "not-writable", "unknown-tag")
+NOT_DONE = ("not-sent", "busy", "line-down", "no-reply", "bad-value", "not-writable", "unknown-tag")
 NOT_SENT = set(NOT_DONE)
 MOST_OUTCOMES = 500  # that every history file of a seed keeps
 GATEWAY = "plant/@gateway/sim"
@@ -187,6 +187,17 @@ class Judge:
             self.broke(f"write of {attempt.value} to {attempt.tag} is told as done, and was not")
         if what in NOT_DONE and attempt.done:
             self.broke(f"write of {attempt.value} to {attempt.tag} was done, and told {what}")
+
+    def in_order(self, group: Sequence[Attempt], *, done: bool) -> None:
+        """Checks a group that was told. `done`: the answer as a whole is good."""
+        times = [min(attempt.done) for attempt in group if attempt.done]
+        if times != sorted(times):
+            self.broke(f"a group was executed in another order: {group}")
+        ends = [attempt.told for attempt in group]
+        if done != (set(ends) == {"written"}):
+            self.broke(f"the answer to a group is {'good' if done else 'an error'}: {ends}")
+        if "not-sent" in ends and set(ends[ends.index("not-sent") :]) != {"not-sent"}:
+            self.broke(f"a group went on after a tag that was not sent: {ends}")
 
     def put(self, key: str, data: bytes) -> None:
         """The gateway puts a document: the outcome of a write?"""

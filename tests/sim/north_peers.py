@@ -37,6 +37,7 @@ class Answer:
     asked: float
     replies: list[Received] = field(default_factory=list)
     errors: list[str] = field(default_factory=list)
+    failures: list[Any] = field(default_factory=list)  # the documents of the errors
     ended: str = ""
     over: asyncio.Event = field(default_factory=asyncio.Event)
 
@@ -152,7 +153,8 @@ class Client:
                 if ok is not None:
                     answer.replies.append(ok)
                 elif err is not None:
-                    answer.errors.append(json.loads(err)["error"])
+                    answer.failures.append(json.loads(err))
+                    answer.errors.append(answer.failures[-1]["error"])
                 else:
                     answer.end("whole")
             case Token(key=key, declared=True):

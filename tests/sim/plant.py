@@ -44,6 +44,8 @@ def make_tag(
     plain = {Unit.BIT: "bool", Unit.WORD: "int16", Unit.DWORD: "int32"}[unit]
     kind = parse_type(settings.pop("type", "bool" if address.bit is not None else plain))
     size = 1 if address.bit is not None or unit is not Unit.WORD else kind.words
+    if unit is Unit.BIT and kind.count:
+        size = kind.count
     return Tag(
         device=device,
         name=name or text,

@@ -15,6 +15,7 @@ from tests.sim.world import run
 
 ROOT = Path(__file__).parents[2]
 LEAN, BUSY, HOSTILE = range(6), range(100, 103), (100_000, 100_001)
+GROUPS = (700_102,)
 
 
 def test_the_seeds_contain_every_protocol_setting_and_fault() -> None:
@@ -53,6 +54,13 @@ def test_five_minutes_on_full_wires_break_no_rule(seed: int) -> None:
 def test_other_parties_on_the_line_break_no_rule(seed: int) -> None:
     story = run(seed, 0.3, "hostile")
     assert not story.broken, "\n".join([story.replay(), *story.broken])
+
+
+@pytest.mark.parametrize("seed", GROUPS)
+def test_groups_of_writes_break_no_rule(seed: int) -> None:
+    story = run(seed, 0.03, "groups")
+    assert not story.broken, "\n".join([story.replay(), *story.broken])
+    assert story.counts["groups done"] < story.counts["groups"]  # some had to stop
 
 
 def test_the_runs_of_a_seed_are_equal_byte_for_byte() -> None:

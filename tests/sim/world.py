@@ -34,6 +34,7 @@ from tests.sim.expect import Expectations
 from tests.sim.faults import Faults
 from tests.sim.freezer import Ear, Freezer
 from tests.sim.gadgets import Gadget
+from tests.sim.groups import write_group
 from tests.sim.judge import Judge
 from tests.sim.manners import Manners
 from tests.sim.net import SimNet
@@ -228,12 +229,15 @@ class World:
     def _tasks(self) -> list[asyncio.Task[None]]:
         """Starts all but the lines: clients, and devices that send by themselves."""
         tasks = []
-        haste = 10.0 if self.story.pace == "lean" else 1.0
+        haste = {"lean": 10.0, "groups": 3.0}.get(self.story.pace, 1.0)
         for device in self.devices.values():
             bus = self._buses[device.name]
             for who in ("writer", "reader", "boss"):
                 chance = random.Random(f"{who} {self.story.seed} {device.name}")
                 person = Client(device, self.judge, bus, chance, haste)
+                if self.story.pace == "groups":
+                    groups = random.Random(f"groups {self.story.seed} {device.name}")
+                    person.groups = partial(write_group, groups)
                 if who == "writer":
                     tasks.append(self._start(person.write_now_and_then()))
                 elif who == "reader":

@@ -127,6 +127,44 @@ async def test_a_modbus_plc_has_the_drivers_word_order(order: Any) -> None:
     assert await driver.read(talk, Span("C32", 207, 1)) == [0x12345678]
 
 
+@pytest.mark.parametrize(
+    ("settings", "address", "kind"),
+    [
+        ({"protocol": "vigor"}, "D100", "uint16[64]"),
+        ({"protocol": "vigor"}, "M0", "bool[128]"),
+        ({"protocol": "vigor"}, "C200", "int32[8]"),
+        ({"protocol": "computer-link"}, "D0100", "float32[16]"),
+        ({"protocol": "computer-link"}, "M0005", "bool[30]"),
+        ({"protocol": "modbus-rtu"}, "holding:7", "int32[60]"),
+        ({"protocol": "modbus-ascii"}, "coil:3", "bool[77]"),
+        ({"protocol": "modbus-tcp"}, "holding:7", "bcd16[50]"),
+        ({"protocol": "modbus-rtu", "addressing": "vigor"}, "D10", "float64[10]"),
+    ],
+)
+async def test_an_array_moves_and_is_written_in_one_exchange(
+    tmp_path: Path, settings: dict[str, Any], address: str, kind: str
+) -> None:
+    rows = {"a": {"address": address, "type": kind}}
+    driver, [tag] = device(tmp_path, rows, **settings)
+    station = station_for(driver, [tag])
+    count, clock = tag.layout.type.count, iter(MINUTES)
+    talk = Wire(driver, lambda request: station.hear(request, next(clock)))
+    found = set()
+    for _ in range(5):
+        value = tag.decode(await driver.read(talk, tag.span))
+        assert isinstance(value, tuple)
+        assert len(value) == count
+        found |= set(value)
+    assert len(talk.sent) == 5
+    assert len(found) > 1
+    new: Value = tuple(number % 2 == 0 for number in range(count))
+    if tag.layout.type.is_number:
+        new = tuple(range(1000, 1000 + count))
+    assert await driver.write(talk, tag.span, tag.encode(new))
+    assert len(talk.sent) == 6
+    assert tag.decode(await driver.read(talk, tag.span)) == new
+
+
 def test_no_plc_speaks_no_protocol(tmp_path: Path) -> None:
     class Foreign:
         protocol = "foreign"

@@ -6,13 +6,14 @@ import pytest
 
 from gateway.config import ConfigErrors, load
 from gateway.config.formulas import parse
+from gateway.numerals import Scalar
 from gateway.tags import Quality, Reason, Sample, Tag, bad, good
 from gateway.tags.formula import Formula
 from gateway.tags.mirror import Mirror
 from gateway.values import Value
 from tests.config.test_config import M, tags
 
-FORMULAS: list[tuple[str, Value, Value, Value]] = [
+FORMULAS: list[tuple[str, Scalar, Scalar, Scalar]] = [
     ("a + b", 0.1, 0.2, 0.3),  # and not 0.30000000000000004
     ("a - b * 2", 10, 3, 4),
     ("(a - b) * 2", 10, 3, 14),
@@ -35,7 +36,9 @@ def formula(text: str) -> tuple[Formula, list[str]]:
 
 
 @pytest.mark.parametrize(("text", "a", "b", "result"), FORMULAS)
-def test_a_formula_calculates_with_decimals(text: str, a: Value, b: Value, result: Value) -> None:
+def test_a_formula_calculates_with_decimals(
+    text: str, a: Scalar, b: Scalar, result: Scalar
+) -> None:
     made, names = formula(text)
     if any(isinstance(value, float) for value in (a, b)):
         made = Formula(text, made.term, whole=False)

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from gateway.config import WebConfig
 from gateway.northbound.audit import Counts
-from gateway.northbound.payload import Failure, Problem
+from gateway.northbound.payload import Failure, GroupResult, Problem
 from gateway.tags import WriteResult
 from gateway.web import metrics
 from gateway.web.server import Server
@@ -56,7 +56,7 @@ class PlainNorth:
 
     def __init__(self) -> None:
         self.changed: dict[str, Mapping[str, Any]] = {}
-        self.endings: dict[bytes, WriteResult | Failure] = {}
+        self.endings: dict[bytes, WriteResult | Failure | GroupResult] = {}
         self.written: list[tuple[str, bytes, str]] = []
         self.began = asyncio.Event()
         self.gate = asyncio.Event()  # writes wait for it
@@ -73,7 +73,9 @@ class PlainNorth:
             **self.changed,
         }
 
-    async def write(self, tag: str, data: bytes, by: str, arrived: float) -> WriteResult | Failure:
+    async def write(
+        self, tag: str, data: bytes, by: str, arrived: float
+    ) -> WriteResult | Failure | GroupResult:
         self.began.set()
         await self.gate.wait()
         self.written.append((tag, data, by))

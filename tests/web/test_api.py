@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from gateway.northbound.payload import Failure, Problem
+from gateway.northbound.payload import Failure, GroupResult, Problem
 from gateway.tags import AlarmRule, Level, WriteResult, good
 from gateway.web.server import Server
 from gateway.web.sources import Sources
@@ -116,8 +116,9 @@ async def test_buckets_are_answered_as_described(tmp_path: Path) -> None:
             assert until_now.json["buckets"][-1]["known"] <= 5.1
 
 
+DONE = WriteResult(7, 0, 0.03, verified=True)
 ENDINGS = [
-    (WriteResult(7, 0, 0.03, verified=True), 200),
+    (DONE, 200),
     (Failure(Problem.BAD_VALUE, "41 is above max 40"), 400),
     (Failure(Problem.NOT_WRITABLE, "no `write`"), 403),
     (Failure(Problem.UNKNOWN_TAG, "no tag"), 404),
@@ -126,12 +127,15 @@ ENDINGS = [
     (Failure(Problem.LINE_DOWN, "no such port"), 503),
     (Failure(Problem.NO_REPLY, "offline"), 503),
     (Failure(Problem.UNCLEAR, "it may be done"), 504),
+    (GroupResult({"recipe": DONE, "run": DONE}, 0.1), 200),
+    (GroupResult({"recipe": DONE, "run": Failure(Problem.NOT_SENT, "recipe")}, 0.1), 502),
+    (GroupResult({"recipe": Failure(Problem.NOT_WRITABLE, "no `write`")}, 0.1), 403),
 ]
 
 
 @pytest.mark.parametrize(("result", "status"), ENDINGS)
 async def test_only_an_acknowledged_write_is_answered_with_200(
-    result: WriteResult | Failure, status: int, tokens: Path
+    result: WriteResult | Failure | GroupResult, status: int, tokens: Path
 ) -> None:
     async with serving(tokens_file=tokens) as client:
         client.north.endings[b"7"] = result

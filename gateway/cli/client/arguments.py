@@ -58,11 +58,14 @@ def matches(key: str, wanted: list[str]) -> bool:
 
 
 def parse_value(text: str) -> Value:
-    """Parses a JSON scalar (`true`, `12.5`, `"AB"`); any other text is a string."""
+    """Parses JSON (`true`, `12.5`, `"AB"`, `[1, 2]`); any other text is a string."""
     try:
         value = json.loads(text, parse_float=parse_decimal)
     except ValueError:
         return text
-    if isinstance(value, float) and not math.isfinite(value):
+    elements = value if isinstance(value, list) else [value]
+    if not all(isinstance(one, (bool, int, float, str)) for one in elements):
+        return text
+    if any(isinstance(one, float) and not math.isfinite(one) for one in elements):
         return text  # NaN and 1e999 are not JSON
-    return value if isinstance(value, (bool, int, float, str)) else text
+    return tuple(value) if isinstance(value, list) else value

@@ -130,8 +130,10 @@ class Client:
         served = partial(self.status, f"lines/{line}")
         return traced(session, keys, line, until, served, self._tell)
 
-    def write(self, tag: str, value: Value) -> dict[str, object]:
+    def write(self, tag: str, value: Value | dict[str, Value]) -> dict[str, object]:
         """Returns the outcome as the gateway sends it: `value ...` or `error ...`.
+
+        `tag`: also a device, with the values by tag. The outcome of each is in `tags`.
 
         Raises `GatewayError` when no gateway accepts the write, or none replies.
         """

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import Literal, TypeVar
 
 from gateway.errors import BadValue, ConfigError, Garbled
+from gateway.numerals import Scalar
 from gateway.protocols.driver import Cost, Talk, Timing
 from gateway.protocols.frames.bytetext import NAME, octets
 from gateway.protocols.frames.codec import FrameCodec, FrameReader
@@ -19,7 +20,6 @@ from gateway.protocols.frames.messages import Ask, Listen, Values, Write, filled
 from gateway.protocols.frames.patterns import check_pattern, longest_match
 from gateway.protocols.frames.presets import written_out
 from gateway.protocols.unsolicited import UnsolicitedFrame
-from gateway.values import Value
 
 T = TypeVar("T")
 
@@ -123,7 +123,7 @@ class Frames:
         frame = octets(one.send)
         return await talk.ask(frame, reply, _without_echo(talk, frame, one.answers))
 
-    def put(self, name: str, value: Value) -> bytes:
+    def put(self, name: str, value: Scalar) -> bytes:
         """Returns the bytes of a value in the frame that writes it.
 
         Raises `BadValue`, also for bytes that the framing cannot carry: before anything is sent.

@@ -4,12 +4,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from gateway.numerals import Scalar
 from gateway.protocols.driver import Address, Area, Cost, Span, Talk, Timing, Traits, Unit
 from gateway.protocols.frames.codec import FrameCodec
 from gateway.protocols.frames.device import Frames
 from gateway.protocols.frames.listener import Listener
 from gateway.protocols.typed_fields import TypedField
-from gateway.values import Value
 
 LISTENED, WRITTEN = "listened", "written"
 _TRAITS = Traits(baudrate=9600, format="8N1", numbered=False)
@@ -22,11 +22,11 @@ class WrittenField:
     settings: Frames
     name: str
 
-    def put(self, value: Value) -> bytes:
+    def put(self, value: Scalar) -> bytes:
         """Returns its bytes. Raises `BadValue`, also for bytes that the framing cannot carry."""
         return self.settings.put(self.name, value)
 
-    def take(self, raw: bytes) -> Value:
+    def take(self, raw: bytes) -> Scalar:
         """Returns the value of bytes from `put`. Raises `Garbled`."""
         return self.settings.write[self.name].value.take(raw)
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 from gateway.errors import BadValue, ConfigError, Evidence, Garbled
-from gateway.numerals import real, shortest, whole
-from gateway.values import LONGEST_STRING, Kind, Value, ValueType
+from gateway.numerals import Scalar, real, shortest, whole
+from gateway.values import LONGEST_STRING, Kind, ValueType
 
 FieldType = Literal[
     "uint8",
@@ -188,7 +188,7 @@ class Field:
             raise _garbled(f"the frame has {len(frame)} bytes, not {end}", frame)
         return frame[start:end]
 
-    def take(self, raw: bytes) -> Value:
+    def take(self, raw: bytes) -> Scalar:
         """Returns the value of the bytes. Raises `Garbled`."""
         match self.type:
             case "text":
@@ -205,7 +205,7 @@ class Field:
             raise _garbled(f"no {self.encoding} text", raw) from None
         return text.rstrip(" ") if self.columns is not None else text
 
-    def _written_number(self, raw: bytes) -> Value:
+    def _written_number(self, raw: bytes) -> Scalar:
         point = self.decimal_point.encode()
         plain = raw.strip(b" ")
         if point == b"," and b"." in plain:
@@ -216,7 +216,7 @@ class Field:
         text = (match["sign"] + match["number"]).decode()
         return int(text) if self.type == "integer" else float(text)
 
-    def _raw_number(self, raw: bytes) -> Value:
+    def _raw_number(self, raw: bytes) -> Scalar:
         if len(raw) != self.size:
             raise _garbled(f"{self.type} takes {self.size} bytes", raw)
         if self.hex:
@@ -237,7 +237,7 @@ class Field:
             return int(number) >> 8 if self.byte == "high" else int(number) & 0xFF
         return number if self.bit is None else bool(int(number) >> self.bit & 1)
 
-    def put(self, value: Value) -> bytes:
+    def put(self, value: Scalar) -> bytes:
         """Returns the bytes of a value. Raises `BadValue`."""
         if self.bit is not None or self.byte is not None:
             raise BadValue("a part of a number cannot be written")
@@ -246,7 +246,7 @@ class Field:
         number = real(value) if self.kind == "number" else whole(value)
         return self._put_written(number) if self.size is None else self._put_raw(number)
 
-    def _put_text(self, value: Value) -> bytes:
+    def _put_text(self, value: Scalar) -> bytes:
         if not isinstance(value, str):
             raise BadValue(f"{value!r} is no text")
         if not value.isprintable():

@@ -5,12 +5,12 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 
 from gateway.errors import ConfigError, Evidence, Garbled, Refused
+from gateway.numerals import Scalar
 from gateway.protocols.frames.bytetext import NAME, Hole, octets, template
 from gateway.protocols.frames.fields import Field, check_writable
 from gateway.protocols.frames.patterns import pattern
-from gateway.values import Value
 
-Values = Mapping[str, Value | Garbled]
+Values = Mapping[str, Scalar | Garbled]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -132,7 +132,7 @@ def _values(match: str, fields: Mapping[str, Field], frame: bytes) -> Values | N
     return {name: _value(name, one, frame, found) for name, one in fields.items()}
 
 
-def _value(name: str, one: Field, frame: bytes, found: re.Match[bytes]) -> Value | Garbled:
+def _value(name: str, one: Field, frame: bytes, found: re.Match[bytes]) -> Scalar | Garbled:
     try:
         return one.take(_raw(name, one, frame, found))
     except Garbled as error:

@@ -108,6 +108,8 @@ def words_of(dwords: Sequence[int], *, low_first: bool) -> list[int]:
 _ACCEPTED = 5
 _WRITES = (5, 6, 15, 16)
 _NOT_DONE = (1, 2, 3, 6, 10)  # exceptions without any effect
+# Of these, the exceptions that name no address and no value: of several none was looked at.
+_UNEXECUTED = (1, 6, 10)
 
 
 def raise_refusal(pdu: bytes, function: int) -> None:
@@ -128,4 +130,5 @@ def raise_refusal(pdu: bytes, function: int) -> None:
     said = f"exception {code:02X} to function {function:02d}: {words}"
     if function in _WRITES and code not in _NOT_DONE:
         raise Unclear(f"{said}; part of it may be done")
-    raise Refused(said, code=f"{code:02X}", refusal=refusal)
+    unexecuted = code in _UNEXECUTED
+    raise Refused(said, code=f"{code:02X}", refusal=refusal, unexecuted=unexecuted)

@@ -49,10 +49,11 @@ from gateway.protocols.vigor.ear import vigor_ear
 # Characters of a 51 request and of a 61 request without data; of a 70 or 71 request.
 _BLOCK_REQUEST, _FORCE_REQUEST = 14, 12
 _LARGEST = {Unit.BIT: 1, Unit.WORD: 0xFFFF, Unit.DWORD: 0xFFFFFFFF}
+_NO_COMMAND = "12"
 _REFUSALS = {
     "10": (Refusal.DAMAGED, "ASCII conversion error, our request did not arrive whole"),
     "11": (Refusal.DAMAGED, "sum check error, our request did not arrive whole"),
-    "12": (Refusal.OTHER, "no such command"),
+    _NO_COMMAND: (Refusal.OTHER, "no such command"),
     "14": (Refusal.DAMAGED, "stop bit, parity, frame or overrun error: line settings or noise"),
     "28": (Refusal.ADDRESS, "data address out of range"),
 }
@@ -164,6 +165,11 @@ class Vigor:
         body = b"%04X%02X" % (covered.address, covered.size) + data.hex().upper().encode("ascii")
         await self._write_body(talk, WRITE, body)
         return True
+
+    def writes_around(self, span: Span) -> bool:
+        """True for bits that do not fill their bytes, except a single one that can be forced."""
+        covered = cover(span)
+        return covered is not None and bool(covered.ahead or covered.behind) and not _forced(span)
 
     async def resync(
         self,
@@ -318,6 +324,7 @@ def _answers(station: int, command: str, count: int) -> Callable[[Frame], bytes 
             f"station {station} answers {frame.status} to command {command}: {meaning}",
             code=frame.status,
             refusal=refusal,
+            unexecuted=refusal is Refusal.DAMAGED or frame.status == _NO_COMMAND,
         )
 
     return answers

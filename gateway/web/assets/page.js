@@ -7,6 +7,7 @@ const LATE = 3000; // ms that an event may be later than the fastest one
 const SLEPT = 10000; // ms in which this program did not run
 const SHOWN = 200; // rows of devices
 const WINDOW = 10000; // ms of the wire
+const LONGEST_LIST = 200; // characters of an array that are shown
 
 const known = { devices: new Map(), lines: [], loads: new Map(), exchanges: [], tags: new Map() };
 let token = "";
@@ -343,7 +344,11 @@ async function showTags() {
   nextAfter = next;
   byId("next").disabled = next === null;
   byId("first").disabled = !after;
-  byId("write-tag").replaceChildren(...tags.filter((tag) => tag.write).map((tag) => element("option", tag.tag)));
+  byId("write-tag").replaceChildren(...tags.filter((tag) => tag.write).map((tag) => {
+    const option = element("option", tag.tag);
+    if (tag.length) option.dataset.length = tag.length;
+    return option;
+  }));
   byId("writing").hidden = !tags.some((tag) => tag.write);
   for (const tag of tags) {
     const row = element("tr");
@@ -351,8 +356,8 @@ async function showTags() {
     const title = element("th", name);
     title.scope = "row";
     title.title = [tag.description, tag.type, tag.address].filter(Boolean).join(", ");
-    const cells = [element("td", "", "number value"), element("td", tag.unit), element("td"), element("td", "", "number"), element("td")];
-    if (tag.history) {
+    const cells = [element("td", "", tag.length ? "value" : "number value"), element("td", tag.unit), element("td"), element("td", "", "number"), element("td")];
+    if (tag.history && !tag.length) { // a list has no line
       const button = element("button", "trend", "link");
       button.type = "button";
       button.setAttribute("aria-label", `trend of ${tag.tag}`);
@@ -362,7 +367,7 @@ async function showTags() {
     row.append(title, ...cells);
     byId("values").append(row);
     const { last } = known.tags.get(name) ?? {}; // its value may have come before its row
-    known.tags.set(name, { cells, last });
+    known.tags.set(name, { cells, last, isList: Boolean(tag.length) });
     if (last) showValue(last);
   }
 }
@@ -379,7 +384,10 @@ function showValue(last) {
   const tag = known.tags.get(last[0]);
   tag.last = last;
   if (!tag.cells) return;
-  tag.cells[0].textContent = last[2] ? last[1] : "–";
+  const text = last[2] ? last[1] : "–";
+  const isLong = tag.isList && text.length > LONGEST_LIST;
+  tag.cells[0].textContent = isLong ? `${text.slice(0, text.lastIndexOf(",", LONGEST_LIST) + 1)} …` : text;
+  tag.cells[0].title = isLong ? text : "";
   showQuality(tag);
 }
 
@@ -448,16 +456,17 @@ byId("write-form").addEventListener("submit", async (event) => {
   event.preventDefault();
   token = byId("write-token").value.trim() || token;
   const [tag, value] = [byId("write-tag").value, byId("write-value").value.trim()];
+  const isList = byId("write-tag").selectedOptions[0]?.dataset.length; // it goes out as typed: [1, 2]
   if (!confirm(`Write ${tag} = ${value} ?`)) return;
   put("write-result", "writing …");
   const query = new URLSearchParams({ tag });
   try {
     const reply = await fetch(`api/write?${query}`, {
-      method: "POST", body: asJson(value), headers: { ...headers(), "Content-Type": "application/json" },
+      method: "POST", body: isList ? value : asJson(value), headers: { ...headers(), "Content-Type": "application/json" },
     });
     const found = await reply.json();
     const done = found.acknowledged ? (found.verified ? "acknowledged and read back" : "acknowledged") : "sent to all, which no device acknowledges";
-    put("write-result", reply.ok ? `${tag} = ${found.value}: ${done}` : `${tag}: ${found.error}${found.reason ? `: ${found.reason}` : ""}`);
+    put("write-result", reply.ok ? `${tag} = ${Array.isArray(found.value) ? `[${found.value.join(", ")}]` : found.value}: ${done}` : `${tag}: ${found.error}${found.reason ? `: ${found.reason}` : ""}`);
   } catch {
     put("write-result", `${tag}: the connection ended; it is not known whether the value was written`);
   }

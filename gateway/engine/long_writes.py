@@ -1,0 +1,79 @@
+"""Writes that need several requests, and the sentence that accounts for every address of them."""
+
+from bisect import bisect_left
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from gateway.errors import GatewayError, Refused, Unclear
+from gateway.protocols.driver import Address, AnyDriver, Span
+
+
+@dataclass(slots=True)
+class LongWrite:
+    """The requests of one write, and how far they came."""
+
+    driver: AnyDriver
+    spans: Sequence[Span]  # of the requests, in their order
+    elements: int  # of the value; 0: it is no list
+    asked: int = 0  # requests sent
+    done: int = 0  # of these, acknowledged
+    # The resync after each request: it shows that the acknowledgement was not an earlier one that
+    # arrived twice. Empty: no acknowledgement can be mistaken for another.
+    tokens: Sequence[int] = ()
+
+    def doubt(self) -> None:
+        """Notes that the order of the replies is unknown: nothing is certain to be done."""
+        self.done = 0
+
+    def ended(self, error: GatewayError) -> GatewayError:
+        """Returns the error with all addresses: in the PLC, unknown, not sent."""
+        if not self.asked or self.done == len(self.spans):
+            return error
+        refused, parts = isinstance(error, Refused), []
+        if self.done:
+            parts.append(f"{self._part(0, self.done)} is in the PLC")
+        if self.done < self.asked:
+            how = "was refused" if refused else "is unknown"
+            parts.append(f"{self._part(self.done, self.asked)} {how}")
+        if self.asked < len(self.spans):
+            parts.append(f"{self._part(self.asked, len(self.spans))} was not sent")
+        text = f"{', '.join(parts)}: {error}"
+        if isinstance(error, Refused) and not self.done:
+            return Refused(text, code=error.code, refusal=error.refusal)
+        return Unclear(text)
+
+    def _part(self, begin: int, end: int) -> str:
+        """Names the addresses and elements of these requests."""
+        (area, start, _), last = self.spans[0], self.spans[-1]
+        ends = [*(span.start for span in self.spans), last.start + last.size]
+        first, after = ends[begin], ends[end]
+        spelt = [self.driver.spell(Address(area, number)) for number in (first, after - 1)]
+        text = spelt[0] if first == after - 1 else "..".join(spelt)
+        if not self.elements:
+            return text
+        units = ends[-1] - start
+        low, high = ((number - start) * self.elements // units for number in (first, after))
+        return (
+            f"{text} ({f'element {low}' if high == low + 1 else f'elements {low} to {high - 1}'})"
+        )
+
+
+def long_write(driver: AnyDriver, span: Span, elements: int) -> LongWrite | None:
+    """Returns the fewest requests that write the span; None: one is enough.
+
+    No request ends inside an element: the PLC would have one half of a number for a while.
+    """
+    if driver.write_cost(span) is not None:
+        return None
+    (area, start, size), step = span, 1 if not elements else max(1, span.size // elements)
+    spans, at = [], start
+    while at < start + size:
+        steps = range(1, (start + size - at) // step + 1)
+        most = bisect_left(
+            steps, True, key=lambda n: driver.write_cost(Span(area, at, n * step)) is None
+        )
+        if not most:
+            return None  # it can never be written: the driver says why
+        spans.append(Span(area, at, most * step))
+        at += most * step
+    return LongWrite(driver, spans, elements)
