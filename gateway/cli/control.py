@@ -1,13 +1,10 @@
 """The `control` command: sends a command like `run` or `stop` to a PLC."""
 
-import asyncio
 from typing import Annotated
 
 import typer
 
-from gateway.cli import direct
 from gateway.cli.client import connected
-from gateway.cli.logs import LogFormat, LogLevel, set_up
 from gateway.cli.terminal import ConfigPath, Direct, end, err, printable
 from gateway.cli.write import error_code, outcome
 from gateway.config import load
@@ -25,8 +22,9 @@ def control(
     loaded = load(config)
     check_command(loaded, device, command)
     if without_gateway:
-        set_up(LogFormat.TEXT, LogLevel.ERROR)
-        print(asyncio.run(direct.control(loaded, device, command, argument)).answer)
+        from gateway.cli import direct
+
+        print(direct.run(direct.control(loaded, device, command, argument)).answer)
         return
     with connected(loaded, err.print) as client:
         answer = client.control(line_of(loaded, device).name, device, command, argument)

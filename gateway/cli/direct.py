@@ -1,12 +1,17 @@
-"""Reads, writes and commands without a running gateway: opens the port in this process."""
+"""Reads, writes and commands without a running gateway: opens the port in this process.
+
+Commands import it only with `--direct`: it drives lines, which a client of a gateway does not need.
+"""
 
 import asyncio
 import time
-from collections.abc import AsyncIterator, Collection, Iterable, Sequence
+from collections.abc import AsyncIterator, Collection, Coroutine, Iterable, Sequence
 from collections.abc import Set as AbstractSet
 from contextlib import asynccontextmanager, suppress
 from dataclasses import replace
+from typing import Any, TypeVar
 
+from gateway.cli.logs import LogFormat, LogLevel, set_up
 from gateway.config import Config, LineConfig
 from gateway.config.commands import check_command, line_of
 from gateway.engine.device import Device
@@ -20,6 +25,7 @@ from gateway.tags import Reason, Sample, Tag, WriteResult, bad
 from gateway.tags.mirror import Mirror
 from gateway.values import Value
 
+T = TypeVar("T")
 SERVED = "is on a served line: only the running gateway has it, without --direct"
 LISTEN_FOR = 5.0  # seconds, for unsolicited frames
 WRITE_WITHIN = 30.0  # seconds for several tags
@@ -42,6 +48,12 @@ class _Once:
 
     def online(self, device: Device, online: bool) -> None:
         """The samples say all that counts here."""
+
+
+def run(talk: Coroutine[Any, Any, T]) -> T:
+    """Runs one of the functions below, and logs errors only."""
+    set_up(LogFormat.TEXT, LogLevel.ERROR)
+    return asyncio.run(talk)
 
 
 async def read(config: Config, tags: Sequence[Tag]) -> list[Sample]:

@@ -1,14 +1,11 @@
 """The `read` command: the current values, from the gateway or from the PLC."""
 
-import asyncio
 import sys
 from typing import Annotated
 
 import typer
 
-from gateway.cli import direct
 from gateway.cli.client import connected, matches, tags_by_key, wanted_keys
-from gateway.cli.logs import LogFormat, LogLevel, set_up
 from gateway.cli.tables import is_good, print_rows, row_of
 from gateway.cli.terminal import FAILED, AsJson, ConfigPath, Direct, TagNames, Utc, err
 from gateway.config import load
@@ -33,9 +30,10 @@ def read(
     if max_age is not None:
         parse_max_age(max_age)  # reports a mistake even when no gateway runs
     if without_gateway:
-        set_up(LogFormat.TEXT, LogLevel.ERROR)
+        from gateway.cli import direct
+
         chosen = [tag for key, tag in by_key.items() if matches(key, wanted)]
-        samples = asyncio.run(direct.read(loaded, chosen))
+        samples = direct.run(direct.read(loaded, chosen))
         rows = [row_of(sample) for sample in samples]
         for failure in dict.fromkeys(f"{s.tag.device}: {s.detail}" for s in samples if s.detail):
             err.print(failure)

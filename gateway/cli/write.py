@@ -1,6 +1,5 @@
 """The `write` command: writes one tag, or several of a device, and prints the outcome."""
 
-import asyncio
 import json
 import sys
 import time
@@ -11,9 +10,7 @@ from typing import Annotated
 import orjson
 import typer
 
-from gateway.cli import direct
 from gateway.cli.client import connected, parse_value, suggestion, tags_by_key
-from gateway.cli.logs import LogFormat, LogLevel, set_up
 from gateway.cli.tables import value_text
 from gateway.cli.terminal import FAILED, USER_MISTAKE, AsJson, ConfigPath, Direct, err, printable
 from gateway.config import Config, load
@@ -106,7 +103,6 @@ def _value(config: Path, known: Mapping[str, Tag], name: str, text: str) -> Valu
 
 def _write_one(config: Config, tag: Tag, value: Value, *, directly: bool) -> dict[str, object]:
     if directly:
-        set_up(LogFormat.TEXT, LogLevel.ERROR)
         return _write_directly(config, tag, value)
     with connected(config, err.print) as client:
         return client.write(tag.key, value)
@@ -123,11 +119,12 @@ def _write_group(
     if not directly:
         with connected(config, err.print) as client:
             return client.write(device, dict(values))
-    set_up(LogFormat.TEXT, LogLevel.ERROR)
+    from gateway.cli import direct
+
     tags = [(known[f"{device}/{name}"], value) for name, value in values.items()]
     started = time.monotonic()
     try:
-        ends = asyncio.run(direct.write_group(config, tags))
+        ends = direct.run(direct.write_group(config, tags))
     except GatewayError as error:
         return _decoded(payload.outcome(payload.failure(error)))
     results = {
@@ -159,8 +156,10 @@ def _parsed(text: str, tag: Tag) -> Value:
 
 def _write_directly(config: Config, tag: Tag, value: Value) -> dict[str, object]:
     """Writes without a gateway. Returns the outcome in the words of a gateway."""
+    from gateway.cli import direct
+
     try:
-        return _decoded(payload.outcome(asyncio.run(direct.write(config, tag, value))))
+        return _decoded(payload.outcome(direct.run(direct.write(config, tag, value))))
     except GatewayError as error:
         return _decoded(payload.outcome(payload.failure(error)))
 
