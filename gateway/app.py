@@ -15,18 +15,16 @@ from gateway.config.commands import check_command, every_command, speaker
 from gateway.engine.device import Device, DeviceSettings
 from gateway.engine.forecast import LineForecast, forecast
 from gateway.engine.requests import WRITE_EXPIRY, CommandResult, Peeked
-from gateway.errors import BadValue, Busy, ConfigError, GatewayError, Offline
+from gateway.errors import GatewayError
 from gateway.line.build import OpenPort, line_of, opener
 from gateway.line.duty import Duty
-from gateway.line.groups import ended
 from gateway.line.line import Line
 from gateway.line.on_demand import OnDemand
+from gateway.line.requests import Requests
 from gateway.line.serving import Serving
 from gateway.line.wire_log import WireLog
 from gateway.northbound.served_status import served_documents
 from gateway.northbound.status import Document, device_document, line_document, standing
-from gateway.protocols.driver import Address
-from gateway.protocols.ranges import addresses, spans
 from gateway.serving.station import Station
 from gateway.tags import Reason, Sample, Tag, WriteResult, bad
 from gateway.tags.mirror import Mirror
@@ -34,8 +32,6 @@ from gateway.tags.scan import Scan
 from gateway.tags.timestamps import rfc3339
 from gateway.transfers.forecast import transfer_forecasts, with_transfers
 from gateway.values import Value
-
-MOST_PEEKED = 256  # addresses of one peek
 
 
 def forecasts(
@@ -99,6 +95,7 @@ class Gateway:
         self.alarms = Alarms(self._tags.values(), wall)
         self.add_document("alarms", self.alarms.counts)
         self.serving = Serving(config, self, self._find_sample, wall=wall, duty=self.duty)
+        self._requests = Requests(self._places, self._tags, self.serving, wall)
         for line in config.lines:
             if not line.serve:
                 self.add_line(line)
@@ -117,10 +114,9 @@ class Gateway:
 
     def add_line(self, config: LineConfig) -> Line:
         """Makes a line, which needs `plan` and `planned` before it runs."""
-        devices = [device for device in config.devices if device.enabled]
         line = line_of(
             config,
-            devices,
+            [device for device in config.devices if device.enabled],
             self,
             open_port=self._open_line(config),
             wall=self._wall,
@@ -289,21 +285,7 @@ class Gateway:
             self._publish(changed)  # history keeps it too
 
     async def write(self, tag: Tag, value: Value, within: float = WRITE_EXPIRY) -> WriteResult:
-        """Returns when the device has acknowledged.
-
-        Raises `BadValue` before anything is sent, otherwise a `GatewayError`.
-        """
-        if self._tags.get(tag.key) is not tag:  # its scale or limits may be others now
-            place = self._places.get(tag.device)
-            if place is None or tag not in place[1].settings.targets:
-                raise Busy(f"the file was reloaded, and {tag.key} with it; not sent")
-        if self.serving.holds(tag):
-            return await self.serving.write(tag, value)
-        if tag.device not in self._places:
-            raise Offline(f"device {tag.device} is disabled; nothing was sent")
-        units = tag.encode(value)
-        line, device = self._places[tag.device]
-        return await line.write(device, tag, units, within)
+        return await self._requests.write(tag, value, within)
 
     async def write_group(
         self,
@@ -311,71 +293,25 @@ class Gateway:
         within: float = WRITE_EXPIRY,
         patience: float = WRITE_EXPIRY,
     ) -> Sequence[WriteResult | GatewayError]:
-        """Writes tags of one device in their order; returns the outcome of each.
+        return await self._requests.write_group(values, within, patience)
 
-        What has not ended after `patience` seconds is `Unclear`. Raises `GatewayError` when nothing
-        was sent.
-        """
-        name = values[0][0].device
-        if any(self._tags.get(tag.key) is not tag for tag, _ in values):
-            raise Busy(f"the file was reloaded, and {name} with it; not sent")
-        if self.serving.holds(values[0][0]):
-            return await self.serving.write_group(values)
-        if name not in self._places:
-            raise Offline(f"device {name} is disabled; nothing was sent")
-        units = [(tag, tag.encode(value)) for tag, value in values]
-        line, device = self._places[name]
-        return await ended(line.write_group(device, units, within), patience)
+    async def control(
+        self, device: str, command: str, argument: str = "", within: float = WRITE_EXPIRY
+    ) -> CommandResult:
+        check_command(self.config, device, command)
+        return await self._requests.control(device, command, argument, within)
+
+    async def peek(self, device: str, text: str) -> Peeked:
+        return await self._requests.peek(device, text)
+
+    def dialling(self, device: str) -> float:
+        return self._requests.dialling(device)
 
     def commands(self) -> Mapping[str, frozenset[str]]:
         return every_command(self.config)
 
     def speaker(self, line: str) -> str:
         return speaker(self.config, line)
-
-    async def control(
-        self, device: str, command: str, argument: str = "", within: float = WRITE_EXPIRY
-    ) -> CommandResult:
-        """Returns the reply of the device.
-
-        Raises `BadValue` before anything is sent, otherwise a `GatewayError`.
-        """
-        check_command(self.config, device, command)
-        if device not in self._places:
-            raise Offline(f"device {device} is disabled; nothing was sent")
-        line, receiver = self._places[device]
-        loop = asyncio.get_running_loop()
-        started = loop.time()
-        answer = await line.command(receiver, command, argument, within)
-        return CommandResult(answer, self._wall(), loop.time() - started)
-
-    async def peek(self, device: str, text: str) -> Peeked:
-        """Reads any addresses once, such as `D100..D119`.
-
-        Raises `BadValue` before anything is sent, otherwise a `GatewayError`.
-        """
-        if device not in self._places:
-            raise Offline(f"no device {device} is polled here; nothing was sent")
-        line, receiver = self._places[device]
-        try:
-            area, numbers = addresses(receiver.driver, text, MOST_PEEKED)
-            parts = list(spans(receiver.driver, area, numbers))
-        except ConfigError as error:
-            raise BadValue(str(error)) from None
-        loop = asyncio.get_running_loop()
-        started, units = loop.time(), list[int]()
-        within = WRITE_EXPIRY + line.dialling
-        for part in parts:
-            if self._places.get(device) != (line, receiver):
-                raise Busy(f"the file was reloaded, and {device} with it; read it again")
-            units += map(int, (await line.peek(receiver, part, within)).split())
-        first = receiver.driver.spell(Address(area, numbers.start))
-        return Peeked(first, units, self._wall(), loop.time() - started)
-
-    def dialling(self, device: str) -> float:
-        """Returns the seconds that a request may wait for a telephone call; 0: for none."""
-        place = self._places.get(device)
-        return 0.0 if place is None else place[0].dialling
 
     def is_fresh(self, tag: Tag, max_age: float) -> bool:
         """True if the last read is younger than `max_age` seconds, or no read is possible now."""

@@ -2433,7 +2433,7 @@ MUTANTS = (
     ),
     Mutant(
         "a write for the tag of before is sent",
-        "app.py",
+        "line/requests.py",
         "        if self._tags.get(tag.key) is not tag:",
         "        if False:",
         "tests/reload/test_renewal.py",
@@ -2805,7 +2805,7 @@ MUTANTS = (
     ),
     Mutant(
         "a range is written with its old address",
-        "app.py",
+        "line/requests.py",
         "            if place is None or tag not in place[1].settings.targets:\n",
         "            if place is None:\n",
         "tests/transfers/test_runner.py",
