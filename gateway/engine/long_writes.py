@@ -5,7 +5,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from gateway.errors import GatewayError, Refused, Unclear
-from gateway.protocols.driver import Address, AnyDriver, Span
+from gateway.protocols.driver import Address, AnyDriver, Span, WritesAround
+
+_TRIED = 8  # lengths of a request, until one needs no addresses around it: bits are in eights
 
 
 @dataclass(slots=True)
@@ -59,11 +61,12 @@ class LongWrite:
 
 
 def long_write(driver: AnyDriver, span: Span, elements: int) -> LongWrite | None:
-    """Returns the fewest requests that write the span; None: one is enough.
+    """Returns the fewest requests that write the span and nothing else; None: one is enough.
 
-    No request ends inside an element: the PLC would have one half of a number for a while.
+    No request ends inside an element: the PLC would have one half of a number for a while. None
+    also where it cannot be done: then the driver says why, or must write addresses around it.
     """
-    if driver.write_cost(span) is not None:
+    if driver.write_cost(span) is not None and not writes_around(driver, span):
         return None
     (area, start, size), step = span, 1 if not elements else max(1, span.size // elements)
     spans, at = [], start
@@ -73,7 +76,16 @@ def long_write(driver: AnyDriver, span: Span, elements: int) -> LongWrite | None
             steps, True, key=lambda n: driver.write_cost(Span(area, at, n * step)) is None
         )
         if not most:
-            return None  # it can never be written: the driver says why
-        spans.append(Span(area, at, most * step))
-        at += most * step
+            return None
+        tried = (Span(area, at, n * step) for n in (*range(most, max(1, most - _TRIED), -1), 1))
+        fits = next((one for one in tried if not writes_around(driver, one)), None)
+        if fits is None:
+            return None
+        spans.append(fits)
+        at += fits.size
     return LongWrite(driver, spans, elements)
+
+
+def writes_around(driver: AnyDriver, span: Span) -> bool:
+    """Returns True if a write of the span also writes addresses around it."""
+    return isinstance(driver, WritesAround) and driver.writes_around(span)

@@ -7,7 +7,8 @@ are written, and no address between them.
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from gateway.protocols.driver import Span, WritesAround
+from gateway.engine.long_writes import writes_around
+from gateway.protocols.driver import Span
 from gateway.tags import Tag
 
 if TYPE_CHECKING:
@@ -42,8 +43,7 @@ def run_of(writes: "Sequence[Write]") -> tuple[int, Span]:
         reads = reads or tag.part is not None or verified(tag)
         if driver.write_cost(hull) is None or (reads and driver.cost(hull) is None):
             break
-        around = isinstance(driver, WritesAround) and driver.writes_around(hull)
-        if len(written) == hull.size and not around:
+        if len(written) == hull.size and not writes_around(driver, hull):
             count, run = number, hull
     return count, run
 

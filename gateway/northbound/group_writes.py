@@ -61,6 +61,7 @@ class GroupWrites:
         self._waiting += 1
         try:
             by, within = self._acceptance.accept(key, data, sender)
+            self._check_room()
             pairs = parse_group(data or b"")
             for name, value in pairs:
                 asked.append(_Asked(name, None if isinstance(value, BadValue) else value))
@@ -83,6 +84,10 @@ class GroupWrites:
             if not asked:
                 self._audit(WriteOutcome(device, None, refused or whole, at, took, by))
         return GroupResult({one.name: one.result for one in asked}, took) if asked else whole
+
+    def _check_room(self) -> None:
+        if self._waiting > MOST_WAITING:
+            raise Busy(f"{MOST_WAITING} groups are waiting already")
 
     def _checked(
         self, device: str, pairs: Sequence[tuple[str, Value | BadValue]], asked: Sequence[_Asked]
@@ -129,8 +134,6 @@ class GroupWrites:
     ) -> None:
         if not values:
             return
-        if self._waiting > MOST_WAITING:
-            raise Busy(f"{MOST_WAITING} groups are waiting already")
         dialling = self._plant.dialling(values[0][0].device)
         patience = self._patience + dialling
         ends = await self._plant.write_group(values, within + dialling, patience)

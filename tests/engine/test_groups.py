@@ -454,6 +454,23 @@ async def test_no_request_of_a_long_write_ends_inside_a_number() -> None:
         ]
 
 
+@on_virtual_time
+async def test_an_array_of_bits_never_writes_the_bits_around_it() -> None:
+    """M8 to M15 fill a byte. The others are forced, because M5 and M17 are not of the array."""
+    tags = [make_tag("M6", type="bool[11]", write=RULE, **SLOW), make_tag("M17", **SLOW)]
+    dev = device(tags)
+    line = plant([dev])
+    value = (True, False, True, True) * 2 + (True, True, True)
+    async with running(line):
+        await asyncio.sleep(3)
+        asked = now()
+        outcome = line.submit(dev, tags[0], value)
+        await asyncio.sleep(1)
+        assert outcome.once.value == value
+        assert [data[3:5] for data in writes(line, asked)] == [b"70", b"71", b"61", b"70"]
+        assert line.stations[0].memory.read("M", 6, 11) == [int(bit) for bit in value]
+
+
 def bits() -> tuple[Plant, Device]:
     """200 points of a PLC that takes 160 in one request, and acknowledges all writes alike."""
     driver = ComputerLink(station=5, profile="fx")

@@ -8,7 +8,7 @@ import pytest
 
 from gateway.errors import BadValue, Busy, NoReply, Refused
 from gateway.line.duty import Duty
-from gateway.northbound import payload
+from gateway.northbound import group_writes, payload
 from gateway.northbound.acceptance import Acceptance, Sender
 from gateway.northbound.group_writes import GroupWrites
 from gateway.northbound.keys import Keys
@@ -129,6 +129,15 @@ def test_a_group_of_the_past_is_not_sent() -> None:
     assert isinstance(result, Failure)
     assert result.problem is Problem.BUSY
     assert rig.plant.written == []
+
+
+def test_with_many_groups_waiting_the_next_is_busy(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(group_writes, "MOST_WAITING", 0)
+    rig = Rig(recipes())
+    result = rig.write({"recipe/a": 1})
+    assert isinstance(result, Failure)
+    assert result.problem is Problem.BUSY
+    assert (rig.plant.written, rig.outcomes) == ([], {"": "busy"})
 
 
 @pytest.mark.parametrize(

@@ -2602,14 +2602,14 @@ MUTANTS = (
     Mutant(
         "a run goes over a gap",
         "engine/runs.py",
-        "        if len(written) == hull.size and not around:\n",
-        "        if not around:\n",
+        "        if len(written) == hull.size and not writes_around(driver, hull):\n",
+        "        if not writes_around(driver, hull):\n",
         "tests/engine/test_groups.py",
     ),
     Mutant(
         "a run of bits writes the bits around it",
         "engine/runs.py",
-        "        if len(written) == hull.size and not around:\n",
+        "        if len(written) == hull.size and not writes_around(driver, hull):\n",
         "        if len(written) == hull.size:\n",
         "tests/engine/test_groups.py",
     ),
@@ -2681,6 +2681,13 @@ MUTANTS = (
         "engine/long_writes.py",
         "1 if not elements else max(1, span.size // elements)",
         "1",
+        "tests/engine/test_groups.py",
+    ),
+    Mutant(
+        "an array of bits writes the bits around it",
+        "engine/long_writes.py",
+        "is not None and not writes_around(driver, span):\n",
+        "is not None:\n",
         "tests/engine/test_groups.py",
     ),
     Mutant(

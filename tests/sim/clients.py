@@ -2,6 +2,7 @@
 
 import asyncio
 import random
+import re
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -19,6 +20,7 @@ from tests.sim.judge import Judge
 from tests.sim.stations import Troubled
 from tests.sim.wire import SimWire
 
+CLAIM = " is in the PLC"
 SOON = 1.0  # seconds within which an unacknowledged request arrives, if ever
 NOT_SENT = (Busy, Offline, LineDown)
 _QUIET = ("deaf", "reboot", "vanish", "flicker", "hung", *DELAYING)
@@ -82,6 +84,8 @@ class Client:
                 number += 1
                 if tag.layout.type.kind is Kind.BOOL:
                     value: Value = self.chance.random() < 0.5
+                elif count := tag.layout.type.count:
+                    value = tuple((number * 40_503 + n) % (1 << 16) for n in range(count))
                 else:
                     bits = 32 if tag.span.size == 2 else 16
                     value = (number * 40_503) % (1 << bits)
@@ -129,7 +133,8 @@ class Client:
     ) -> None:
         judge, bus, station = self.judge, self.bus, self.judge.stations[tag.device]
         since, sent, beside_others, held = asked
-        holds = tag.decode(station.holds(tag)) == value
+        now = tag.decode(station.holds(tag))
+        holds = now == value
         most = 2 if tag.write is not None and tag.write.repeat else 1
         match outcome:
             case WriteResult(acknowledged=False):
@@ -142,7 +147,8 @@ class Client:
             case Busy() | Offline() | LineDown():
                 true = obeyed == 0 and (sent == 0 or beside_others)
             case _:
-                true = True
+                true = _claimed(str(outcome), value) == _claimed(str(outcome), now)
+                judge.story.counts["parts of long writes"] += CLAIM in str(outcome)
         true = true and obeyed <= most
         if true:
             return
@@ -314,6 +320,14 @@ def _alike(one: Device, other: Device) -> bool:
         case ComputerLink() as a, ComputerLink() as b:
             return (a.frame_format, a.sum_check) == (b.frame_format, b.sum_check)
     return False
+
+
+def _claimed(said: str, value: Value | None) -> Value | None:
+    """Returns the elements that an unclear end says are in the PLC."""
+    claim = re.search(rf"elements? (\d+)(?: to (\d+))?\){CLAIM}", said)
+    if claim is None or not isinstance(value, tuple):
+        return None
+    return value[int(claim[1]) : int(claim[2] or claim[1]) + 1]
 
 
 def times(station: Troubled, tag: Tag) -> int:

@@ -3,11 +3,13 @@
 import random
 from collections.abc import Sequence
 
+from gateway.engine.device import Device
 from gateway.errors import GatewayError, NotSent
 from gateway.tags import Tag, WriteResult
 from gateway.values import Kind, Value
 from tests.sim.clients import NOT_SENT, Asked, Client, all_times, times
 from tests.sim.hostile import DELAYING
+from tests.sim.more import MOST_WORDS
 
 
 async def write_group(chance: random.Random, client: Client, few: list[tuple[Tag, Value]]) -> None:
@@ -29,7 +31,7 @@ async def write_group(chance: random.Random, client: Client, few: list[tuple[Tag
     judge.story.counts["groups done"] += all(isinstance(end, WriteResult) for end in ends)
     judge.story.counts["tags of groups"] += len(writes)
     judge.story.counts["writes of groups"] += sent
-    most = sum(2 if tag.write and tag.write.repeat else 1 for tag, _ in writes)
+    most = sum(_requests(device, tag) for tag, _ in writes)
     if sent > most + len(writes) // 2:
         judge.broke(f"{device.name}: {len(writes)} tags were sent {sent} times")
     stopped = ""  # the first tag that was not sent for another
@@ -64,4 +66,12 @@ def _larger(
 def _value(tag: Tag, chance: random.Random) -> Value:
     if tag.layout.type.kind is Kind.BOOL:
         return chance.random() < 0.5
+    if tag.layout.type.count:
+        return tuple(chance.randrange(1 << 16) for _ in range(tag.span.size))
     return chance.randrange(1 << 16 * tag.span.size)
+
+
+def _requests(device: Device, tag: Tag) -> int:
+    """Returns the most requests that write the tag alone."""
+    one = 1 if device.driver.write_cost(tag.span) else -(-tag.span.size // MOST_WORDS)
+    return 2 * one if tag.write is not None and tag.write.repeat else one

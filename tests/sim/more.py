@@ -6,6 +6,7 @@ It uses its own `random.Random`, so the PLCs of a seed stay as they are.
 import random
 from typing import Any
 
+MOST_WORDS = 3  # that some devices take in one request
 SEPARATE = "<SOH>"  # no other protocol of ours begins with it
 
 
@@ -211,17 +212,30 @@ def add_neighbours(
             if "w1" not in tags or device["protocol"] == "frames":
                 continue
             area, first = _split(tags["w0"]["address"])
-            words = {"g0": first + 1, "g4": first + 4, "g5": first + 5, "g6": first + 11}
-            for tag, number in words.items():
-                tags[tag] = {"address": f"{area}{number}", "type": "uint16", "write": rule(chance)}
-            for tag, bit in (("g7", 0), ("g8", 15)):
-                tags[tag] = {"address": f"{area}{first + 10}.{bit}", "write": rule(chance)}
-            area, point = _split(tags["w2"]["address"])
-            for number in range(point - point % 8, point - point % 8 + 8):
-                if number != point:
-                    tags[f"b{number}"] = {"address": f"{area}{number}", "write": rule(chance)}
+            _neighbours(tags, area, first, chance)
+            if device["protocol"].startswith("modbus") and chance.random() < 0.4:
+                device["max_write_words"] = MOST_WORDS  # so the array takes three requests
             if chance.random() < 0.2:
                 missing[name] = missing.get(name, frozenset()) | {first + 4}
+
+
+def _neighbours(tags: dict[str, Any], area: str, first: int, chance: random.Random) -> None:
+    """Adds words, bits of a word, an array, and the bits that fill the byte of `w2`."""
+    for tag, number in {
+        "g0": first + 1,
+        "g4": first + 4,
+        "g5": first + 5,
+        "g6": first + 11,
+    }.items():
+        tags[tag] = {"address": f"{area}{number}", "type": "uint16", "write": rule(chance)}
+    for tag, bit in (("g7", 0), ("g8", 15)):
+        tags[tag] = {"address": f"{area}{first + 10}.{bit}", "write": rule(chance)}
+    array = {"address": f"{area}{first + 12}", "type": "uint16[7]", "write": rule(chance)}
+    tags["g9"] = array
+    bits, point = _split(tags["w2"]["address"])
+    for number in range(point - point % 8, point - point % 8 + 8):
+        if number != point:
+            tags[f"b{number}"] = {"address": f"{bits}{number}", "write": rule(chance)}
 
 
 def _split(address: str) -> tuple[str, int]:
