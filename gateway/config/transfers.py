@@ -33,6 +33,8 @@ class TransferRows:
     def build(self, raw: object) -> tuple[list[LineConfig], tuple[TransferRule, ...]]:
         """Returns the lines with the tags of ranges, and the rows without mistakes."""
         rows = raw if isinstance(raw, list) else []
+        if not rows:
+            return [*self.lines], ()
         ranges = Ranges(self.lines, self.intervals, self.mistakes)
         finder = _Finder.of(self.lines, ranges, certain=not len(self.mistakes))
         found = [rule for place, row in enumerate(rows) if (rule := self._row(place, row, finder))]
