@@ -84,6 +84,7 @@ class Audit:
         self.counts = Counts()
         self._refusals = RateLimit(BURST, EVERY)
         self._untold = Counter[str]()  # refusals of each kind since the last summary
+        self._ends: dict[str | None, Problem | None] = {}  # of the last write of each transfer
 
     @property
     def suppressed(self) -> int:
@@ -100,6 +101,22 @@ class Audit:
             return
         _log(outcome)
         self._tell(outcome.time, payload.write_outcome(outcome), refused=not was_sent)
+
+    def of_transfer(self, outcome: WriteOutcome) -> None:
+        """Takes the outcome of a row of transfers, which may write each second for years.
+
+        It is in the log and in history when the row ends in another way than before.
+        """
+        problem = outcome.result.problem if isinstance(outcome.result, Failure) else None
+        was_sent = problem is None or problem in _SENT
+        self.counts.count(outcome, was_sent=was_sent)
+        data = payload.write_outcome(outcome)
+        if outcome.by not in self._ends or self._ends[outcome.by] is not problem:
+            self._ends[outcome.by] = problem
+            _log(outcome)
+            self._tell(outcome.time, data, refused=not was_sent)
+        elif was_sent:
+            self._publish(data)
 
     def report_suppressed(self) -> None:
         """Summarises the refusals suppressed since the previous call, if there are any."""

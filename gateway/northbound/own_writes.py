@@ -49,5 +49,6 @@ class OwnWrites:
             raise
         finally:
             took, key = time.monotonic() - started, self._keys.value(tag.key)
-            self._audit(WriteOutcome(key, value, ended, time.time_ns(), took, by))
+            outcome = WriteOutcome(key, value, ended, time.time_ns(), took, by)
+            self._audit.of_transfer(outcome)
         return ended

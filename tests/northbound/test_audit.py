@@ -54,3 +54,22 @@ def test_a_rate_limit_allows_a_burst_and_then_one_per_interval() -> None:
     assert passed == [0, 1, 2, 4, 8, 12, 16]
     assert limit.newly_suppressed() == limit.suppressed == 20 - len(passed)
     assert limit.newly_suppressed() == 0
+
+
+def test_a_transfer_that_writes_each_second_fills_no_log_and_no_history() -> None:
+    published: list[bytes] = []
+    recorded: list[bool] = []
+    audit = Audit(published.append, lambda time, text, *, refused: recorded.append(refused))
+    done, busy = WriteResult(1, 0, took=0.1), Failure(Problem.BUSY, "offline")
+    unclear = Failure(Problem.UNCLEAR, "?")
+    with structlog.testing.capture_logs() as lines:
+        ends: list[WriteResult | Failure] = [*[done] * 500, *[busy] * 500, unclear, unclear, done]
+        for end in ends:
+            audit.of_transfer(outcome(end))
+        audit(outcome(busy))  # a client's refusal still has all the room
+    assert [line["event"] for line in lines] == [
+        *("tag written", "write failed", "write unclear", "tag written", "write failed"),
+    ]
+    assert recorded == [False, True, False, False, True]
+    assert len(published) == 500 + 1 + 2 + 1 + 1  # what was sent is published, each time
+    assert audit.suppressed == 0
