@@ -26,7 +26,9 @@ class Losses:
         self._limit = limit
         self._slow_at = _NEVER
         self._round = 0
-        self._suspects: dict[Tag, None] = {}  # in the order of their last put
+        # By key, in the order of their last put: the tag that a reload put there takes the place
+        # of the one before.
+        self._suspects: dict[str, Tag] = {}
         self._lock = threading.Lock()
 
     def sent(self, samples: Iterable[Sample], took: float, now: float) -> None:
@@ -39,15 +41,16 @@ class Losses:
                 self._slow_at = now
                 self._round = 0
             for sample in samples:
-                self._suspects.pop(sample.tag, None)
-                self._suspects[sample.tag] = None
+                key = sample.tag.key
+                self._suspects.pop(key, None)
+                self._suspects[key] = sample.tag
 
     def due(self, now: float) -> list[Tag]:
         """Returns the tags to put again now; the longest waiting first."""
         with self._lock:
             if not self._suspects or now < self._slow_at + ROUNDS[self._round]:
                 return []
-            tags = list(self._suspects)
+            tags = list(self._suspects.values())
             self._round += 1
             if self._round == len(ROUNDS):
                 self._suspects.clear()

@@ -27,7 +27,7 @@ from gateway.northbound.blocks import parts_of
 from gateway.northbound.keys import Keys
 from gateway.northbound.losses import Losses
 from gateway.northbound.tag_index import TagIndex
-from gateway.tags import Sample, Tag
+from gateway.tags import Reason, Sample, Tag
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 
@@ -97,15 +97,17 @@ class Publisher:
         stamp = self._session.new_timestamp
         with self._filled:
             for sample in samples:
-                key = self._value_keys.get(sample.tag) or self._value_key(sample.tag)
+                key = self._value_keys.get(sample.tag) or self._value_key(sample)
                 # Removed first, so that the entry moves to the end: stamps leave in order.
                 if self._waiting.pop(key, None) is not None:
                     self.counters.superseded += 1
                 self._waiting[key] = (stamp(), key, sample)
             self._filled.notify()
 
-    def _value_key(self, tag: Tag) -> str:
-        key = self._value_keys[tag] = self._keys.value(tag.key)
+    def _value_key(self, sample: Sample) -> str:
+        key = self._keys.value(sample.tag.key)
+        if sample.reason is not Reason.DISABLED:  # otherwise its tag may have gone already
+            self._value_keys[sample.tag] = key
         return key
 
     def block(self, device: str, samples: Sequence[Sample]) -> None:

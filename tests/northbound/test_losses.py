@@ -51,3 +51,9 @@ def test_puts_long_after_the_last_slow_one_are_not_suspect(losses: Losses) -> No
     losses.sent([LEVEL], LIMIT, 100.0)
     losses.sent([SPEED], 0.0, 100.0 + ROUNDS[-1] + 0.1)
     assert losses.due(101.0) == [LEVEL.tag]
+
+
+def test_reloads_under_a_full_link_keep_no_tag_of_before(losses: Losses) -> None:
+    for n in range(100):  # each reload makes another tag of the same name
+        losses.sent([good(tag("mixer", "speed"), n, 0)], LIMIT, 100.0 + n)
+    assert len(losses.due(300.0)) == 1

@@ -1357,7 +1357,7 @@ MUTANTS = (
     Mutant(
         "values that a full link may have dropped are only counted",
         "northbound/losses.py",
-        "                self._suspects[sample.tag] = None\n",
+        "                self._suspects[key] = sample.tag\n",
         "                pass\n",
         "tests/northbound/test_losses.py",
         (19, 20),
@@ -1452,8 +1452,8 @@ MUTANTS = (
     Mutant(
         "an acknowledged write is not published",
         "northbound/audit.py",
-        "        self._publish(data)\n",
-        "        if refused:\n            self._publish(data)\n",
+        "        self._publish(data)\n        if self._record",
+        "        if refused:\n            self._publish(data)\n        if self._record",
         "tests/northbound/test_writes.py",
         (7,),
         "north",
