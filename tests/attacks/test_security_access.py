@@ -27,6 +27,7 @@ from tests.northbound.access import GATEWAY_RULES, ROUTER_RULES, rules, secret
 from tests.zenoh_peer import Subscription, ZenohPeer
 
 RECIPE, DIAL = "plant/mixer/recipe/@set", "plant/oven/dial/@set"
+GROUP = "plant/mixer/@set"
 LOOPBACK, GLOBAL = "plant/oven/@loopback", "plant/@gateway/demo/lines/annex/global"
 STATUS = "plant/@gateway/demo/status"
 FORGED = b'{"value": "forged", "quality": "good", "time": "2026-11-20T12:00:00Z"}'
@@ -42,17 +43,18 @@ class Rights(NamedTuple):
 # The users of the page, and those of its section on other rights.
 USERS = {
     "viewer": Rights(True),
-    "operator": Rights(True, (RECIPE, DIAL)),
+    "operator": Rights(True, (RECIPE, DIAL, GROUP)),
     "health": Rights(False),
     "commander": Rights(True, (LOOPBACK, GLOBAL)),
-    "mixer-operator": Rights(True, (RECIPE,)),
+    "mixer-operator": Rights(True, (RECIPE, GROUP)),
+    "recipe-operator": Rights(True, (RECIPE,)),
 }
 
 
 def with_other_rights(page_rules: str) -> dict[str, Any]:
-    """Returns the rules of the page with two users more, as the page explains."""
+    """Returns the rules of the page with three users more, as the page explains."""
     found: dict[str, Any] = rules(page_rules)
-    kept, like_write, like_outcome, _, one_device = [
+    kept, like_write, like_outcome, _, one_device, some_tags = [
         re.findall(r"`([^`]+)`", unit.text)
         for unit in units(RULES)
         if unit.section == "Other rights"
@@ -75,7 +77,13 @@ def with_other_rights(page_rules: str) -> dict[str, Any]:
     assert [all_of_them] == next(r["key_exprs"] for r in found["rules"] if r["id"] == rule)
     others = next(policy["rules"] for policy in found["policies"] if "ask" in policy["rules"])
     permit("mixer-operator", [*others, copied(rule, "write-mixer", [only]), kept_rule])
+    assert some_tags == [GROUP, only, RECIPE]
+    permit("recipe-operator", [*others, copied(rule, "write-recipe", [RECIPE]), kept_rule])
     return found
+
+
+def group_of(value: bytes) -> bytes:
+    return b'{"recipe": %b}' % value
 
 
 def password_of(name: str) -> str:
@@ -141,7 +149,7 @@ async def test_every_user_does_what_the_page_says_and_nothing_else(
             await reads(person, USERS[name])
         stolen = [await forges(person) for person in people.values()]
         before = len(program.lines)
-        values = dict(zip(USERS, (b"11", b"12", b"13", b"14", b"15"), strict=True))
+        values = dict(zip(USERS, (b"11", b"12", b"13", b"14", b"15", b"16"), strict=True))
         for name, person in people.items():
             await asks(person, USERS[name], values[name])
         refused = await people["operator"].get("plant/**/@set", values["operator"])
@@ -154,7 +162,7 @@ async def test_every_user_does_what_the_page_says_and_nothing_else(
         assert len(asked) == sum(len(rights.writes) for rights in USERS.values())
         assert not program.has_said("forged")
         for queries, own in zip(stolen, values.values(), strict=True):
-            assert {sample.payload for sample in queries.samples} <= {own}
+            assert {sample.payload for sample in queries.samples} <= {own, group_of(own)}
         received = [sample for each in (*heard, outcomes) for sample in each.samples]
         assert not any(
             b"forged" in sample.payload or sample.kind == "DELETE" for sample in received
@@ -217,7 +225,9 @@ async def forges(person: ZenohPeer) -> Subscription:
 
 async def asks(person: ZenohPeer, rights: Rights, value: bytes) -> None:
     """Writes and commands on every key. The gateway answers the allowed ones."""
-    for key, data in ((RECIPE, value), (DIAL, value), (LOOPBACK, b"AB"), (GLOBAL, b"on")):
+    group = group_of(value)
+    requests = {RECIPE: value, DIAL: value, GROUP: group, LOOPBACK: b"AB", GLOBAL: b"on"}
+    for key, data in requests.items():
         replies = await person.get(key, data, target="ALL")
         assert [reply.ok for reply in replies] == ([True] if key in rights.writes else []), key
     if RECIPE not in rights.writes:

@@ -228,6 +228,9 @@ RULES: dict[str, dict[str, tuple[str, ...]]] = {
         "**One device only.** To let a user write one device only, use `plant/mixer/**/@set` "
         "instead of `plant/**/@set` in a rule of its own like `write`. The rule `outcome` stays as "
         "it is: the gateway declares the whole key.": (USERS,),
+        "**Some tags only.** `plant/mixer/@set` writes [any tags of the device](write-groups.md), "
+        "and `plant/mixer/**/@set` matches it. To let a user write some tags only, allow their "
+        "keys one by one (`plant/mixer/recipe/@set`).": (USERS,),
     },
 }
 

@@ -10,6 +10,7 @@ BRIDGES = ROOT / "examples" / "bridges"
 PAGE = (ROOT / "docs" / "integrate.md").read_text("utf-8")
 NOT_OF_WRITES = {Problem.BAD_QUERY, Problem.DAMAGED, Problem.NO_HISTORY}
 NOT_OF_WRITES |= {Problem.NOTHING_TO_ACKNOWLEDGE}
+NOT_OF_WRITES |= {Problem.NOT_SENT, Problem.INCOMPLETE}  # of several tags at once
 
 
 def codes(file: str) -> dict[str, str]:

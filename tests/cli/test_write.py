@@ -11,7 +11,7 @@ from gateway.cli.write import outcome
 from gateway.config import load
 from gateway.errors import GatewayError
 from tests.cli.conftest import TAGS, Command, documents
-from tests.e2e.processes import plc_gateway, started, vigor_line, write_config
+from tests.e2e.processes import plc_gateway, started, until, vigor_line, write_config
 from tests.zenoh_peer import free_endpoint
 
 
@@ -56,8 +56,12 @@ def test_write_prints_the_reply_of_the_plc(
     assert (done.code, done.err) == (0, "")
     assert done.out.startswith(f"{tag} = {value}: {how}, ")
     assert done.out.endswith(" ms\n")
-    [row] = documents(plc_gateway("read", running, tag, "--json", "--max-age", "0s").out)
-    assert str(row["value"]) == value.replace("true", "True")
+
+    def is_read() -> bool:  # a slow machine may miss a reply
+        [row] = documents(plc_gateway("read", running, tag, "--json", "--max-age", "0s").out)
+        return str(row["value"]) == value.replace("true", "True")
+
+    until(is_read, f"{tag} is {value}")
 
 
 def test_write_as_json(running: Path) -> None:
