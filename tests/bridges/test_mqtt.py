@@ -106,7 +106,7 @@ def test_a_client_of_the_broker_sees_no_good_value_that_is_not(
                 seen.says("plant/oven/heat", '"value": 5', '"good"')
 
                 gateway.offline("mixer")
-                seen.says("plant/mixer/raw", '"bad"')
+                seen.says("plant/mixer/raw", '"no-reply"')
                 gateway.put("mixer/speed", 13.5)  # no token says that it is of now
                 gateway.put("oven/heat", 6)
                 seen.says("plant/oven/heat", '"value": 6')
