@@ -18,7 +18,7 @@ from gateway.line.line import Line
 from gateway.tags import Quality, Sample
 from tests.e2e.processes import write_config
 
-PATIENCE = 20.0  # seconds; never waited for when all is well
+PATIENCE = 60.0  # seconds; never waited for when all is well
 
 
 def crc(data: bytes) -> bytes:

@@ -15,7 +15,7 @@ from gateway.line.build import line_of
 from gateway.line.line import Line
 from gateway.tags import Quality, Sample
 
-PATIENCE = 20.0  # seconds; never waited for when all is well
+PATIENCE = 60.0  # seconds; never waited for when all is well
 Handler = Callable[[int, asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
 
 

@@ -44,7 +44,7 @@ async def asking(slow: ZenohPeer, link: PacedLink) -> AsyncIterator[asyncio.Task
     """Long answers are on their way over the link."""
     answers = asyncio.create_task(slow.many([("plant/**", None)] * 16, 25))
     try:
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(60):
             while not link.is_busy:
                 await asyncio.sleep(0.01)
         yield answers

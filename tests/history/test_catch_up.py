@@ -68,7 +68,7 @@ async def serving(
     northbound = Northbound(settings, "demo", below, history=historian)
     serves = asyncio.create_task(northbound.run())
     try:
-        async with asyncio.timeout(5):
+        async with asyncio.timeout(60):
             await northbound.opened.wait()
         yield northbound
     finally:
@@ -241,7 +241,7 @@ async def test_outcomes_of_writes_and_commands_are_queried_by_time(tmp_path: Pat
     ):
         for outcome in done:
             record_outcome(historian, outcome)
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(60):
             while historian.document()["writes_stored"] != len(done):
                 await asyncio.sleep(0.01)
 

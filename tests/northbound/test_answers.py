@@ -9,7 +9,7 @@ import zenoh
 from gateway.northbound.answers import REFUSALS_LIMIT, AnswerPool
 from gateway.northbound.workers import Workers
 
-PATIENCE = 10.0  # seconds
+PATIENCE = 60.0  # seconds; never waited for when all is well
 
 
 class Query:

@@ -53,7 +53,7 @@ async def gateway_process(endpoint: str, fails: str = "") -> asyncio.subprocess.
         stderr=asyncio.subprocess.PIPE,
     )
     assert process.stdout is not None
-    async with asyncio.timeout(10):
+    async with asyncio.timeout(60):
         while b"serving" not in await process.stdout.readline():
             pass
     return process

@@ -6,7 +6,7 @@ from contextlib import AbstractContextManager
 
 from gateway.northbound.turns import Pause, Rank, Turns
 
-PATIENCE = 10.0  # seconds
+PATIENCE = 60.0  # seconds; never waited for when all is well
 
 
 class Clock:

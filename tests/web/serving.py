@@ -117,7 +117,7 @@ class Client:
         reader, writer = await asyncio.open_connection("127.0.0.1", self.port)
         try:
             writer.write("\r\n".join(lines).encode() + body)
-            whole = await asyncio.wait_for(reader.read(), 10)
+            whole = await asyncio.wait_for(reader.read(), 60)
         finally:
             writer.close()
             await writer.wait_closed()
