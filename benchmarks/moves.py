@@ -21,7 +21,8 @@ import structlog
 import gateway
 from benchmarks.transactions import VIGOR_STATION, process, tcp_opener
 from benchmarks.words import words
-from gateway.engine.device import Device, DeviceSettings
+from gateway.engine.device import Device
+from gateway.engine.device_settings import DeviceSettings
 from gateway.engine.engine import Engine
 from gateway.engine.jobs import Job, Poll
 from gateway.engine.requests import Write

@@ -12,7 +12,8 @@ from gateway.alarms.watched import watch
 from gateway.config import Config, LineConfig
 from gateway.config.changes import DeviceChange
 from gateway.config.commands import check_command, every_command, speaker
-from gateway.engine.device import Device, DeviceSettings
+from gateway.engine.device import Device
+from gateway.engine.device_settings import DeviceSettings
 from gateway.engine.forecast import LineForecast, forecast
 from gateway.engine.requests import WRITE_EXPIRY, CommandResult, Peeked
 from gateway.errors import GatewayError
@@ -30,27 +31,7 @@ from gateway.tags import Reason, Sample, Tag, WriteResult, bad
 from gateway.tags.mirror import Mirror
 from gateway.tags.scan import Scan
 from gateway.tags.timestamps import rfc3339
-from gateway.transfers.forecast import transfer_forecasts, with_transfers
 from gateway.values import Value
-
-
-def forecasts(
-    config: Config, report: Callable[[str, float], None] | None = None
-) -> list[LineForecast]:
-    """Calculates the load and the worst ages of each line of the file.
-
-    `report` receives the name of this step and the share of it that is done.
-    """
-    found = []
-    for line in config.lines:
-        if line.serve:
-            continue
-        devices = [Device(device, line.wire) for device in line.devices if device.enabled]
-        found.append(forecast(line.name, devices, line.wire))
-        if report is not None:
-            report("planning the requests", len(found) / len(config.lines))
-    return with_transfers(found, transfer_forecasts(config, found))
-
 
 REMOVED = "removed from the file"
 

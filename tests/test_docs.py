@@ -31,7 +31,7 @@ from gateway.config import (
 )
 from gateway.config.commands import TO_ALL, every_command
 from gateway.config.yaml_file import read_yaml
-from gateway.engine.device import DeviceSettings
+from gateway.engine.device_settings import DeviceSettings
 from gateway.history import Historian
 from gateway.line.duty import Duty
 from gateway.northbound import payload

@@ -12,7 +12,7 @@ from typing import Self
 
 from gateway.config import LineConfig
 from gateway.errors import GatewayError
-from gateway.protocols.driver import Dissected
+from gateway.protocols.capabilities import Dissected
 from gateway.protocols.listening import Asked, Ear, Listenable
 
 _RAW_IP, _UPPER_PDU = 101, 252  # link types

@@ -9,7 +9,6 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from gateway import app
 from gateway.cli.modem_plan import modem_plan, modem_warnings
 from gateway.cli.progress import progress
 from gateway.cli.served_plan import served_plan
@@ -22,7 +21,7 @@ from gateway.northbound.northbound import check as zenoh_warnings
 from gateway.planning.planner import describe
 from gateway.planning.wire_timing import NETWORK_BAUD, WireTiming
 from gateway.tags.tag import CounterRule
-from gateway.transfers.forecast import TransferForecast, transfer_forecasts
+from gateway.transfers.forecast import TransferForecast, forecasts, transfer_forecasts
 from gateway.web import exposure
 
 
@@ -47,13 +46,13 @@ def check(
     with progress(err) as report:
         loaded = load(config, report)
         warnings = zenoh_warnings(loaded) + exposure.check(loaded)
-        lines = app.forecasts(loaded, report)
+        lines = forecasts(loaded, report)
     few = sum(len(line.blocks) for line in lines) <= 100
     out.print(plan(lines, every_block=few if blocks is None else blocks))
     for part in _without_polls(loaded):
         out.print(part)
-    forecasts = {line.name: line for line in lines}
-    modems = [(line, forecasts.get(line.name)) for line in loaded.lines if line.modem is not None]
+    by_name = {line.name: line for line in lines}
+    modems = [(line, by_name.get(line.name)) for line in loaded.lines if line.modem is not None]
     for line, forecast in modems:
         out.print(Text(modem_plan(line, forecast)))
         warnings += [] if forecast is None else modem_warnings(line, forecast)

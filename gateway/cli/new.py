@@ -19,7 +19,7 @@ from gateway.config import load, parsers
 from gateway.config.messages import one_of
 from gateway.config.yaml_insert import written
 from gateway.errors import ConfigError
-from gateway.protocols.driver import Scannable
+from gateway.protocols.capabilities import Scannable
 from gateway.protocols.registry import PROTOCOLS
 from gateway.transport import SerialSettings
 

@@ -5,13 +5,15 @@ from dataclasses import dataclass, field, replace
 from itertools import product
 
 from gateway.config import parsers
-from gateway.engine.device import Device, DeviceSettings
+from gateway.engine.device import Device
+from gateway.engine.device_settings import DeviceSettings
 from gateway.errors import ConfigError, Garbled, LineDown, Refused, Unclear
 from gateway.line.channel import Channel, Echo
 from gateway.line.transaction import Transaction
 from gateway.line.wire_log import WireLog
 from gateway.planning.wire_timing import WireTiming, character_bits
-from gateway.protocols.driver import AnyDriver, ScanHints, Scannable
+from gateway.protocols.capabilities import ScanHints, Scannable
+from gateway.protocols.driver import AnyDriver
 from gateway.protocols.registry import PROTOCOLS
 from gateway.protocols.swapped import SWAPPED, KnownReplies, is_swapped
 from gateway.transport import (

@@ -15,7 +15,7 @@ from gateway.config.yaml_file import TEXTS, file_text
 from gateway.config.zenoh_records import ZenohConfig
 
 if TYPE_CHECKING:
-    from gateway.engine.device import DeviceSettings
+    from gateway.engine.device_settings import DeviceSettings
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

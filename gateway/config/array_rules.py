@@ -6,7 +6,7 @@ from dataclasses import replace
 from gateway.config.messages import Mistakes, Path
 from gateway.config.model import TagSection
 from gateway.planning.planner import items_of
-from gateway.protocols.driver import AnyDriver, Cost, Span
+from gateway.protocols.driver import Addressing, Cost, Span
 from gateway.tags import Tag
 from gateway.values import ValueType
 
@@ -22,7 +22,7 @@ def array_misfits(own: TagSection, kind: ValueType) -> Iterator[tuple[str, str]]
             yield setting, what
 
 
-def most_that_fits(driver: AnyDriver, span: Span, kind: ValueType, *, write: bool) -> str:
+def most_that_fits(driver: Addressing, span: Span, kind: ValueType, *, write: bool) -> str:
     """Returns the longest array there that one request holds, for a message; empty: none."""
     size = span.size // kind.count
     cost_of = driver.write_cost if write else driver.cost
@@ -33,7 +33,7 @@ def most_that_fits(driver: AnyDriver, span: Span, kind: ValueType, *, write: boo
     return ""
 
 
-def check_overlaps(driver: AnyDriver, tags: Sequence[Tag], path: Path, mistakes: Mistakes) -> None:
+def check_overlaps(driver: Addressing, tags: Sequence[Tag], path: Path, mistakes: Mistakes) -> None:
     """Notes tags that overlap and that no request can read together: each is read as a whole."""
     areas = {tag.span.area for tag in tags if tag.span.size > _LONG and tag.shape is None}
     for area in areas:

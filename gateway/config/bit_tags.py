@@ -6,14 +6,14 @@ from typing import Any
 from gateway.config import shaping_parsers
 from gateway.config.messages import Mistakes, Path
 from gateway.errors import ConfigError
-from gateway.protocols.driver import AnyDriver, Unit
+from gateway.protocols.driver import Addressing, Unit
 from gateway.protocols.typed_fields import TypedFields
 
 Rows = Iterator[tuple[str, object, Path]]
 
 
 def with_bits(
-    rows: Mapping[str, object], path: Path, driver: AnyDriver | None, mistakes: Mistakes
+    rows: Mapping[str, object], path: Path, driver: Addressing | None, mistakes: Mistakes
 ) -> Rows:
     """Yields name, settings and place of each tag; for a tag with bits, of each of its bits."""
     for name, raw in rows.items():
@@ -24,7 +24,7 @@ def with_bits(
 
 
 def _bits(
-    name: str, raw: Mapping[str, Any], place: Path, driver: AnyDriver, mistakes: Mistakes
+    name: str, raw: Mapping[str, Any], place: Path, driver: Addressing, mistakes: Mistakes
 ) -> Rows:
     try:
         bits = shaping_parsers.bits(raw["bits"])

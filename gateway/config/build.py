@@ -45,7 +45,7 @@ from gateway.config.validate import (
     section,
     unknown,
 )
-from gateway.engine.device import DeviceSettings
+from gateway.engine.device_settings import DeviceSettings
 from gateway.errors import ConfigError
 from gateway.protocols.driver import AnyDriver, Timing
 from gateway.protocols.registry import PROTOCOLS
@@ -173,17 +173,17 @@ class Builder:
         settings = section(DeviceSection, common, path, self.mistakes, "a device")
         driver = self._driver(raw.get("protocol"), own, path)
         defaults = self._defaults(raw, path, outer)
-        real, driver = driver, ServedView(driver) if serve and driver is not None else driver
+        addressing = ServedView(driver) if serve and driver is not None else driver
         self._intervals[name] = defaults.every
-        tags = self._tags.build(name, raw.get("tags"), (*path, "tags"), defaults, driver)
+        tags = self._tags.build(name, raw.get("tags"), (*path, "tags"), defaults, addressing)
         sheets = len(self._sheets.used)
         own_sheet = None if settings is None else settings.tags_from
         for sheet in filter(None, (own_sheet, self.imports.get(name))):
             place, taken = (*path, "tags_from"), {tag.name for tag in tags}
-            tags += self._sheets.build(name, sheet, place, defaults, driver, taken)
-        if settings is None or real is None:
+            tags += self._sheets.build(name, sheet, place, defaults, addressing, taken)
+        if settings is None or driver is None:
             return None
-        driver, served = real, None
+        served = None
         if serve:
             rest = [sheet.raw for sheet in self._sheets.used[sheets:]]
             device = ServedDevice(driver, settings, raw, rest, defaults, path, self.mistakes)

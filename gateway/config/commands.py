@@ -3,10 +3,10 @@
 from collections.abc import Mapping
 
 from gateway.config import Config, LineConfig
-from gateway.engine.device import DeviceSettings
+from gateway.engine.device_settings import DeviceSettings
 from gateway.engine.requests import why_not_commanded
 from gateway.errors import BadValue
-from gateway.protocols.driver import Controllable
+from gateway.protocols.capabilities import Controllable
 
 TO_ALL = "global"  # goes to every station of the line; no station replies
 

@@ -11,7 +11,7 @@ from gateway.config.model import ComputedSection, TagDefaults, TagSection
 from gateway.config.tag_rules import TagSource, build_tag, inherit
 from gateway.config.validate import section
 from gateway.errors import ConfigError
-from gateway.protocols.driver import AnyDriver
+from gateway.protocols.driver import Addressing
 from gateway.protocols.models import Model, model_of
 from gateway.protocols.typed_fields import TypedFields
 from gateway.tags import Tag
@@ -50,7 +50,7 @@ class DeviceTags:
         raw_tags: object,
         path: Path,
         defaults: TagDefaults,
-        driver: AnyDriver | None,
+        driver: Addressing | None,
     ) -> tuple[Tag, ...]:
         """Returns the tags of a device, without those that have mistakes."""
         alike: _Alike = {}
@@ -89,7 +89,7 @@ class DeviceTags:
         raw: object,
         place: Path,
         defaults: TagDefaults,
-        driver: AnyDriver | None,
+        driver: Addressing | None,
     ) -> Tag | None:
         own = section(TagSection, raw, place, self.mistakes, "a tag")
         if own is None or driver is None:

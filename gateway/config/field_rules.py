@@ -15,7 +15,7 @@ from gateway.config.tag_rules import (
     only_for_numbers,
     write_rule,
 )
-from gateway.protocols.driver import AnyDriver, Span, Unit
+from gateway.protocols.driver import Addressing, Span, Unit
 from gateway.protocols.typed_fields import TypedField, TypedFields
 from gateway.tags import Publish, Tag, WriteRule
 from gateway.values import Layout
@@ -24,7 +24,7 @@ _OF_WORDS = ("type", "word_order", "byte_order", "byte", "bits")
 
 
 def field_tag(
-    source: TagSource, driver: AnyDriver, fields: TypedFields, mistakes: Mistakes
+    source: TagSource, driver: Addressing, fields: TypedFields, mistakes: Mistakes
 ) -> Tag | None:
     """Returns the tag, or None after its mistakes were noted. `fields` is the driver as well."""
     before = len(mistakes)

@@ -10,7 +10,7 @@ from gateway.config import parsers
 from gateway.config.messages import Mistakes, Path, one_of, shown
 from gateway.config.model import DeviceSection, LineSection, TagDefaults
 from gateway.config.records import LineConfig
-from gateway.engine.device import DeviceSettings
+from gateway.engine.device_settings import DeviceSettings
 from gateway.errors import ConfigError
 from gateway.protocols.driver import Address, AnyDriver, Area, Cost, Span, Timing, Traits
 from gateway.serving.registers import STALE_AFTER, Row, Served, cells_of
@@ -26,7 +26,7 @@ _OF_MASTERS = ("reply_timeout", "retries", "verify_reads", "late_guard", "silenc
 
 @dataclass(frozen=True, slots=True)
 class ServedView:
-    """A driver as a station sees its addresses: the gateway gives a value to every one of them."""
+    """The addresses of a driver as a station has them: the gateway gives every one a value."""
 
     driver: AnyDriver
 
@@ -64,18 +64,6 @@ class ServedView:
 
     def write_cost(self, span: Span) -> Cost | None:
         return self.driver.cost(span)
-
-    def codec(self) -> Any:
-        return self.driver.codec()
-
-    async def read(self, *_: Any) -> Sequence[int]:
-        raise NotImplementedError
-
-    async def write(self, *_: Any) -> bool:
-        raise NotImplementedError
-
-    async def resync(self, *_: Any) -> int:
-        raise NotImplementedError
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,7 @@ from gateway.config.model import TagDefaults, TagSection
 from gateway.config.validate import settings_of
 from gateway.config.yaml_events import plain_data
 from gateway.errors import ConfigError
-from gateway.protocols.driver import AnyDriver
+from gateway.protocols.driver import Addressing
 from gateway.sheets import Grid, Sheet, link_table, read_grid, read_sheet
 from gateway.tags import Tag
 
@@ -58,7 +58,7 @@ class SheetTags:
         file: FilePath,
         path: Path,
         defaults: TagDefaults,
-        driver: AnyDriver | None,
+        driver: Addressing | None,
         taken: Collection[str],
     ) -> tuple[Tag, ...]:
         """Returns the tags of a device in a sheet. `path`: of the setting that names the sheet."""

@@ -10,7 +10,7 @@ from gateway.config.messages import Mistakes, Path
 from gateway.config.model import ComputedSection, TagDefaults, TagSection, WriteSection
 from gateway.config.shaping_rules import shaping_of
 from gateway.errors import BadValue, ConfigError
-from gateway.protocols.driver import Address, AnyDriver, Area, Span, Unit
+from gateway.protocols.driver import Address, Addressing, Area, Span, Unit
 from gateway.tags import Tag, WriteRule
 from gateway.values import BYTES, Byte, Kind, Layout, Order, ValueType
 
@@ -51,7 +51,7 @@ def inherit(outer: TagDefaults, inner: TagDefaults | ComputedSection) -> TagDefa
     return outer.model_copy(update=replaced)
 
 
-def build_tag(source: TagSource, driver: AnyDriver, mistakes: Mistakes) -> Tag | None:
+def build_tag(source: TagSource, driver: Addressing, mistakes: Mistakes) -> Tag | None:
     """Returns the tag, or None after its mistakes were noted."""
     before = len(mistakes)
     address = address_of(source, driver, mistakes)
@@ -79,7 +79,7 @@ def build_tag(source: TagSource, driver: AnyDriver, mistakes: Mistakes) -> Tag |
     return kept_tag(source.own, settings, tag, source.path, mistakes)
 
 
-def address_of(source: TagSource, driver: AnyDriver, mistakes: Mistakes) -> Address | None:
+def address_of(source: TagSource, driver: Addressing, mistakes: Mistakes) -> Address | None:
     """Returns the address of the tag, or None after the mistake was noted."""
     try:
         return driver.address(source.own.address)
@@ -132,7 +132,7 @@ def assemble(
 def _type(
     source: TagSource,
     settings: TagDefaults,
-    driver: AnyDriver,
+    driver: Addressing,
     address: Address,
     mistakes: Mistakes,
 ) -> ValueType:
@@ -148,7 +148,7 @@ def _type(
     return default
 
 
-def _default_type(driver: AnyDriver, unit: Unit) -> ValueType:
+def _default_type(driver: Addressing, unit: Unit) -> ValueType:
     match unit:
         case Unit.BIT:
             return ValueType(Kind.BOOL)
@@ -159,7 +159,7 @@ def _default_type(driver: AnyDriver, unit: Unit) -> ValueType:
 
 
 def _layout(
-    source: TagSource, settings: TagDefaults, driver: AnyDriver, area: Area, kind: ValueType
+    source: TagSource, settings: TagDefaults, driver: Addressing, area: Area, kind: ValueType
 ) -> Layout:
     if area.unit is Unit.DWORD:  # the driver puts it together, whatever its order on the wire
         return Layout(kind)
@@ -169,7 +169,7 @@ def _layout(
     return Layout(kind, settings.word_order, settings.byte_order or usual)
 
 
-def _type_misfit(kind: ValueType, area: Area, address: Address, driver: AnyDriver) -> str | None:
+def _type_misfit(kind: ValueType, area: Area, address: Address, driver: Addressing) -> str | None:
     spelt = driver.spell(address)
     if area.unit is Unit.BIT or address.bit is not None:
         what = "is a bit" if address.bit is None else "is one bit of a word"
@@ -188,7 +188,7 @@ def _type_misfit(kind: ValueType, area: Area, address: Address, driver: AnyDrive
 
 def _misfits(
     source: TagSource,
-    driver: AnyDriver,
+    driver: Addressing,
     address: Address,
     span: Span,
     kind: ValueType,
@@ -249,7 +249,7 @@ def only_for_numbers(source: TagSource, kind: ValueType) -> Iterator[tuple[str, 
 def _write(
     source: TagSource,
     settings: TagDefaults,
-    driver: AnyDriver,
+    driver: Addressing,
     span: Span,
     kind: ValueType,
     mistakes: Mistakes,

@@ -1,10 +1,10 @@
-"""One device on a line: its settings, its plan, its health and its record."""
+"""The state of one device on a line: its plan, its health and its record."""
 
 import math
 from collections.abc import Sequence
 from dataclasses import InitVar, dataclass, field
-from typing import Literal
 
+from gateway.engine.device_settings import DeviceSettings
 from gateway.engine.health import Health, State, diagnosis
 from gateway.engine.monitor_list import MonitorList
 from gateway.engine.records import Record
@@ -16,9 +16,9 @@ from gateway.planning.bad_addresses import RETRIES, BadAddresses, KnownBad
 from gateway.planning.monitor_lists import with_monitor_list
 from gateway.planning.planner import Block, around, plan, runs_of
 from gateway.planning.wire_timing import Transactions, WireTiming
-from gateway.protocols.driver import AnyDriver, Cost, Monitor, NoReplyCauses, Span, Timing, Windowed
+from gateway.protocols.capabilities import Monitor, NoReplyCauses, Windowed
+from gateway.protocols.driver import AnyDriver, Cost, Span, Timing
 from gateway.protocols.swapped import SWAPPED, KnownReplies, is_swapped
-from gateway.serving.registers import Served
 from gateway.tags import Tag
 
 MOST_PLANNED = 1000  # tags times intervals: planning them takes some tenths of a second
@@ -31,38 +31,6 @@ ANSWERS_TWICE = (
     "device server repeats replies"
 )
 HALF_LIFE = 10.0  # seconds until past use of the wire counts half
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DeviceSettings:
-    """One station on a line, as the file describes it. Times in seconds."""
-
-    name: str
-    driver: AnyDriver
-    timing: Timing  # the defaults of the protocol, with the settings of the file
-    turnaround: float | None = None  # None: measured
-    late_guard: float = 0.5  # the longest wait for a late reply after a time-out
-    verify_reads: int = 1  # reads in a row that must agree
-    blocks: bool | Literal["only"] = False  # one put per scan: also, or instead of one per tag
-    control: bool = False  # run, stop, ... are allowed
-    listen_only: bool = False  # another master asks it; nothing is ever sent
-    enabled: bool = True
-    tags: tuple[Tag, ...] = ()
-    targets: tuple[Tag, ...] = ()  # that only transfers write: no poll, no value
-    served: Served | None = None  # it is a station of the gateway, for a master on its line
-    wire_tags: tuple[Tag, ...] = field(init=False, repr=False)  # those with an address
-
-    def __post_init__(self) -> None:
-        tags = [tag for tag in self.tags if tag.formula is None]
-        found = tuple(tag if tag.kept is None else tag.inputs[0] for tag in tags)
-        object.__setattr__(self, "wire_tags", found)
-
-    @property
-    def answerable(self) -> bool:
-        """False for a device that is only written to, or only sends unsolicited frames."""
-        areas = self.driver.areas
-        used = [areas[tag.span.area] for tag in self.wire_tags] or areas.values()
-        return any(area.readable for area in used) and not self.listen_only
 
 
 @dataclass(slots=True, eq=False)

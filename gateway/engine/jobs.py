@@ -13,7 +13,8 @@ from gateway.engine.requests import Command, Request, Resyncs, Write
 from gateway.engine.runs import needs_read, together
 from gateway.errors import BadValue, Busy, DeviceError, LineDown, Refused, Unclear
 from gateway.planning.planner import Block
-from gateway.protocols.driver import Span, UnnumberedReplies
+from gateway.protocols.capabilities import UnnumberedReplies
+from gateway.protocols.driver import Span
 from gateway.tags.scan import Scan
 
 NOT_QUEUED, EXPEDITED, ON_DEMAND = -1, -2, -3  # tickets of polls that are in no heap

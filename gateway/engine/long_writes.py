@@ -5,7 +5,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from gateway.errors import GatewayError, Refused, Unclear
-from gateway.protocols.driver import Address, AnyDriver, Span, WritesAround
+from gateway.protocols.capabilities import WritesAround
+from gateway.protocols.driver import Address, AnyDriver, Span
 
 _TRIED = 8  # lengths of a request, until one needs no addresses around it: bits are in eights
 

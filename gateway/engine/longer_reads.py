@@ -5,7 +5,8 @@ from collections.abc import Hashable, Iterator, Mapping, Sequence
 
 from gateway.planning.bad_addresses import BadAddresses, within
 from gateway.planning.planner import Block
-from gateway.protocols.driver import Cost, Span, UnnumberedReplies
+from gateway.protocols.capabilities import UnnumberedReplies
+from gateway.protocols.driver import Cost, Span
 
 LONGEST_STEP = 16  # addresses by which a read may grow, to reach the next byte of bits
 MOST_CHOICES = 3  # shapes of one block: an extra reply that is late by two requests is noticed

@@ -12,7 +12,8 @@ from gateway.engine.long_writes import LongWrite
 from gateway.engine.longer_reads import MOST_CHOICES, LongerReads
 from gateway.planning.bad_addresses import BadAddresses
 from gateway.planning.planner import Block
-from gateway.protocols.driver import AnyDriver, Span, UnnumberedReplies
+from gateway.protocols.capabilities import UnnumberedReplies
+from gateway.protocols.driver import AnyDriver, Span
 from gateway.tags import Tag
 
 QUIET = 0.25  # seconds after a reply in which an extra reply would have arrived

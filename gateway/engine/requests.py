@@ -9,7 +9,8 @@ from gateway.engine.device import Device
 from gateway.engine.long_writes import LongWrite, long_write
 from gateway.engine.runs import run_of
 from gateway.errors import GatewayError, NotSent
-from gateway.protocols.driver import AnyDriver, Controllable, ScatteredWriter, Span
+from gateway.protocols.capabilities import Controllable, ScatteredWriter
+from gateway.protocols.driver import AnyDriver, Span
 from gateway.tags import Tag, WriteResult
 from gateway.values import Value
 

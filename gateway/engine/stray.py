@@ -8,7 +8,8 @@ from gateway.engine.device import Device
 from gateway.engine.effects import Effects
 from gateway.engine.results import Results
 from gateway.errors import Garbled
-from gateway.protocols.driver import Codec, StrayFrames, UnnumberedReplies
+from gateway.protocols.capabilities import StrayFrames, UnnumberedReplies
+from gateway.protocols.driver import Codec
 
 LOG_EVERY = 10.0  # seconds for each device; other frames are logged at level debug
 PAUSE = 0.1  # seconds without a byte after which a frame begins

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol, runtime_checkable
 
 from gateway.engine.changes import Changes
-from gateway.engine.device import DeviceSettings
+from gateway.engine.device_settings import DeviceSettings
 
 
 @runtime_checkable

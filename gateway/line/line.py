@@ -15,7 +15,8 @@ import structlog
 
 from gateway.engine.calls import Calls
 from gateway.engine.changes import Changes
-from gateway.engine.device import Device, DeviceSettings
+from gateway.engine.device import Device
+from gateway.engine.device_settings import DeviceSettings
 from gateway.engine.effects import Effect, LogEvent, OnlineChange, Pause, RequestEnded, Samples
 from gateway.engine.engine import Engine
 from gateway.engine.jobs import Idle, Poll, Reopen, Result, Settle, Traffic

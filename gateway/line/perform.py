@@ -36,7 +36,8 @@ from gateway.errors import (
 )
 from gateway.line.transaction import Transaction
 from gateway.planning.planner import Block
-from gateway.protocols.driver import AnyDriver, Controllable, Monitor, ScatteredWriter, Span, Talk
+from gateway.protocols.capabilities import Controllable, Monitor, ScatteredWriter
+from gateway.protocols.driver import AnyDriver, Span, Talk
 
 T = TypeVar("T")
 TWO_REPLIES = "two replies arrived, and the first may be that to an earlier write"

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 from gateway.config import LineConfig
-from gateway.engine.device import DeviceSettings
+from gateway.engine.device_settings import DeviceSettings
 from gateway.line.replay import SILENT_BEFORE, Learned, Replay
 from gateway.line.wire_file import LoggedPiece, LoggedValue
 from gateway.protocols.driver import Address, Span

@@ -7,7 +7,8 @@ from collections.abc import Collection, Sequence
 
 from gateway.planning.planner import Block
 from gateway.planning.rows import Seconds
-from gateway.protocols.driver import AnyDriver, Monitor, Span, Unit
+from gateway.protocols.capabilities import Monitor
+from gateway.protocols.driver import AnyDriver, Span, Unit
 
 
 def with_monitor_list(

@@ -5,10 +5,10 @@ synchronously. A `Driver` turns frames into words with `async def`; it can only 
 receive frames of the transaction it is given.
 """
 
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar, runtime_checkable
+from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 from gateway.values import Kind, Order
 
@@ -146,8 +146,8 @@ class Talk(Protocol[F]):
         """
 
 
-class Driver(Protocol[F]):
-    """Frames <-> words for one device. A frozen dataclass whose fields are its YAML settings."""
+class Addressing(Protocol):
+    """The addresses of one device, and what requests for them cost."""
 
     @property
     def protocol(self) -> str: ...
@@ -182,6 +182,10 @@ class Driver(Protocol[F]):
     def write_cost(self, span: Span) -> Cost | None:
         """As `cost`, for writing."""
 
+
+class Driver(Addressing, Protocol[F]):
+    """Frames <-> words for one device. A frozen dataclass whose fields are its YAML settings."""
+
     def codec(self) -> Codec[F]: ...
 
     async def read(self, talk: Talk[F], span: Span) -> Sequence[int]:
@@ -214,150 +218,3 @@ class Driver(Protocol[F]):
 
 
 AnyDriver = Driver[Any]
-
-
-# ---- Optional capabilities ---------------------------------------------------------------
-
-
-@runtime_checkable
-class ScatteredWriter(Protocol[F]):
-    """A driver that can write several separate spans with one request (BT, WT)."""
-
-    def scattered_write_cost(self, spans: Sequence[Span]) -> Cost | None:
-        """Returns None when these spans do not fit one request."""
-
-    async def write_scattered(
-        self, talk: Talk[F], parts: Sequence[tuple[Span, Sequence[int]]]
-    ) -> bool: ...
-
-
-@runtime_checkable
-class WritesAround(Protocol):
-    """A driver whose writes of some spans also write addresses around them, as just read."""
-
-    def writes_around(self, span: Span) -> bool:
-        """Returns True if a write of the span writes more than the span."""
-
-
-@runtime_checkable
-class Monitor(Protocol[F]):
-    """A driver whose device stores a list of addresses and reads it cheaply (BM/MB, WM/MN).
-
-    The device loses its list at power-off: after any error, `register` it again.
-    """
-
-    def monitor_cost(self, spans: Sequence[Span]) -> Cost | None:
-        """Returns the cost of reading the list; None if these spans cannot be registered."""
-
-    async def register(self, talk: Talk[F], spans: Sequence[Span]) -> None: ...
-
-    async def read_registered(
-        self, talk: Talk[F], spans: Sequence[Span]
-    ) -> list[Sequence[int]]: ...
-
-
-@runtime_checkable
-class Windowed(Protocol):
-    """A driver whose replies carry a number: several requests may be outstanding."""
-
-    @property
-    def window(self) -> int:
-        """The most outstanding requests."""
-
-
-@runtime_checkable
-class NoReplyCauses(Protocol):
-    """A driver with causes why its device may not reply at all."""
-
-    @property
-    def no_reply_causes(self) -> str:
-        """The causes, in a sentence or two for people."""
-
-
-@runtime_checkable
-class StrayFrames(Protocol):
-    """A driver that can explain stray frames: frames that are no reply to any request."""
-
-    def from_this_station(self, frame: Any) -> bool:
-        """Returns True when the device itself sent the frame."""
-
-    def describe_stray(self, frame: Any) -> str | None:
-        """Returns a phrase for the log; None for a frame that needs no explanation."""
-
-
-@runtime_checkable
-class UnnumberedReplies(Protocol):
-    """A driver whose replies name no request: they differ by shape only, kind and length."""
-
-    @property
-    def unnumbered(self) -> bool:
-        """False where the settings give each reply a number."""
-
-    def cost(self, span: Span) -> Cost | None:
-        """As in `Driver`."""
-
-    def reply_shape(self, span: Span) -> Hashable:
-        """Returns the shape of the reply to a read of `span`.
-
-        Replies of different shapes are never taken for each other.
-        """
-
-    def write_shapes(self, span: Span, units: Sequence[int]) -> Sequence[Hashable]:
-        """Returns the shapes of all replies to a write of `span`, in their order."""
-
-    def resync_shape(
-        self, outstanding: Span | None, probe_token: int, spans: Sequence[Span] = ()
-    ) -> Hashable:
-        """Returns the shape of the reply to `resync`; None where no other reply can have it."""
-
-    def is_reply(self, frame: Any) -> bool:
-        """Returns True for a reply of this station: for no request and no unsolicited frame."""
-
-
-@runtime_checkable
-class Controllable(Protocol[F]):
-    """A driver whose device accepts commands: run, stop, loopback, model."""
-
-    @property
-    def controls(self) -> frozenset[str]: ...
-
-    @property
-    def broadcast_commands(self) -> frozenset[str]:
-        """The commands that go to all stations of the line, and get no reply."""
-
-    async def control(self, talk: Talk[F], command: str, argument: str) -> str:
-        """Returns the reply of the device. Raises `BadValue` for an argument it cannot send."""
-
-
-@runtime_checkable
-class EchoConflict(Protocol):
-    """A driver with a setting that does not work on a line that echoes."""
-
-    @property
-    def echo_conflict(self) -> tuple[str, str] | None:
-        """The setting and the reason; None where the settings of this device work."""
-
-
-@runtime_checkable
-class Dissected(Protocol):
-    """A driver whose frames Wireshark knows."""
-
-    @property
-    def dissector(self) -> str:
-        """The name of the dissector in Wireshark."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ScanHints:
-    """Settings of `scan` for a protocol."""
-
-    formats: Sequence[str] = ("8N1",)  # of a serial line, the most likely first
-    stations: range = range(1, 32)  # default of the command
-    variants: Sequence[Mapping[str, object]] = ({},)  # YAML settings to try at each station
-
-
-@runtime_checkable
-class Scannable(Protocol):
-    """A driver class whose stations `scan` can look for."""
-
-    scan_hints: ClassVar[ScanHints]

@@ -3,7 +3,7 @@
 from collections.abc import Hashable
 from dataclasses import dataclass, field, fields, is_dataclass
 
-from gateway.protocols.driver import AnyDriver
+from gateway.protocols.driver import Addressing
 
 
 @dataclass(frozen=True, slots=True)
@@ -11,7 +11,7 @@ class Model:
     """The areas, addresses and costs that several drivers share. Equal for drivers that do."""
 
     key: Hashable
-    driver: AnyDriver = field(compare=False, repr=False)  # one of them
+    driver: Addressing = field(compare=False, repr=False)  # one of them
     _hash: int = field(init=False, compare=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -21,7 +21,7 @@ class Model:
         return self._hash
 
 
-def model_of(driver: AnyDriver) -> Model:
+def model_of(driver: Addressing) -> Model:
     """Returns the model of a driver: its settings without the station number, and its areas.
 
     The number may decide which areas can be read: no station answers a broadcast.

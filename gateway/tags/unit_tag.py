@@ -1,13 +1,13 @@
 """A tag of one unit of a device, with the value that the device has in it."""
 
-from gateway.protocols.driver import Address, AnyDriver, Span, Unit
+from gateway.protocols.driver import Address, Addressing, Span, Unit
 from gateway.tags.tag import Tag
 from gateway.values import Kind, Layout, ValueType
 
 _TYPES = {Unit.BIT: Kind.BOOL, Unit.WORD: Kind.UINT16, Unit.DWORD: Kind.UINT32}
 
 
-def unit_tag(device: str, driver: AnyDriver, address: Address, name: str, every: float) -> Tag:
+def unit_tag(device: str, driver: Addressing, address: Address, name: str, every: float) -> Tag:
     """`address`: of an area of the driver."""
     unit = driver.areas[address.area].unit
     return Tag(

@@ -1,11 +1,11 @@
-"""Calculates what the transfers cost their lines, and how old a carried value can be."""
+"""Forecasts the lines with their transfers: the load, and how old a carried value can be."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from gateway.config import Config
 from gateway.engine.device import Device
-from gateway.engine.forecast import LineForecast, TimedWrites, write_seconds
+from gateway.engine.forecast import LineForecast, TimedWrites, forecast, write_seconds
 from gateway.tags.transfer import TransferRule, leaves
 
 
@@ -22,6 +22,24 @@ class TransferForecast:
     def load(self) -> float:
         """The share of the wire time of the line."""
         return self.writes.often * self.writes.seconds
+
+
+def forecasts(
+    config: Config, report: Callable[[str, float], None] | None = None
+) -> list[LineForecast]:
+    """Calculates the load and the worst ages of each polled line, with its transfers.
+
+    `report` receives the name of this step and the share of it that is done.
+    """
+    found = []
+    for line in config.lines:
+        if line.serve:
+            continue
+        devices = [Device(device, line.wire) for device in line.devices if device.enabled]
+        found.append(forecast(line.name, devices, line.wire))
+        if report is not None:
+            report("planning the requests", len(found) / len(config.lines))
+    return with_transfers(found, transfer_forecasts(config, found))
 
 
 def transfer_forecasts(config: Config, lines: Sequence[LineForecast]) -> list[TransferForecast]:

@@ -2,7 +2,7 @@
 
 import asyncio
 from collections.abc import Awaitable, Callable, Coroutine, Sequence
-from contextlib import suppress
+from contextlib import AsyncExitStack, suppress
 from typing import Any, Protocol
 
 import serialx
@@ -41,7 +41,7 @@ class Signals(Protocol):
 
 
 class SerialSignals:
-    """Those of a serial port. A pseudo terminal and a network port have none."""
+    """DTR and CD of a serial port. A pseudo terminal and a network port have neither."""
 
     def __init__(self, port: Port) -> None:
         transport = port.transport if isinstance(port, StreamPort) else None
@@ -87,14 +87,13 @@ class ModemPort:
     ) -> None:
         """Opens the port of the modem, and sets the modem up. Raises `LineDown`."""
         self._port = await opens(self)
-        try:
+        async with AsyncExitStack() as failed:
+            failed.push_async_callback(self.close)
             self._signals = signals(self._port)
             self._carrier = await self._signals.carrier()
             self._modem.dtr = self._carrier is not None
             await self._ended(self._modem.open)
-        except BaseException:
-            await self.close()
-            raise
+            failed.pop_all()
 
     async def dial(self) -> None:
         """Returns when the carrier is there. Raises `CallEnded` in the words of the modem."""

@@ -4,11 +4,10 @@ from typing import Any
 
 import pytest
 
-from gateway.app import forecasts
 from gateway.config import Config, ConfigErrors, built
 from gateway.config.changes import needs_restart
 from gateway.tags import Tag
-from gateway.transfers.forecast import transfer_forecasts
+from gateway.transfers.forecast import forecasts, transfer_forecasts
 
 TAGS: dict[str, Any] = {
     "speed": {"address": "D10", "every": "2s"},

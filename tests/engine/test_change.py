@@ -5,7 +5,8 @@ from itertools import pairwise
 from typing import Any
 
 from gateway.engine.changes import Changes
-from gateway.engine.device import Device, DeviceSettings
+from gateway.engine.device import Device
+from gateway.engine.device_settings import DeviceSettings
 from gateway.engine.engine import Engine
 from gateway.engine.health import State
 from gateway.engine.jobs import Idle, Poll, Probe, Resynced, Settle

@@ -2,7 +2,8 @@
 
 import math
 
-from gateway.engine.device import Device, DeviceSettings
+from gateway.engine.device import Device
+from gateway.engine.device_settings import DeviceSettings
 from gateway.engine.effects import Effect, OnlineChange, RequestEnded, Samples
 from gateway.engine.engine import Engine
 from gateway.engine.health import State

@@ -12,17 +12,10 @@ from pydantic import TypeAdapter, ValidationError
 
 from gateway.config import load
 from gateway.errors import BadValue, ConfigError, DeviceError, Garbled, NoReply, Refusal, Refused
+from gateway.protocols.capabilities import Controllable, Monitor, ScatteredWriter
 from gateway.protocols.computer_link import NO_REPLY_CAUSES, ComputerLink, Enquiry, Frame, Text
 from gateway.protocols.computer_link.devices import ProfileName
-from gateway.protocols.driver import (
-    Address,
-    Controllable,
-    Cost,
-    Driver,
-    Monitor,
-    ScatteredWriter,
-    Span,
-)
+from gateway.protocols.driver import Address, Cost, Driver, Span
 from tests.doubles import Script, Wire
 from tests.protocols.computer_link_peer import PROCEDURES, FrameFormat, Peer, Procedure
 from tests.vectors import vectors

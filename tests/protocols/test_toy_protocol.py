@@ -19,18 +19,8 @@ from gateway.config import Config, ConfigErrors, load, schema
 from gateway.errors import ConfigError, Refusal, Refused
 from gateway.planning.wire_timing import WireTiming
 from gateway.protocols import registry as protocols
-from gateway.protocols.driver import (
-    Address,
-    Area,
-    Cost,
-    Driver,
-    ScanHints,
-    Span,
-    Talk,
-    Timing,
-    Traits,
-    Unit,
-)
+from gateway.protocols.capabilities import ScanHints
+from gateway.protocols.driver import Address, Area, Cost, Driver, Span, Talk, Timing, Traits, Unit
 from gateway.simulator.plant import station_for
 from gateway.simulator.port import open_simulator
 from gateway.stations import registry as stations

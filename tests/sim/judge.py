@@ -5,7 +5,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from gateway.app import Gateway
-from gateway.protocols.driver import Span, UnnumberedReplies
+from gateway.protocols.capabilities import UnnumberedReplies
+from gateway.protocols.driver import Span
 from gateway.protocols.frames import FrameDriver
 from gateway.protocols.frames.driver import LISTENED
 from gateway.tags import Quality, Reason, Sample, Tag

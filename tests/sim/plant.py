@@ -11,7 +11,8 @@ from functools import partial
 from typing import Any
 
 from gateway.engine import requests
-from gateway.engine.device import Device, DeviceSettings
+from gateway.engine.device import Device
+from gateway.engine.device_settings import DeviceSettings
 from gateway.engine.engine import Engine
 from gateway.engine.health import State
 from gateway.errors import GatewayError

@@ -21,7 +21,7 @@ import structlog
 from gateway.app import Gateway
 from gateway.config import LineConfig, load
 from gateway.engine.changes import Changes
-from gateway.engine.device import DeviceSettings
+from gateway.engine.device_settings import DeviceSettings
 from gateway.engine.shorter_silences import Pace
 from gateway.protocols.frames import FrameDriver
 from gateway.protocols.frames.driver import LISTENED

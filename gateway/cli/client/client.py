@@ -299,7 +299,8 @@ class Client:
         timeout = REPLY_TIMEOUT + dialling
         with self._session.declare_querier(key, timeout=timeout) as querier:
             served = any(reply.ok is not None for reply in self._query(documents))
-            if not (served and querier.matching_status.matching):  # type: ignore[attr-defined]
+            matches = querier.matching_status
+            if not (served and matches.matching):  # type: ignore[attr-defined]  # not in the stub
                 may = f"may {self._user} do this, and " if self._user else ""
                 raise GatewayError(f"no gateway accepts {key}: nothing was sent; {may}{_CHANGED}")
             for reply in querier.get(payload=payload, attachment=signature(key, payload)):

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal, TypeVar
 
 from gateway.errors import BadValue, ConfigError
+from gateway.protocols.capabilities import ScanHints
 from gateway.protocols.computer_link.access import Access, possible, read_access, write_access
 from gateway.protocols.computer_link.codec import (
     ALL_STATIONS,
@@ -37,7 +38,7 @@ from gateway.protocols.computer_link.scattered import (
     scattered_access,
 )
 from gateway.protocols.devices import parse_device, spell_device
-from gateway.protocols.driver import Address, Area, Cost, ScanHints, Span, Talk, Timing, Traits
+from gateway.protocols.driver import Address, Area, Cost, Span, Talk, Timing, Traits
 from gateway.protocols.listening import Ear, Learn
 
 LinkTalk = Talk[Frame]

@@ -5,17 +5,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Literal
 
 from gateway.errors import ConfigError
-from gateway.protocols.driver import (
-    Address,
-    Area,
-    Codec,
-    Cost,
-    ScanHints,
-    Span,
-    Talk,
-    Timing,
-    Traits,
-)
+from gateway.protocols.capabilities import ScanHints
+from gateway.protocols.driver import Address, Area, Codec, Cost, Span, Talk, Timing, Traits
 from gateway.protocols.listening import Ear, Learn
 from gateway.protocols.modbus import ascii as ascii_
 from gateway.protocols.modbus import mbap, rtu

@@ -8,18 +8,9 @@ from functools import lru_cache
 from typing import ClassVar, Literal
 
 from gateway.errors import BadValue, ConfigError, Refusal, Refused
+from gateway.protocols.capabilities import ScanHints
 from gateway.protocols.devices import parse_device, spell_device
-from gateway.protocols.driver import (
-    Address,
-    Area,
-    Cost,
-    ScanHints,
-    Span,
-    Talk,
-    Timing,
-    Traits,
-    Unit,
-)
+from gateway.protocols.driver import Address, Area, Cost, Span, Talk, Timing, Traits, Unit
 from gateway.protocols.harmless import HarmlessReads, told_from
 from gateway.protocols.listening import Ear, Learn
 from gateway.protocols.vigor.codec import (
