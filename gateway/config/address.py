@@ -1,21 +1,23 @@
 """Reads only the part of the file that a client needs to reach its gateway."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeVar
 
-from pydantic import ValidationError
-
-from gateway.config.messages import ConfigErrors, Mistakes, OptionPlaces
-from gateway.config.session_files import zenoh_config
-from gateway.config.session_model import GatewaySection, ZenohSection
+from gateway.config import parsers
+from gateway.config.messages import Mistakes, OptionPlaces
+from gateway.config.session_files import with_files
 from gateway.config.yaml_events import first_sections
 from gateway.config.yaml_file import TEXTS, file_text
-from gateway.config.zenoh_records import ZenohConfig
+from gateway.config.zenoh_records import LISTEN, NAME, TlsConfig, ZenohConfig, ZenohMode
+from gateway.errors import ConfigError
 
 if TYPE_CHECKING:
     from gateway.engine.device_settings import DeviceSettings
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,11 +46,70 @@ def address(path: Path) -> Address | None:
         data = first_sections(file_text(path).encode(), TEXTS, ("gateway", "zenoh"))
         if data is None:
             return None
-        gateway = GatewaySection.model_validate(data.get("gateway", {}))
-        zenoh = ZenohSection.model_validate(data.get("zenoh", {}))
-    except (ConfigErrors, ValidationError):
+        gateway = _settings(data.get("gateway", {}), _GATEWAY)
+        zenoh = ZenohConfig(**{"listen": LISTEN} | _settings(data.get("zenoh", {}), _ZENOH))
+        zenoh.check()
+    except ValueError:  # and `ConfigError`, which is one
         return None
-    settings = zenoh_config(zenoh, path.parent, mistakes)
-    if len(mistakes):
+    zenoh = with_files(zenoh, path.parent, mistakes)
+    if len(mistakes) or ("standby_alone" in gateway and "standby" not in gateway):
         return None
-    return Address(name=gateway.name, standby=gateway.standby, zenoh=settings)
+    return Address(name=gateway.get("name", NAME), standby=gateway.get("standby"), zenoh=zenoh)
+
+
+def _settings(raw: object, parse: Mapping[str, Callable[[Any], object]]) -> dict[str, Any]:
+    """Returns the settings of a section, parsed. Raises `ConfigError` at any mistake."""
+    if not isinstance(raw, dict) or not raw.keys() <= parse.keys():
+        raise ConfigError("the sections need a whole check")
+    return {name: parse[name](value) for name, value in raw.items()}
+
+
+def _endpoints(raw: object) -> tuple[str, ...]:
+    return tuple(parsers.endpoint(one) for one in _of(list, raw))
+
+
+def _listen(raw: object) -> tuple[str, ...]:
+    return tuple(parsers.once(list(_endpoints(raw))))
+
+
+def _tls(raw: object) -> TlsConfig:
+    tls = TlsConfig(**_settings(raw, _TLS))
+    tls.check()
+    return tls
+
+
+def _of(kind: type[T], raw: object) -> T:
+    if not isinstance(raw, kind):
+        raise ConfigError(f"{raw!r} is no {kind.__name__}")
+    return raw
+
+
+# The settings of `GatewaySection` and `ZenohSection`, without pydantic: importing it takes a third
+# of the time of a short command.
+_FLAG = partial(_of, bool)
+_GATEWAY: Mapping[str, Callable[[Any], object]] = {
+    "name": parsers.name,
+    "standby": parsers.name,
+    "standby_alone": parsers.interval,
+    "state": parsers.path,
+    "watch_config": _FLAG,
+    "secret_file": parsers.path,
+}
+_TLS: Mapping[str, Callable[[Any], object]] = {
+    "ca": parsers.path,
+    "certificate": parsers.path,
+    "key": parsers.path,
+    "mutual": _FLAG,
+}
+_ZENOH: Mapping[str, Callable[[Any], object]] = {
+    "prefix": parsers.prefix,
+    "mode": ZenohMode,
+    "listen": _listen,
+    "connect": _endpoints,
+    "config_file": parsers.path,
+    "tls": _tls,
+    "user": partial(_of, str),
+    "password_file": parsers.path,
+    "users_file": parsers.path,
+    "refresh": parsers.interval,
+}

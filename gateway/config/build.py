@@ -34,7 +34,7 @@ from gateway.config.served import (
     only_served,
     until_the_next_call,
 )
-from gateway.config.session_files import existing_file, zenoh_config
+from gateway.config.session_files import existing_file, with_files
 from gateway.config.sheet_tags import SheetTags
 from gateway.config.tag_rules import inherit
 from gateway.config.transfers import TransferRows
@@ -107,7 +107,7 @@ class Builder:
             standby_alone=top.gateway.standby_alone,
             secret_file=self._file(top.gateway.secret_file, ("gateway", "secret_file")),
             writers_file=self._file(top.writers.file, ("writers", "file")) if top.writers else None,
-            zenoh=zenoh_config(top.zenoh, self.folder, self.mistakes),
+            zenoh=with_files(top.zenoh.record(), self.folder, self.mistakes),
             history=self._history(top),
             web=self._web(top),
             alarms=self._alarms(top, lines),

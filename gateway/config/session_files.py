@@ -1,37 +1,32 @@
 """The Zenoh session of the file, with the files that it names."""
 
+from dataclasses import replace
 from pathlib import Path as FilePath
 
 from gateway.config.messages import Mistakes, Path
-from gateway.config.session_model import ZenohSection
-from gateway.config.zenoh_records import TlsConfig, ZenohConfig, ZenohMode
+from gateway.config.zenoh_records import ZenohConfig
 
 
-def zenoh_config(found: ZenohSection, folder: FilePath, mistakes: Mistakes) -> ZenohConfig:
-    """Returns the session. Paths are relative to `folder`; notes each file that is not there."""
+def with_files(found: ZenohConfig, folder: FilePath, mistakes: Mistakes) -> ZenohConfig:
+    """Returns the session with its paths below `folder`; notes each file that is not there."""
 
     def file(name: FilePath | None, *place: str) -> FilePath | None:
         return existing_file(name, folder, ("zenoh", *place), mistakes)
 
     tls = found.tls
-    return ZenohConfig(
-        prefix=found.prefix,
-        mode=ZenohMode(found.mode),
-        listen=tuple(found.listen),
-        connect=tuple(found.connect),
-        config_file=file(found.config_file, "config_file"),
-        tls=None
-        if tls is None
-        else TlsConfig(
+    if tls is not None:
+        tls = replace(
+            tls,
             ca=file(tls.ca, "tls", "ca"),
             certificate=file(tls.certificate, "tls", "certificate"),
             key=file(tls.key, "tls", "key"),
-            mutual=tls.mutual,
-        ),
-        user=found.user,
+        )
+    return replace(
+        found,
+        config_file=file(found.config_file, "config_file"),
+        tls=tls,
         password_file=file(found.password_file, "password_file"),
         users_file=file(found.users_file, "users_file"),
-        refresh=found.refresh,
     )
 
 

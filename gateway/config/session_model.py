@@ -13,6 +13,7 @@ from gateway.config.setting_types import (
     Name,
     Prefix,
 )
+from gateway.config.zenoh_records import LISTEN, NAME, TlsConfig, ZenohConfig, ZenohMode
 
 
 class Section(BaseModel):
@@ -30,7 +31,7 @@ class Section(BaseModel):
 class GatewaySection(Section):
     """This gateway."""
 
-    name: Name = "gateway"
+    name: Name = NAME
     """The chunk of this gateway in the keys."""
     state: FilePath | None = None
     """Keeps refused addresses across restarts; with $STATE_DIRECTORY left out: state.json there."""
@@ -64,11 +65,12 @@ class TlsSection(Section):
 
     @model_validator(mode="after")
     def _together(self) -> Self:
-        if (self.certificate is None) is not (self.key is None):
-            raise ValueError("certificate and key belong together")
-        if self.mutual and (self.ca is None or self.certificate is None):
-            raise ValueError("mutual needs ca, certificate and key")
+        self.record().check()
         return self
+
+    def record(self) -> TlsConfig:
+        """Returns the settings as plain data; paths as in the file."""
+        return TlsConfig(**dict(self))
 
 
 class ZenohSection(Section):
@@ -78,7 +80,7 @@ class ZenohSection(Section):
     """The beginning of every key."""
     mode: Literal["peer", "client", "router"] = "peer"
     """The role of this session in the network."""
-    listen: Endpoints = ["tcp/127.0.0.1:7447"]
+    listen: Endpoints = list(LISTEN)
     """Endpoints to listen on; by default only this machine can connect."""
     connect: list[Endpoint] = []
     """Endpoints to connect to."""
@@ -97,6 +99,11 @@ class ZenohSection(Section):
 
     @model_validator(mode="after")
     def _with_user(self) -> Self:
-        if self.password_file is not None and self.user is None:
-            raise ValueError("password_file has no effect without user")
+        self.record().check()
         return self
+
+    def record(self) -> ZenohConfig:
+        """Returns the settings as plain data; paths as in the file."""
+        tls = None if self.tls is None else self.tls.record()
+        lists = {"listen": tuple(self.listen), "connect": tuple(self.connect)}
+        return ZenohConfig(**{**dict(self), **lists, "mode": ZenohMode(self.mode), "tls": tls})

@@ -1,5 +1,7 @@
 """The address of a gateway, read without the rest of its file."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -36,7 +38,7 @@ def test_the_address_is_that_of_the_whole_file(path: Path) -> None:
         "zenoh: {prefix: plant/site-1, mode: client, connect: [tcp/a:1, tls/b:2], user: u}",
         "zenoh: {listen: [], connect: [tcp/a:1], refresh: 5min}\ngateway: {name: '1'}",
         "zenoh: {tls: {ca: plant.yaml}, users_file: plant.yaml, config_file: plant.yaml}",
-        "gateway: {name: 12}",
+        "gateway: {name: 12, secret_file: plant.yaml, standby: hall}",
     ],
 )
 @pytest.mark.parametrize("first", [True, False])
@@ -55,6 +57,16 @@ def test_every_setting_counts_as_in_the_whole_file(
         "gateway: {nam: a}",
         "gateway: {name: a b}",
         "gateway: 5",
+        "gateway:",
+        "gateway: {standby_alone: 5s}",
+        "gateway: {watch_config: 1}",
+        "zenoh: {mode: server}",
+        "zenoh: {user: 5}",
+        "zenoh: {tls: {mutual: true}}",
+        "zenoh: {tls: {key: plant.yaml}}",
+        "zenoh: {tls: {keys: plant.yaml}}",
+        "zenoh: {tls: {ca: none.pem}}",
+        "zenoh: {refresh: 5}",
         "zenoh: {listen: tcp/127.0.0.1:7447}",
         "zenoh: {users_file: none.txt}",
         "zenoh: {password_file: plant.yaml}",
@@ -85,3 +97,10 @@ def test_what_follows_the_two_sections_is_not_read(tmp_path: Path) -> None:
 
 def test_a_file_that_is_not_there_has_no_address(tmp_path: Path) -> None:
     assert address(tmp_path / "none.yaml") is None
+
+
+def test_a_short_command_does_not_import_pydantic() -> None:
+    """It takes a third of the processor time of a `status` call."""
+    code = "import sys, gateway.cli.status; print('pydantic' in sys.modules)"
+    asked = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert asked.stdout == "False\n"
