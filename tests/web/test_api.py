@@ -105,8 +105,10 @@ async def test_buckets_are_answered_as_described(tmp_path: Path) -> None:
             chart = f"/api/history?tag={SPEED.key}&time=[now(-1h)..now(-10s)]&bucket=1d"
             answer = (await client.ask(chart)).json
             assert violations(answer, schema("/api/history", 200)) == []
-            first, last = answer["buckets"][0], answer["buckets"][-1]  # two around midnight
-            assert (first["quality"], last["last"]) == ("partial", 8)
+            known = [
+                one for one in answer["buckets"] if one["quality"] != "bad"
+            ]  # of one day or two
+            assert (known[0]["quality"], known[-1]["last"]) == ("partial", 8)
             found = (await client.ask(f"{chart}&agg=last&quality=good")).json["buckets"]
             assert all(one["quality"] == "good" for one in found)
             wrong = await client.ask(f"{chart}&agg=average")
