@@ -2817,4 +2817,11 @@ MUTANTS = (
         "False",
         "tests/engine/test_together.py",
     ),
+    Mutant(
+        "a resync that a reset cut off is not outstanding",
+        "engine/conclusions.py",
+        "                device.health.left_outstanding(None, now)\n",
+        "                pass\n",
+        "tests/line/test_repeated_replies.py",
+    ),
 )
