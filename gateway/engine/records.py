@@ -2,8 +2,41 @@
 
 from collections import Counter
 from dataclasses import dataclass, field
+from enum import StrEnum
 
 from gateway.errors import DeviceError, Garbled, NoReply, Refused
+
+MOST_RESULTS = 20  # a modem that says noise does not fill the memory
+
+
+class CallState(StrEnum):
+    """The telephone of a line, for users."""
+
+    IDLE = "idle"
+    DIALLING = "dialling"
+    CONNECTED = "connected"
+
+
+@dataclass(slots=True)
+class CallRecord:
+    """Telephone calls of a line since the start. Times by the line's clock."""
+
+    state: CallState = CallState.IDLE
+    since: float | None = None  # when the state began
+    made: int = 0  # calls with a carrier
+    failed: int = 0  # tries without a carrier, and calls that broke off
+    last_failure: str = ""
+    last_result: str = ""
+    results: Counter[str] = field(default_factory=Counter)
+
+    def enter(self, state: CallState, now: float) -> None:
+        self.state, self.since = state, now
+
+    def count(self, result: str) -> None:
+        """Counts the end of a call, or of a try."""
+        self.last_result = result
+        known = result in self.results or len(self.results) < MOST_RESULTS
+        self.results[result if known else "other"] += 1
 
 
 @dataclass(slots=True)
@@ -18,6 +51,7 @@ class LineRecord:
     unasked: int = 0  # bytes that arrived outside of a transaction
     trouble: str = ""  # why the port is not open
     last_trouble: str = ""  # why the port was not open last
+    calls: CallRecord | None = None  # with a modem that dials, once it was there
 
 
 @dataclass(slots=True)
