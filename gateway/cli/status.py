@@ -140,13 +140,13 @@ def _calls(documents: Documents) -> list[RenderableType]:
     table = _table("calls", "state", "for", "next call", "last result", "made", "failed")
     for name, document in below("lines/", documents):
         if calls := document["calls"]:
-            since, until = calls["since"], calls["next"]
+            since, until = calls.get("since"), calls.get("next")
             table.add_row(
                 Text(name),
-                _state(calls["state"]),
+                _state(calls.get("state", "")),
                 "-" if since is None else span(since),
                 "-" if until is None else f"in {span(until)}",
-                Text(printable(calls["last_result"] or "-")),
+                Text(printable(calls.get("last_result") or "-")),
                 str(calls["made"]),
                 str(calls["failed"]),
             )
@@ -164,7 +164,7 @@ def _transfers(documents: Documents) -> list[RenderableType]:
             Text(printable(document["to"])),
             _state(document["state"]),
             document["code"] or "-",
-            _ago(document["last_carried"]),
+            _ago(document.get("last_carried")),
             str(document["carried"]),
             str(document["unclear"]),
             Text(printable(json.dumps(document["value"])[:_LONGEST_VALUE])),

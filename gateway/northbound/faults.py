@@ -14,8 +14,7 @@ def faults(documents: Documents) -> Iterator[str]:
     work, a lost router, history not written."""
     for line, document in below("lines/", documents):
         if not document["open"]:
-            again = _next_call(document.get("calls") or {})
-            yield f"line {line} is down: {document['trouble'] or 'not opened yet'}{again}"
+            yield f"line {line} is down: {document['trouble'] or 'not opened yet'}"
     for device, document in below("devices/", documents):
         if document["standing"] == "silent":
             yield f"{device} is silent: {document['diagnosis']}"
@@ -46,7 +45,7 @@ def warnings(documents: Documents) -> Iterator[str]:
             yield f"line {line} is asked for {load:.1f} times what it carries: see `check`"
         calls = document.get("calls") or {}
         if document["open"] and calls.get("in_a_row"):
-            yield f"line {line}: the last call failed: {calls['last_failure']}{_next_call(calls)}"
+            yield f"line {line}: the last call failed: {calls['last_failure']}"
     for device, other in documents["status"]["refused_devices"].items():
         yield f"{device} is served by another gateway, {other}"
     yield from _held_up(documents, unreachable)
@@ -62,14 +61,6 @@ def warnings(documents: Documents) -> Iterator[str]:
         )
     if lost := documents.get("history", {}).get("lost"):
         yield f"history: {lost} samples were lost since the start"
-
-
-def _next_call(calls: Mapping[str, Any]) -> str:
-    """Returns when a line with a modem dials again."""
-    seconds = calls.get("next")
-    if seconds is None:
-        return ""
-    return f"; next call in {f'{seconds / 60:.0f} min' if seconds >= 100 else f'{seconds:.0f} s'}"
 
 
 def _unreachable(documents: Documents) -> set[str]:

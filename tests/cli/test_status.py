@@ -160,14 +160,11 @@ def test_transfers_of_a_silent_device_do_not_hide_it(healthy: dict[str, Any]) ->
 def test_the_calls_of_a_modem_are_shown(healthy: dict[str, Any]) -> None:
     documents = changed(healthy, "lines/hall", calls=calling()["calls"])
     assert list(faults(documents)) == []
-    said = "line hall: the last call failed: modem:/dev/ttyS0: BUSY; next call in 14 min"
+    said = "line hall: the last call failed: modem:/dev/ttyS0: BUSY"
     assert list(warnings(documents)) == [said]
     assert re.search(
         r"^hall +idle +4 s +in 14 min +BUSY +7 +2 *$", text_of(documents, 80), re.MULTILINE
     )
-    gone = calling(next=30.0, in_a_row=0)["calls"]
-    down = changed(healthy, "lines/hall", open=False, trouble="NO CARRIER", calls=gone)
-    assert list(faults(down)) == ["line hall is down: NO CARRIER; next call in 30 s"]
 
 
 def test_control_characters_of_a_device_do_not_reach_the_terminal(healthy: dict[str, Any]) -> None:

@@ -341,11 +341,14 @@ function showTransfers() {
   byId("transfers-section").hidden = !all.length;
   byId("transfers").replaceChildren(...all.slice(0, SHOWN).map(([number, [from, to, state, code, time, why]]) => {
     const row = element("tr");
-    const carried = element("td", "never", "carried-at");
-    if (time) carried.dataset.time = Date.parse(time);
+    const at = Date.parse(time);
+    const carried = element("td", time ? clock(at) : "never");
+    if (time) carried.dataset.time = at;
+    const reason = element("td", why);
+    if (code) reason.append(element("span", why ? ` (${code})` : code, "code"));
     row.append(
       rowTitle(`${number}: ${from} to ${to}`), element("td", state, STYLES[state] ?? state),
-      carried, element("td", [why, code].filter(Boolean).join(" – ")),
+      carried, reason,
     );
     return row;
   }));
