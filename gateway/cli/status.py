@@ -49,7 +49,9 @@ def health(
     strict: Annotated[
         bool,
         typer.Option(
-            "--strict", help="Fail also on a silent device, a line down, history not written."
+            "--strict",
+            help="Fail also on a silent device, a line down, a transfer that does not work, "
+            "history not written.",
         ),
     ] = False,
 ) -> None:

@@ -119,7 +119,7 @@ def _lines(documents: Documents) -> Iterator[Metric]:
     lines = [*below("lines/", documents)]
     up = _family("line_up", "1: the port is open", "line")
     expected = _family(
-        "line_expected_load_ratio", "Load of the polls that check predicts; 1 is all", "line"
+        "line_expected_load_ratio", "Load that check predicts, with transfers; 1 is all", "line"
     )
     for name, document in lines:
         up.add_metric([name], document["open"])
