@@ -10,7 +10,7 @@ from gateway.engine.effects import Effect, LogEvent
 from gateway.engine.engine import Engine
 from gateway.engine.health import State
 from gateway.engine.jobs import Poll
-from gateway.engine.records import CallRecord, CallState
+from gateway.engine.records import CallState
 from gateway.errors import CallEnded, LineDown
 
 NEVER = float("inf")
@@ -42,7 +42,7 @@ class Calls:
 
     def __init__(self, engine: Engine, rules: CallRules) -> None:
         self.failed = 0  # calls in a row
-        self.record = engine.record.calls = engine.record.calls or CallRecord()
+        self.record = engine.record.telephone()
         engine.schedule.dials = True
         self._engine = engine
         self._rules = rules

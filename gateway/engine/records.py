@@ -53,6 +53,12 @@ class LineRecord:
     last_trouble: str = ""  # why the port was not open last
     calls: CallRecord | None = None  # with a modem that dials, once it was there
 
+    def telephone(self) -> CallRecord:
+        """Returns the record of its calls, which outlives the modem."""
+        if self.calls is None:
+            self.calls = CallRecord()
+        return self.calls
+
 
 @dataclass(slots=True)
 class Record:
