@@ -20,7 +20,6 @@ HOUR = "now(-1h)"
 _STYLES = {"up": "green", "open": "green", "silent": "red", "down": "red", "failing": "yellow"}
 _STYLES |= {"carried": "green", "waiting": "yellow", "stale": "red", "refused": "red"}
 _STYLES |= {"unclear": "red", "connected": "green", "dialling": "yellow"}
-_LONGEST_VALUE = 40  # characters
 
 
 def status(
@@ -158,7 +157,11 @@ def _calls(documents: Documents) -> list[RenderableType]:
 def _transfers(documents: Documents) -> list[RenderableType]:
     """Returns the table of the transfers; nothing without any."""
     rows = transfers(documents)
-    table = _table("transfer", "from", "to", "state", "code", "last", "carried", "unclear", "value")
+    table = _table("transfer")
+    for end in ("from", "to"):
+        table.add_column(end, overflow="fold")  # whole in a narrow terminal too
+    for column in ("state", "code", "last", "carried", "unclear"):
+        table.add_column(column)
     for number, document in rows:
         table.add_row(
             number,
@@ -169,7 +172,6 @@ def _transfers(documents: Documents) -> list[RenderableType]:
             _ago(document.get("last_carried")),
             str(document["carried"]),
             str(document["unclear"]),
-            Text(printable(json.dumps(document["value"])[:_LONGEST_VALUE])),
         )
     return [table, Text()] if rows else []
 

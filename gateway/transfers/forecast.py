@@ -54,14 +54,7 @@ def transfer_forecasts(config: Config, lines: Sequence[LineForecast]) -> list[Tr
         tag: row for line in lines for row in line.blocks for tag in row.block.tags if tag in needed
     }
     latest = {line.name: line.worst_write for line in lines}
-    written = {tags[rule.target].device for rule in rules if rule.target in tags}
-    places = {
-        device.name: (line.name, Device(device, line.wire, plan_now=False))
-        for line in config.lines
-        if line.name in latest
-        for device in line.devices
-        if device.enabled and device.name in written
-    }
+    places = _places(config, lines, {tag.device for tag in tags.values()})
     found = []
     for rule in rules:
         if rule.source not in tags or rule.target not in tags:
@@ -80,15 +73,31 @@ def transfer_forecasts(config: Config, lines: Sequence[LineForecast]) -> list[Tr
     return found
 
 
+def _places(
+    config: Config, lines: Sequence[LineForecast], names: set[str]
+) -> dict[str, tuple[str, Device]]:
+    """Returns these devices with their lines."""
+    polled = {row.device.name: row.device for line in lines for row in line.blocks}
+    planned = {line.name for line in lines}
+    return {
+        one.name: (line.name, polled.get(one.name) or Device(one, line.wire, plan_now=False))
+        for line in config.lines
+        if line.name in planned
+        for one in line.devices
+        if one.enabled and one.name in names
+    }
+
+
 def _tags(config: Config, keys: set[str]) -> dict[str, Tag]:
     """Returns the tags with these keys."""
     devices = {key.partition("/")[0] for key in keys}
+    names = {key.partition("/")[2] for key in keys}  # quicker than to make each key
     return {
         tag.key: tag
         for one in config.devices
         if one.name in devices
         for tag in (*one.tags, *one.targets)
-        if tag.key in keys
+        if tag.name in names and tag.key in keys
     }
 
 

@@ -18,10 +18,12 @@ OWN = "plant/@gateway/demo"
 
 
 def lines() -> dict[str, Any]:
-    hall = vigor_line("simulator", {"speed": {"address": "D10", "write": True, "scale": 0.1}})
+    tags = {"speed": {"address": "D10", "write": True, "scale": 0.1}}
+    hall = vigor_line("simulator", tags, turnaround="5ms")  # not measured: as `check` has it
     hall["devices"]["oven"] = {
         "protocol": "vigor",
         "station": 2,
+        "turnaround": "5ms",
         "tags": {
             "setpoint": {"address": "D7", "write": {"min": 0, "max": 5000}},
             "lamp": {"address": "M3", "write": True},
