@@ -137,7 +137,7 @@ def _devices(documents: Documents) -> Table:
 
 
 def _calls(documents: Documents) -> list[RenderableType]:
-    """Returns the table of the telephone calls; nothing without a modem that dials."""
+    """Returns the table of the telephone calls; nothing without a modem."""
     table = _table("calls", "state", "for", "next call", "last result", "made", "failed")
     for name, document in below("lines/", documents):
         if calls := document["calls"]:

@@ -10,11 +10,10 @@ from gateway.engine.effects import Effect, LogEvent
 from gateway.engine.engine import Engine
 from gateway.engine.health import State
 from gateway.engine.jobs import Poll
-from gateway.engine.records import CallState
+from gateway.engine.records import COMPLETE, CallState
 from gateway.errors import CallEnded, LineDown
 
 NEVER = float("inf")
-COMPLETE, MODEM_LOST = "complete", "modem lost"  # results of calls, beside the modem's words
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -136,23 +135,12 @@ class Calls:
             self._not_before = now
             return []
         self.failed += 1
-        self._note_failure(str(why), why.result)
+        self.record.fail(str(why), why.result)
         if self.failed < self._rules.tries:
             return self._lost(why, now, time) if was_connected else []
         more = f" ({self.failed} calls in a row failed)" if self.failed > 1 else ""
         self.failed = 0
         return self._lost(LineDown(f"{why}{more}"), now, time)
-
-    def lose(self, why: LineDown, now: float) -> None:
-        """Notes that the modem is lost, with the call."""
-        if self.record.state is not CallState.IDLE:
-            self._note_failure(str(why), MODEM_LOST)
-        self.record.enter(CallState.IDLE, now)
-
-    def _note_failure(self, why: str, result: str) -> None:
-        self.record.failed += 1
-        self.record.last_failure = why
-        self.record.count(result)
 
     def _lost(self, why: LineDown, now: float, time: int) -> list[Effect]:
         fields: dict[str, object] = {"line": self._engine.name, "why": str(why)}

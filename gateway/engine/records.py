@@ -6,6 +6,7 @@ from enum import StrEnum
 
 from gateway.errors import DeviceError, Garbled, NoReply, Refused
 
+COMPLETE, MODEM_LOST = "complete", "modem lost"  # results of calls, beside the modem's words
 MOST_RESULTS = 20  # a modem that says noise does not fill the memory
 
 
@@ -32,6 +33,18 @@ class CallRecord:
     def enter(self, state: CallState, now: float) -> None:
         self.state, self.since = state, now
 
+    def fail(self, why: str, result: str) -> None:
+        """Counts a call that failed."""
+        self.failed += 1
+        self.last_failure = why
+        self.count(result)
+
+    def lose(self, why: str, now: float) -> None:
+        """Notes that the modem is lost, perhaps in a call."""
+        if self.state is not CallState.IDLE:
+            self.fail(why, MODEM_LOST)
+            self.enter(CallState.IDLE, now)
+
     def count(self, result: str) -> None:
         """Counts the end of a call, or of a try."""
         self.last_result = result
@@ -51,7 +64,7 @@ class LineRecord:
     unasked: int = 0  # bytes that arrived outside of a transaction
     trouble: str = ""  # why the port is not open
     last_trouble: str = ""  # why the port was not open last
-    calls: CallRecord | None = None  # with a modem that dials, once it was there
+    calls: CallRecord | None = None  # with a modem, once it was there
 
     def telephone(self) -> CallRecord:
         """Returns the record of its calls, which outlives the modem."""

@@ -88,7 +88,7 @@ async def serve_calls(line: CallingLine, port: CallPort, calls: Calls) -> NoRetu
                 continue
             await _call(line, port, calls, now)
     except LineDown as error:
-        calls.lose(error, now())
+        calls.record.lose(str(error), now())
         raise
 
 

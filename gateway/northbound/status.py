@@ -110,21 +110,19 @@ def line_document(
             "cycle": round(expected.cycle, 4),
             "worst_write": round(expected.worst_write, 4),
         },
-        "calls": None if record.calls is None else _calls(record.calls, calls, now),
+        "calls": None if record.calls is None else calls_document(record.calls, calls, now),
     }
 
 
-def _calls(record: CallRecord, calls: Calls | None, now: float) -> Document:
-    """The telephone calls. Without `calls` the modem is not there."""
-    state = CallState.IDLE if calls is None else record.state
-    dials_at = math.inf
-    if calls is not None and state is CallState.IDLE:
-        dials_at = calls.due(now)
+def calls_document(record: CallRecord, calls: Calls | None, now: float) -> Document:
+    """The telephone calls of a line. `calls`: of a modem that dials, and is there."""
+    waits = calls is not None and record.state is CallState.IDLE
+    dials_at = calls.due(now) if calls is not None and waits else math.inf
     return {
-        "state": state.value,
+        "state": record.state.value,
         "since": None if record.since is None else round(now - record.since, 1),
         "next": round(max(0.0, dials_at - now), 1) if dials_at < math.inf else None,
-        "connected": state is CallState.CONNECTED,
+        "connected": record.state is CallState.CONNECTED,
         "made": record.made,
         "failed": record.failed,
         "in_a_row": 0 if calls is None else calls.failed,

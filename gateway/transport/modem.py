@@ -3,7 +3,7 @@
 import asyncio
 from collections.abc import Awaitable, Callable, Coroutine, Sequence
 from contextlib import AsyncExitStack, suppress
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import serialx
 import structlog
@@ -39,6 +39,13 @@ class Signals(Protocol):
         """Returns the signal CD; None: the port has none."""
 
     async def set_dtr(self, on: bool) -> None: ...
+
+
+@runtime_checkable
+class Called(Protocol):
+    """A receiver that knows of each call when it begins."""
+
+    def call_began(self) -> None: ...
 
 
 class SerialSignals:
@@ -190,6 +197,8 @@ class ModemPort:
             case Connected(text):
                 log.info("call connected", port=self.name, modem=text)
                 self._watch = self._start(self._watch_carrier())
+                if isinstance(self._receiver, Called):
+                    self._receiver.call_began()
                 self._end(None)
             case Failed(why):
                 log.info("call failed", port=self.name, modem=why)

@@ -228,7 +228,7 @@ def _state(documents: Documents) -> dict[str, Any]:
 
 
 def _calls(documents: Documents) -> list[list[object]]:
-    """Returns the lines with a modem that dials."""
+    """Returns the lines with a modem."""
     fields = ("state", "since", "next", "last_result", "made", "failed")
     return [
         [name, *(calls[field] for field in fields)]

@@ -18,7 +18,7 @@ from prometheus_client.exposition import CONTENT_TYPE_LATEST, generate_latest
 from prometheus_client.process_collector import ProcessCollector
 from prometheus_client.registry import Collector, CollectorRegistry
 
-from gateway.engine.calls import COMPLETE
+from gateway.engine.records import COMPLETE
 from gateway.northbound.faults import below, faults, transfers, warnings
 from gateway.tags import Quality
 from gateway.web.sources import Documents, Plant
@@ -133,7 +133,7 @@ def _lines(documents: Documents) -> Iterator[Metric]:
 
 
 def _calls(documents: Documents) -> Iterator[Metric]:
-    """Lines with a modem that dials."""
+    """Lines with a modem."""
     ends = _family("line_calls_total", "Ended calls and tries, by result", "line", "result")
     lasts = _family("line_call", "1: a call lasts", "line")
     for name, document in below("lines/", documents):

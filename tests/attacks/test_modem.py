@@ -105,4 +105,5 @@ async def test_b3_8_a_plc_dials_in_and_another_is_dialled(tmp_path: Path) -> Non
                         await outgoing.until_online(False)
                 assert (calls["made"], calls["failed"], calls["last_result"]) == (2, 0, "complete")
                 assert 800 < calls["next"] <= 900
-                assert await calls_of(client, "center") is None  # it does not dial
+                taken = await calls_of(client, "center")
+                assert (taken["state"], taken["made"], taken["next"]) == ("idle", 1, None)
