@@ -78,8 +78,7 @@ class Calls:
 
     def connect(self, now: float) -> list[Effect]:
         """Begins a call."""
-        self.record.enter(CallState.CONNECTED, now)
-        self.record.made += 1
+        self.record.connect(now)
         self._active, self._exchanges = now, self._count()
         engine = self._engine
         effects = [] if engine.is_open else engine.opened(now)

@@ -33,6 +33,11 @@ class CallRecord:
     def enter(self, state: CallState, now: float) -> None:
         self.state, self.since = state, now
 
+    def connect(self, now: float) -> None:
+        """Begins a call: the carrier is there."""
+        self.enter(CallState.CONNECTED, now)
+        self.made += 1
+
     def fail(self, why: str, result: str) -> None:
         """Counts a call that failed."""
         self.failed += 1

@@ -242,9 +242,7 @@ class ServedLine:
 
     def call_began(self) -> None:
         """Notes a telephone call."""
-        record = self.record.telephone()
-        record.enter(CallState.CONNECTED, _now())
-        record.made += 1
+        self.record.telephone().connect(_now())
 
     def call_ended(self) -> None:
         """Notes the end of a telephone call."""
