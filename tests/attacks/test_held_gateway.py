@@ -149,7 +149,9 @@ async def test_the_woken_gateway_of_a_group_does_not_write_over_the_new_active_o
                     held_long_enough = asyncio.create_task(asyncio.sleep(LONGEST_PAUSE + 0.3))
                     plc.acknowledges.set()
                     await asyncio.to_thread(b.says, "device online")
-                    [reply] = await client.get(RECIPE, b"50")
+                    while not (replies := await client.get(RECIPE, b"50")):
+                        await asyncio.sleep(0.02)  # the router does not know its queryables yet
+                    [reply] = replies
                     assert reply.ok
                     await held_long_enough
                 await asyncio.to_thread(a.says, "gateway replaced")
