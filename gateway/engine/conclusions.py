@@ -30,6 +30,7 @@ from gateway.engine.results import Results
 from gateway.engine.shorter_silences import ShorterSilences
 from gateway.engine.together import Together
 from gateway.errors import BadValue, DeviceError, Garbled, LineDown, Refused, Unclear, Unsteady
+from gateway.protocols.driver import EVERY_REQUEST
 
 NEVER_QUIET = "the line is never quiet, the order of replies is unknown: noise, or another master"
 
@@ -124,12 +125,15 @@ class Conclusions:
             ):  # an error reply counts too, but may belong to an older request
                 told_from = result.told_from if isinstance(result, Resynced) else 0
                 outstanding = self._results.outstanding_requests(device)
-                if not probe.again and outstanding > told_from:
+                inherited = self._results.inherits and told_from < EVERY_REQUEST
+                if not probe.again and (outstanding > told_from or inherited):
                     # A device server may pass on all of them, one after another.
                     quiet = device.longest_reply
-                    guard = (outstanding + 1) * quiet
+                    guard = (outstanding + 1 + inherited) * quiet
                     self._in_flight.continuation = Settle(device, guard, quiet, probe)
                 else:
+                    if probe.again:
+                        self._results.inherits = False
                     self._results.answered(device, now, time, resynced=True)
             case Unclear():
                 self.unclear(probe, result, traffic, now, time)
@@ -171,6 +175,7 @@ class Conclusions:
         device, after = settle.device, settle.after
         if settle.error is None:
             if isinstance(result, Settled) and not result.quiet:
+                self._results.inherits = False  # it is another master that speaks
                 self.unclear(after, Garbled(NEVER_QUIET), Traffic(), now, time)
             elif isinstance(after, Probe):
                 again = Probe(device, after.outstanding, after.token + 1, again=True)

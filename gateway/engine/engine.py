@@ -57,11 +57,10 @@ class Engine:
         self.record = LineRecord()
         self.deadline = NEVER  # when `expire` must be called
         self.schedule = Schedule(devices, 0.0, seed)
-        self.name = name
-        self.wire = wire
+        self.name, self.wire = name, wire
         self._effects = Effects()
         self._staleness = Staleness(self.schedule, self._effects)
-        results = Results(name, self.schedule, self._staleness, self._effects)
+        self._results = results = Results(name, self.schedule, self._staleness, self._effects)
         self._polls = PollResults(self.schedule, results, self._effects)
         self._unsolicited: UnsolicitedFrames | Listening
         if listens(devices):
@@ -299,6 +298,10 @@ class Engine:
         self._unsolicited.tick(now, time)
         self._set_deadline()
         return self._effects.take()
+
+    def inherits(self) -> None:
+        """Notes that a device server may have kept requests of an earlier process."""
+        self._results.inherits = True
 
     def opened(self, now: float) -> list[Effect]:
         """Starts all devices again, because the port was opened."""

@@ -22,6 +22,8 @@ class Results:
         self._schedule = schedule
         self._staleness = staleness
         self._effects = effects
+        # An earlier process may have left requests in a device server, until the wire was quiet.
+        self.inherits = False
 
     def answered(self, device: Device, now: float, time: int, *, resynced: bool = False) -> None:
         """Notes a reply of the device, also an error reply. `resynced`: to a resync."""
@@ -80,7 +82,7 @@ class Results:
         if late is not None:
             device.record.count_late()
             timeout = device.timing.reply_timeout
-            last = self.outstanding_requests(device) <= 1
+            last = self.outstanding_requests(device) <= 1 and not self.inherits
             health.replied_late(timeout + late, timeout, last=last)
         if before is not State.OFFLINE:
             self._schedule.failed(now, took)

@@ -97,6 +97,8 @@ def line_of(
     """
     made = [Device(one, config.wire, plan_now=plan_now) for one in devices]
     engine = Engine(config.name, made, config.wire, seed)
+    if not isinstance(config.port, SimulatorAddress):
+        engine.inherits()
     opens = open_port or opener(config)
     if config.listen_only:
         opens = _without_writing(opens)

@@ -94,6 +94,8 @@ class Traits:
         return self.baudrate is None
 
 
+EVERY_REQUEST = 0xFFFF  # `resync` returns it where its reply cannot be that to another request
+
 F = TypeVar("F")
 T = TypeVar("T")
 
@@ -211,7 +213,8 @@ class Driver(Addressing, Protocol[F]):
         request and grows by two with each resync; a second request in the same resync is marked
         with the number after it. So a reply to an earlier resync is not taken for the reply to
         this one either, as far as the protocol can mark a request. Values are discarded. Returns
-        the number of outstanding requests, with `outstanding`, whose replies differ from its own.
+        the number of outstanding requests, with `outstanding`, whose replies differ from its own,
+        or `EVERY_REQUEST`.
 
         Raises `Refused` where only error replies arrived that may belong to an older request.
         """

@@ -72,10 +72,12 @@ def behind(
     driver: AnyDriver,
     *tags: Tag,
     echo_in_file: bool = True,
+    inherits: bool = False,
     **timing: Any,
 ) -> tuple[Plant, Device, Any]:
     """The line, its device, and the memory of its PLC."""
     dev = made_device("plc", driver, WIRE, replace(driver.timing, **timing), tags, GUARD)
     station = station_for(driver, [])
-    line = Plant([dev], [station], server, WIRE, echo_in_file=echo_in_file)  # type: ignore[list-item]
+    stations: Any = [station]
+    line = Plant([dev], stations, server, WIRE, echo_in_file=echo_in_file, inherits=inherits)
     return line, dev, station.memory

@@ -268,3 +268,31 @@ async def test_resets_at_any_moment_of_a_stall_make_no_wrong_value(
         await asyncio.sleep(40)
         assert line.good(dev)
     assert wrong_values(line) == []
+
+
+@by_protocol
+@pytest.mark.parametrize("seed", range(8, 12))
+@on_virtual_time
+async def test_a_gateway_that_starts_takes_no_reply_to_an_earlier_process(
+    driver: AnyDriver, seed: int
+) -> None:
+    """The process ends while the device server is stalled, and the next one finds its requests."""
+    draw = random.Random(seed)
+    words = [
+        100 * n + k for n in range(1, draw.randint(3, 6)) for k in range(draw.choice([1, 1, 2]))
+    ]
+    server, every = Serial(), draw.choice([0.05, 0.2, 1.0])
+    for run in range(12):
+        tags = numbered(driver, *words, every=every)
+        line, dev, memory = behind(server, driver, *tags, inherits=True)
+        for number in range(1000):
+            memory.write(area_of(driver).strip(":"), number, [number])
+        async with running(line):
+            if run:
+                await asyncio.sleep(draw.uniform(0.0, 1.5))
+                server.flows.set()
+            await asyncio.sleep(draw.uniform(3, 8))
+            assert line.good(dev)
+            server.flows.clear()
+            await asyncio.sleep(draw.choice([draw.uniform(0.02, 0.4), draw.uniform(0.1, 3)]))
+        assert wrong_values(line) == []

@@ -2845,4 +2845,32 @@ MUTANTS = (
         "        self._ended",
         "tests/line/test_calling.py",
     ),
+    Mutant(
+        "a reply to an earlier process counts at the start",
+        "engine/conclusions.py",
+        "self._results.inherits and told_from < EVERY_REQUEST",
+        "False",
+        "tests/engine/test_inherited.py",
+    ),
+    Mutant(
+        "a late reply at the start replaces the quiet wire",
+        "engine/results.py",
+        " and not self.inherits\n",
+        "\n",
+        "tests/engine/test_inherited.py",
+    ),
+    Mutant(
+        "a second master keeps all devices offline at the start",
+        "engine/conclusions.py",
+        "                self._results.inherits = False  # it is another master that speaks\n",
+        "",
+        "tests/engine/test_inherited.py",
+    ),
+    Mutant(
+        "a line at a real port inherits nothing",
+        "line/build.py",
+        "        engine.inherits()\n",
+        "        pass\n",
+        "tests/attacks/test_kept_requests.py",
+    ),
 )

@@ -91,11 +91,15 @@ class Plant:
     echo_in_file: bool = True  # False: an adapter echoes, and the file does not mention it
     listeners: list[Callable[[Sequence[Sample]], None]] = field(default_factory=list)
     duty: Duty | None = None
+    inherits: bool = False
     line: Line = field(init=False)
 
     def __post_init__(self) -> None:
+        engine = Engine("line", self.devices, self.wire, self.bench.seed)
+        if self.inherits:
+            engine.inherits()
         self.line = Line(
-            Engine("line", self.devices, self.wire, self.bench.seed),
+            engine,
             lambda receiver: self.bench.open(self.stations, self.wire, receiver),
             self,
             echo=(self.bench.echo and self.echo_in_file) or None,

@@ -38,7 +38,7 @@ from gateway.protocols.computer_link.scattered import (
     scattered_access,
 )
 from gateway.protocols.devices import parse_device, spell_device
-from gateway.protocols.driver import Address, Area, Cost, Span, Talk, Timing, Traits
+from gateway.protocols.driver import EVERY_REQUEST, Address, Area, Cost, Span, Talk, Timing, Traits
 from gateway.protocols.listening import Ear, Learn
 
 LinkTalk = Talk[Frame]
@@ -246,7 +246,7 @@ class ComputerLink:
     ) -> int:
         """Sends a loopback. No data reply has its letter Z; the rest is the `probe_token`."""
         await self._loopback(talk, f"Z{probe_token & 0xFFFF:04X}")
-        return 0xFFFF
+        return EVERY_REQUEST
 
     # Listening to another master
 

@@ -6,7 +6,7 @@ from itertools import count, repeat
 from typing import NamedTuple
 
 from gateway.errors import BadValue, Refused
-from gateway.protocols.driver import Area, Cost, Span, Talk, Unit
+from gateway.protocols.driver import EVERY_REQUEST, Area, Cost, Span, Talk, Unit
 from gateway.protocols.harmless import HarmlessReads, told_from
 from gateway.protocols.modbus import pdu
 from gateway.protocols.modbus.addressing import Dialect, Limits, Place
@@ -15,7 +15,6 @@ from gateway.protocols.modbus.frame import READ_BITS, Frame, answer_length
 
 _REMEMBERED = 1024  # spans whose request is kept ready
 _FEWEST_SIZES, _MOST_SIZES = 4, 16  # of the reads that a resync may send
-_NUMBERS = 0xFFFF
 
 
 class ReadRequest(NamedTuple):
@@ -216,13 +215,13 @@ class Master:
                 await self.read(talk, first)
         except Refused:
             if self.numbered:
-                return _NUMBERS
+                return EVERY_REQUEST
             if loopback or self._form(first) == self._form(second):
                 raise
             await self.read(talk, second)
             first = second
         if self.numbered or loopback:
-            return _NUMBERS
+            return EVERY_REQUEST
         return told_from(first, probe_token, outstanding, pick, self._form)
 
     def _harmless_pick(
