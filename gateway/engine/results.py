@@ -82,7 +82,7 @@ class Results:
         if late is not None:
             device.record.count_late()
             timeout = device.timing.reply_timeout
-            last = self.outstanding_requests(device) <= 1 and not self.inherits
+            last = self.outstanding_requests(device) <= 1
             health.replied_late(timeout + late, timeout, last=last)
         if before is not State.OFFLINE:
             self._schedule.failed(now, took)
