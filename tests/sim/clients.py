@@ -14,9 +14,11 @@ from gateway.protocols.computer_link.replies import model_name
 from gateway.protocols.frames.driver import LISTENED
 from gateway.tags import Quality, Tag, WriteResult
 from gateway.values import Kind, Value
+from tests.sim.arrays import shown, value_of
 from tests.sim.bus import Bus, summed
 from tests.sim.hostile import DELAYING
 from tests.sim.judge import Judge
+from tests.sim.obeyed import counts, most_requests, times
 from tests.sim.stations import Troubled
 from tests.sim.wire import SimWire
 
@@ -82,10 +84,10 @@ class Client:
             writes = []
             for tag in chosen:
                 number += 1
-                if tag.layout.type.kind is Kind.BOOL:
-                    value: Value = self.chance.random() < 0.5
-                elif count := tag.layout.type.count:
-                    value = tuple((number * 40_503 + n) % (1 << 16) for n in range(count))
+                if tag.layout.type.count:
+                    value: Value = value_of(tag, number)
+                elif tag.layout.type.kind is Kind.BOOL:
+                    value = self.chance.random() < 0.5
                 else:
                     bits = 32 if tag.span.size == 2 else 16
                     value = (number * 40_503) % (1 << bits)
@@ -98,7 +100,7 @@ class Client:
     async def _write(self, writes: list[tuple[Tag, Value]]) -> None:
         """Writes several tags at once: in one frame, or one by one after a refusal."""
         frames, since = self.bus.writes[self.number], self.judge.now
-        most = sum(2 if tag.write and tag.write.repeat else 1 for tag, _ in writes)
+        most = sum(most_requests(tag) for tag, _ in writes)
         most += len(writes) > 1
         if self.device.broadcast:
             await asyncio.gather(*(self._tell_all(tag, value) for tag, value in writes))
@@ -113,13 +115,13 @@ class Client:
     async def _write_one(self, tag: Tag, value: Value, beside_others: bool) -> None:
         judge, bus, station = self.judge, self.bus, self.judge.stations[tag.device]
         frames, since = bus.writes[self.number], judge.now
-        known = times(station, tag)
-        held = tag.decode(station.holds(tag))
+        known = counts(station, tag)
+        held = shown(tag, station.holds(tag))
         outcome = await self._outcome(tag, value)
         sent = bus.writes[self.number] - frames
         bus.note("outcome", tag.key, value, type(outcome).__name__, sent)
         judge.story.counts[f"write {type(outcome).__name__}"] += 1
-        obeyed = times(station, tag) - known
+        obeyed = times(station, tag, known)
         asked = Asked(since, sent, beside_others, held)
         await self.judge_end(tag, value, outcome, asked, obeyed)
 
@@ -133,7 +135,7 @@ class Client:
     ) -> None:
         judge, bus, station = self.judge, self.bus, self.judge.stations[tag.device]
         since, sent, beside_others, held = asked
-        now = tag.decode(station.holds(tag))
+        now = shown(tag, station.holds(tag))
         holds = now == value
         most = 2 if tag.write is not None and tag.write.repeat else 1
         match outcome:
@@ -181,7 +183,7 @@ class Client:
         if self.deaf(tag.device, since) or self.bus.hurt_at >= since:
             return
         self.judge.story.counts["told writes checked"] += 1
-        if tag.decode(station.holds(tag)) != value:
+        if shown(tag, station.holds(tag)) != value:
             self.judge.broke(f"{tag.key}: {value!r} was told, and is not there")
 
     async def _tell_all(self, tag: Tag, value: Value) -> None:
@@ -328,15 +330,6 @@ def _claimed(said: str, value: Value | None) -> Value | None:
     if claim is None or not isinstance(value, tuple):
         return None
     return value[int(claim[1]) : int(claim[2] or claim[1]) + 1]
-
-
-def times(station: Troubled, tag: Tag) -> int:
-    """Returns the number of times of writes to the tag: some PLCs write it byte by byte."""
-    return len(all_times(station, tag))
-
-
-def all_times(station: Troubled, tag: Tag) -> set[float]:
-    return {at for at, _ in station.written.get((tag.span.area, tag.span.start), ())}
 
 
 def _switched(station: Troubled) -> int:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from tests.sim.arrays import add_arrays
 from tests.sim.episodes import Episode, disappearances, line_episodes
 from tests.sim.hostile import bridges, hostile_episodes, hostile_manners
 from tests.sim.manners import Manners
@@ -67,6 +68,7 @@ def draw(seed: int, seconds: float, pace: str = "busy") -> Drawn:
             zeros[name] = more.random() < 0.5
             episodes += line_episodes(name, lines[name], more, seconds, haste, pace)
     add_neighbours(lines, missing, seed, pace)
+    add_arrays(lines, seed)
     if pace in ("busy", "lean", "storm"):
         for name, line in lines.items():
             for device, settings in line["devices"].items():
