@@ -85,7 +85,7 @@ soak: .venv/ready
 	$(BIN)/python -m tests.faults.soak --minutes $(MINUTES)
 
 mutants: .venv/ready
-	$(BIN)/python -m tests.sim.mutants
+	$(BIN)/python -m tests.sim.mutants $(if $(QUICK),--quick)
 
 # Faults as an operator meets them, and what each place says of them (docs/operator.md).
 operator: .venv/ready

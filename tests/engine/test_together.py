@@ -3,6 +3,8 @@
 from collections.abc import Callable
 from dataclasses import replace
 
+import pytest
+
 from gateway.engine.device import Device
 from gateway.engine.jobs import Idle, Poll, Probe, Resynced, Settle, Settled, Traffic
 from gateway.engine.together import PROOFS, TRY_AGAIN
@@ -111,3 +113,18 @@ def test_requests_lost_together_are_sent_alone_also_after_the_device_was_offline
     sizes = transactions(rig, 60.0, alone)
     assert sum(size > 1 for size in sizes) <= 2 * PROOFS
     assert reduced(rig) == 1
+
+
+@pytest.mark.parametrize("answers", [first_only, alone])
+@pytest.mark.parametrize("window", [2, 4])
+def test_a_device_that_one_loss_takes_offline_gets_one_at_a_time_too(
+    answers: Answers, window: int
+) -> None:
+    plain = busy_device().settings
+    timing = replace(plain.timing, retries=0)
+    driver = replace(plain.driver, window=window)
+    rig = Rig(Device(replace(plain, driver=driver, timing=timing), WIRE))
+    sizes = transactions(rig, 60.0, answers)
+    assert sum(size > 1 for size in sizes) <= 2 * PROOFS
+    assert reduced(rig) == 1
+    assert max(sizes[-1000:]) == 1

@@ -679,7 +679,7 @@ MUTANTS = (
     Mutant(
         "a device that takes one request at a time gets several",
         "engine/together.py",
-        "now < window.apart_until or poll.block.span in window.suspects",
+        "now < window.apart_until or poll.block.span in suspects",
         "False",
         "tests/engine/test_together.py tests/attacks/test_one_at_a_time.py",
     ),
@@ -2809,5 +2809,12 @@ MUTANTS = (
         "            if place is None or tag not in place[1].settings.targets:\n",
         "            if place is None:\n",
         "tests/transfers/test_runner.py",
+    ),
+    Mutant(
+        "requests go together again before a lost one went alone",
+        "engine/together.py",
+        "now < window.alone_until and suspects - poll.device.bad_addresses.bad.keys()",
+        "False",
+        "tests/engine/test_together.py",
     ),
 )

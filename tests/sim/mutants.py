@@ -84,7 +84,9 @@ def stale() -> list[str]:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("words", nargs="*", help="only mutants whose names hold one of these")
-    words = parser.parse_args().words
+    parser.add_argument("--quick", action="store_true", help="no simulation of what tests caught")
+    options = parser.parse_args()
+    words = options.words
     alive = 0
     for name in stale():
         print(f"STALE: the text to replace is not there, or not once: {name}", flush=True)
@@ -101,20 +103,22 @@ def main() -> int:
             if words and not any(word in mutant.name for word in words):
                 continue
             with put_in(tree, mutant) as there:
-                alive += not (there and _judged(tree, mutant))
+                alive += not (there and _judged(tree, mutant, quick=options.quick))
                 if not there:
                     print(f"{mutant.name}: NOT TRIED, its text is not in {mutant.file}", flush=True)
     print("all mutants were caught" if not alive else f"{alive} mutants live")
     return int(bool(alive))
 
 
-def _judged(tree: Path, mutant: Mutant) -> bool:
+def _judged(tree: Path, mutant: Mutant, *, quick: bool) -> bool:
     print(mutant.name, flush=True)
     caught = False
     for who, command in (
         ("tests", tests(mutant.tests)),
         ("simulation", simulation(mutant)),
     ):
+        if caught and quick:
+            break
         minded, seconds, said = check(tree, command)
         caught |= minded
         print(f"    {who:10} {'caught' if minded else '-':6} {seconds:5.1f} s  {said}", flush=True)
