@@ -2,7 +2,6 @@
 
 import asyncio
 import random
-import re
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -18,11 +17,10 @@ from tests.sim.arrays import shown, value_of
 from tests.sim.bus import Bus, summed
 from tests.sim.hostile import DELAYING
 from tests.sim.judge import Judge
-from tests.sim.obeyed import counts, most_requests, times
+from tests.sim.obeyed import CLAIM, claimed, counts, most_requests, times, unsent_arrived
 from tests.sim.stations import Troubled
 from tests.sim.wire import SimWire
 
-CLAIM = " is in the PLC"
 SOON = 1.0  # seconds within which an unacknowledged request arrives, if ever
 NOT_SENT = (Busy, Offline, LineDown)
 _QUIET = ("deaf", "reboot", "vanish", "flicker", "hung", *DELAYING)
@@ -149,8 +147,9 @@ class Client:
             case Busy() | Offline() | LineDown():
                 true = obeyed == 0 and (sent == 0 or beside_others)
             case _:
-                true = _claimed(str(outcome), value) == _claimed(str(outcome), now)
+                true = claimed(str(outcome), value) == claimed(str(outcome), now)
                 judge.story.counts["parts of long writes"] += CLAIM in str(outcome)
+                true = true and not unsent_arrived(station, tag, str(outcome), since)
         true = true and obeyed <= most
         if true:
             return
@@ -322,14 +321,6 @@ def _alike(one: Device, other: Device) -> bool:
         case ComputerLink() as a, ComputerLink() as b:
             return (a.frame_format, a.sum_check) == (b.frame_format, b.sum_check)
     return False
-
-
-def _claimed(said: str, value: Value | None) -> Value | None:
-    """Returns the elements that an unclear end says are in the PLC."""
-    claim = re.search(rf"elements? (\d+)(?: to (\d+))?\){CLAIM}", said)
-    if claim is None or not isinstance(value, tuple):
-        return None
-    return value[int(claim[1]) : int(claim[2] or claim[1]) + 1]
 
 
 def _switched(station: Troubled) -> int:

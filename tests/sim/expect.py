@@ -153,6 +153,8 @@ class Expectations:
         sample = judge.gateway.mirror[tag]
         if (sample.quality is Quality.GOOD) is not station.lacks(tag):
             return
+        if not station.lacks(tag) and self._flaps(tag):
+            return
         if not station.lacks(tag) and self._passing(tag, judge.began + episode.end):
             return
         if sample.reason is Reason.OVERDUE and self.times(self.judge.buses[tag.device].line)[1] > 1:
@@ -161,6 +163,11 @@ class Expectations:
             f"{tag.key} is {sample.quality.value} ({sample.reason}: {sample.detail}) "
             f"{limit:.0f} s after {episode.kind} of {episode.device or episode.line} ended"
         )
+
+    def _flaps(self, tag: Tag) -> bool:
+        """Returns True for a Vigor station that may be silent to resyncs: they read M0 too."""
+        station = self.judge.stations[tag.device]
+        return station.protocol == "vigor" and station.manners.unknown == SILENT
 
     def _passing(self, tag: Tag, since: float) -> bool:
         """Unsolicited frames collide with replies: some are lost and come again.
@@ -278,8 +285,8 @@ class Expectations:
             # Without a header a frame counts after 50 ms of silence, which a busy line rarely has.
             patience += 180 * every
         if station.manners.unknown == SILENT:  # its blocks are halved by time-outs
-            if device.driver.protocol == "vigor":  # every second resync reads M0, which it lacks
-                return math.inf
+            if device.driver.protocol == "vigor":
+                return math.inf  # it flaps
             patience *= 3
         return patience
 

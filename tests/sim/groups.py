@@ -65,8 +65,8 @@ def _larger(
 
 def _value(tag: Tag, chance: random.Random) -> Value:
     if tag.layout.type.count:
-        number = [chance.randrange(1 << 16) for _ in range(tag.span.size)][0]
-        return value_of(tag, number)
+        numbers = [chance.randrange(1 << 16) for _ in range(tag.span.size)]
+        return value_of(tag, numbers[0])
     if tag.layout.type.kind is Kind.BOOL:
         return chance.random() < 0.5
     return chance.randrange(1 << 16 * tag.span.size)
