@@ -153,7 +153,8 @@ class Expectations:
         sample = judge.gateway.mirror[tag]
         if (sample.quality is Quality.GOOD) is not station.lacks(tag):
             return
-        if not station.lacks(tag) and self._flaps(tag):
+        behind = _behind(self.judge.buses[tag.device]) > judge.now - LONGEST_PAUSE
+        if not station.lacks(tag) and (behind or self._flaps(tag)):
             return
         if not station.lacks(tag) and self._passing(tag, judge.began + episode.end):
             return
@@ -250,8 +251,7 @@ class Expectations:
         if not bus.line.engine.devices:
             return
         longest, load = self.times(bus.line)
-        # A server that stays behind delays every reply by more than a short reply_timeout.
-        behind = bus.wire.behind if isinstance(bus.wire, SimWire) else -math.inf
+        behind = _behind(bus)
         for device in bus.line.engine.devices:
             for tag in device.tags:
                 station = self.judge.stations.get(device.name)
@@ -307,6 +307,8 @@ class Expectations:
             return
         judge = self.judge
         for bus in self.lines.values():
+            if _behind(bus) > judge.now - LONGEST_PAUSE:
+                continue
             for device in bus.line.engine.devices:
                 well = device.state is State.ONLINE and judge.online.get(device.name)
                 if not well and not device.broadcast and not bus.collides:
@@ -322,6 +324,11 @@ class Expectations:
                     lacks = judge.stations[device.name].lacks(tag)
                     if (sample.quality is Quality.GOOD) is lacks:
                         judge.broke(f"{tag.key} at the end: {sample}")
+
+
+def _behind(bus: Bus) -> float:
+    """When a server was behind: it delays every reply by more than a short reply_timeout."""
+    return bus.wire.behind if isinstance(bus.wire, SimWire) else -math.inf
 
 
 def _disturbs(bus: Bus, episode: Episode) -> bool:
