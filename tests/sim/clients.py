@@ -17,7 +17,15 @@ from tests.sim.arrays import shown, value_of
 from tests.sim.bus import Bus, summed
 from tests.sim.hostile import DELAYING
 from tests.sim.judge import Judge
-from tests.sim.obeyed import CLAIM, claimed, counts, most_requests, times, unsent_arrived
+from tests.sim.obeyed import (
+    CLAIM,
+    claimed,
+    counts,
+    most_requests,
+    times,
+    unsent_arrived,
+    written_by_clients,
+)
 from tests.sim.stations import Troubled
 from tests.sim.wire import SimWire
 
@@ -51,6 +59,10 @@ class Client:
     def number(self) -> int:
         return self.bus.number_of(self.device)
 
+    def sent(self) -> int:
+        """Counts the write frames to the device; transfers may have sent more."""
+        return self.bus.writes[self.number] - self.bus.carried[self.number]
+
     def blind(self, what: str) -> None:
         count = what if summed(self.device) else f"{what} without a sum"
         self.judge.story.counts[count] += 1
@@ -72,7 +84,7 @@ class Client:
     # Writes
 
     async def write_now_and_then(self) -> None:
-        tags = [tag for tag in self.device.tags if tag.write is not None]
+        tags = written_by_clients(self.device.tags)
         number = self.chance.randrange(1000)
         pause = self.chance.choice((2.0, 10.0, 30.0, 120.0))
         while tags:
@@ -97,14 +109,14 @@ class Client:
 
     async def _write(self, writes: list[tuple[Tag, Value]]) -> None:
         """Writes several tags at once: in one frame, or one by one after a refusal."""
-        frames, since = self.bus.writes[self.number], self.judge.now
+        frames, since = self.sent(), self.judge.now
         most = sum(most_requests(tag) for tag, _ in writes)
         most += len(writes) > 1
         if self.device.broadcast:
             await asyncio.gather(*(self._tell_all(tag, value) for tag, value in writes))
         else:
             await asyncio.gather(*(self._write_one(t, v, len(writes) > 1) for t, v in writes))
-        sent = self.bus.writes[self.number] - frames
+        sent = max(0, self.sent() - frames)
         if sent > most:
             self.judge.broke(f"{self.device.name}: {len(writes)} writes were sent {sent} times")
         if self.bus.hurt_at < since:
@@ -112,11 +124,11 @@ class Client:
 
     async def _write_one(self, tag: Tag, value: Value, beside_others: bool) -> None:
         judge, bus, station = self.judge, self.bus, self.judge.stations[tag.device]
-        frames, since = bus.writes[self.number], judge.now
+        frames, since = self.sent(), judge.now
         known = counts(station, tag)
         held = shown(tag, station.holds(tag))
         outcome = await self._outcome(tag, value)
-        sent = bus.writes[self.number] - frames
+        sent = max(0, self.sent() - frames)
         bus.note("outcome", tag.key, value, type(outcome).__name__, sent)
         judge.story.counts[f"write {type(outcome).__name__}"] += 1
         obeyed = times(station, tag, known)
@@ -187,9 +199,9 @@ class Client:
 
     async def _tell_all(self, tag: Tag, value: Value) -> None:
         judge, bus = self.judge, self.bus
-        frames, since = bus.writes[self.number], judge.now
+        frames, since = self.sent(), judge.now
         outcome = await self._outcome(tag, value)
-        sent = bus.writes[self.number] - frames
+        sent = max(0, self.sent() - frames)
         bus.note("told all", tag.key, value, type(outcome).__name__, sent)
         judge.story.counts[f"broadcast {type(outcome).__name__}"] += 1
         if isinstance(outcome, WriteResult) and outcome.acknowledged:

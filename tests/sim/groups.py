@@ -9,15 +9,15 @@ from gateway.values import Kind, Value
 from tests.sim.arrays import shown, value_of
 from tests.sim.clients import NOT_SENT, Asked, Client
 from tests.sim.hostile import DELAYING
-from tests.sim.obeyed import all_times, counts, most_requests, times
+from tests.sim.obeyed import all_times, counts, most_requests, times, written_by_clients
 
 
 async def write_group(chance: random.Random, client: Client, few: list[tuple[Tag, Value]]) -> None:
     """Writes tags in their order. After the first that is not done none may arrive."""
     device, judge, bus = client.device, client.judge, client.bus
-    tags = [tag for tag in device.tags if tag.write is not None]
+    tags = written_by_clients(device.tags)
     writes, station = _larger(few, tags, chance), judge.stations[device.name]
-    frames, since = bus.writes[client.number], judge.now
+    frames, since = client.sent(), judge.now
     known = [counts(station, tag) for tag, _ in writes]
     held = [shown(tag, station.holds(tag)) for tag, _ in writes]
     ends: Sequence[WriteResult | GatewayError]
@@ -25,7 +25,7 @@ async def write_group(chance: random.Random, client: Client, few: list[tuple[Tag
         ends = await judge.gateway.write_group(writes, 5.0, 60.0)
     except GatewayError as error:
         ends = [error] * len(writes)
-    sent = bus.writes[client.number] - frames
+    sent = max(0, client.sent() - frames)
     bus.note("group", device.name, [type(end).__name__ for end in ends], sent)
     judge.story.counts["groups"] += 1
     judge.story.counts["groups done"] += all(isinstance(end, WriteResult) for end in ends)

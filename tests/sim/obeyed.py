@@ -1,13 +1,21 @@
 """Counts how often a PLC has carried out the writes of a tag, and what their ends claim."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from gateway.tags import Tag
 from gateway.values import Value
 from tests.sim.stations import Troubled
 
 CLAIM = " is in the PLC"
+
+
+TARGETS = ("t0", "t1", "t2")  # of transfers
+
+
+def written_by_clients(tags: Iterable[Tag]) -> list[Tag]:
+    """Returns the tags that can be written, without the targets of transfers."""
+    return [tag for tag in tags if tag.write is not None and tag.name not in TARGETS]
 
 
 def most_requests(tag: Tag) -> int:
