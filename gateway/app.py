@@ -31,6 +31,7 @@ from gateway.tags import Reason, Sample, Tag, WriteResult, bad
 from gateway.tags.mirror import Mirror
 from gateway.tags.scan import Scan
 from gateway.tags.timestamps import rfc3339
+from gateway.transfers.expected import Expected
 from gateway.values import Value
 
 REMOVED = "removed from the file"
@@ -71,7 +72,7 @@ class Gateway:
         self._tags = {tag.key: tag for device in config.devices for tag in device.tags}
         self._places: dict[str, tuple[Line, Device]] = {}
         self._open_line, self._seeds = open_line, itertools.count()
-        self._forecasts: dict[str, LineForecast] = {}
+        self._expected = Expected(lambda: self.config)
         self._on_demand = OnDemand(self._places.get, self.sample)
         self.alarms = Alarms(self._tags.values(), wall)
         self.add_document("alarms", self.alarms.counts)
@@ -113,7 +114,7 @@ class Gateway:
     def remove_line(self, line: Line) -> None:
         """Removes a line that has ended, and has no devices any more."""
         self.lines.remove(line)
-        self._forecasts.pop(line.engine.name, None)
+        self._expected.drop(line.engine.name)
 
     @staticmethod
     def plan(line: Line) -> LineForecast:
@@ -125,13 +126,13 @@ class Gateway:
 
     def planned(self, line: Line, expected: LineForecast) -> None:
         """Takes over the plans of a line: it may run now."""
-        self.expect(line, expected)
+        self.expect(expected)
         for device in line.engine.devices:
             line.engine.schedule.plan(device, 0.0)
 
-    def expect(self, line: Line, expected: LineForecast) -> None:
+    def expect(self, line: LineForecast) -> None:
         """Takes over the forecast of a line."""
-        self._forecasts[line.engine.name] = expected
+        self._expected.take(line)
 
     def take_over(self, changes: Iterable[DeviceChange]) -> None:
         """Takes over the tags of changed devices: their first, next or last samples."""
@@ -323,9 +324,10 @@ class Gateway:
                 | {station.name: station.presence.value for station in self.serving.stations},
             }
         }
+        forecasts = self._expected.lines()
         for line in self.lines:
             engine = line.engine
-            if (expected := self._forecasts.get(engine.name)) is None:
+            if (expected := forecasts.get(engine.name)) is None:
                 continue  # not planned yet
             documents[f"lines/{engine.name}"] = line_document(engine, expected, line.calls, now)
         for name, (line, device) in self._places.items():

@@ -57,7 +57,11 @@ class LineDown(GatewayError):
 
 
 class CallEnded(LineDown):
-    """A telephone call that failed, or ended without our doing."""
+    """A telephone call that failed, or ended without our doing. `result`: in a word or two."""
+
+    def __init__(self, message: str, result: str) -> None:
+        super().__init__(message)
+        self.result = result
 
 
 class DeviceError(GatewayError):

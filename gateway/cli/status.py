@@ -14,13 +14,12 @@ from rich.text import Text
 from gateway.cli.client import reached
 from gateway.cli.repeated import repeated
 from gateway.cli.terminal import FAILED, AsJson, ConfigPath, err, out, printable
-from gateway.northbound.faults import Documents, below, faults, warnings
+from gateway.northbound.faults import Documents, below, faults, transfers, warnings
 
 HOUR = "now(-1h)"
 _STYLES = {"up": "green", "open": "green", "silent": "red", "down": "red", "failing": "yellow"}
 _STYLES |= {"carried": "green", "waiting": "yellow", "stale": "red", "refused": "red"}
-_STYLES |= {"unclear": "red"}
-_LONGEST_VALUE = 40  # characters
+_STYLES |= {"unclear": "red", "connected": "green", "dialling": "yellow"}
 
 
 def status(
@@ -49,7 +48,9 @@ def health(
     strict: Annotated[
         bool,
         typer.Option(
-            "--strict", help="Fail also on a silent device, a line down, history not written."
+            "--strict",
+            help="Fail also on a silent device, a line down, a transfer that does not work, "
+            "history not written.",
         ),
     ] = False,
 ) -> None:
@@ -78,6 +79,7 @@ def view(documents: Documents, outcomes: list[dict[str, Any]] | None) -> Rendera
         Text(),
         _devices(documents),
         Text(),
+        *_calls(documents),
         *_transfers(documents),
         _services(documents, outcomes),
     ]
@@ -134,22 +136,42 @@ def _devices(documents: Documents) -> Table:
     return table
 
 
+def _calls(documents: Documents) -> list[RenderableType]:
+    """Returns the table of the telephone calls; nothing without a modem."""
+    table = _table("calls", "state", "for", "next call", "last result", "made", "failed")
+    for name, document in below("lines/", documents):
+        if calls := document["calls"]:
+            since, until = calls.get("since"), calls.get("next")
+            table.add_row(
+                Text(name),
+                _state(calls.get("state", "")),
+                "-" if since is None else span(since),
+                "-" if until is None else f"in {span(until)}",
+                Text(printable(calls.get("last_result") or "-")),
+                str(calls["made"]),
+                str(calls["failed"]),
+            )
+    return [table, Text()] if table.rows else []
+
+
 def _transfers(documents: Documents) -> list[RenderableType]:
     """Returns the table of the transfers; nothing without any."""
-    rows = sorted(below("transfers/", documents), key=lambda row: int(row[0]))
-    table = _table("transfer", "from", "to", "state", "code", "age", "carried", "unclear", "value")
+    rows = transfers(documents)
+    table = _table("transfer")
+    for end in ("from", "to"):
+        table.add_column(end, overflow="fold")  # whole in a narrow terminal too
+    for column in ("state", "code", "last", "carried", "unclear"):
+        table.add_column(column)
     for number, document in rows:
-        age = document["age"]
         table.add_row(
             number,
             Text(printable(document["from"])),
             Text(printable(document["to"])),
             _state(document["state"]),
             document["code"] or "-",
-            "-" if age is None else f"{age:.1f} s",
+            _ago(document.get("last_carried")),
             str(document["carried"]),
             str(document["unclear"]),
-            Text(printable(json.dumps(document["value"])[:_LONGEST_VALUE])),
         )
     return [table, Text()] if rows else []
 
@@ -195,6 +217,10 @@ def _share(load: float | None) -> str:
 
 def _number(value: float | None) -> str:
     return "-" if value is None else f"{value:.1f}"
+
+
+def _ago(seconds: float | None) -> str:
+    return "-" if seconds is None else f"{span(seconds)} ago"
 
 
 def _counts(counts: Mapping[str, int]) -> str:

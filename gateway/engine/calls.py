@@ -10,7 +10,8 @@ from gateway.engine.effects import Effect, LogEvent
 from gateway.engine.engine import Engine
 from gateway.engine.health import State
 from gateway.engine.jobs import Poll
-from gateway.errors import LineDown
+from gateway.engine.records import COMPLETE, CallState
+from gateway.errors import CallEnded, LineDown
 
 NEVER = float("inf")
 
@@ -39,11 +40,8 @@ class Calls:
     """
 
     def __init__(self, engine: Engine, rules: CallRules) -> None:
-        self.connected = False
         self.failed = 0  # calls in a row
-        self.made = 0  # calls with a carrier
-        self.failures = 0  # tries of calls
-        self.last_failure = ""
+        self.record = engine.record.telephone()
         engine.schedule.dials = True
         self._engine = engine
         self._rules = rules
@@ -74,10 +72,13 @@ class Calls:
             return min(map(_due, polls), default=NEVER)
         return min((self._ended + poll.block.every for poll in polls), default=NEVER)
 
+    def dial(self, now: float) -> None:
+        """Begins a try of a call."""
+        self.record.enter(CallState.DIALLING, now)
+
     def connect(self, now: float) -> list[Effect]:
         """Begins a call."""
-        self.connected = True
-        self.made += 1
+        self.record.connect(now)
         self._active, self._exchanges = now, self._count()
         engine = self._engine
         effects = [] if engine.is_open else engine.opened(now)
@@ -118,27 +119,27 @@ class Calls:
     # The end of a call
 
     def end(
-        self, why: LineDown | None, now: float, time: int, *, working: bool = False
+        self, why: CallEnded | None, now: float, time: int, *, working: bool = False
     ) -> list[Effect]:
         """Ends a call, or a try of one. `why` None: it is complete, and we hung up.
 
         `working`: it broke off during a transaction.
         """
-        was_connected, self.connected = self.connected, False
+        was_connected = self.record.state is CallState.CONNECTED
+        self.record.enter(CallState.IDLE, now)
         self._ended, self._not_before = now, now + self._rules.retry_pause
         if why is None or (was_connected and not working and not self._is_busy(now)):
+            self.record.count(COMPLETE)
             self.failed = 0
             self._not_before = now
             return []
         self.failed += 1
-        self.failures += 1
-        self.last_failure = str(why)
+        self.record.fail(str(why), why.result)
         if self.failed < self._rules.tries:
             return self._lost(why, now, time) if was_connected else []
-        if self.failed > 1:
-            why = LineDown(f"{why} ({self.failed} calls in a row failed)")
+        more = f" ({self.failed} calls in a row failed)" if self.failed > 1 else ""
         self.failed = 0
-        return self._lost(why, now, time)
+        return self._lost(LineDown(f"{why}{more}"), now, time)
 
     def _lost(self, why: LineDown, now: float, time: int) -> list[Effect]:
         fields: dict[str, object] = {"line": self._engine.name, "why": str(why)}

@@ -133,6 +133,8 @@ class Conclusions:
                     self._results.answered(device, now, time, resynced=True)
             case Unclear():
                 self.unclear(probe, result, traffic, now, time)
+            case LineDown():  # its reply may still arrive, on the next connection
+                device.health.left_outstanding(None, now)
             case BadValue():
                 raise result
 

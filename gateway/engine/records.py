@@ -2,8 +2,59 @@
 
 from collections import Counter
 from dataclasses import dataclass, field
+from enum import StrEnum
 
 from gateway.errors import DeviceError, Garbled, NoReply, Refused
+
+COMPLETE, MODEM_LOST = "complete", "modem lost"  # results of calls, beside the modem's words
+MOST_RESULTS = 20  # a modem that says noise does not fill the memory
+
+
+class CallState(StrEnum):
+    """The telephone of a line, for users."""
+
+    IDLE = "idle"
+    DIALLING = "dialling"
+    CONNECTED = "connected"
+
+
+@dataclass(slots=True)
+class CallRecord:
+    """Telephone calls of a line since the start. Times by the line's clock."""
+
+    state: CallState = CallState.IDLE
+    since: float | None = None  # when the state began
+    made: int = 0  # calls with a carrier
+    failed: int = 0  # tries without a carrier, and calls that broke off
+    last_failure: str = ""
+    last_result: str = ""
+    results: Counter[str] = field(default_factory=Counter)
+
+    def enter(self, state: CallState, now: float) -> None:
+        self.state, self.since = state, now
+
+    def connect(self, now: float) -> None:
+        """Begins a call: the carrier is there."""
+        self.enter(CallState.CONNECTED, now)
+        self.made += 1
+
+    def fail(self, why: str, result: str) -> None:
+        """Counts a call that failed."""
+        self.failed += 1
+        self.last_failure = why
+        self.count(result)
+
+    def lose(self, why: str, now: float) -> None:
+        """Notes that the modem is lost, perhaps in a call."""
+        if self.state is not CallState.IDLE:
+            self.fail(why, MODEM_LOST)
+            self.enter(CallState.IDLE, now)
+
+    def count(self, result: str) -> None:
+        """Counts the end of a call, or of a try."""
+        self.last_result = result
+        known = result in self.results or len(self.results) < MOST_RESULTS
+        self.results[result if known else "other"] += 1
 
 
 @dataclass(slots=True)
@@ -18,6 +69,13 @@ class LineRecord:
     unasked: int = 0  # bytes that arrived outside of a transaction
     trouble: str = ""  # why the port is not open
     last_trouble: str = ""  # why the port was not open last
+    calls: CallRecord | None = None  # with a modem, once it was there
+
+    def telephone(self) -> CallRecord:
+        """Returns the record of its calls, which outlives the modem."""
+        if self.calls is None:
+            self.calls = CallRecord()
+        return self.calls
 
 
 @dataclass(slots=True)

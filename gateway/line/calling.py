@@ -7,7 +7,7 @@ from typing import NoReturn, Protocol, runtime_checkable
 
 from gateway.engine.calls import CallRules, Calls
 from gateway.engine.effects import Effect
-from gateway.errors import CallEnded
+from gateway.errors import CallEnded, LineDown
 from gateway.line.channel import Channel
 from gateway.transport import (
     ModemAddress,
@@ -79,19 +79,29 @@ class CallingLine(Protocol):
 async def serve_calls(line: CallingLine, port: CallPort, calls: Calls) -> NoReturn:
     """Serves one call after another, until the port of the modem is lost. Raises `LineDown`."""
     now = asyncio.get_running_loop().time
-    while True:
-        line.catch_up(now())
-        due = calls.due(now())
-        if due > now():
-            await line.idle(due)
-            continue
-        ended: CallEnded | None = None
-        try:
-            await port.dial()
-            channel = line.begin(port)
-            line.deliver(calls.connect(now()))
-            await line.serve(channel)
-        except CallEnded as error:
-            ended = error
-        await port.hang_up()
-        line.end_call(calls, ended)
+    try:
+        while True:
+            line.catch_up(now())
+            due = calls.due(now())
+            if due > now():
+                await line.idle(due)
+                continue
+            await _call(line, port, calls, now)
+    except LineDown as error:
+        calls.record.lose(str(error), now())
+        raise
+
+
+async def _call(line: CallingLine, port: CallPort, calls: Calls, now: Callable[[], float]) -> None:
+    """Makes one call. Raises `LineDown`."""
+    ended: CallEnded | None = None
+    try:
+        calls.dial(now())
+        await port.dial()
+        channel = line.begin(port)
+        line.deliver(calls.connect(now()))
+        await line.serve(channel)
+    except CallEnded as error:
+        ended = error
+    await port.hang_up()
+    line.end_call(calls, ended)

@@ -25,6 +25,8 @@ class Answered(Protocol):
 
     def ended(self) -> None: ...
 
+    def call_began(self) -> None: ...
+
     def call_ended(self) -> None: ...
 
 
@@ -91,6 +93,9 @@ class Conversation:
             self._reply.cancel()
             self._reply = None
             self._line.unsent += 1
+
+    def call_began(self) -> None:
+        self._line.call_began()
 
     def lost(self, error: Exception) -> None:
         if isinstance(error, CallEnded):  # the next call is another master's

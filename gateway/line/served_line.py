@@ -14,6 +14,7 @@ from typing import Protocol
 import structlog
 
 from gateway.config import LineConfig
+from gateway.engine.records import COMPLETE, CallState, LineRecord
 from gateway.errors import LineDown
 from gateway.line.conversation import Conversation
 from gateway.line.duty import Duty
@@ -72,8 +73,7 @@ class ServedLine:
             if device.enabled
         }
         self.opened: float | None = None  # by the loop's clock; None: closed
-        self.openings = 0
-        self.trouble = ""  # why it is closed
+        self.record = LineRecord()  # how often it was opened, why it is closed, calls
         self.stale = 0  # requests that later bytes have followed
         self.unsent = 0  # replies that later bytes have followed
         self._sink = sink
@@ -103,10 +103,9 @@ class ServedLine:
             try:
                 await self._open_and_serve()
             except LineDown as error:
-                known = str(error) == self.trouble
+                known = str(error) == self.record.trouble
                 (log.debug if known else log.warning)("line down", line=self.name, why=str(error))
-                self.trouble = str(error)
-                self._closed()
+                self._closed(str(error))
             if _now() - begun > REOPEN_LONGEST:
                 pause = REOPEN_FIRST
             await asyncio.sleep(pause * jitter.uniform(0.8, 1.2))
@@ -154,16 +153,21 @@ class ServedLine:
 
     def _begin(self) -> None:
         log.info("line open", line=self.name)
-        self.opened, self.trouble = _now(), ""
-        self.openings += 1
+        self.opened = _now()
+        self.record.opened += 1
+        self.record.trouble = ""
+        if isinstance(self.config.port, ModemAddress):
+            self.record.telephone()
         for station in self.stations.values():
             station.opened(self.opened)
 
-    def _closed(self) -> None:
-        self.opened = None
+    def _closed(self, why: str) -> None:
+        self.opened, self.record.trouble = None, why
+        if self.record.calls is not None:
+            self.record.calls.lose(why, _now())
         for station in self.stations.values():
             was = station.presence
-            self._give(station.lost(self._wall(), self.trouble))
+            self._give(station.lost(self._wall(), why))
             if was is Presence.PRESENT:
                 self._sink.online(station, False)
 
@@ -236,8 +240,15 @@ class ServedLine:
         if samples:
             self._sink.samples(samples)
 
+    def call_began(self) -> None:
+        """Notes a telephone call."""
+        self.record.telephone().connect(_now())
+
     def call_ended(self) -> None:
         """Notes the end of a telephone call."""
+        record = self.record.telephone()
+        record.enter(CallState.IDLE, _now())
+        record.count(COMPLETE)  # the caller knows if it is
         for station in self.stations.values():
             if station.call_ended():
                 self._sink.online(station, False)

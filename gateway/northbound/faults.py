@@ -1,21 +1,29 @@
 """Finds what is wrong in the status documents of a gateway, as sentences for people."""
 
+import re
 from collections.abc import Iterator, Mapping
 from typing import Any
 
 JUMP_SHOWN = 3600.0  # seconds
+ROWS_SHOWN = 10  # numbers of transfers in one sentence
 Documents = Mapping[str, Mapping[str, Any]]  # by path: `status`, `lines/hall-1`, `devices/mixer`
 
 
 def faults(documents: Documents) -> Iterator[str]:
-    """Yields what needs a person: lines that are down, silent devices, a lost router,
-    history not written."""
+    """Yields what needs a person: lines that are down, silent devices, transfers that do not
+    work, a lost router, history not written."""
     for line, document in below("lines/", documents):
         if not document["open"]:
             yield f"line {line} is down: {document['trouble'] or 'not opened yet'}"
     for device, document in below("devices/", documents):
         if document["standing"] == "silent":
             yield f"{device} is silent: {document['diagnosis']}"
+    unreachable = _unreachable(documents)
+    for number, row in transfers(documents):
+        if _fails(row) and not _waits_for(row, unreachable, documents):
+            yield (
+                f"transfer {number} ({row['from']} to {row['to']}) is {row['state']}: {row['why']}"
+            )
     zenoh = documents.get("zenoh", {})
     if (wanted := zenoh.get("connect")) and not {"router", "peer"} & set(zenoh["to"]):
         yield f"Zenoh: not connected to {' or '.join(wanted)}: its clients get no values"
@@ -26,24 +34,21 @@ def faults(documents: Documents) -> Iterator[str]:
 
 def warnings(documents: Documents) -> Iterator[str]:
     """Yields what is not as it should be, while other values are good."""
-    down = {
-        device
-        for _, document in below("lines/", documents)
-        if not document["open"]
-        for device in document["devices"]
-    }
+    unreachable = _unreachable(documents)
     for device, document in below("devices/", documents):
-        known = document["standing"] == "silent" or device in down
-        if document["diagnosis"] and not known:
+        if document["diagnosis"] and device not in unreachable:
             yield f"{device}: {document['diagnosis']}"
         yield from document["refused_addresses"]
     for line, document in below("lines/", documents):
         load = document["expected"]["load"]
         if load > 1.0:
             yield f"line {line} is asked for {load:.1f} times what it carries: see `check`"
+        calls = document.get("calls") or {}
+        if document["open"] and calls.get("in_a_row"):
+            yield f"line {line}: the last call failed: {calls['last_failure']}"
     for device, other in documents["status"]["refused_devices"].items():
         yield f"{device} is served by another gateway, {other}"
-    yield from _transfers(documents)
+    yield from _held_up(documents, unreachable)
     reload = documents.get("reload", {})
     if reload.get("refused"):
         more = f" and {len(reload['why']) - 1} more" if len(reload["why"]) > 1 else ""
@@ -58,11 +63,48 @@ def warnings(documents: Documents) -> Iterator[str]:
         yield f"history: {lost} samples were lost since the start"
 
 
-def _transfers(documents: Documents) -> Iterator[str]:
-    for number, document in below("transfers/", documents):
-        if document["state"] not in ("starting", "carried"):
-            row = f"transfer {number} ({document['from']} to {document['to']})"
-            yield f"{row} is {document['state']}: {document['why']}"
+def _unreachable(documents: Documents) -> set[str]:
+    """Returns the devices that are a fault by themselves, or by their line."""
+    found = {
+        device
+        for _, document in below("lines/", documents)
+        if not document["open"]
+        for device in document["devices"]
+    }
+    devices = below("devices/", documents)
+    return found | {name for name, document in devices if document["standing"] == "silent"}
+
+
+def _fails(row: Mapping[str, Any]) -> bool:
+    return row["state"] not in ("starting", "carried")
+
+
+def _waits_for(row: Mapping[str, Any], unreachable: set[str], documents: Documents) -> list[str]:
+    """Returns the devices of a row that cannot be reached now, or are not polled at all."""
+    names = [re.split("[/:]", row[end], maxsplit=1)[0] for end in ("from", "to")]
+    return [one for one in names if one in unreachable or f"devices/{one}" not in documents]
+
+
+def _held_up(documents: Documents, unreachable: set[str]) -> Iterator[str]:
+    """Yields the transfers that wait for a device: their cause is among the faults already."""
+    waiting: dict[str, list[str]] = {}
+    for number, row in transfers(documents):
+        if _fails(row) and (devices := _waits_for(row, unreachable, documents)):
+            waiting.setdefault(devices[0], []).append(number)
+    for device, numbers in sorted(waiting.items()):
+        rows = f"transfer {numbers[0]} waits" if len(numbers) == 1 else _several(numbers)
+        yield f"{rows} for {device}"
+
+
+def _several(numbers: list[str]) -> str:
+    shown = ", ".join(numbers[:ROWS_SHOWN])
+    more = len(numbers) - ROWS_SHOWN
+    return f"transfers {shown}{f' and {more} more' if more > 0 else ''} wait"
+
+
+def transfers(documents: Documents) -> list[tuple[str, Mapping[str, Any]]]:
+    """Returns the documents of the transfers by number, in this order."""
+    return sorted(below("transfers/", documents), key=lambda row: int(row[0]))
 
 
 def below(folder: str, documents: Documents) -> Iterator[tuple[str, Mapping[str, Any]]]:

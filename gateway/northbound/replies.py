@@ -31,6 +31,8 @@ _TOO_LONG = f"this is not all: an answer ends after {ANSWER_WITHIN:g} s. Query i
 _INCOMPLETE = "the gateway is ending: this is not all"
 _NO_HISTORY = Failure(Problem.NO_HISTORY, "no history is kept here: ask without _time")
 
+_Row = tuple[str, str]  # the key of a reply, and its document
+
 
 class Replies:
     """Every method replies to one query and may block while the client does not receive.
@@ -234,20 +236,13 @@ class Replies:
     def writes(self, now: int, query: zenoh.Query) -> None:
         """Replies with recorded outcomes, on the key of their publication. `now` as in
         `history`."""
-        if not query.key_expr.intersects(self._keys.writes):
-            return
-        if self._history is None:
-            self.outcome(_NO_HISTORY, query)
-            return
-        try:
-            limit = _limit(query.parameters.get("limit"))
-            time_range = query.parameters.get("_time") or ""
-            for outcome in self._history.writes(time_range, limit, now):
-                if self._ended:
-                    raise Busy(_INCOMPLETE)
-                self._reply(query, self._keys.writes, outcome.encode(), self._stamp())
-        except GatewayError as error:
-            self._failed(error, query)
+        key = self._keys.writes
+
+        def found(history: History, time_range: str, limit: int | None) -> Iterator[_Row]:
+            return ((key, row) for row in history.writes(time_range, limit, now))
+
+        if query.key_expr.intersects(key):
+            self._past(found, query)
 
     def alarms(self, query: zenoh.Query) -> None:
         """Replies with the document of each alarm of the query."""
@@ -268,16 +263,23 @@ class Replies:
 
     def past_alarms(self, now: int, query: zenoh.Query) -> None:
         """Replies with recorded changes, each on the key of its alarm. `now` as in `history`."""
+
+        def found(history: History, time_range: str, limit: int | None) -> Iterator[_Row]:
+            rows = history.alarms(time_range, None, now)
+            keyed = ((self._keys.alarm(str(orjson.loads(row)["alarm"])), row) for row in rows)
+            return islice((one for one in keyed if query.key_expr.intersects(one[0])), limit)
+
+        self._past(found, query)
+
+    def _past(
+        self, found: Callable[[History, str, int | None], Iterator[_Row]], query: zenoh.Query
+    ) -> None:
         if self._history is None:
             self.outcome(_NO_HISTORY, query)
             return
         try:
             limit = _limit(query.parameters.get("limit"))
-            time_range = query.parameters.get("_time") or ""
-            found = self._history.alarms(time_range, None, now)
-            keys = ((self._keys.alarm(str(orjson.loads(row)["alarm"])), row) for row in found)
-            matching = (one for one in keys if query.key_expr.intersects(one[0]))
-            for key, row in islice(matching, limit):
+            for key, row in found(self._history, query.parameters.get("_time") or "", limit):
                 if self._ended:
                     raise Busy(_INCOMPLETE)
                 self._reply(query, key, row.encode(), self._stamp())

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from math import isinf
 
 from gateway.line.served_line import ServedLine
-from gateway.northbound.status import Document
+from gateway.northbound.status import Document, calls_document
 from gateway.serving.station import Station
 
 
@@ -49,14 +49,15 @@ def _station(station: Station, now: float) -> Document:
 
 
 def _line(line: ServedLine, now: float) -> Document:
+    record = line.record
     open_for = 0.0 if line.opened is None else now - line.opened
     asked = sum(station.counts.requests for station in line.stations.values())
     return {
         "open": line.is_open,
         "served": True,
-        "trouble": line.trouble,
-        "last_trouble": line.trouble,
-        "opened": line.openings,
+        "trouble": record.trouble,
+        "last_trouble": record.trouble,
+        "opened": record.opened,
         "open_for": round(open_for, 1),
         "open_time": round(open_for, 3),
         "baudrate": line.config.wire.baudrate,
@@ -70,6 +71,6 @@ def _line(line: ServedLine, now: float) -> Document:
             "slowest_write": 0.0,
         },
         "unasked_bytes": 0,
-        "calls": None,
+        "calls": None if record.calls is None else calls_document(record.calls, None, now),
         "expected": {"load": 0.0, "requests_per_second": 0.0, "cycle": 0.0, "worst_write": 0.0},
     }

@@ -1,5 +1,6 @@
 """The state of lines and devices as documents, for status keys and the status page."""
 
+import math
 from collections.abc import Mapping, Sequence
 
 from gateway.engine.calls import Calls
@@ -8,6 +9,7 @@ from gateway.engine.engine import Engine
 from gateway.engine.forecast import LineForecast
 from gateway.engine.health import State
 from gateway.engine.jobs import Poll
+from gateway.engine.records import CallRecord, CallState
 from gateway.planning.bad_addresses import BadRange
 from gateway.planning.planner import describe
 from gateway.tags.timestamps import rfc3339
@@ -108,15 +110,23 @@ def line_document(
             "cycle": round(expected.cycle, 4),
             "worst_write": round(expected.worst_write, 4),
         },
-        "calls": None if calls is None else _calls(calls),
+        "calls": None if record.calls is None else calls_document(record.calls, calls, now),
     }
 
 
-def _calls(calls: Calls) -> Document:
-    """The telephone calls since the modem was opened."""
+def calls_document(record: CallRecord, calls: Calls | None, now: float) -> Document:
+    """The telephone calls of a line. `calls`: of a modem that dials, and is there."""
+    waits = calls is not None and record.state is CallState.IDLE
+    dials_at = calls.due(now) if calls is not None and waits else math.inf
     return {
-        "connected": calls.connected,
-        "made": calls.made,
-        "failed": calls.failures,
-        "last_failure": calls.last_failure,
+        "state": record.state.value,
+        "since": None if record.since is None else round(now - record.since, 1),
+        "next": round(max(0.0, dials_at - now), 1) if dials_at < math.inf else None,
+        "connected": record.state is CallState.CONNECTED,
+        "made": record.made,
+        "failed": record.failed,
+        "in_a_row": 0 if calls is None else calls.failed,
+        "last_result": record.last_result,
+        "last_failure": record.last_failure,
+        "results": dict(record.results),
     }

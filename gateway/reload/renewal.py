@@ -130,7 +130,7 @@ class Renewal:
         settings = {one.name: one.devices for one in self._difference.config.lines}
         await line.change(changes, settings.get(engine.name, ()), applied)
         devices = [*engine.devices]
-        gateway.expect(line, await off_loop(forecast, engine.name, devices, engine.wire))
+        gateway.expect(await off_loop(forecast, engine.name, devices, engine.wire))
 
     def _on(self, line: str) -> list[DeviceChange]:
         """Returns the changes of enabled devices that the line has from now on."""

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from gateway.config import Config
 from gateway.engine.device import Device
 from gateway.engine.forecast import LineForecast, TimedWrites, forecast, write_seconds
+from gateway.tags import Tag
 from gateway.tags.transfer import TransferRule, leaves
 
 
@@ -43,21 +44,21 @@ def forecasts(
 
 
 def transfer_forecasts(config: Config, lines: Sequence[LineForecast]) -> list[TransferForecast]:
-    """Returns the rows of the file. `lines`: all polled lines."""
+    """Returns the rows of the file. `lines`: the polled lines that are planned."""
     if not config.transfers:
         return []
-    tags = {tag.key: tag for one in config.devices for tag in (*one.tags, *one.targets)}
-    polls = {tag: row for line in lines for row in line.blocks for tag in row.block.tags}
-    latest = {line.name: line.worst_write for line in lines}
-    places = {
-        device.name: (line.name, Device(device, line.wire, plan_now=False))
-        for line in config.lines
-        if line.name in latest
-        for device in line.devices
-        if device.enabled
+    rules = config.transfers
+    tags = _tags(config, {key for rule in rules for key in (rule.source, rule.target)})
+    needed = {leaf for rule in rules if rule.source in tags for leaf in leaves(tags[rule.source])}
+    polls = {
+        tag: row for line in lines for row in line.blocks for tag in row.block.tags if tag in needed
     }
+    latest = {line.name: line.worst_write for line in lines}
+    places = _places(config, lines, {tag.device for tag in tags.values()})
     found = []
-    for rule in config.transfers:
+    for rule in rules:
+        if rule.source not in tags or rule.target not in tags:
+            continue  # of a device that another gateway serves
         source, target = tags[rule.source], tags[rule.target]
         line, device = places.get(target.device, ("", None))
         seconds = 0.0 if device is None else write_seconds(device, target)
@@ -70,6 +71,34 @@ def transfer_forecasts(config: Config, lines: Sequence[LineForecast]) -> list[Tr
         often = 1 / (rule.every or changes)  # at most: it changes with each read
         found.append(TransferForecast(rule, line, TimedWrites(often, seconds), age))
     return found
+
+
+def _places(
+    config: Config, lines: Sequence[LineForecast], names: set[str]
+) -> dict[str, tuple[str, Device]]:
+    """Returns these devices with their lines."""
+    polled = {row.device.name: row.device for line in lines for row in line.blocks}
+    planned = {line.name for line in lines}
+    return {
+        one.name: (line.name, polled.get(one.name) or Device(one, line.wire, plan_now=False))
+        for line in config.lines
+        if line.name in planned
+        for one in line.devices
+        if one.enabled and one.name in names
+    }
+
+
+def _tags(config: Config, keys: set[str]) -> dict[str, Tag]:
+    """Returns the tags with these keys."""
+    devices = {key.partition("/")[0] for key in keys}
+    names = {key.partition("/")[2] for key in keys}  # quicker than to make each key
+    return {
+        tag.key: tag
+        for one in config.devices
+        if one.name in devices
+        for tag in (*one.tags, *one.targets)
+        if tag.name in names and tag.key in keys
+    }
 
 
 def with_transfers(

@@ -70,6 +70,7 @@ class Row:
         self.rule = rule
         self.counts: Counter[End] = Counter()
         self.last: Outcome | None = None  # the end of the last write
+        self.carried_at: float | None = None  # when the target acknowledged last
         self.writing: Carry | None = None
         self._seen: Value | None = None  # the last published value of the source
         self._wanted = False  # a change was not carried yet
@@ -148,6 +149,8 @@ class Row:
             self._again(carry, now)
             return
         self._pause = FIRST_PAUSE
+        if outcome.end is End.DONE:
+            self.carried_at = now
         done = outcome.end is End.DONE and not carry.substitute
         self._held = carry.value if done else None
 

@@ -247,7 +247,8 @@ class Transfers:
             raise AssertionError(f"{one.name} has ended")
         reading = self._reading(source)
         state, code, why = one.row.verdict(reading)
-        counts, carried = one.row.counts, one.carried
+        counts, carried, at = one.row.counts, one.carried, one.row.carried_at
+        now = asyncio.get_running_loop().time()
         return {
             "from": one.rule.text[0],
             "to": one.rule.text[1],
@@ -258,6 +259,7 @@ class Transfers:
             "why": why,
             "value": None if carried is None else carried.value,
             "time": None if carried is None else rfc3339(carried.time),
+            "last_carried": None if at is None else round(now - at, 1),
             "age": round(reading.age, 3) if reading.age < math.inf else None,
             "carried": counts[End.DONE],
             "not_done": counts[End.NOT_DONE],

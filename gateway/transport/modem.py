@@ -3,7 +3,7 @@
 import asyncio
 from collections.abc import Awaitable, Callable, Coroutine, Sequence
 from contextlib import AsyncExitStack, suppress
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import serialx
 import structlog
@@ -27,6 +27,7 @@ from gateway.transport.port import Port, Receiver
 from gateway.transport.stream import StreamPort
 
 log = structlog.get_logger("gateway.line")
+LOST = "carrier lost"  # the result of a call
 LOOK = 0.25  # seconds between two looks at the signal CD
 LONGEST_ANSWER = 1.0  # seconds of a modem that hangs up while its port is closed
 
@@ -38,6 +39,13 @@ class Signals(Protocol):
         """Returns the signal CD; None: the port has none."""
 
     async def set_dtr(self, on: bool) -> None: ...
+
+
+@runtime_checkable
+class Called(Protocol):
+    """A receiver that knows of each call when it begins."""
+
+    def call_began(self) -> None: ...
 
 
 class SerialSignals:
@@ -108,7 +116,7 @@ class ModemPort:
     def write(self, data: bytes) -> None:
         """Raises `CallEnded` between calls: the modem would take data for commands."""
         if self._port is None or self._modem.state is not State.ONLINE:
-            raise CallEnded(f"{self.name}: no call")
+            raise CallEnded(f"{self.name}: no call", LOST)
         self._port.write(data)
 
     async def close(self) -> None:
@@ -189,15 +197,18 @@ class ModemPort:
             case Connected(text):
                 log.info("call connected", port=self.name, modem=text)
                 self._watch = self._start(self._watch_carrier())
+                if isinstance(self._receiver, Called):
+                    self._receiver.call_began()
                 self._end(None)
             case Failed(why):
                 log.info("call failed", port=self.name, modem=why)
-                self._end(CallEnded(f"{self.name}: {why}"))
+                word, _, _ = why.partition(":")
+                self._end(CallEnded(f"{self.name}: {why}", word))
             case Ready():
                 self._end(None)
             case Ended(why):
                 log.info("call ended", port=self.name, modem=why)
-                self._receiver.lost(CallEnded(f"{self.name}: {why}"))
+                self._receiver.lost(CallEnded(f"{self.name}: {why}", LOST))
             case Broken(why):
                 self.lost(LineDown(f"{self.name}: {why}"))
 

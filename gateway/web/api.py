@@ -18,7 +18,7 @@ from gateway.history.course import Now
 from gateway.history.question import question
 from gateway.history.rows import has_value
 from gateway.northbound import buckets, past, payload
-from gateway.northbound.faults import below, faults, warnings
+from gateway.northbound.faults import below, faults, transfers, warnings
 from gateway.northbound.interfaces import History
 from gateway.northbound.meta import meta_fields
 from gateway.northbound.payload import Problem
@@ -65,6 +65,7 @@ class Api:
         return [
             web.get("/api/status", self._status),
             web.get("/api/lines", self._lines),
+            web.get("/api/transfers", self._transfers),
             web.get("/api/devices", self._device_page),
             web.get("/api/devices/{device}", self._device),
             web.get("/api/tags", self._tags),
@@ -86,6 +87,19 @@ class Api:
     async def _lines(self, _: web.Request) -> web.Response:
         documents = await self._north.documents(STATE_AGE)
         return await json_off_loop(lambda: {"lines": dict(below("lines/", documents))})
+
+    async def _transfers(self, request: web.Request) -> web.Response:
+        limit, after = limit_of(request, _ITEMS, MOST_ITEMS), request.query.get("after", "0")
+        if not after.isdecimal():
+            return answer(400, f"after={payload.short(after)} is no number of a transfer")
+        documents = await self._north.documents(STATE_AGE)
+
+        def page() -> object:
+            found = [one for one in transfers(documents) if int(one[0]) > int(after)]
+            shown = [{"transfer": int(number), **one} for number, one in found[:limit]]
+            return {"transfers": shown, "next": found[limit - 1][0] if found[limit:] else None}
+
+        return await json_off_loop(page)
 
     async def _device_page(self, request: web.Request) -> web.Response:
         limit, after = limit_of(request, _ITEMS, MOST_ITEMS), request.query.get("after", "")

@@ -17,7 +17,7 @@ import orjson
 from aiohttp import ClientConnectionResetError, web
 
 from gateway.northbound import payload
-from gateway.northbound.faults import below
+from gateway.northbound.faults import below, transfers
 from gateway.tags import Quality, Sample, Tag
 from gateway.web.alarms import alarms_shown
 from gateway.web.api import Api, overview
@@ -33,6 +33,7 @@ STATE_EVERY = 2.0
 LOAD_EVERY = 5.0  # as often as the status is published: it costs nothing more
 KEPT_LOADS = 360  # half an hour
 TAGS_SHOWN = 200  # of one device
+_BY_NAME = ("devices", "transfers")  # of the state: a page gets their changes
 MOST_SENTENCES = 50  # about what is wrong, and about what to look at
 
 
@@ -143,7 +144,7 @@ class Page:
         self._exchange = 0  # the number of the last one
         self._load = 0  # the number of the last measurement
         self._sent: dict[Tag, Sample] = {}
-        self._devices: Mapping[str, object] = {}
+        self._shown: Mapping[str, Mapping[str, object]] = {}  # by the names `_BY_NAME`
         self._values_due = self._state_due = 0.0
 
     async def next(self) -> bytes:
@@ -172,10 +173,9 @@ class Page:
 
     def _state(self, documents: Documents) -> dict[str, Any]:
         whole = self._events.state(documents)
-        known, devices = self._devices, whole["devices"]
-        changed = {name: one for name, one in devices.items() if known.get(name) != one}
-        self._devices = devices
-        return {**whole, "ready": self._sources.ready(), "devices": changed}
+        changed = {name: _changes(self._shown.get(name, {}), whole[name]) for name in _BY_NAME}
+        self._shown = {name: whole[name] for name in _BY_NAME}
+        return {**whole, "ready": self._sources.ready(), **changed}
 
     def _values(self, tags: Sequence[Tag]) -> list[list[object]]:
         """Returns the values that changed, or were read again: the text of the value as in JSON,
@@ -218,11 +218,37 @@ def _state(documents: Documents) -> dict[str, Any]:
             ]
             for name, one in below("lines/", documents)
         ],
+        "calls": _calls(documents),
+        "transfers": {number: _transfer(one) for number, one in transfers(documents)},
         "devices": {
             name: [line_of.get(name, ""), one["standing"], one["diagnosis"]]
             for name, one in below("devices/", documents)
         },
     }
+
+
+def _calls(documents: Documents) -> list[list[object]]:
+    """Returns the lines with a modem."""
+    fields = ("state", "since", "next", "last_result", "made", "failed")
+    return [
+        [name, *(calls[field] for field in fields)]
+        for name, one in below("lines/", documents)
+        if (calls := one.get("calls"))
+    ]
+
+
+def _transfer(one: Mapping[str, Any]) -> list[object]:
+    """Returns what the page shows of a row: it changes only when something happens."""
+    code = "" if one["code"] is None else f"{one['code']}: {one['meaning']}"
+    works = one["state"] == "carried"
+    why = "" if works else one["why"]
+    return [one["from"], one["to"], one["state"], code, one["time"], why]
+
+
+def _changes(known: Mapping[str, object], now: Mapping[str, object]) -> dict[str, object]:
+    """Returns what a page has to take over; None: it is gone."""
+    changed = {name: one for name, one in now.items() if known.get(name) != one}
+    return changed | dict.fromkeys(known.keys() - now.keys())
 
 
 def _event(kind: str, data: object) -> bytes:

@@ -18,7 +18,8 @@ from prometheus_client.exposition import CONTENT_TYPE_LATEST, generate_latest
 from prometheus_client.process_collector import ProcessCollector
 from prometheus_client.registry import Collector, CollectorRegistry
 
-from gateway.northbound.faults import below, faults, warnings
+from gateway.engine.records import COMPLETE
+from gateway.northbound.faults import below, faults, transfers, warnings
 from gateway.tags import Quality
 from gateway.web.sources import Documents, Plant
 
@@ -118,17 +119,29 @@ def _lines(documents: Documents) -> Iterator[Metric]:
     lines = [*below("lines/", documents)]
     up = _family("line_up", "1: the port is open", "line")
     expected = _family(
-        "line_expected_load_ratio", "Load of the polls that check predicts; 1 is all", "line"
+        "line_expected_load_ratio", "Load that check predicts, with transfers; 1 is all", "line"
     )
     for name, document in lines:
         up.add_metric([name], document["open"])
         expected.add_metric([name], document["expected"]["load"])
-    yield from (up, expected)
+    yield from (up, expected, *_calls(documents))
     for metric, field, text in _LINE:
         family = _family(metric, text, "line")
         for name, document in lines:
             family.add_metric([name], document[field])
         yield family
+
+
+def _calls(documents: Documents) -> Iterator[Metric]:
+    """Lines with a modem."""
+    ends = _family("line_calls_total", "Ended calls and tries, by result", "line", "result")
+    lasts = _family("line_call", "1: a call lasts", "line")
+    for name, document in below("lines/", documents):
+        if calls := document.get("calls"):
+            lasts.add_metric([name], calls["state"] == "connected")
+            for result, count in ({COMPLETE: 0} | calls["results"]).items():
+                ends.add_metric([name, result], count)
+    yield from (ends, lasts)
 
 
 def _devices(documents: Documents, plant: Plant) -> Iterator[Metric]:
@@ -156,17 +169,19 @@ def _devices(documents: Documents, plant: Plant) -> Iterator[Metric]:
 
 
 def _transfers(documents: Documents) -> Iterator[Metric]:
-    rows = [*below("transfers/", documents)]
     labels = ("transfer", "from", "to")
     works = _family("transfer_works", "1: the last value was carried", *labels)
     ends = _family("transfer_writes_total", "Writes of transfers by outcome", *labels, "outcome")
-    for number, document in rows:
+    text = "Seconds since the target acknowledged a value"
+    last = _family("transfer_last_carried_seconds", text, *labels)
+    for number, document in transfers(documents):
         place = [number, document["from"], document["to"]]
+        if (ago := document["last_carried"]) is not None:
+            last.add_metric(place, ago)
         works.add_metric(place, document["state"] == "carried")
         for outcome in ("carried", "not_done", "refused", "unclear"):
             ends.add_metric([*place, outcome], document[outcome])
-    if rows:
-        yield from (works, ends)
+    yield from (works, ends, last)
 
 
 def _qualities(plant: Plant, line_of: Mapping[str, str]) -> Metric:

@@ -1,11 +1,13 @@
 """A running gateway with two modems, and a client on Zenoh in another process."""
 
+import asyncio
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import Any
 
 from gateway.stations.vigor import VigorStation
 from tests.e2e.processes import started, write_config
-from tests.e2e.pty_modem import PtyModem
+from tests.e2e.pty_modem import PATIENCE, PtyModem
 from tests.serving.easy_link import frame
 from tests.transport.modem import ModemModel
 from tests.zenoh_peer import ZenohPeer, free_endpoint
@@ -13,6 +15,11 @@ from tests.zenoh_peer import ZenohPeer, free_endpoint
 SETTINGS = {"guard": "100ms"}
 LATE = timedelta(seconds=5)  # a stamp is never new for an old value, but may be too old
 D0 = "1C0002"  # its address and two bytes
+
+
+async def calls_of(client: ZenohPeer, line: str) -> Any:
+    [document] = await client.get(f"plant/@gateway/demo/lines/{line}")
+    return document.json["calls"]
 
 
 async def test_b3_8_a_plc_dials_in_and_another_is_dialled(tmp_path: Path) -> None:
@@ -92,3 +99,11 @@ async def test_b3_8_a_plc_dials_in_and_another_is_dialled(tmp_path: Path) -> Non
                 [*_, kept] = await client.get("plant/vr1/level?_time=[now(-60s)..]")
                 assert kept.json == sample.json
                 assert called.calls == 2
+                # The status counts both calls, once the second one has ended.
+                async with asyncio.timeout(PATIENCE):
+                    while (calls := await calls_of(client, "site"))["state"] != "idle":
+                        await outgoing.until_online(False)
+                assert (calls["made"], calls["failed"], calls["last_result"]) == (2, 0, "complete")
+                assert 800 < calls["next"] <= 900
+                taken = await calls_of(client, "center")
+                assert (taken["state"], taken["made"], taken["next"]) == ("idle", 1, None)

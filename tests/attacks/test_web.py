@@ -24,8 +24,8 @@ from tests.e2e.processes import (
     vigor_line,
     write_config,
 )
-from tests.web.browser import browser
-from tests.web.serving import TOKEN
+from tests.web.browser import Tab, browser
+from tests.web.serving import TOKEN, calling, serving, transfer
 from tests.zenoh_peer import free_endpoint
 
 EXAMPLES = ROOT / "examples" / "prometheus"
@@ -85,6 +85,7 @@ def begun(stack: ExitStack, folder: Path) -> Page:
         {"hall": vigor_line("simulator", TAGS), "yard": silent},
         history={"path": "history.db"},
         web={"listen": f"127.0.0.1:{port}", "tokens_file": "tokens.txt"},
+        transfers=[{"from": "oven/level", "to": "mixer/recipe"}],  # its line is down
     )
     page = Page(stack.enter_context(started(config)), port)
     page.program.says("device online")
@@ -150,6 +151,14 @@ VALUES = '[...document.querySelectorAll("#values tr")].map((row) => row.cells[1]
 QUALITIES = '[...document.querySelectorAll("#values tr")].map((row) => row.cells[3].textContent)'
 
 
+CELLS = (
+    '[...document.querySelectorAll("#{} tr")]'
+    '.map((row) => [...row.querySelectorAll("td")].map((td) => td.textContent))'
+)
+STALE = "stale never oven/level is bad: line-down ("
+LONG_AGO = "2026-01-02T03:04:05.000000Z"
+
+
 ACKNOWLEDGE = f"""
 for (const [id, value] of Object.entries({{token: "{TOKEN}", name: "Ana", alarm: "line:yard"}}))
   document.getElementById(`acknowledge-${{id}}`).value = value;
@@ -175,6 +184,7 @@ async def test_the_page_is_live_and_turns_grey_at_once_when_the_gateway_ends(
             'document.body?.className === "" && !!document.querySelector("#devices tr")'
         )
         assert "line yard is down" in await tab.value('document.querySelector("#wrong").innerText')
+        await tab.until(f'{CELLS.format("transfers")}[0]?.join(" ").startsWith("{STALE}")')
         await tab.until('document.querySelector("#alarms").innerText.includes("line:yard")')
         await tab.value(ACKNOWLEDGE)
         await tab.until(
@@ -207,3 +217,38 @@ async def test_the_page_is_live_and_turns_grey_at_once_when_the_gateway_ends(
         await tab.until('document.body.className === "stale"')
         assert await tab.value(QUALITIES) == 4 * ["not live"]
         assert "not live since" in await tab.value('document.querySelector("#live").innerText')
+        await calls_and_transfers_are_shown(tab)
+
+
+async def calls_and_transfers_are_shown(tab: Tab) -> None:
+    """By the same browser: each start of one takes long."""
+    async with serving() as client:
+        documents = client.north.changed
+        documents["lines/far"] = calling()
+        documents["transfers/2"] = transfer("carried", code="0", meaning="normal", time=LONG_AGO)
+        documents["transfers/10"] = transfer("refused", why="251 is more than 250")
+        await tab.open(f"http://127.0.0.1:{client.port}/")
+        await tab.until(
+            f'document.body?.className === "" && {CELLS.format("transfers")}.length === 2'
+        )
+        assert await tab.value(CELLS.format("calls")) == [
+            ["idle for 4.0 s", "in 14 min", "BUSY", "7", "2"]
+        ]
+        [refused, carried] = await tab.value(CELLS.format("transfers"))
+        assert refused == ["refused", "never", "251 is more than 250"]
+        await tab.until(f"/^\\d+ d ago$/.test({CELLS.format('transfers')}[1][1])")
+        assert (carried[0], carried[2]) == ("carried", "0: normal")
+        titles = (
+            '[...document.querySelectorAll("#transfers th[scope=row]")].map((th) => th.innerText)'
+        )
+        assert (await tab.value(titles))[0] == "10: mixer/speed to oven/setpoint"
+        wrong = await tab.value('document.querySelector("#wrong").innerText')
+        assert "transfer 10 waits for oven" in wrong  # which is silent
+        assert "line far: the last call failed: modem:/dev/ttyS0: BUSY" in wrong
+        fits = "(({scrollWidth, clientWidth}) => scrollWidth <= clientWidth)"
+        for name in ("calls", "transfers"):
+            assert await tab.value(f'{fits}(document.querySelector("#{name}").closest(".wide"))')
+        del documents["transfers/10"], documents["lines/far"]  # a reload
+        await tab.until(f"{CELLS.format('transfers')}.length === 1")
+        assert await tab.value('document.querySelector("#calls-section").hidden')
+        assert tab.errors == []

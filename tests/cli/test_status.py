@@ -16,7 +16,10 @@ from rich.console import Console
 from gateway.cli.status import span, view
 from gateway.northbound.faults import faults, warnings
 from tests.e2e.processes import Done, gateway, plc_gateway, started, vigor_line, write_config
+from tests.web.serving import calling, transfer
 from tests.zenoh_peer import free_endpoint
+
+TO_MIXER = {"from": "mixer/a", "to": "mixer:D1..D9"}
 
 
 def device_on(port: str, name: str) -> dict[str, Any]:
@@ -119,6 +122,49 @@ def test_what_is_no_fault_is_told(
     assert list(faults(documents)) == []
     [sentence] = warnings(documents)
     assert sentence.startswith(says)
+
+
+def text_of(documents: dict[str, Any], width: int = 100) -> str:
+    screen = Console(width=width, record=True, file=io.StringIO())
+    screen.print(view(documents, None))
+    return screen.export_text()
+
+
+def test_a_transfer_that_does_not_work_is_a_fault(healthy: dict[str, Any]) -> None:
+    refused = transfer("refused", **TO_MIXER, why="251 is more than 250", last_carried=75.0)
+    documents = changed(healthy, "transfers/10", **refused)
+    documents["transfers/2"] = {**transfer("carried", **TO_MIXER), "last_carried": 3.0}
+    [said] = faults(documents)
+    assert said == "transfer 10 (mixer/a to mixer:D1..D9) is refused: 251 is more than 250"
+    text = text_of(documents)
+    assert re.search(r"^2 +mixer/a .* 3 s ago", text, re.MULTILINE)
+    assert re.search(r"^10 +mixer/a .*refused .* 1 min ago", text, re.MULTILINE)
+    assert text.index("\n2 ") < text.index("\n10 ")
+    assert "calls" not in text  # it has no modem
+
+
+def test_transfers_of_a_silent_device_do_not_hide_it(healthy: dict[str, Any]) -> None:
+    documents = changed(healthy, "devices/mixer", standing="silent", diagnosis="No byte came back")
+    stale = transfer("stale", **TO_MIXER, why="mixer/a is bad: no-reply")
+    documents |= {f"transfers/{number}": stale for number in range(1, 13)}
+    assert list(faults(documents)) == ["mixer is silent: No byte came back"]
+    [said] = warnings(documents)
+    assert said == "transfers 1, 2, 3, 4, 5, 6, 7, 8, 9, 10 and 2 more wait for mixer"
+    documents = changed(
+        healthy, "transfers/1", **transfer("stale", **{"from": "oven/a", "to": "mixer/b"})
+    )
+    assert list(faults(documents)) == []
+    assert list(warnings(documents)) == ["transfer 1 waits for oven"]  # it is not enabled
+
+
+def test_the_calls_of_a_modem_are_shown(healthy: dict[str, Any]) -> None:
+    documents = changed(healthy, "lines/hall", calls=calling()["calls"])
+    assert list(faults(documents)) == []
+    said = "line hall: the last call failed: modem:/dev/ttyS0: BUSY"
+    assert list(warnings(documents)) == [said]
+    assert re.search(
+        r"^hall +idle +4 s +in 14 min +BUSY +7 +2 *$", text_of(documents, 80), re.MULTILINE
+    )
 
 
 def test_control_characters_of_a_device_do_not_reach_the_terminal(healthy: dict[str, Any]) -> None:

@@ -9,6 +9,8 @@ from typing import Any
 
 from gateway.cli.status import view
 from gateway.cli.terminal import out
+from gateway.config import load
+from gateway.transfers.forecast import forecasts
 from tests.e2e.processes import started, vigor_line, write_config
 from tests.zenoh_peer import ZenohPeer, free_endpoint
 
@@ -16,16 +18,24 @@ OWN = "plant/@gateway/demo"
 
 
 def lines() -> dict[str, Any]:
-    hall = vigor_line("simulator", {"speed": {"address": "D10", "write": True, "scale": 0.1}})
+    tags = {"speed": {"address": "D10", "write": True, "scale": 0.1}}
+    hall = vigor_line("simulator", tags, turnaround="5ms")  # not measured: as `check` has it
     hall["devices"]["oven"] = {
         "protocol": "vigor",
         "station": 2,
+        "turnaround": "5ms",
         "tags": {
             "setpoint": {"address": "D7", "write": {"min": 0, "max": 5000}},
             "lamp": {"address": "M3", "write": True},
         },
     }
     return {"hall": hall}
+
+
+def load_of(file: Path) -> float:
+    """Returns the load of the line that `check` prints."""
+    [line] = forecasts(load(file))
+    return round(line.load, 4)
 
 
 async def test_a_value_is_carried_and_its_row_goes_on_over_a_reload(tmp_path: Path) -> None:
@@ -51,6 +61,10 @@ async def test_a_value_is_carried_and_its_row_goes_on_over_a_reload(tmp_path: Pa
             assert (row.json["state"], row.json["code"]) == ("refused", None)
             assert (row.json["value"], row.json["refused"]) == (125, 1)
             assert "9000" in row.json["why"]
+            assert row.json["last_carried"] < 60
+            [line] = await client.get(f"{OWN}/lines/hall")
+            first_load = line.json["expected"]["load"]
+            assert first_load == load_of(file)
 
             # A row is put in front: the row of before has another number, and writes nothing new.
             lamp = {"from": "oven/lamp", "to": "mixer/run", "every": "200ms"}
@@ -69,6 +83,7 @@ async def test_a_value_is_carried_and_its_row_goes_on_over_a_reload(tmp_path: Pa
             assert (known["state"], known["refused"], known["value"]) == ("refused", 1, 125)
             assert documents["transfers/1"]["state"] == "carried"
             assert documents["transfers/1"]["when"] == "every 0.2 s"
+            assert documents["lines/hall"]["expected"]["load"] == load_of(file) > first_load
             with out.capture() as shown:
                 out.print(view(documents, None))
             text = shown.get()

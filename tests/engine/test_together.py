@@ -8,6 +8,7 @@ import pytest
 from gateway.engine.device import Device
 from gateway.engine.jobs import Idle, Poll, Probe, Resynced, Settle, Settled, Traffic
 from gateway.engine.together import PROOFS, TRY_AGAIN
+from gateway.protocols.modbus.drivers import ModbusTcp
 from tests.engine.rig import REPLIED, SILENCE, Rig, tcp_device
 from tests.sim.bench import WIRE
 
@@ -122,7 +123,7 @@ def test_a_device_that_one_loss_takes_offline_gets_one_at_a_time_too(
 ) -> None:
     plain = busy_device().settings
     timing = replace(plain.timing, retries=0)
-    driver = replace(plain.driver, window=window)
+    driver = ModbusTcp(station=1, window=window)
     rig = Rig(Device(replace(plain, driver=driver, timing=timing), WIRE))
     sizes = transactions(rig, 60.0, answers)
     assert sum(size > 1 for size in sizes) <= 2 * PROOFS

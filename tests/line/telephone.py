@@ -27,7 +27,7 @@ class Cable:
 
     def __init__(self, model: ModemModel, receiver: Receiver) -> None:
         self._model = model
-        self._receiver = receiver
+        self.receiver = receiver
         self._timer: asyncio.TimerHandle | None = None
         self._open = True
 
@@ -53,7 +53,7 @@ class Cable:
 
     def _arrive(self, data: bytes) -> None:
         if self._open:
-            self._receiver.received(data)
+            self.receiver.received(data)
 
 
 class Telephone:

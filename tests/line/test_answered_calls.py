@@ -7,11 +7,13 @@ from pathlib import Path
 from typing import Any
 
 from gateway.config import LineConfig, built
+from gateway.errors import LineDown
 from gateway.line.served_line import ServedLine
+from gateway.northbound.served_status import served_documents
 from gateway.serving.station import Station
 from gateway.tags import Quality, Sample
 from gateway.transport import ModemAddress, Port, PortAddress, Receiver, SerialSettings, open_modem
-from tests.line.telephone import Cable
+from tests.line.telephone import Cable, now
 from tests.serving.easy_link import frame
 from tests.sim.virtual import on_virtual_time
 from tests.transport.modem import ModemModel
@@ -114,6 +116,35 @@ async def test_each_call_is_answered_and_the_values_stay_between_them() -> None:
         assert values == [(250, Quality.GOOD)] * 2
         assert caller.present == [True, False] * 2
         assert caller.model.commands.count("ATA") == 2
+
+
+@on_virtual_time
+async def test_the_status_counts_answered_calls() -> None:
+    async with ready(Caller(center())) as caller:
+
+        def shown() -> Any:
+            documents: Any = served_documents([caller.line], now())
+            return documents["lines/center"]["calls"]
+
+        quiet = shown()
+        assert (quiet["state"], quiet["since"], quiet["next"]) == ("idle", None, None)
+        await caller.call()
+        lasts = shown()
+        assert (lasts["state"], lasts["made"], lasts["last_result"]) == ("connected", 1, "")
+        assert 0 < lasts["since"] < 2
+        caller.say(caller.model.drop())
+        await asyncio.sleep(60)
+        ended = shown()
+        assert (ended["state"], ended["failed"], ended["last_result"]) == ("idle", 0, "complete")
+        await caller.call()
+        assert caller.cable is not None
+        caller.cable.receiver.lost(LineDown("unplugged"))
+        await asyncio.sleep(0.05)
+        lost = shown()
+        assert (lost["state"], lost["made"], lost["failed"]) == ("idle", 2, 1)
+        assert lost["last_result"] == "modem lost"
+        caller.model.online = False
+        await asyncio.sleep(10)
 
 
 @on_virtual_time

@@ -1,12 +1,15 @@
 """Telephone calls: when a line dials, when it hangs up, and what becomes of values and writes."""
 
 import asyncio
+from typing import Any
 
 import pytest
 
+from gateway.engine.forecast import forecast
 from gateway.errors import LineDown, Unclear
+from gateway.northbound.status import line_document
 from gateway.tags import Quality, Reason
-from tests.line.telephone import Telephone, running
+from tests.line.telephone import Telephone, now, running
 from tests.sim.virtual import on_virtual_time
 from tests.transport.modem import ModemModel
 
@@ -24,6 +27,55 @@ async def test_every_15_min_dials_once_for_all_that_is_due() -> None:
         assert far.model.calls == 5
         assert far.now["level2000"].quality is Quality.GOOD
         assert far.line.engine.record.last_trouble == ""
+
+
+def shown(far: Telephone) -> dict[str, Any]:
+    """The calls in the status document of the line."""
+    engine = far.line.engine
+    polls = forecast(engine.name, engine.devices, engine.wire)
+    document: Any = line_document(engine, polls, far.line.calls, now())
+    found: dict[str, Any] = document["calls"]
+    return found
+
+
+@on_virtual_time
+async def test_the_status_shows_each_state_of_the_calls() -> None:
+    words = ("BUSY", "CONNECT 9600")
+    far = Telephone(ModemModel(words, after=5.0), retry_pause="30s", idle="4s")
+    async with running(far):
+        await asyncio.sleep(4)
+        dials = shown(far)
+        assert (dials["state"], dials["next"], dials["last_result"]) == ("dialling", None, "")
+        await asyncio.sleep(6)
+        busy = shown(far)
+        assert (busy["state"], busy["in_a_row"], busy["last_result"]) == ("idle", 1, "BUSY")
+        assert 0 < busy["since"] < 6
+        assert busy["next"] == pytest.approx(30 - busy["since"], abs=0.2)
+        await asyncio.sleep(busy["next"] + 6)
+        lasts = shown(far)
+        assert (lasts["state"], lasts["connected"], lasts["made"]) == ("connected", True, 1)
+        await asyncio.sleep(20)
+        done = shown(far)
+        assert (done["state"], done["in_a_row"], done["last_result"]) == ("idle", 0, "complete")
+        assert done["results"] == {"BUSY": 1, "complete": 1}
+        assert QUARTER - 60 < done["next"] < QUARTER
+
+
+@on_virtual_time
+async def test_the_counts_of_calls_outlive_the_modem() -> None:
+    far = Telephone(ModemModel())
+    async with running(far):
+        await asyncio.sleep(3)
+        assert shown(far)["state"] == "connected"
+        far.model.deaf = True
+        far.line.lost(LineDown("unplugged"))
+        await asyncio.sleep(0.1)
+        lost = shown(far)
+        assert (lost["state"], lost["next"], lost["last_result"]) == ("idle", None, "modem lost")
+        assert (lost["made"], lost["failed"], lost["last_failure"]) == (1, 1, "unplugged")
+        far.model.deaf = False
+        await asyncio.sleep(QUARTER)
+        assert shown(far)["made"] >= 2
 
 
 @on_virtual_time

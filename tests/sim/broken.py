@@ -2817,4 +2817,32 @@ MUTANTS = (
         "False",
         "tests/engine/test_together.py",
     ),
+    Mutant(
+        "a resync that a reset cut off is not outstanding",
+        "engine/conclusions.py",
+        "                device.health.left_outstanding(None, now)\n",
+        "                pass\n",
+        "tests/line/test_repeated_replies.py",
+    ),
+    Mutant(
+        "a transfer that does not work is no fault",
+        "northbound/faults.py",
+        '    return row["state"] not in ("starting", "carried")\n',
+        "    return False\n",
+        "tests/cli/test_status.py",
+    ),
+    Mutant(
+        "the load of a running line has no transfers",
+        "transfers/expected.py",
+        "            whole = with_transfers(polls, transfer_forecasts(config, polls))\n",
+        "            whole = polls\n",
+        "tests/transfers/test_expected.py",
+    ),
+    Mutant(
+        "an ended call is shown as connected",
+        "engine/calls.py",
+        "        self.record.enter(CallState.IDLE, now)\n        self._ended",
+        "        self._ended",
+        "tests/line/test_calling.py",
+    ),
 )

@@ -51,6 +51,32 @@ DOCUMENTS: Mapping[str, Mapping[str, Any]] = {
 }
 
 
+def transfer(state: str, **fields: Any) -> Mapping[str, Any]:
+    """The document of a transfer from mixer/speed to oven/setpoint."""
+    counts = dict.fromkeys(("carried", "not_done", "refused", "unclear"), 0)
+    values = {"value": None, "time": None, "last_carried": None, "age": None}
+    words = {"when": "on change", "code": None, "meaning": "", "why": ""}
+    ends = {"from": "mixer/speed", "to": "oven/setpoint"}
+    return {**ends, **words, "state": state, **values, **counts, **fields}
+
+
+def calling(**fields: Any) -> Mapping[str, Any]:
+    """The document of a line with a modem: its last call failed."""
+    calls = {
+        "state": "idle",
+        "since": 4.0,
+        "next": 840.0,
+        "connected": False,
+        "made": 7,
+        "failed": 2,
+        "in_a_row": 1,
+        "last_result": "BUSY",
+        "last_failure": "modem:/dev/ttyS0: BUSY",
+        "results": {"complete": 7, "BUSY": 2},
+    }
+    return {**DOCUMENTS["lines/hall"], "devices": {}, "calls": {**calls, **fields}}
+
+
 class PlainNorth:
     """Documents from a dict, and writes that end as `endings` says for their payload."""
 

@@ -15,7 +15,15 @@ from gateway.web.sources import Sources
 from tests.history.recorded import SPEED, history
 from tests.northbound.plant import PlainDevice, PlainPlant, mixer, tag
 from tests.schema_check import violations
-from tests.web.serving import TOKEN, Client, PlainNorth, local, serving
+from tests.web.serving import (
+    TOKEN,
+    Client,
+    PlainNorth,
+    calling,
+    local,
+    serving,
+    transfer,
+)
 
 DESCRIBED = json.loads((Path(__file__).parents[2] / "gateway/web/assets/openapi.json").read_text())
 PAGE = {"/", "/page.js", "/page.css", "/openapi.json"}
@@ -45,6 +53,8 @@ async def test_the_description_has_every_address_and_no_other() -> None:
     [
         ("/api/status", "/api/status", 200),
         ("/api/lines", "/api/lines", 200),
+        ("/api/transfers", "/api/transfers", 200),
+        ("/api/transfers?after=x", "/api/transfers", 400),
         ("/api/devices", "/api/devices", 200),
         ("/api/devices?line=hall&limit=1", "/api/devices", 200),
         ("/api/devices?limit=0", "/api/devices", 400),
@@ -76,6 +86,22 @@ async def test_the_pages_of_a_list_have_every_tag_once() -> None:
         assert found == ["mixer/speed", "mixer/alarms/door", "mixer/recipe", "oven/temperature"]
         some = (await client.ask("/api/tags?find=DOOR")).json["tags"]
         assert [one["tag"] for one in some] == ["mixer/alarms/door"]
+
+
+async def test_transfers_are_in_pages_by_number() -> None:
+    async with serving() as client:
+        stale = transfer("stale", code="A", meaning="no response", why="mixer/speed is bad")
+        rows = {2: stale, 10: transfer("carried", value=[1, 2], last_carried=3.5), 3: stale}
+        client.north.changed |= {f"transfers/{number}": one for number, one in rows.items()}
+        client.north.changed["lines/far"] = calling()
+        first = (await client.ask("/api/transfers?limit=2")).json
+        assert violations(first, schema("/api/transfers", 200)) == []
+        assert ([one["transfer"] for one in first["transfers"]], first["next"]) == ([2, 3], "3")
+        last = (await client.ask(f"/api/transfers?after={first['next']}")).json
+        assert violations(last, schema("/api/transfers", 200)) == []
+        assert ([one["transfer"] for one in last["transfers"]], last["next"]) == ([10], None)
+        lines = (await client.ask("/api/lines")).json
+        assert violations(lines, schema("/api/lines", 200)) == []
 
 
 async def test_history_is_answered_as_described(tmp_path: Path) -> None:

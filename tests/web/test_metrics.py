@@ -7,7 +7,7 @@ from gateway.northbound.payload import Failure, Problem, WriteOutcome
 from gateway.tags import WriteResult
 from gateway.web import metrics
 from tests.northbound.plant import mixer
-from tests.web.serving import PlainNorth
+from tests.web.serving import PlainNorth, calling, transfer
 
 
 def outcome(took: float, problem: Problem | None = None) -> WriteOutcome:
@@ -62,13 +62,26 @@ async def test_values_are_counted_by_quality() -> None:
 
 async def test_transfers_are_counted_by_outcome() -> None:
     ends = {"carried": 7, "not_done": 1, "refused": 0, "unclear": 2}
-    row = {"from": "a/x", "to": "b:D0..D9", "state": "unclear", "why": "no reply", **ends}
+    rows = {"from": "a/x", "to": "b:D0..D9", "last_carried": 3.5, **ends}
     north = PlainNorth()
-    north.changed["transfers/2"] = row
+    north.changed["transfers/2"] = transfer("unclear", **rows)
+    north.changed["transfers/10"] = transfer("starting")
     found = await scraped(north)
     place = ("a/x", "b:D0..D9")
     assert found["plc_gateway_transfer_works", *place, "2"] == 0
     writes = "plc_gateway_transfer_writes_total"
     assert found[writes, "a/x", "unclear", "b:D0..D9", "2"] == 2
     assert found[writes, "a/x", "carried", "b:D0..D9", "2"] == 7
+    last = "plc_gateway_transfer_last_carried_seconds"
+    assert [value for (name, *_), value in found.items() if name == last] == [3.5]
     assert "plc_gateway_transfer_works" not in {name for name, *_ in await scraped(PlainNorth())}
+
+
+async def test_calls_are_counted_by_result() -> None:
+    north = PlainNorth()
+    north.changed["lines/far"] = calling(state="connected", results={"BUSY": 2})
+    found = await scraped(north)
+    assert found["plc_gateway_line_call", "far"] == 1
+    ends = "plc_gateway_line_calls_total"
+    assert (found[ends, "far", "BUSY"], found[ends, "far", "complete"]) == (2, 0)
+    assert (ends, "hall", "complete") not in found  # it has no modem

@@ -9,7 +9,7 @@ const SHOWN = 200; // rows of devices
 const WINDOW = 10000; // ms of the wire
 const LONGEST_LIST = 200; // characters of an array that are shown
 
-const known = { devices: new Map(), lines: [], loads: new Map(), exchanges: [], tags: new Map() };
+const known = { devices: new Map(), transfers: new Map(), lines: [], loads: new Map(), exchanges: [], tags: new Map() };
 let token = "";
 let choice = readHash();
 let stream = null; // of the current choice
@@ -99,6 +99,7 @@ async function follow() {
   fastest = Infinity;
   known.exchanges = [];
   known.loads.clear();
+  known.transfers.clear(); // their first event has all
   const query = new URLSearchParams();
   for (const [name, value] of Object.entries(choice)) if (value) query.set(name, value);
   while (stream === mine) {
@@ -117,6 +118,7 @@ async function follow() {
     if (stream !== mine) return;
     valuesLive = false;
     known.devices.clear();
+    known.transfers.clear();
     known.loads.clear();
     setLive(false, why);
     await new Promise((done) => setTimeout(done, 1000));
@@ -180,9 +182,18 @@ function takeState(state) {
   }
   showAlarms(state.alarms);
   known.lines = state.lines;
-  for (const [name, device] of Object.entries(state.devices)) known.devices.set(name, device);
   showLines();
-  if (Object.keys(state.devices).length) showDevices();
+  showCalls(state.calls);
+  if (merge(known.transfers, state.transfers) || !known.transfers.size) showTransfers();
+  if (merge(known.devices, state.devices)) showDevices();
+}
+
+function merge(into, changes) {
+  for (const [name, one] of Object.entries(changes)) {
+    if (one === null) into.delete(name);
+    else into.set(name, one);
+  }
+  return Object.keys(changes).length > 0;
 }
 
 // -- alarms --
@@ -301,6 +312,51 @@ function lineRow() {
   return row;
 }
 
+// -- calls and transfers --
+
+function rowTitle(text) {
+  const title = element("th", text);
+  title.scope = "row";
+  return title;
+}
+
+function showCalls(calls) {
+  byId("calls-section").hidden = !calls.length;
+  byId("calls").replaceChildren(...calls.map(([line, state, since, next, result, made, failed]) => {
+    const row = element("tr");
+    row.append(
+      rowTitle(line), element("td", since === null ? state : `${state} for ${span(since)}`, state),
+      element("td", next === null ? "" : `in ${span(next)}`), element("td", result),
+      element("td", String(made), "number"), element("td", String(failed), "number"),
+    );
+    return row;
+  }));
+}
+
+const STATES = { unclear: 0, refused: 1, stale: 2, waiting: 3, starting: 4, carried: 5 };
+const STYLES = { stale: "old" }; // `stale` is the class of a page that is not live
+
+function showTransfers() {
+  const all = [...known.transfers].sort(([a, one], [b, other]) => STATES[one[2]] - STATES[other[2]] || a - b);
+  byId("transfers-section").hidden = !all.length;
+  byId("transfers").replaceChildren(...all.slice(0, SHOWN).map(([number, [from, to, state, code, time, why]]) => {
+    const row = element("tr");
+    const at = Date.parse(time);
+    const carried = element("td", time ? clock(at) : "never");
+    if (time) carried.dataset.time = at;
+    const reason = element("td", why);
+    if (code) reason.append(element("span", why ? ` (${code})` : code, "code"));
+    row.append(
+      rowTitle(`${number}: ${from} to ${to}`), element("td", state, STYLES[state] ?? state),
+      carried, reason,
+    );
+    return row;
+  }));
+  const working = all.filter(([, one]) => one[2] === "carried").length;
+  put("transfer-count", `${working} of ${all.length} carry their value${all.length > SHOWN ? `; ${SHOWN} are shown` : ""}`);
+  showAges();
+}
+
 const ORDER = { silent: 0, failing: 1, starting: 2, up: 3 };
 
 function showDevices() {
@@ -405,6 +461,10 @@ function showAges() {
       const text = span(Math.max(0, (now - tag.last[3]) / 1000));
       if (tag.cells[3].textContent !== text) tag.cells[3].textContent = text;
     }
+  }
+  for (const cell of document.querySelectorAll("#transfers [data-time]")) {
+    const text = `${span(Math.max(0, (now - cell.dataset.time) / 1000))} ago`;
+    if (cell.textContent !== text) cell.textContent = text;
   }
 }
 
