@@ -24,6 +24,7 @@ from tests.sim.judge import Judge
 from tests.sim.obeyed import all_times, counts, most_requests, times
 
 SPOKEN = 1.0  # seconds: the longest write, with its resync, and the read before it
+LOOP = 0.01  # seconds: the moments of two writes are seen a little later
 LOOK = 20.0  # seconds between two looks at the states
 _DONE = WriteResult.__name__
 _NO_CHANCE = random.Random(0)  # for clients that draw nothing
@@ -141,6 +142,8 @@ class Carrier:
         elif rule.every is None and row.at >= 0.0 and not row.instead:
             if row.sure and value == row.written:
                 judge.broke(f"{name} carried {value!r} twice")
+            elif judge.now - row.at < row.source.every - LOOP:
+                judge.broke(f"{name} carried two values in {judge.now - row.at:.3f} s")
             elif row.changed_at < row.at:
                 judge.broke(f"{name} carried {value!r} again, but the source did not change")
 
