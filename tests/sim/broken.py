@@ -2711,6 +2711,8 @@ MUTANTS = (
         "            return None\n",
         "        if source.value is None:\n            return None\n",
         "tests/transfers/test_row.py",
+        (910_409,),
+        hours=0.5,
     ),
     Mutant(
         "a transfer repeats an unclear write",
