@@ -69,6 +69,7 @@ class TransferRows:
             offset=own.offset,
             stale=own.stale or max(SHORTEST_STALE, INTERVALS * source.every),
             substitute=own.if_stale,
+            read_every=finder.read_every(source),
         )
 
     def _check_repeats(self, rules: Sequence[TransferRule]) -> None:
@@ -159,6 +160,18 @@ class _Finder:
             arrives = isinstance(driver, Unsolicited) and driver.unsolicited_only(one.span)
             if not (arrives or driver.areas[one.span.area].readable):
                 yield "from", f"{one.key} can only be written, so there is no value to carry"
+
+    def read_every(self, tag: Tag) -> float:
+        """Returns the shortest interval of the polls that read it; 0: it arrives by itself."""
+        polled = [one.every for one in leaves(tag) if self._is_polled(one)]
+        return min(polled, default=0.0)
+
+    def _is_polled(self, tag: Tag) -> bool:
+        device = self.devices.get(tag.device)
+        if device is None or device.served is not None or device.listen_only:
+            return False
+        driver = device.driver
+        return not (isinstance(driver, Unsolicited) and driver.unsolicited_only(tag.span))
 
     def unwritable(self, tag: Tag) -> Iterator[tuple[str, str]]:
         if tag.formula is not None:

@@ -30,6 +30,7 @@ class TransferRule:
     offset: float = 0.0
     stale: float = 5.0  # an older read is not carried
     substitute: Value | None = None  # written once when the source is too old; None: nothing is
+    read_every: float = 0.0  # the interval of the source; 0: no poll reads it
 
     @property
     def when(self) -> str:

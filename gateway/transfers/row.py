@@ -1,7 +1,9 @@
 """One transfer: which write is due, what it carries, and its state. No I/O, no clock.
 
 A row carries only a good value whose last read is younger than `stale`. It carries each value
-once: a write that may have been done is not repeated. At most one write is under way.
+once: a write that may have been done is not repeated. At most one write is under way. A write lets
+the block of its target be read at once, which may hold the source: so the next change waits for the
+interval of the source.
 """
 
 import math
@@ -78,6 +80,7 @@ class Row:
         self._good_at = now  # the last good read of the source; at the start: now
         self._substituted = False  # since the source became too old
         self._due = now
+        self._next_change = now  # before that no change is carried
         self._not_before, self._pause = now, FIRST_PAUSE
 
     def changed(self, value: Value) -> None:
@@ -87,6 +90,8 @@ class Row:
 
     def target_online(self, now: float) -> None:
         """Tries a write again at once: the target replies."""
+        if now < self._not_before:
+            self._next_change = now
         self._not_before, self._pause = now, FIRST_PAUSE
 
     def next(self, source: Reading, now: float) -> Carry | None:
@@ -126,10 +131,13 @@ class Row:
             if self._due <= now:  # late: one write, not one for each interval
                 self._due = now + every
             return True
-        if not self._wanted:
+        if not self._wanted or now < self._next_change:
             return False
         self._wanted = False
-        return self._held is None or value != self._held
+        if self._held is not None and value == self._held:
+            return False
+        self._next_change = now + self.rule.read_every
+        return True
 
     def _substitute(self, now: float) -> Carry | None:
         value = self.rule.substitute
@@ -156,7 +164,7 @@ class Row:
 
     def _again(self, carry: Carry, now: float) -> None:
         """The write was certainly not done: it is due again after a pause, if it still holds."""
-        self._not_before = now + self._pause
+        self._not_before = self._next_change = now + self._pause
         self._pause = min(2 * self._pause, LONGEST_PAUSE)
         if carry.substitute:
             self._substituted = False
@@ -170,6 +178,8 @@ class Row:
         soon = now + min(LOOK_EVERY, self.rule.stale / _LOOKS)
         looks = self._wanted or self.rule.substitute is not None
         if self.rule.every is None:
+            if self._wanted and now < self._next_change:
+                return min(soon, self._next_change)
             return soon if looks else math.inf
         due = self._due if self._due > now else soon
         return min(due, soon) if looks else due

@@ -71,6 +71,7 @@ class Bus:
     heard: bytes = b""  # since the gateway sent last
     request: bytes = b""  # as it reached the stations
     writes: Counter[int] = field(default_factory=Counter)  # write frames by station number
+    carried: Counter[int] = field(default_factory=Counter)  # at most so many of transfers, or twice
     commands: Counter[int] = field(default_factory=Counter)
     misled: set[str] = field(default_factory=set)  # that accepted a damaged monitor list
     questions: deque[tuple[float, Asked]] = field(default_factory=lambda: deque(maxlen=64))

@@ -2,7 +2,6 @@
 
 import asyncio
 import random
-import re
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -14,13 +13,22 @@ from gateway.protocols.computer_link.replies import model_name
 from gateway.protocols.frames.driver import LISTENED
 from gateway.tags import Quality, Tag, WriteResult
 from gateway.values import Kind, Value
+from tests.sim.arrays import shown, value_of
 from tests.sim.bus import Bus, summed
 from tests.sim.hostile import DELAYING
 from tests.sim.judge import Judge
+from tests.sim.obeyed import (
+    CLAIM,
+    claimed,
+    counts,
+    most_requests,
+    times,
+    unsent_arrived,
+    written_by_clients,
+)
 from tests.sim.stations import Troubled
 from tests.sim.wire import SimWire
 
-CLAIM = " is in the PLC"
 SOON = 1.0  # seconds within which an unacknowledged request arrives, if ever
 NOT_SENT = (Busy, Offline, LineDown)
 _QUIET = ("deaf", "reboot", "vanish", "flicker", "hung", *DELAYING)
@@ -51,6 +59,10 @@ class Client:
     def number(self) -> int:
         return self.bus.number_of(self.device)
 
+    def sent(self) -> int:
+        """Counts the write frames to the device; transfers may have sent more."""
+        return self.bus.writes[self.number] - self.bus.carried[self.number]
+
     def blind(self, what: str) -> None:
         count = what if summed(self.device) else f"{what} without a sum"
         self.judge.story.counts[count] += 1
@@ -72,7 +84,7 @@ class Client:
     # Writes
 
     async def write_now_and_then(self) -> None:
-        tags = [tag for tag in self.device.tags if tag.write is not None]
+        tags = written_by_clients(self.device.tags)
         number = self.chance.randrange(1000)
         pause = self.chance.choice((2.0, 10.0, 30.0, 120.0))
         while tags:
@@ -82,10 +94,10 @@ class Client:
             writes = []
             for tag in chosen:
                 number += 1
-                if tag.layout.type.kind is Kind.BOOL:
-                    value: Value = self.chance.random() < 0.5
-                elif count := tag.layout.type.count:
-                    value = tuple((number * 40_503 + n) % (1 << 16) for n in range(count))
+                if tag.layout.type.count:
+                    value: Value = value_of(tag, number)
+                elif tag.layout.type.kind is Kind.BOOL:
+                    value = self.chance.random() < 0.5
                 else:
                     bits = 32 if tag.span.size == 2 else 16
                     value = (number * 40_503) % (1 << bits)
@@ -97,14 +109,14 @@ class Client:
 
     async def _write(self, writes: list[tuple[Tag, Value]]) -> None:
         """Writes several tags at once: in one frame, or one by one after a refusal."""
-        frames, since = self.bus.writes[self.number], self.judge.now
-        most = sum(2 if tag.write and tag.write.repeat else 1 for tag, _ in writes)
+        frames, since = self.sent(), self.judge.now
+        most = sum(most_requests(tag) for tag, _ in writes)
         most += len(writes) > 1
         if self.device.broadcast:
             await asyncio.gather(*(self._tell_all(tag, value) for tag, value in writes))
         else:
             await asyncio.gather(*(self._write_one(t, v, len(writes) > 1) for t, v in writes))
-        sent = self.bus.writes[self.number] - frames
+        sent = max(0, self.sent() - frames)
         if sent > most:
             self.judge.broke(f"{self.device.name}: {len(writes)} writes were sent {sent} times")
         if self.bus.hurt_at < since:
@@ -112,14 +124,14 @@ class Client:
 
     async def _write_one(self, tag: Tag, value: Value, beside_others: bool) -> None:
         judge, bus, station = self.judge, self.bus, self.judge.stations[tag.device]
-        frames, since = bus.writes[self.number], judge.now
-        known = times(station, tag)
-        held = tag.decode(station.holds(tag))
+        frames, since = self.sent(), judge.now
+        known = counts(station, tag)
+        held = shown(tag, station.holds(tag))
         outcome = await self._outcome(tag, value)
-        sent = bus.writes[self.number] - frames
+        sent = max(0, self.sent() - frames)
         bus.note("outcome", tag.key, value, type(outcome).__name__, sent)
         judge.story.counts[f"write {type(outcome).__name__}"] += 1
-        obeyed = times(station, tag) - known
+        obeyed = times(station, tag, known)
         asked = Asked(since, sent, beside_others, held)
         await self.judge_end(tag, value, outcome, asked, obeyed)
 
@@ -133,7 +145,7 @@ class Client:
     ) -> None:
         judge, bus, station = self.judge, self.bus, self.judge.stations[tag.device]
         since, sent, beside_others, held = asked
-        now = tag.decode(station.holds(tag))
+        now = shown(tag, station.holds(tag))
         holds = now == value
         most = 2 if tag.write is not None and tag.write.repeat else 1
         match outcome:
@@ -147,8 +159,9 @@ class Client:
             case Busy() | Offline() | LineDown():
                 true = obeyed == 0 and (sent == 0 or beside_others)
             case _:
-                true = _claimed(str(outcome), value) == _claimed(str(outcome), now)
+                true = claimed(str(outcome), value) == claimed(str(outcome), now)
                 judge.story.counts["parts of long writes"] += CLAIM in str(outcome)
+                true = true and not unsent_arrived(station, tag, str(outcome), since)
         true = true and obeyed <= most
         if true:
             return
@@ -181,14 +194,14 @@ class Client:
         if self.deaf(tag.device, since) or self.bus.hurt_at >= since:
             return
         self.judge.story.counts["told writes checked"] += 1
-        if tag.decode(station.holds(tag)) != value:
+        if shown(tag, station.holds(tag)) != value:
             self.judge.broke(f"{tag.key}: {value!r} was told, and is not there")
 
     async def _tell_all(self, tag: Tag, value: Value) -> None:
         judge, bus = self.judge, self.bus
-        frames, since = bus.writes[self.number], judge.now
+        frames, since = self.sent(), judge.now
         outcome = await self._outcome(tag, value)
-        sent = bus.writes[self.number] - frames
+        sent = max(0, self.sent() - frames)
         bus.note("told all", tag.key, value, type(outcome).__name__, sent)
         judge.story.counts[f"broadcast {type(outcome).__name__}"] += 1
         if isinstance(outcome, WriteResult) and outcome.acknowledged:
@@ -320,23 +333,6 @@ def _alike(one: Device, other: Device) -> bool:
         case ComputerLink() as a, ComputerLink() as b:
             return (a.frame_format, a.sum_check) == (b.frame_format, b.sum_check)
     return False
-
-
-def _claimed(said: str, value: Value | None) -> Value | None:
-    """Returns the elements that an unclear end says are in the PLC."""
-    claim = re.search(rf"elements? (\d+)(?: to (\d+))?\){CLAIM}", said)
-    if claim is None or not isinstance(value, tuple):
-        return None
-    return value[int(claim[1]) : int(claim[2] or claim[1]) + 1]
-
-
-def times(station: Troubled, tag: Tag) -> int:
-    """Returns the number of times of writes to the tag: some PLCs write it byte by byte."""
-    return len(all_times(station, tag))
-
-
-def all_times(station: Troubled, tag: Tag) -> set[float]:
-    return {at for at, _ in station.written.get((tag.span.area, tag.span.start), ())}
 
 
 def _switched(station: Troubled) -> int:

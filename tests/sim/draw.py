@@ -6,10 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from tests.sim.arrays import add_arrays
 from tests.sim.episodes import Episode, disappearances, line_episodes
 from tests.sim.hostile import bridges, hostile_episodes, hostile_manners
 from tests.sim.manners import Manners
 from tests.sim.more import add_neighbours, add_to, net_line, raw_line, rule
+from tests.sim.transfer_rows import add_transfers
 
 PROTOCOLS = ("vigor", "computer-link", "modbus-rtu", "modbus-ascii")
 # How often tags are read: `busy` fills the wires, `lean` leaves time for many hours.
@@ -67,6 +69,8 @@ def draw(seed: int, seconds: float, pace: str = "busy") -> Drawn:
             zeros[name] = more.random() < 0.5
             episodes += line_episodes(name, lines[name], more, seconds, haste, pace)
     add_neighbours(lines, missing, seed, pace)
+    add_arrays(lines, seed)
+    rows = add_transfers(lines, seed)
     if pace in ("busy", "lean", "storm"):
         for name, line in lines.items():
             for device, settings in line["devices"].items():
@@ -83,7 +87,7 @@ def draw(seed: int, seconds: float, pace: str = "busy") -> Drawn:
         "gateway": {"name": "demo"},
         "defaults": {"publish": chance.choice(("always", "always", "change"))},
         "lines": lines,
-    }
+    } | ({"transfers": rows} if rows else {})
     manners, between = hostile_manners(lines, seed, pace), bridges(lines, seed, pace)
     in_order = tuple(sorted(episodes, key=_order))
     return Drawn(document, missing, in_order, tuple(jumps), chunks, zeros, manners, between)

@@ -153,6 +153,9 @@ class Expectations:
         sample = judge.gateway.mirror[tag]
         if (sample.quality is Quality.GOOD) is not station.lacks(tag):
             return
+        behind = _behind(self.judge.buses[tag.device]) > judge.now - LONGEST_PAUSE
+        if not station.lacks(tag) and (behind or self._flaps(tag)):
+            return
         if not station.lacks(tag) and self._passing(tag, judge.began + episode.end):
             return
         if sample.reason is Reason.OVERDUE and self.times(self.judge.buses[tag.device].line)[1] > 1:
@@ -161,6 +164,11 @@ class Expectations:
             f"{tag.key} is {sample.quality.value} ({sample.reason}: {sample.detail}) "
             f"{limit:.0f} s after {episode.kind} of {episode.device or episode.line} ended"
         )
+
+    def _flaps(self, tag: Tag) -> bool:
+        """Returns True for a Vigor station that may be silent to resyncs: they read M0 too."""
+        station = self.judge.stations[tag.device]
+        return station.protocol == "vigor" and station.manners.unknown == SILENT
 
     def _passing(self, tag: Tag, since: float) -> bool:
         """Unsolicited frames collide with replies: some are lost and come again.
@@ -243,8 +251,7 @@ class Expectations:
         if not bus.line.engine.devices:
             return
         longest, load = self.times(bus.line)
-        # A server that stays behind delays every reply by more than a short reply_timeout.
-        behind = bus.wire.behind if isinstance(bus.wire, SimWire) else -math.inf
+        behind = _behind(bus)
         for device in bus.line.engine.devices:
             for tag in device.tags:
                 station = self.judge.stations.get(device.name)
@@ -278,8 +285,8 @@ class Expectations:
             # Without a header a frame counts after 50 ms of silence, which a busy line rarely has.
             patience += 180 * every
         if station.manners.unknown == SILENT:  # its blocks are halved by time-outs
-            if device.driver.protocol == "vigor":  # every second resync reads M0, which it lacks
-                return math.inf
+            if device.driver.protocol == "vigor":
+                return math.inf  # it flaps
             patience *= 3
         return patience
 
@@ -300,6 +307,8 @@ class Expectations:
             return
         judge = self.judge
         for bus in self.lines.values():
+            if _behind(bus) > judge.now - LONGEST_PAUSE:
+                continue
             for device in bus.line.engine.devices:
                 well = device.state is State.ONLINE and judge.online.get(device.name)
                 if not well and not device.broadcast and not bus.collides:
@@ -315,6 +324,11 @@ class Expectations:
                     lacks = judge.stations[device.name].lacks(tag)
                     if (sample.quality is Quality.GOOD) is lacks:
                         judge.broke(f"{tag.key} at the end: {sample}")
+
+
+def _behind(bus: Bus) -> float:
+    """When a server was behind: it delays every reply by more than a short reply_timeout."""
+    return bus.wire.behind if isinstance(bus.wire, SimWire) else -math.inf
 
 
 def _disturbs(bus: Bus, episode: Episode) -> bool:

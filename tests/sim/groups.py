@@ -3,35 +3,35 @@
 import random
 from collections.abc import Sequence
 
-from gateway.engine.device import Device
 from gateway.errors import GatewayError, NotSent
 from gateway.tags import Tag, WriteResult
 from gateway.values import Kind, Value
-from tests.sim.clients import NOT_SENT, Asked, Client, all_times, times
+from tests.sim.arrays import shown, value_of
+from tests.sim.clients import NOT_SENT, Asked, Client
 from tests.sim.hostile import DELAYING
-from tests.sim.more import MOST_WORDS
+from tests.sim.obeyed import all_times, counts, most_requests, times, written_by_clients
 
 
 async def write_group(chance: random.Random, client: Client, few: list[tuple[Tag, Value]]) -> None:
     """Writes tags in their order. After the first that is not done none may arrive."""
     device, judge, bus = client.device, client.judge, client.bus
-    tags = [tag for tag in device.tags if tag.write is not None]
+    tags = written_by_clients(device.tags)
     writes, station = _larger(few, tags, chance), judge.stations[device.name]
-    frames, since = bus.writes[client.number], judge.now
-    known = [times(station, tag) for tag, _ in writes]
-    held = [tag.decode(station.holds(tag)) for tag, _ in writes]
+    frames, since = client.sent(), judge.now
+    known = [counts(station, tag) for tag, _ in writes]
+    held = [shown(tag, station.holds(tag)) for tag, _ in writes]
     ends: Sequence[WriteResult | GatewayError]
     try:
         ends = await judge.gateway.write_group(writes, 5.0, 60.0)
     except GatewayError as error:
         ends = [error] * len(writes)
-    sent = bus.writes[client.number] - frames
+    sent = max(0, client.sent() - frames)
     bus.note("group", device.name, [type(end).__name__ for end in ends], sent)
     judge.story.counts["groups"] += 1
     judge.story.counts["groups done"] += all(isinstance(end, WriteResult) for end in ends)
     judge.story.counts["tags of groups"] += len(writes)
     judge.story.counts["writes of groups"] += sent
-    most = sum(_requests(device, tag) for tag, _ in writes)
+    most = sum(most_requests(tag) for tag, _ in writes)
     if sent > most + len(writes) // 2:
         judge.broke(f"{device.name}: {len(writes)} tags were sent {sent} times")
     stopped = ""  # the first tag that was not sent for another
@@ -44,7 +44,7 @@ async def write_group(chance: random.Random, client: Client, few: list[tuple[Tag
         words = [other.span for other, _ in writes]
         if words.count(tag.span) > 1:
             continue  # bits of one word: the PLC gets them together
-        obeyed = times(station, tag) - before
+        obeyed = times(station, tag, before)
         await client.judge_end(tag, value, end, Asked(since, sent, True, was), obeyed)
         if obeyed and bus.hurt_at < since and not client.deaf(tag.device, since, DELAYING):
             at = min(at for at in all_times(station, tag) if at >= since)
@@ -64,14 +64,9 @@ def _larger(
 
 
 def _value(tag: Tag, chance: random.Random) -> Value:
+    if tag.layout.type.count:
+        numbers = [chance.randrange(1 << 16) for _ in range(tag.span.size)]
+        return value_of(tag, numbers[0])
     if tag.layout.type.kind is Kind.BOOL:
         return chance.random() < 0.5
-    if tag.layout.type.count:
-        return tuple(chance.randrange(1 << 16) for _ in range(tag.span.size))
     return chance.randrange(1 << 16 * tag.span.size)
-
-
-def _requests(device: Device, tag: Tag) -> int:
-    """Returns the most requests that write the tag alone."""
-    one = 1 if device.driver.write_cost(tag.span) else -(-tag.span.size // MOST_WORDS)
-    return 2 * one if tag.write is not None and tag.write.repeat else one

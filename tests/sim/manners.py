@@ -97,8 +97,10 @@ def _bytewise(tag: Tag) -> Span:
     area, start, size = tag.span
     if tag.unit_kind is not Unit.BIT:
         return tag.span
-    first = start // 16 * 16
-    return Span(area, first, (start + size + 15) // 16 * 16 - first)
+    first, last = start // 16 * 16, start + size - 1
+    if tag.layout.type.count:
+        last = last // 8 * 8 + 15  # a word of bits can begin in the middle of another one
+    return Span(area, first, (last + 16) // 16 * 16 - first)
 
 
 def is_unknown(inner: Station, reply: bytes) -> bool:

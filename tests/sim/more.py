@@ -6,6 +6,7 @@ It uses its own `random.Random`, so the PLCs of a seed stay as they are.
 import random
 from typing import Any
 
+LATER = 900_000  # seeds from here on have more; those before keep the plants they had
 MOST_WORDS = 3  # that some devices take in one request
 SEPARATE = "<SOH>"  # no other protocol of ours begins with it
 

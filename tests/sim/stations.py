@@ -16,11 +16,11 @@ from gateway.simulator.plant import station_for
 from gateway.stations.station import Memory, Station
 from gateway.tags import Tag
 from gateway.values import Value
+from tests.sim.arrays import BLINK, Clocks, shown
 from tests.sim.gadgets import Gadget, wrapping_of
 from tests.sim.manners import SILENT, Holes, Manners, is_unknown, outside, refusal
 from tests.sim.requests import shape_of
 
-BLINK = 4096  # ms between two changes of a moving bit
 SLACK = 2  # ms: moments are rounded to milliseconds on both sides
 
 
@@ -213,9 +213,11 @@ class Troubled:
         area, start, _ = tag.span
         if self.lacked(tag, since, until):
             return False
-        if tag.write is not None:
+        if tag.write is not None or (area, start) not in self.computed:
             return self._was_written(tag, value, since, until)
         first, last = milliseconds(since) - SLACK, milliseconds(until) + SLACK
+        if tag.layout.type.count:
+            return clocks_of(self, tag).had(value, first, last)
         own = offset(self.number, area, start)
         if tag.unit_kind is Unit.BIT:
             seen = {(ms + own) // BLINK & 1 for ms in (first, last)}
@@ -252,7 +254,7 @@ class Troubled:
                 next((unit for at, unit in reversed(history) if at <= moment), 0)
                 for history in histories
             ]
-            if tag.decode(units) == value:
+            if shown(tag, units) == value:
                 return True
         return False
 
@@ -264,6 +266,14 @@ def station_of(driver: AnyDriver, device: str) -> Station:
     return station_for(driver, ())
 
 
+def clocks_of(station: Troubled, tag: Tag) -> Clocks:
+    """Returns the clocks of an array: each element has that of its address."""
+    area, start, size = tag.span
+    step = size // tag.layout.type.count
+    own = tuple(offset(station.number, area, start + n) for n in range(0, size, step))
+    return Clocks(tag, own, station.coarse)
+
+
 def set_going(
     station: Troubled, tags: Sequence[Tag], areas: Iterable[str] = (), others: Sequence[Tag] = ()
 ) -> None:
@@ -272,6 +282,7 @@ def set_going(
     `areas`: all of the station; `others`: tags of broadcasts, which it has too.
     """
     memory = station.inner.memory
+    written = {place for tag in tags if tag.write is not None for place in _places(tag)}
     for tag in tags:
         area, start, size = tag.span
         if not memory.holds(area, start, size):
@@ -279,9 +290,14 @@ def set_going(
         if tag.write is not None:
             memory.write(area, start, [0] * size)
             continue
+        if not written.isdisjoint(_places(tag)):
+            continue  # one element of an array that is written
+        clocks = clocks_of(station, tag) if tag.layout.type.count else None
         for part in range(size):
             kind = tag.unit_kind
             motion = moving(station.number, area, start, kind, part, station.coarse)
+            if clocks is not None:
+                motion = clocks.unit(part)
             memory.animate(area, start + part, motion)
             station.computed.add((area, start + part))
     station.outside = outside(station.manners.has, [*tags, *others], areas)

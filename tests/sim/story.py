@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 
 # Words of a report, and the rule of docs/proof.md that it breaks.
 _RULES = {
+    "transfer ": "transfer",
     "which was not in the PLC": "wrong value",
     "which was not said": "wrong value",
     "is not fresh": "wrong value",

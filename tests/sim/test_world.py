@@ -16,6 +16,7 @@ from tests.sim.world import run
 ROOT = Path(__file__).parents[2]
 LEAN, BUSY, HOSTILE = range(6), range(100, 103), (100_000, 100_001)
 GROUPS = (700_102,)
+LATER = 910_300  # with arrays and transfers
 
 
 def test_the_seeds_contain_every_protocol_setting_and_fault() -> None:
@@ -61,6 +62,12 @@ def test_groups_of_writes_break_no_rule(seed: int) -> None:
     story = run(seed, 0.03, "groups")
     assert not story.broken, "\n".join([story.replay(), *story.broken])
     assert story.counts["groups done"] < story.counts["groups"]  # some had to stop
+
+
+def test_arrays_and_transfers_break_no_rule() -> None:
+    story = run(LATER, 0.03, "storm")
+    assert not story.broken, "\n".join([story.replay(), *story.broken])
+    assert story.counts["carried WriteResult"] > 20
 
 
 def test_the_runs_of_a_seed_are_equal_byte_for_byte() -> None:

@@ -30,6 +30,7 @@ from gateway.transport import Receiver, TcpAddress
 from tests.sim.bus import Bus
 from tests.sim.clients import Client
 from tests.sim.draw import Drawn, draw
+from tests.sim.episodes import CALM
 from tests.sim.expect import Expectations
 from tests.sim.faults import Faults
 from tests.sim.freezer import Ear, Freezer
@@ -44,6 +45,7 @@ from tests.sim.requests import ALL, protocol_of, station_in
 from tests.sim.speaker import speak_now_and_then
 from tests.sim.stations import Troubled, set_going, station_of
 from tests.sim.story import Story
+from tests.sim.transfers import Carrier
 from tests.sim.virtual import run_virtual
 from tests.sim.wire import SimWire
 
@@ -79,6 +81,7 @@ class World:
         self._buses = {d.name: self._lines[s.name] for s in config.lines for d in s.devices}
         self.judge = Judge(gateway, self._buses, self.stations, story, self._began)
         most = 400 + 8 * len(self.judge.known) + 4 * len(drawn.episodes)
+        self.carrier = Carrier(self.judge, self._buses, self.devices)
         self.expect = Expectations(self.judge, self._lines, seconds, most)
         tags = {tag.key: tag for device in config.devices for tag in device.tags}
         self.faults = Faults(
@@ -282,6 +285,8 @@ class World:
         ]
         others = [*self._tasks(), self._start(self._reload_now_and_then())]
         others.append(asyncio.create_task(self.expect.look_around()))
+        others.append(asyncio.create_task(self.carrier.look_around()))
+        self.freezer.inside().run(self.carrier.transfers.start)
         suffering = asyncio.create_task(self.faults.suffer())
         done, _ = await asyncio.wait(
             lines + others, timeout=self.seconds, return_when=asyncio.FIRST_EXCEPTION
@@ -292,6 +297,9 @@ class World:
         if suffering.done() and suffering.exception() is not None:
             self.judge.broke(f"faults ended by themselves: {suffering.exception()!r}")
         self.expect.at_the_end()
+        if self.seconds > 2 * CALM:
+            self.carrier.at_the_end()
+        await self.carrier.transfers.stop()
         for task in (everything := [*lines, *others, suffering]):
             task.cancel()
         await asyncio.gather(*everything, return_exceptions=True)

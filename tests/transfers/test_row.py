@@ -58,6 +58,24 @@ def test_each_new_value_is_carried_once() -> None:
     assert one.counts[End.DONE] == 1
 
 
+def test_a_value_that_an_earlier_read_brought_waits_for_the_interval_of_the_source() -> None:
+    """The write reads the block of its target, and the source may be in it: no end otherwise."""
+    one = row(read_every=2.0)
+    assert carried(one, 1, 1.0) is not None
+    one.ended(DONE, 1.1)
+    assert carried(one, 2, 1.2) is None
+    assert one.wake(2.5) == 3.0
+    assert one.next(good(2), 3.0) == Carry(2, within=5.0)
+    one.ended(NOT_DONE, 3.1)
+    assert one.next(good(2), 3.6) == Carry(2, within=5.0)  # tried again, as ever
+    one.ended(NOT_DONE, 3.7)
+    one.target_online(3.8)
+    assert one.next(good(2), 3.8) == Carry(2, within=5.0)
+    one.ended(DONE, 3.9)
+    assert carried(one, 2, 5.0) is None  # as the target has it
+    assert carried(one, 3, 5.8) == Carry(3, within=5.0)
+
+
 def test_only_the_newest_value_waits_while_a_write_is_under_way() -> None:
     one = row()
     assert carried(one, 1, 1.0) is not None
