@@ -67,12 +67,12 @@ async def test_quality_goes_bad_within_two_intervals_and_good_again(plant: Plant
         await heard.next(lambda s: s.key == "plant/mixer/speed" and _good(s))
 
         plant.plc.tell("mute 1")
-        bad = await heard.next(lambda s: s.key == "plant/mixer/speed" and not _good(s))
+        bad = await heard.next(lambda s: s.key == "plant/mixer/speed" and _bad(s))
         assert bad.json["value"] is None
         assert bad.json["reason"] == "no-reply"
         last_good = [s for s in heard.samples if s.key == bad.key and _good(s)][-1]
         assert _time(bad) - _time(last_good) <= 2 * EVERY + SLACK
-        await heard.next(lambda s: s.key == "plant/mixer/fault" and not _good(s))
+        await heard.next(lambda s: s.key == "plant/mixer/fault" and _bad(s))
         gone = await alive.next(lambda t: t.kind == "DELETE")
         assert gone.key == f"{ALIVE}/mixer"
 
@@ -134,6 +134,11 @@ async def test_the_gateways_token_ends_with_the_gateway(plant: Plant) -> None:
 
 def _good(sample: Received) -> bool:
     return bool(sample.json["quality"] == "good")
+
+
+def _bad(sample: Received) -> bool:
+    """It is bad, and was good before."""
+    return sample.json["quality"] == "bad" and sample.json["reason"] != "starting"
 
 
 def _time(sample: Received) -> float:

@@ -103,6 +103,7 @@ async def test_a_peer_without_power_is_detected_and_comes_back(
             await heard.next(_is(5))
 
             # For a moment: TCP sends again what was lost, and what is late does no harm.
+            heard.forget()
             cable.pull()
             told = await heard.next(_bad)
             assert told.json["reason"] == "no-reply"
