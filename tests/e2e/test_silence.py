@@ -138,7 +138,7 @@ def _good(sample: Received) -> bool:
 
 def _bad(sample: Received) -> bool:
     """It is bad, and was good before."""
-    return sample.json["quality"] == "bad" and sample.json["reason"] != "starting"
+    return not _good(sample) and bool(sample.json["reason"] != "starting")
 
 
 def _time(sample: Received) -> float:
