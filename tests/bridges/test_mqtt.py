@@ -166,6 +166,7 @@ def test_a_command_is_written_once_and_has_its_outcome(mosquitto: Broker, tmp_pa
                 twice = '{"id": "a", "value": 8}'
                 assert '"id": "a", "outcome": "written"' in outcome(twice, "-q", "1")
                 assert '"id": "a", "outcome": "written"' in outcome(twice, "-q", "1")
+                gateway.until_written(2)
                 assert gateway.written == [("mixer/recipe", 7), ("mixer/recipe", 8)]
                 # What could be done twice, or would come late, is not sent.
                 assert '"bad-value"' in outcome("9", "-q", "1")
@@ -177,6 +178,7 @@ def test_a_command_is_written_once_and_has_its_outcome(mosquitto: Broker, tmp_pa
                 assert '"refused"' in outcome("7")
                 gateway.answer = "silent"
                 assert '"unclear"' in outcome("7")
+                gateway.until_written(4)
                 assert len(gateway.written) == 4
                 gateway.answer = "held"
                 client.publish("@set/mixer/recipe", '{"id": "b", "value": 8}', "-q", "1")
