@@ -5,7 +5,7 @@ import pytest
 from gateway.engine.device import Device
 from gateway.engine.health import State
 from gateway.engine.jobs import Idle, Poll, Probe, Resynced, Sent
-from gateway.engine.longer_reads import KNOWN_FOR, MOST_FAILED, MOST_WARY
+from gateway.engine.longer_reads import KNOWN_FOR, MOST_FAILED, MOST_WARY, LongerReads
 from gateway.engine.reply_shapes import (
     MARK_FIRST,
     MARK_LONGEST,
@@ -341,3 +341,13 @@ def test_a_device_that_is_silent_about_other_addresses_stays_online_with_no_retr
     assert "device offline" not in [event.event for event in rig.logged]
     assert longer == MOST_FAILED
     assert own > 30
+
+
+def test_a_refused_longer_read_leaves_those_on_the_other_side() -> None:
+    driver = ModbusRtu(station=1)
+    longer = LongerReads(driver, {"holding": (90, 110)}, BadAddresses(driver.cost))
+    span = Span("holding", 100, 1)
+    longer.refused(span, Span("holding", 100, 2), 0.0)
+    _, *others = [read for read, _ in longer.choices(span)]
+    assert others
+    assert all(read.start + read.size == 101 for read in others)
