@@ -13,6 +13,7 @@ from gateway.config.transfer_settings import TransferSection
 from gateway.config.validate import section
 from gateway.engine.device_settings import DeviceSettings
 from gateway.errors import BadValue
+from gateway.protocols.driver import AnyDriver
 from gateway.protocols.unsolicited import Unsolicited
 from gateway.tags import Tag
 from gateway.tags.transfer import TransferRule, leaves
@@ -157,8 +158,7 @@ class _Finder:
             if device is None or device.served is not None:
                 continue
             driver = device.driver
-            arrives = isinstance(driver, Unsolicited) and driver.unsolicited_only(one.span)
-            if not (arrives or driver.areas[one.span.area].readable):
+            if not (_arrives(driver, one) or driver.areas[one.span.area].readable):
                 yield "from", f"{one.key} can only be written, so there is no value to carry"
 
     def read_every(self, tag: Tag) -> float:
@@ -170,8 +170,7 @@ class _Finder:
         device = self.devices.get(tag.device)
         if device is None or device.served is not None or device.listen_only:
             return False
-        driver = device.driver
-        return not (isinstance(driver, Unsolicited) and driver.unsolicited_only(tag.span))
+        return not _arrives(device.driver, tag)
 
     def unwritable(self, tag: Tag) -> Iterator[tuple[str, str]]:
         if tag.formula is not None:
@@ -209,6 +208,11 @@ def _misfits(own: TransferSection, source: Tag, target: Tag) -> Iterator[tuple[s
 
 def _size(text: str, count: int) -> str:
     return f"{text} has {count} elements" if count else f"{text} has one value"
+
+
+def _arrives(driver: AnyDriver, tag: Tag) -> bool:
+    """Returns True if the device sends the value by itself: no poll reads it."""
+    return isinstance(driver, Unsolicited) and driver.unsolicited_only(tag.span)
 
 
 _Cell = tuple[str, str, int]  # device, area, number

@@ -56,6 +56,8 @@ class Conclusions:
         self.silence = LineSilence()
         self.shorter = shorter
         self.together = Together(effects)
+        # An earlier process may have left requests in a device server, until the wire was quiet.
+        self.inherits = False
         self._in_flight = in_flight
         self._results = results
         self._polls = polls
@@ -125,7 +127,7 @@ class Conclusions:
             ):  # an error reply counts too, but may belong to an older request
                 told_from = result.told_from if isinstance(result, Resynced) else 0
                 outstanding = self._results.outstanding_requests(device)
-                inherited = self._results.inherits and told_from < EVERY_REQUEST
+                inherited = self.inherits and told_from < EVERY_REQUEST
                 if not probe.again and (outstanding > told_from or inherited):
                     # A device server may pass on all of them, one after another.
                     quiet = device.longest_reply
@@ -133,7 +135,7 @@ class Conclusions:
                     self._in_flight.continuation = Settle(device, guard, quiet, probe)
                 else:
                     if probe.again:
-                        self._results.inherits = False
+                        self.inherits = False
                     self._results.answered(device, now, time, resynced=True)
             case Unclear():
                 self.unclear(probe, result, traffic, now, time)
@@ -175,7 +177,7 @@ class Conclusions:
         device, after = settle.device, settle.after
         if settle.error is None:
             if isinstance(result, Settled) and not result.quiet:
-                self._results.inherits = False  # it is another master that speaks
+                self.inherits = False  # it is another master that speaks
                 self.unclear(after, Garbled(NEVER_QUIET), Traffic(), now, time)
             elif isinstance(after, Probe):
                 again = Probe(device, after.outstanding, after.token + 1, again=True)

@@ -13,7 +13,6 @@ from gateway.engine.changes import Changes
 from gateway.engine.conclusions import Conclusions
 from gateway.engine.device import Device
 from gateway.engine.effects import Effect, Effects
-from gateway.engine.health import State
 from gateway.engine.jobs import (
     Idle,
     InFlight,
@@ -60,7 +59,7 @@ class Engine:
         self.name, self.wire = name, wire
         self._effects = Effects()
         self._staleness = Staleness(self.schedule, self._effects)
-        self._results = results = Results(name, self.schedule, self._staleness, self._effects)
+        results = Results(name, self.schedule, self._staleness, self._effects)
         self._polls = PollResults(self.schedule, results, self._effects)
         self._unsolicited: UnsolicitedFrames | Listening
         if listens(devices):
@@ -96,7 +95,7 @@ class Engine:
             raise AssertionError(f"{in_flight.job!r} is not concluded")
         silence = self._conclusions.silence
         may_reopen = silence.noted and not self.schedule.dials
-        if may_reopen and silence.due <= now and self._every_station_failed():
+        if may_reopen and silence.due <= now and silence.confirmed(self.schedule, self.devices):
             return silence.reopen(now)
         job: Transacted | Idle | None = None
         if self._unsolicited.speakers:
@@ -116,14 +115,6 @@ class Engine:
             in_flight.charged = job.device if isinstance(job, Probe) else None
         in_flight.job, in_flight.begun = job, now
         return job
-
-    def _every_station_failed(self) -> bool:
-        """Polls a station that replied last time, before the port is opened again."""
-        for device in self.devices:
-            if device.health.state is State.ONLINE and (polls := self.schedule.polls(device)):
-                self.schedule.expedite(polls[0])
-                return False
-        return True
 
     def alongside(self, poll: Poll, now: float) -> Sequence[Poll]:
         """Other due polls of a device that takes several requests at once.
@@ -301,7 +292,7 @@ class Engine:
 
     def inherits(self) -> None:
         """Notes that a device server may have kept requests of an earlier process."""
-        self._results.inherits = True
+        self._conclusions.inherits = True
 
     def opened(self, now: float) -> list[Effect]:
         """Starts all devices again, because the port was opened."""

@@ -1,6 +1,11 @@
 """Line silence: decides that a port through which no reply comes is opened again."""
 
+from collections.abc import Sequence
+
+from gateway.engine.device import Device
+from gateway.engine.health import State
 from gateway.engine.jobs import Reopen, Result, Sent, Settled
+from gateway.engine.schedule import Schedule
 from gateway.errors import (
     BadValue,
     DeviceError,
@@ -68,6 +73,14 @@ class LineSilence:
     def due(self) -> float:
         """The time to open the port again."""
         return self._begun + (self._limit or FIRST) if self._requests >= SEVERAL else NEVER
+
+    def confirmed(self, schedule: Schedule, devices: Sequence[Device]) -> bool:
+        """Returns True if every station failed. Otherwise has one polled that replied last time."""
+        for device in devices:
+            if device.health.state is State.ONLINE and (polls := schedule.polls(device)):
+                schedule.expedite(polls[0])
+                return False
+        return True
 
     def reopen(self, now: float) -> Reopen:
         """Returns the job that opens the port again, and doubles the time until the next."""

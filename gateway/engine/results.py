@@ -22,8 +22,6 @@ class Results:
         self._schedule = schedule
         self._staleness = staleness
         self._effects = effects
-        # An earlier process may have left requests in a device server, until the wire was quiet.
-        self.inherits = False
 
     def answered(self, device: Device, now: float, time: int, *, resynced: bool = False) -> None:
         """Notes a reply of the device, also an error reply. `resynced`: to a resync."""

@@ -87,7 +87,7 @@ class _Open:
             self.min = self.max = value
         elif value < self.min:  # type: ignore[operator]  # both are numbers
             self.min = value
-        elif value > self.max:  # type: ignore[operator]
+        elif value > self.max:  # type: ignore[operator]  # as above
             self.max = value
 
     def count(self, value: Value | None, reason: str | None) -> None:
@@ -107,7 +107,7 @@ class _Open:
         if not self.has_begun:
             self.enter(value)
         self.known += duration
-        # A running mean: a sum of large numbers would overflow.
+        # A running mean: a sum of large numbers would overflow. The value is a number here.
         if value.__class__ not in _WITHOUT_MEAN:
             self.mean += (value - self.mean) * (duration / self.known)  # type: ignore[operator]
 

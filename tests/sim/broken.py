@@ -630,8 +630,8 @@ MUTANTS = (
     Mutant(
         "a hung session is never reopened",
         "engine/engine.py",
-        "        if may_reopen and silence.due <= now and self._every_station_failed():\n",
-        "        if False:\n",
+        "and silence.due <= now and silence.confirmed(self.schedule, self.devices):\n",
+        "and False:\n",
         "tests/engine/test_line_silence.py tests/attacks/test_hung_session.py",
     ),
     Mutant(
@@ -643,7 +643,7 @@ MUTANTS = (
     ),
     Mutant(
         "a port is opened again beside a station that replies",
-        "engine/engine.py",
+        "engine/line_silence.py",
         "            if device.health.state is State.ONLINE and (polls",
         "            if False and (polls",
         "tests/engine/test_line_silence.py",
@@ -2850,14 +2850,14 @@ MUTANTS = (
     Mutant(
         "a reply to an earlier process counts at the start",
         "engine/conclusions.py",
-        "self._results.inherits and told_from < EVERY_REQUEST",
+        "self.inherits and told_from < EVERY_REQUEST",
         "False",
         "tests/engine/test_inherited.py",
     ),
     Mutant(
         "a second master keeps all devices offline at the start",
         "engine/conclusions.py",
-        "                self._results.inherits = False  # it is another master that speaks\n",
+        "                self.inherits = False  # it is another master that speaks\n",
         "",
         "tests/engine/test_inherited.py",
     ),
