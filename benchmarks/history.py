@@ -14,8 +14,8 @@ import time
 from pathlib import Path
 
 from benchmarks.northbound import memory
-from gateway.history import Historian
-from gateway.history.recent import MOST_RUNS
+from gateway.parts.history import Historian
+from gateway.parts.history.recent import MOST_RUNS
 from gateway.protocols.driver import Address, Span, Unit
 from gateway.tags import Sample, Tag, good
 from gateway.values import Layout, parse_type

@@ -24,11 +24,11 @@ import zenoh
 from benchmarks.history import tags
 from benchmarks.northbound import Device, Plant
 from gateway.config import ZenohConfig, ZenohMode
-from gateway.history import Historian
-from gateway.history.recent import MOST_RUNS
 from gateway.northbound.northbound import Northbound
-from gateway.northbound.session_settings import configure
-from gateway.service import THREAD_SWITCH
+from gateway.northbound.session.session_settings import configure
+from gateway.parts.history import Historian
+from gateway.parts.history.recent import MOST_RUNS
+from gateway.service.service import THREAD_SWITCH
 from gateway.tags import good
 from tests.zenoh_peer import free_endpoint
 

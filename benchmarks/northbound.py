@@ -34,16 +34,16 @@ from typing import Literal, NamedTuple
 import structlog
 import zenoh
 
-from gateway.alarms import Alarms
 from gateway.config import ZenohConfig, ZenohMode
 from gateway.engine.requests import CommandResult, Peeked
 from gateway.errors import GatewayError
-from gateway.line.duty import Duty
+from gateway.line.send_permit import Duty
 from gateway.line.wire_log import WireLog
 from gateway.northbound.northbound import Northbound
-from gateway.northbound.session_settings import configure
+from gateway.northbound.session.session_settings import configure
+from gateway.parts.alarms import Alarms
 from gateway.protocols.driver import Address, Span, Unit
-from gateway.service import GC_THRESHOLDS, THREAD_SWITCH
+from gateway.service.service import GC_THRESHOLDS, THREAD_SWITCH
 from gateway.tags import Sample, Tag, WriteResult, WriteRule, good
 from gateway.tags.mirror import Mirror
 from gateway.values import Layout, Value, parse_type

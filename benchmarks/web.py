@@ -22,13 +22,13 @@ from pathlib import Path
 import structlog
 
 from benchmarks.start import HERE, Sizes, rows, started
-from gateway.app import Gateway
 from gateway.config import Config, load
-from gateway.northbound import payload
-from gateway.northbound.audit import Counts
-from gateway.web.api import Api
-from gateway.web.events import WIRE_EVERY, Events, Loads, Page
-from gateway.web.sources import Documents, Sources
+from gateway.contract import payload
+from gateway.northbound.requests.audit import Counts
+from gateway.parts.web.api import Api
+from gateway.parts.web.events import WIRE_EVERY, Events, Loads, Page
+from gateway.parts.web.sources import Documents, Sources
+from gateway.plant.plant import Gateway
 from tests.e2e.processes import free_port
 from tests.sim.virtual import run_virtual
 from tests.web.browser import browser

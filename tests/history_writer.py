@@ -18,7 +18,7 @@ from typing import Any
 
 import structlog
 
-from gateway.history import Historian
+from gateway.parts.history import Historian
 from gateway.protocols.driver import Address, Span, Unit
 from gateway.tags import Sample, Tag, good
 from gateway.values import Layout, parse_type

@@ -10,13 +10,13 @@ from typing import Any
 
 import pytest
 
-from gateway.app import Gateway
 from gateway.config import ZenohMode, load
 from gateway.errors import BadValue, LineDown, Offline
-from gateway.line.on_demand import FRESH_WITHIN
+from gateway.parts.transfers.forecast import forecasts
+from gateway.plant.on_demand import FRESH_WITHIN
+from gateway.plant.plant import Gateway
 from gateway.stations.vigor import VigorStation
 from gateway.tags import Quality, Reason, Sample, Tag, good
-from gateway.transfers.forecast import forecasts
 from gateway.transport import Receiver
 from tests.e2e.processes import vigor_line, write_config
 from tests.sim.bench import WIRE, Bench, Unruly

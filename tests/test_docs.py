@@ -31,15 +31,15 @@ from gateway.config import (
 )
 from gateway.config.commands import TO_ALL, every_command
 from gateway.config.yaml_file import read_yaml
+from gateway.contract import payload
+from gateway.contract.keys import Keys
+from gateway.contract.meta import meta
+from gateway.contract.payload import Problem
 from gateway.engine.device_settings import DeviceSettings
-from gateway.history import Historian
-from gateway.line.duty import Duty
-from gateway.northbound import payload
-from gateway.northbound.keys import Keys
-from gateway.northbound.meta import meta
-from gateway.northbound.payload import Problem
-from gateway.northbound.secrets import exposures
-from gateway.northbound.standby import GroupSettings, Standby
+from gateway.line.send_permit import Duty
+from gateway.northbound.group.standby import GroupSettings, Standby
+from gateway.northbound.session.exposures import exposures
+from gateway.parts.history import Historian
 from gateway.protocols.registry import PROTOCOLS
 from gateway.tags import Reason, WriteResult, bad, good
 from tests.e2e.processes import ROOT, Program, plc_gateway, started, until

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from gateway import service
+from gateway.service import service
 from gateway.tags import good
 from tests.history.recorded import history
 from tests.sim.plant import make_tag

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from gateway.supervisor import Supervisor
+from gateway.service.supervisor import Supervisor
 
 
 @pytest.fixture

@@ -8,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gateway.errors import BadValue, ConfigError
-from gateway.numerals import Scalar
 from gateway.values import (
     Kind,
     Layout,
@@ -19,6 +18,7 @@ from gateway.values import (
     swapped,
     to_words,
 )
+from gateway.values.numerals import Scalar
 
 LOW, HIGH = Order.LOW_FIRST, Order.HIGH_FIRST
 INTEGERS = {

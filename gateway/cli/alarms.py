@@ -64,8 +64,8 @@ def alarms(
 
 def _known(path: Path) -> dict[str, None]:
     """Returns the names of all alarms of the file."""
-    from gateway.alarms.watched import LINE  # with all protocols, as `load`
     from gateway.config import load
+    from gateway.parts.alarms.watched import LINE  # with all protocols, as `load`
 
     config = load(path)
     tags = (tag.key for device in config.devices for tag in device.tags if tag.alarm is not None)

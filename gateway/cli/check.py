@@ -16,13 +16,13 @@ from gateway.cli.terminal import FAILED, ConfigPath, err, out
 from gateway.config import Config, expanded_text, load, state_folder
 from gateway.engine.forecast import LineForecast
 from gateway.engine.listening import why_not_learned
-from gateway.history.place import trouble
 from gateway.northbound.northbound import check as zenoh_warnings
+from gateway.parts.history.place import trouble
+from gateway.parts.transfers.forecast import TransferForecast, forecasts, transfer_forecasts
+from gateway.parts.web import exposure
 from gateway.planning.planner import describe
 from gateway.planning.wire_timing import NETWORK_BAUD, WireTiming
 from gateway.tags.tag import CounterRule
-from gateway.transfers.forecast import TransferForecast, forecasts, transfer_forecasts
-from gateway.web import exposure
 
 
 def check(

@@ -18,9 +18,9 @@ from gateway.engine.device import Device
 from gateway.engine.requests import WRITE_EXPIRY, CommandResult
 from gateway.engine.unsolicited import unsolicited_tags
 from gateway.errors import BadValue, GatewayError, LineDown
-from gateway.line import build
 from gateway.line.groups import ended
 from gateway.line.line import Line, SampleSink
+from gateway.plant import build
 from gateway.tags import Reason, Sample, Tag, WriteResult, bad
 from gateway.tags.mirror import Mirror
 from gateway.values import Value

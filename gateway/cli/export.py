@@ -14,8 +14,8 @@ from gateway.cli.client import matches, wanted_keys
 from gateway.cli.terminal import ConfigPath, TagNames
 from gateway.config import load
 from gateway.config.transfer_ranges import is_range
+from gateway.contract.meta import meta_fields
 from gateway.errors import ConfigError
-from gateway.northbound.meta import meta_fields
 from gateway.protocols.driver import Unit
 from gateway.tags import Tag
 from gateway.tags.tag import CounterRule

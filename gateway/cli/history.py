@@ -12,15 +12,16 @@ from gateway.cli.client.arguments import matches, wanted_keys
 from gateway.cli.history_files import Column, new_file, write_csv, writer_of
 from gateway.cli.terminal import ConfigPath, TagNames, err
 from gateway.config import Config, load
+from gateway.contract.buckets import Now
+from gateway.contract.question import Question, question
+from gateway.contract.timerange import TimeRange, time_range
 from gateway.errors import Damaged, GatewayError
-from gateway.history.course import Course, Now
-from gateway.history.offline import offline
-from gateway.history.question import Question, question
-from gateway.history.rows import has_value
-from gateway.history.search import Search
-from gateway.history.timerange import TimeRange, time_range
+from gateway.parts.history.course import Course
+from gateway.parts.history.offline import offline
+from gateway.parts.history.search import Search
 from gateway.tags import Quality, Reason, Sample, Tag
 from gateway.tags.recorded import RecordedQuery
+from gateway.tags.sample import has_value
 
 cli = typer.Typer(help="Recorded samples.", no_args_is_help=True)
 

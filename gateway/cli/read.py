@@ -9,8 +9,8 @@ from gateway.cli.client import connected, matches, tags_by_key, wanted_keys
 from gateway.cli.tables import is_good, print_rows, row_of
 from gateway.cli.terminal import FAILED, AsJson, ConfigPath, Direct, TagNames, Utc, err
 from gateway.config import load
+from gateway.contract.keys import max_age as parse_max_age
 from gateway.errors import GatewayError
-from gateway.northbound.keys import max_age as parse_max_age
 
 
 def read(

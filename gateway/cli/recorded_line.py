@@ -9,8 +9,8 @@ from gateway.config import LineConfig, built, load
 from gateway.config.validate import driver_settings
 from gateway.config.yaml_scalars import scalar
 from gateway.errors import ConfigError, GatewayError
-from gateway.line.recorded import of_units, stations_asked, timed
-from gateway.line.wire_file import LoggedPiece, LoggedValue, entries
+from gateway.parts.recording.recorded import of_units, stations_asked, timed
+from gateway.parts.recording.wire_file import LoggedPiece, LoggedValue, entries
 from gateway.protocols.driver import AnyDriver
 from gateway.protocols.listening import Listenable
 from gateway.protocols.registry import PROTOCOLS

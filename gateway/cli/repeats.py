@@ -13,7 +13,7 @@ from typing import Any
 
 import structlog
 
-from gateway.northbound.rate_limit import RateLimit
+from gateway.contract.rate_limit import RateLimit
 
 Entry = MutableMapping[str, Any]
 Key = tuple[str, ...]

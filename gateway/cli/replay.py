@@ -18,9 +18,9 @@ from gateway.cli.terminal import FAILED, printable
 from gateway.config import LineConfig
 from gateway.errors import ConfigError, GatewayError
 from gateway.line.exchanges import shown
-from gateway.line.recorded import timed
-from gateway.line.replay import Difference, Learned, Replay
-from gateway.line.wire_file import LoggedPiece, LoggedValue
+from gateway.parts.recording.recorded import timed
+from gateway.parts.recording.replay import Difference, Learned, Replay
+from gateway.parts.recording.wire_file import LoggedPiece, LoggedValue
 
 
 def replay(

@@ -7,8 +7,8 @@ from functools import partial
 from gateway.cli.simulate import stop_event, tcp_address
 from gateway.config import LineConfig
 from gateway.errors import GatewayError
-from gateway.line.recorded import courses, of_units
-from gateway.line.wire_file import LoggedPiece
+from gateway.parts.recording.recorded import courses, of_units
+from gateway.parts.recording.wire_file import LoggedPiece
 from gateway.protocols.listening import Listenable
 from gateway.simulator.recorded import Answered, Course, OtherStations, RecordedStation
 from gateway.simulator.serve import serve_on_pty, serve_on_tcp

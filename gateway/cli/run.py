@@ -14,13 +14,14 @@ from typing import Annotated
 import structlog
 import typer
 
-from gateway import __version__, service
+from gateway import __version__
 from gateway.cli.check import size
 from gateway.cli.logs import LogFormat, LogLevel, set_up
 from gateway.cli.progress import progress
 from gateway.cli.terminal import FAILED, USER_MISTAKE, ConfigPath, err
 from gateway.config import Config, load
 from gateway.errors import ConfigError, GatewayError
+from gateway.service import service
 from gateway.tags import Tag, WriteRule
 from gateway.transport.loop import new_event_loop
 from gateway.values import Kind

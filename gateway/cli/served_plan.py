@@ -9,7 +9,7 @@ from rich.text import Text
 from gateway.config import LineConfig
 from gateway.engine.device_settings import DeviceSettings
 from gateway.protocols.driver import Address, Span
-from gateway.serving.registers import Row, Served
+from gateway.stations.served.registers import Row, Served
 
 
 def served_plan(line: LineConfig) -> RenderableType:

@@ -14,7 +14,7 @@ from rich.text import Text
 from gateway.cli.client import reached
 from gateway.cli.repeated import repeated
 from gateway.cli.terminal import FAILED, AsJson, ConfigPath, err, out, printable
-from gateway.northbound.faults import Documents, below, faults, transfers, warnings
+from gateway.contract.faults import Documents, below, faults, transfers, warnings
 
 HOUR = "now(-1h)"
 _STYLES = {"up": "green", "open": "green", "silent": "red", "down": "red", "failing": "yellow"}

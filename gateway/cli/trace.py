@@ -16,7 +16,7 @@ from gateway.cli.terminal import AsJson, ConfigPath, err, printable
 from gateway.config import Config, LineConfig, load, parsers
 from gateway.config.messages import meant
 from gateway.errors import ConfigError
-from gateway.line.wire_file import event_lines
+from gateway.parts.recording.wire_file import event_lines
 
 LineName = Annotated[str, typer.Argument(metavar="LINE", help="A line of the file.")]
 _WIDTH = 40  # characters of the request

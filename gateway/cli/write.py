@@ -14,9 +14,9 @@ from gateway.cli.client import connected, parse_value, suggestion, tags_by_key
 from gateway.cli.tables import value_text
 from gateway.cli.terminal import FAILED, USER_MISTAKE, AsJson, ConfigPath, Direct, err, printable
 from gateway.config import Config, load
+from gateway.contract import payload
+from gateway.contract.payload import Problem
 from gateway.errors import BadValue, ConfigError, GatewayError
-from gateway.northbound import payload
-from gateway.northbound.payload import Problem
 from gateway.tags import Tag
 from gateway.values import Kind, Value
 

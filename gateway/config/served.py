@@ -13,8 +13,8 @@ from gateway.config.records import LineConfig
 from gateway.engine.device_settings import DeviceSettings
 from gateway.errors import ConfigError
 from gateway.protocols.driver import Address, AnyDriver, Area, Cost, Span, Timing, Traits
-from gateway.serving.registers import STALE_AFTER, Row, Served, cells_of
-from gateway.serving.registry import can_serve, common_settings, served_protocols
+from gateway.stations.served.registers import STALE_AFTER, Row, Served, cells_of
+from gateway.stations.served.registry import can_serve, common_settings, served_protocols
 from gateway.tags import Publish, Tag
 from gateway.transport.port import SimulatorAddress
 from gateway.values import Kind

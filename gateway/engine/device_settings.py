@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from gateway.protocols.driver import AnyDriver, Timing
-from gateway.serving.registers import Served
+from gateway.stations.served.registers import Served
 from gateway.tags import Tag
 
 

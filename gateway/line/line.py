@@ -25,8 +25,8 @@ from gateway.errors import CallEnded, GatewayError, LineDown
 from gateway.line.calling import CallPort, dialling, rules_of, serve_calls
 from gateway.line.changing import Changeable, WaitingChange
 from gateway.line.channel import NEVER, Channel, Expiry, channels
-from gateway.line.duty import Duty
 from gateway.line.perform import perform
+from gateway.line.send_permit import Duty
 from gateway.line.together import perform_together
 from gateway.line.transaction import Transaction
 from gateway.line.wire_log import WireLog

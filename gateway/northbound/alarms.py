@@ -7,16 +7,16 @@ from typing import Protocol
 
 import orjson
 
-from gateway.alarms import Alarms, Entry, Event, NothingToAcknowledge, State
+from gateway.contract import payload
+from gateway.contract.interfaces import History, Plant
+from gateway.contract.keys import Keys
+from gateway.contract.payload import Failure, Problem, WriteOutcome
+from gateway.contract.writers import NotAllowed, Repeated
 from gateway.errors import BadValue, GatewayError
-from gateway.northbound import payload
-from gateway.northbound.acceptance import Acceptance, Sender
-from gateway.northbound.audit import Audit
-from gateway.northbound.interfaces import History, Plant
-from gateway.northbound.keys import Keys
-from gateway.northbound.payload import Failure, Problem, WriteOutcome
-from gateway.northbound.publisher import Publisher
-from gateway.northbound.writers import NotAllowed, Repeated
+from gateway.northbound.publishing.publisher import Publisher
+from gateway.northbound.requests.acceptance import Acceptance, Sender
+from gateway.northbound.requests.audit import Audit
+from gateway.parts.alarms import Alarms, Entry, Event, NothingToAcknowledge, State
 from gateway.tags import Level, Quality, Sample, Tag
 from gateway.tags.timestamps import rfc3339
 

@@ -9,31 +9,32 @@ import structlog
 import zenoh
 
 from gateway.config import Config, ZenohConfig, ZenohMode
+from gateway.contract import secrets
+from gateway.contract.interfaces import Device, History, Plant
+from gateway.contract.keys import Keys
+from gateway.contract.payload import Failure, GroupResult
+from gateway.contract.writers import Writers
 from gateway.errors import GatewayError
-from gateway.northbound import secrets
-from gateway.northbound.acceptance import Acceptance
-from gateway.northbound.admission import Admission
 from gateway.northbound.alarms import AlarmPublisher
-from gateway.northbound.audit import Audit
-from gateway.northbound.inbox import Inbox
-from gateway.northbound.incoming import Declarations, Incoming
-from gateway.northbound.interfaces import Device, History, Plant
-from gateway.northbound.keys import Keys
-from gateway.northbound.link_monitor import LinkMonitor
-from gateway.northbound.losses import Losses
-from gateway.northbound.one_process import only_process
-from gateway.northbound.own_writes import OwnWrites
-from gateway.northbound.payload import Failure, GroupResult
-from gateway.northbound.publisher import Publisher, ScanBatches
-from gateway.northbound.republish import Republisher
-from gateway.northbound.session import CLOSE_WITHIN, off_loop, open_session
-from gateway.northbound.session_settings import configure, connect_endpoints, drop_limit
-from gateway.northbound.standby import GroupSettings
-from gateway.northbound.status_publisher import StatusPublisher
-from gateway.northbound.tag_index import TagIndex
-from gateway.northbound.traces import Traces
-from gateway.northbound.watchdog import Watchdog
-from gateway.northbound.writers import Writers
+from gateway.northbound.answering.tag_index import TagIndex
+from gateway.northbound.group.admission import Admission
+from gateway.northbound.group.standby import GroupSettings
+from gateway.northbound.publishing.losses import Losses
+from gateway.northbound.publishing.publisher import Publisher, ScanBatches
+from gateway.northbound.publishing.republish import Republisher
+from gateway.northbound.publishing.status_publisher import StatusPublisher
+from gateway.northbound.publishing.traces import Traces
+from gateway.northbound.requests.acceptance import Acceptance
+from gateway.northbound.requests.audit import Audit
+from gateway.northbound.requests.inbox import Inbox
+from gateway.northbound.requests.incoming import Declarations, Incoming
+from gateway.northbound.requests.own_writes import OwnWrites
+from gateway.northbound.session import exposures
+from gateway.northbound.session.link_monitor import LinkMonitor
+from gateway.northbound.session.one_process import only_process
+from gateway.northbound.session.session import CLOSE_WITHIN, off_loop, open_session
+from gateway.northbound.session.session_settings import configure, connect_endpoints, drop_limit
+from gateway.northbound.session.watchdog import Watchdog
 from gateway.tags import Sample, Tag, WriteResult
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
@@ -321,9 +322,9 @@ def group_settings(config: Config) -> GroupSettings:
 
 
 def _exposures(session: zenoh.Config, writers: Path | None, group: GroupSettings) -> list[str]:
-    found = secrets.exposures(session)
+    found = exposures.exposures(session)
     if writers is not None:
-        found += secrets.unruled(session)
+        found += exposures.unruled(session)
     if group.group is not None and group.secret_file is None:
-        found += secrets.unsigned()
+        found += exposures.unsigned()
     return found

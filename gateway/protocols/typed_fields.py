@@ -7,9 +7,9 @@ the `Garbled` that hides it; a write sends the bytes of the value.
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
-from gateway.numerals import Scalar
 from gateway.protocols.driver import Address
 from gateway.values import ValueType
+from gateway.values.numerals import Scalar
 
 
 class Shape(Protocol):

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 from gateway.errors import Garbled
-from gateway.numerals import Scalar
 from gateway.protocols.driver import Span
+from gateway.values.numerals import Scalar
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,11 +8,11 @@ from functools import lru_cache
 from typing import Any, NamedTuple
 
 from gateway.errors import Garbled
-from gateway.numerals import Scalar
 from gateway.protocols.driver import Unit
 from gateway.tags.scaling import Linear, scaled, scaled_float
 from gateway.tags.shaping import Shaping, shaped
 from gateway.values import BYTES, Byte, Layout, Value, from_word, from_words
+from gateway.values.numerals import Scalar
 
 Decode = Callable[[Any], Value | None]
 DecodeOne = Callable[[Any], Scalar | None]  # of a value that is no array

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from decimal import Context, Decimal, DivisionByZero, InvalidOperation, Overflow
 
-from gateway.numerals import Scalar
+from gateway.values.numerals import Scalar
 
 # A part of a formula: it is calculated from the values of the inputs, in their order.
 Term = Callable[[Sequence[Decimal]], Decimal]

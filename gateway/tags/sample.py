@@ -1,5 +1,6 @@
 """Samples: the values of tags with their quality, time and reason."""
 
+import math
 from enum import StrEnum
 from typing import NamedTuple
 
@@ -64,3 +65,10 @@ class WriteResult(NamedTuple):
     took: float  # seconds from submitting to the acknowledgement
     verified: bool = False  # read back and found equal
     acknowledged: bool = True  # False only for a broadcast: no device acknowledges it
+
+
+def has_value(sample: Sample) -> bool:
+    """True if the sample is good, and a value that JSON has."""
+    value = sample.value
+    is_known = sample.quality is Quality.GOOD and value is not None
+    return is_known and not (isinstance(value, float) and not math.isfinite(value))

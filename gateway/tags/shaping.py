@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 from gateway.errors import BadValue
-from gateway.numerals import Scalar
 from gateway.tags.scaling import Ends
+from gateway.values.numerals import Scalar
 
 
 class Bounds(NamedTuple):

@@ -6,7 +6,6 @@ from enum import StrEnum
 from typing import Any, NamedTuple
 
 from gateway.errors import BadValue, Garbled
-from gateway.numerals import Scalar
 from gateway.protocols.driver import Address, Span, Unit
 from gateway.protocols.typed_fields import Shape
 from gateway.tags.alarm import AlarmRule
@@ -23,6 +22,7 @@ from gateway.tags.formula import Formula
 from gateway.tags.scaling import Linear, exact_below, linear, type_of, unscaled, unscaled_float
 from gateway.tags.shaping import Names, Shaping
 from gateway.values import Layout, Value, to_words
+from gateway.values.numerals import Scalar
 
 # Larger whole numbers are refused at once: as many bits as the largest float has.
 _MOST_BITS = 1024

@@ -3,10 +3,10 @@
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
-from gateway.numerals import Scalar
 from gateway.tags.scaling import linear, scaled, scaled_float
 from gateway.tags.tag import Tag
 from gateway.values import Value
+from gateway.values.numerals import Scalar
 
 
 def leaves(tag: Tag) -> Iterator[Tag]:

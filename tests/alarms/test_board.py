@@ -10,10 +10,10 @@ import orjson
 import pytest
 from structlog.testing import capture_logs
 
-from gateway.alarms import Alarms, Entry, Event, Reading, State
-from gateway.alarms.file import AlarmFile
-from gateway.app import Gateway
 from gateway.config import load
+from gateway.parts.alarms import Alarms, Entry, Event, Reading, State
+from gateway.parts.alarms.file import AlarmFile
+from gateway.plant.plant import Gateway
 from gateway.tags import AlarmRule, Deadband, Level, Reason, Tag, bad, good
 from gateway.tags.mirror import Mirror
 from gateway.tags.scan import Decoder
@@ -141,7 +141,7 @@ def _calls(function: Any, scan: Any) -> int:
 
     def profile(frame: FrameType, event: str, _: Any) -> None:
         nonlocal found
-        found += event == "call" and "gateway/alarms/" in frame.f_code.co_filename
+        found += event == "call" and "gateway/parts/alarms/" in frame.f_code.co_filename
 
     sys.setprofile(profile)
     try:

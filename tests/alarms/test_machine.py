@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gateway.alarms.machine import (
+from gateway.parts.alarms.machine import (
     IN_ALARM,
     TRANSITIONS,
     Alarm,

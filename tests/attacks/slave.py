@@ -13,8 +13,8 @@ from typing import Any
 
 from gateway.config import load
 from gateway.engine.device import Device
-from gateway.line.build import line_of
 from gateway.line.line import Line
+from gateway.plant.build import line_of
 from gateway.tags import Quality, Sample
 from tests.e2e.processes import write_config
 

@@ -11,8 +11,8 @@ from typing import Any
 
 from gateway.config import load
 from gateway.engine.device import Device
-from gateway.line.build import line_of
 from gateway.line.line import Line
+from gateway.plant.build import line_of
 from gateway.tags import Quality, Sample
 
 PATIENCE = 60.0  # seconds; never waited for when all is well

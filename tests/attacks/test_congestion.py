@@ -4,7 +4,7 @@ import asyncio
 from pathlib import Path
 from typing import Any
 
-from gateway.northbound.republish import _SETTLE_TIME
+from gateway.northbound.publishing.republish import _SETTLE_TIME
 from tests.attacks.tcp_peer import peer
 from tests.e2e.paced_link import UNLIMITED, paced_link
 from tests.e2e.processes import started, write_config

@@ -9,7 +9,7 @@ from tests.zenoh_peer import ZenohPeer, free_endpoint
 
 # The command itself; only the longest wait is shorter, so that the suite is.
 RUN = """
-import gateway.northbound.election as election
+import gateway.northbound.group.election as election
 election.SETTLE_TIME = 0.5
 from gateway.cli.main import main
 main()

@@ -9,8 +9,8 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from gateway.line.arrival import HELD
-from gateway.line.duty import SETTLE
-from gateway.northbound.election import LONGEST_PAUSE
+from gateway.line.send_permit import SETTLE
+from gateway.northbound.group.election import LONGEST_PAUSE
 from tests.attacks.tcp_peer import peer, tcp_reply
 from tests.e2e.processes import Program, free_port, started, station, vigor_line, write_config
 from tests.zenoh_peer import ZenohPeer, free_endpoint
@@ -19,7 +19,7 @@ RECIPE = "plant/mixer/recipe/@set"
 HOLD = HELD + 0.3  # seconds
 # The command itself; the waits of the election are shorter, so that the suite is.
 RUN = """
-import gateway.northbound.election as election
+import gateway.northbound.group.election as election
 election.SETTLE_TIME, election.CLAIM_TIME = 0.3, 0.8
 from gateway.cli.main import main
 main()

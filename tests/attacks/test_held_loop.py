@@ -14,8 +14,8 @@ from tests.zenoh_peer import Received, ZenohPeer, free_endpoint
 # from standard input.
 RUN = """
 import signal, sys
-import gateway.northbound.election as election
-import gateway.northbound.watchdog as watchdog
+import gateway.northbound.group.election as election
+import gateway.northbound.session.watchdog as watchdog
 election.SETTLE_TIME = election.CLAIM_TIME = 0.3
 watchdog.LIMIT = 1.5
 signal.signal(signal.SIGUSR1, lambda *_: print("ok", sys.stdin.readline(), flush=True))

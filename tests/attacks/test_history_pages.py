@@ -8,8 +8,8 @@ from contextlib import asynccontextmanager, closing
 from pathlib import Path
 from typing import Any
 
-from gateway.history.file import HistoryFile
-from gateway.history.sections import SECTION
+from gateway.parts.history.file import HistoryFile
+from gateway.parts.history.sections import SECTION
 from gateway.tags import good
 from tests.e2e.paced_link import paced_link
 from tests.e2e.processes import Program, started, write_config
@@ -44,7 +44,7 @@ def config(folder: Path, endpoint: str) -> Path:
 
 # The command itself; the pause between two checks of the file is shorter, so that the suite is.
 RUN = """
-import gateway.history.checker as checker
+import gateway.parts.history.checker as checker
 checker.READ_EVERY = 0.05
 from gateway.cli.main import main
 main()

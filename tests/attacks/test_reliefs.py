@@ -10,8 +10,8 @@ from tests.zenoh_peer import free_endpoint
 RUN = """
 import asyncio, sys, weakref
 from pathlib import Path
-from gateway import service
-from gateway.app import Gateway
+from gateway.service import (service)
+from gateway.plant.plant import Gateway
 from gateway.config import load
 
 made = []

@@ -17,7 +17,7 @@ RECIPE = "plant/mixer/recipe/@set"
 ALICE = f"alice:{'a' * 40}"
 # The command itself; the waits of the election are shorter, so that the suite is.
 RUN = """
-import gateway.northbound.election as election
+import gateway.northbound.group.election as election
 election.SETTLE_TIME, election.CLAIM_TIME = 0.3, 0.8
 from gateway.cli.main import main
 main()

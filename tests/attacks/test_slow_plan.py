@@ -12,8 +12,8 @@ from tests.zenoh_peer import ZenohPeer, free_endpoint
 RUN = """
 import asyncio, sys
 from pathlib import Path
-from gateway import service
-from gateway.app import Gateway
+from gateway.service import (service)
+from gateway.plant.plant import Gateway
 from gateway.config import load
 from gateway.line.line import Line
 

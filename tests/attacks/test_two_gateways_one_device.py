@@ -9,7 +9,7 @@ from contextlib import ExitStack, asynccontextmanager, contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
-from gateway.line.duty import SETTLE
+from gateway.line.send_permit import SETTLE
 from tests.e2e.processes import (
     Program,
     free_port,

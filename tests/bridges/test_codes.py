@@ -2,7 +2,7 @@
 
 import re
 
-from gateway.northbound.payload import Problem
+from gateway.contract.payload import Problem
 from gateway.tags import Reason
 from tests.e2e.processes import ROOT
 

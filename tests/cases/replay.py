@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from gateway.line.wire_file import LoggedPiece, entries
+from gateway.parts.recording.wire_file import LoggedPiece, entries
 
 
 class Piece(NamedTuple):

@@ -9,11 +9,11 @@ from typing import Any
 
 import pytest
 
-from gateway.app import Gateway
 from gateway.config import load
 from gateway.engine.jobs import Poll
 from gateway.engine.schedule import Schedule
 from gateway.errors import Busy
+from gateway.plant.plant import Gateway
 from gateway.protocols.computer_link import ComputerLink
 from gateway.tags import Quality, Reason, Sample
 from tests.sim.bench import Bench, Unruly

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from gateway.history.file import HistoryFile
+from gateway.parts.history.file import HistoryFile
 from gateway.tags import Reason, bad, good
 from tests.cli.conftest import Command
 from tests.e2e.processes import vigor_line, write_config

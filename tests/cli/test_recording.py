@@ -7,7 +7,7 @@ import pytest
 
 from gateway.cli.recording import FILES, Recording
 from gateway.errors import GatewayError
-from gateway.line.wire_file import LoggedPiece, LoggedValue, entries, event_lines
+from gateway.parts.recording.wire_file import LoggedPiece, LoggedValue, entries, event_lines
 
 LINE = "1795369149.294760 > 20 03 00 04 00 02 83 7b\n"
 

@@ -14,7 +14,7 @@ import pytest
 from rich.console import Console
 
 from gateway.cli.status import span, view
-from gateway.northbound.faults import faults, warnings
+from gateway.contract.faults import faults, warnings
 from tests.e2e.processes import Done, gateway, plc_gateway, started, vigor_line, write_config
 from tests.web.serving import calling, transfer
 from tests.zenoh_peer import free_endpoint

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from gateway.config import ConfigErrors, load
-from gateway.northbound.meta import meta_fields
+from gateway.contract.meta import meta_fields
 from gateway.protocols.driver import Span
 from gateway.values import Kind, ValueType
 from tests.config.test_config import M, on_mixer, tags

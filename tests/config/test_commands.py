@@ -8,11 +8,11 @@ from typing import Any
 
 import pytest
 
-from gateway.app import Gateway
 from gateway.config import load
 from gateway.config.commands import NotControlled, check_command, speaker
+from gateway.contract.keys import Keys
 from gateway.errors import BadValue, ConfigError, LineDown
-from gateway.northbound.keys import Keys
+from gateway.plant.plant import Gateway
 from tests.e2e.processes import plc_gateway, started, write_config
 from tests.zenoh_peer import ZenohPeer, free_endpoint
 

@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from gateway.config import ConfigErrors, load
+from gateway.contract.meta import meta_fields
 from gateway.errors import BadValue
-from gateway.northbound.meta import meta_fields
 from gateway.tags import Tag
 from gateway.values import Value
 from tests.config.test_config import M, tags

@@ -6,8 +6,8 @@ import pytest
 
 from gateway.config import Config, ConfigErrors, built
 from gateway.config.changes import needs_restart
+from gateway.parts.transfers.forecast import forecasts, transfer_forecasts
 from gateway.tags import Tag
-from gateway.transfers.forecast import forecasts, transfer_forecasts
 
 TAGS: dict[str, Any] = {
     "speed": {"address": "D10", "every": "2s"},

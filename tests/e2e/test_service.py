@@ -14,13 +14,13 @@ from typing import Any
 
 import pytest
 
-from gateway import service
-from gateway.alarms import Alarms
-from gateway.alarms.file import AlarmFile
-from gateway.app import Gateway
 from gateway.config import load
-from gateway.history import Historian
-from gateway.northbound.inbox import Inbox
+from gateway.northbound.requests.inbox import Inbox
+from gateway.parts.alarms import Alarms
+from gateway.parts.alarms.file import AlarmFile
+from gateway.parts.history import Historian
+from gateway.plant.plant import Gateway
+from gateway.service import service
 from gateway.tags import Sample, good
 from tests.e2e.processes import (
     Program,
@@ -38,10 +38,13 @@ from tests.zenoh_peer import ZenohPeer, free_endpoint
 
 TAGS = {f"d{n}": {"address": f"D{n}"} for n in range(700, 708)}
 # The command itself, with a state file that is written more often.
-SOON = "import gateway.service as s; s.SAVE_EVERY = 0.05; from gateway.cli.main import main; main()"
+SOON = (
+    "import gateway.service.service as s; s.SAVE_EVERY = 0.05; "
+    "from gateway.cli.main import main; main()"
+)
 # The command itself, with a history that fails at the first sample.
 BROKEN = """
-from gateway.history.file import HistoryFile
+from gateway.parts.history.file import HistoryFile
 def store(self, run, start, samples): raise IndexError("the history is broken")
 HistoryFile.store = store
 from gateway.cli.main import main; main()

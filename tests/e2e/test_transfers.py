@@ -10,7 +10,7 @@ from typing import Any
 from gateway.cli.status import view
 from gateway.cli.terminal import out
 from gateway.config import load
-from gateway.transfers.forecast import forecasts
+from gateway.parts.transfers.forecast import forecasts
 from tests.e2e.processes import started, vigor_line, write_config
 from tests.zenoh_peer import ZenohPeer, free_endpoint
 

@@ -16,10 +16,10 @@ from gateway.config import load
 from gateway.engine.device import Device
 from gateway.engine.forecast import LineForecast, forecast
 from gateway.engine.reply_shapes import MARK_LONGEST
+from gateway.parts.transfers.forecast import forecasts
 from gateway.planning.planner import shortest_round
 from gateway.planning.wire_timing import WireTiming
 from gateway.tags import Tag
-from gateway.transfers.forecast import forecasts
 from tests.e2e.processes import vigor_line, write_config
 from tests.sim.plant import device, words
 from tests.vectors import vectors

@@ -12,7 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from structlog.testing import capture_logs
 
-from gateway.app import Gateway
 from gateway.config import Config, LineConfig, load
 from gateway.engine.device import Device
 from gateway.engine.health import State
@@ -20,9 +19,10 @@ from gateway.engine.jobs import Idle, Job
 from gateway.engine.request_results import Differs
 from gateway.engine.unsolicited import REPLY_WITHIN
 from gateway.errors import GatewayError, LineDown, Refused
-from gateway.line.build import line_of
 from gateway.line.line import Line
-from gateway.northbound.republish import Republisher
+from gateway.northbound.publishing.republish import Republisher
+from gateway.plant.build import line_of
+from gateway.plant.plant import Gateway
 from gateway.stations.vigor import VigorStation
 from gateway.tags import Quality, Reason, Sample, Tag, WriteResult, good
 from gateway.transport import Port, Receiver

@@ -12,8 +12,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from gateway.config import ConfigErrors, load
+from gateway.contract.parsing import parse_write
 from gateway.errors import BadValue, GatewayError
-from gateway.northbound.parsing import parse_write
 from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.driver import AnyDriver, Span
 from gateway.protocols.modbus import ModbusAscii, ModbusRtu, ModbusTcp

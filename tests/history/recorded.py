@@ -10,9 +10,9 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
-from gateway.history import Historian
-from gateway.northbound import payload
-from gateway.northbound.payload import WriteOutcome
+from gateway.contract import payload
+from gateway.contract.payload import WriteOutcome
+from gateway.parts.history import Historian
 from gateway.tags import Sample, Tag, WriteResult, good
 from gateway.values import Value
 from tests.history_writer import WEEK, tag, until

@@ -13,16 +13,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gateway.contract.buckets import MOST_BUCKETS, NOT_RECORDED, Bucket, Now, Step, buckets
+from gateway.contract.question import Question, question
+from gateway.contract.timerange import EARLIEST, LATEST, TimeRange
 from gateway.errors import BadValue, Damaged
-from gateway.history.buckets import MOST_BUCKETS, NOT_RECORDED, Bucket, Step, buckets
-from gateway.history.course import DAMAGED, Course, Now
-from gateway.history.damage import Damage
-from gateway.history.file import HistoryFile
-from gateway.history.newest import Newest
-from gateway.history.question import Question, question
-from gateway.history.reader import Reader
-from gateway.history.recent import Recent
-from gateway.history.timerange import EARLIEST, LATEST, TimeRange
+from gateway.parts.history.course import DAMAGED, Course
+from gateway.parts.history.damage import Damage
+from gateway.parts.history.file import HistoryFile
+from gateway.parts.history.newest import Newest
+from gateway.parts.history.reader import Reader
+from gateway.parts.history.recent import Recent
 from gateway.tags import Reason, Sample, bad, good
 from tests.history.recorded import DOOR, NOON, SECOND, SPEED
 

@@ -12,16 +12,15 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from gateway.config import ZenohConfig, ZenohMode
+from gateway.contract import payload
+from gateway.contract.buckets import Bucket, Now
+from gateway.contract.interfaces import History
+from gateway.contract.payload import Failure, Problem, WriteOutcome
+from gateway.contract.question import Question
 from gateway.engine.requests import CommandResult
-from gateway.history import Historian
-from gateway.history.buckets import Bucket
-from gateway.history.course import Now
-from gateway.history.question import Question
-from gateway.northbound import payload
-from gateway.northbound.answers import HISTORY_LIMIT
-from gateway.northbound.interfaces import History
+from gateway.northbound.answering.answers import HISTORY_LIMIT
 from gateway.northbound.northbound import Northbound
-from gateway.northbound.payload import Failure, Problem, WriteOutcome
+from gateway.parts.history import Historian
 from gateway.tags import Reason, Sample, Tag, WriteResult, bad, good
 from gateway.tags.recorded import Recorded, RecordedQuery
 from tests.e2e.processes import Program

@@ -9,14 +9,14 @@ from pathlib import Path
 
 import pytest
 
+from gateway.contract.timerange import EARLIEST, LATEST
 from gateway.errors import Busy, Damaged
-from gateway.history import Historian, TimeRange, checker
-from gateway.history.file import HistoryFile
-from gateway.history.reader import Reader
-from gateway.history.recent import Recent
-from gateway.history.schema import ForeignFile
-from gateway.history.search import Search
-from gateway.history.timerange import EARLIEST, LATEST
+from gateway.parts.history import Historian, TimeRange, checker
+from gateway.parts.history.file import HistoryFile
+from gateway.parts.history.reader import Reader
+from gateway.parts.history.recent import Recent
+from gateway.parts.history.schema import ForeignFile
+from gateway.parts.history.search import Search
 from gateway.tags import Sample, Tag, good
 from gateway.tags.recorded import RecordedQuery
 from gateway.values import Value

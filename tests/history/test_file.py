@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from gateway.history.file import HistoryFile
+from gateway.parts.history.file import HistoryFile
 from tests.history.recorded import NOON, SECOND, history, numbered, sorted_runs, values
 from tests.history_writer import until
 

@@ -12,10 +12,10 @@ from typing import Any
 import pytest
 
 from gateway.errors import BadValue, Busy
-from gateway.history import Historian
-from gateway.history.reader import Reader
-from gateway.history.recent import Recent
-from gateway.history.sections import FullRow
+from gateway.parts.history import Historian
+from gateway.parts.history.reader import Reader
+from gateway.parts.history.recent import Recent
+from gateway.parts.history.sections import FullRow
 from gateway.protocols.driver import Span
 from gateway.tags import Reason, bad, good
 from gateway.values import Layout, Value, parse_type

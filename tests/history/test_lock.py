@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from gateway.errors import Busy
-from gateway.history import Historian, lock
+from gateway.parts.history import Historian, lock
 from tests.history.recorded import (
     EVERYTHING,
     SMALL,

@@ -6,8 +6,8 @@ import time
 from contextlib import closing
 from pathlib import Path
 
+from gateway.contract.payload import Failure, Problem, WriteOutcome
 from gateway.engine.requests import CommandResult
-from gateway.northbound.payload import Failure, Problem, WriteOutcome
 from gateway.tags import WriteResult
 from tests.history.recorded import (
     EVERYTHING,

@@ -10,13 +10,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gateway.contract.timerange import EARLIEST, LATEST
 from gateway.errors import Busy, Damaged
-from gateway.history import Historian, TimeRange
-from gateway.history.file import HistoryFile
-from gateway.history.outcomes import Outcome, Ring
-from gateway.history.reader import Part, Reader, in_order
-from gateway.history.recent import Identity
-from gateway.history.timerange import EARLIEST, LATEST
+from gateway.parts.history import Historian, TimeRange
+from gateway.parts.history.file import HistoryFile
+from gateway.parts.history.outcomes import Outcome, Ring
+from gateway.parts.history.reader import Part, Reader, in_order
+from gateway.parts.history.recent import Identity
 from gateway.tags import Sample, good
 from tests.history.recorded import DOOR, EVERYTHING, NOON, SECOND, SPEED, history, numbered, values
 from tests.history_writer import WEEK, tag, until

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
+from gateway.contract.payload import WriteOutcome
 from gateway.errors import Busy
-from gateway.history import Historian, time_range
-from gateway.history.outcomes import MOST_WAITING
-from gateway.history.recent import MOST_RUNS
-from gateway.northbound.payload import WriteOutcome
+from gateway.parts.history import Historian, time_range
+from gateway.parts.history.outcomes import MOST_WAITING
+from gateway.parts.history.recent import MOST_RUNS
 from gateway.tags import WriteResult
 from tests.history.recorded import (
     EVERYTHING,

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.history.rows import from_row, to_row
-from gateway.history.timerange import EARLIEST, LATEST
+from gateway.contract.timerange import EARLIEST, LATEST
+from gateway.parts.history.rows import from_row, to_row
 from gateway.tags import Quality, Reason, Sample, good
 from gateway.values import Value
 from tests.history.recorded import NOON, SPEED

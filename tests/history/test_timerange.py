@@ -4,9 +4,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gateway.contract.timerange import EARLIEST, LATEST
 from gateway.errors import BadValue
-from gateway.history import TimeRange, time_range
-from gateway.history.timerange import EARLIEST, LATEST
+from gateway.parts.history import TimeRange, time_range
 from tests.history.recorded import NOON, SECOND
 
 

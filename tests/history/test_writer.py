@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from gateway.errors import Busy
-from gateway.history import Historian
-from gateway.history.file import HistoryFile
+from gateway.parts.history import Historian
+from gateway.parts.history.file import HistoryFile
 from tests.history.recorded import (
     EVERYTHING,
     SPEED,

@@ -10,9 +10,9 @@ from pymodbus import FramerType
 from pymodbus.client import AsyncModbusSerialClient, AsyncModbusTcpClient
 
 from gateway.config import built
-from gateway.line.served_line import ServedLine
-from gateway.serving.registers import Row
-from gateway.serving.station import Station
+from gateway.parts.serving.served_line import ServedLine
+from gateway.stations.served.registers import Row
+from gateway.stations.served.station import Station
 from gateway.tags import Sample, good
 from tests.conftest import needs
 from tests.interop.peers import finished, free_port, pty_pair

@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 from gateway.line.channel import Channel, Echo
-from gateway.line.duty import Duty
+from gateway.line.send_permit import Duty
 from gateway.line.transaction import Transaction
 from gateway.line.wire_log import WireLog
 from gateway.planning.wire_timing import WireTiming

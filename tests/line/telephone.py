@@ -9,8 +9,8 @@ from typing import Any
 from gateway.config import built
 from gateway.engine.device import Device
 from gateway.engine.requests import WRITE_EXPIRY
-from gateway.line.build import line_of
 from gateway.line.calling import ModemOpener
+from gateway.plant.build import line_of
 from gateway.stations.vigor import VigorStation
 from gateway.tags import Sample, Tag, WriteResult
 from gateway.transport import ModemAddress, Port, PortAddress, Receiver, SerialSettings

@@ -8,9 +8,9 @@ from typing import Any
 
 from gateway.config import LineConfig, built
 from gateway.errors import LineDown
-from gateway.line.served_line import ServedLine
-from gateway.northbound.served_status import served_documents
-from gateway.serving.station import Station
+from gateway.parts.serving.served_line import ServedLine
+from gateway.parts.serving.status import served_documents
+from gateway.stations.served.station import Station
 from gateway.tags import Quality, Sample
 from gateway.transport import ModemAddress, Port, PortAddress, Receiver, SerialSettings, open_modem
 from tests.line.telephone import Cable, now

@@ -5,9 +5,9 @@ from typing import Any
 
 import pytest
 
+from gateway.contract.status import line_document
 from gateway.engine.forecast import forecast
 from gateway.errors import LineDown, Unclear
-from gateway.northbound.status import line_document
 from gateway.tags import Quality, Reason
 from tests.line.telephone import Telephone, now, running
 from tests.sim.virtual import on_virtual_time

@@ -8,8 +8,8 @@ import pytest
 from gateway.engine.requests import Write
 from gateway.errors import Busy
 from gateway.line.arrival import HELD, PERIOD, ArrivalClock
-from gateway.line.duty import PROOF_VALID, SETTLE, Duty
 from gateway.line.perform import perform
+from gateway.line.send_permit import PROOF_VALID, SETTLE, Duty
 from gateway.tags import WriteResult, WriteRule
 from tests.line.fake_port import FakePort, opened
 from tests.sim.plant import device, make_tag, plant, running

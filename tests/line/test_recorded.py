@@ -5,9 +5,9 @@ from pathlib import Path
 
 from gateway.cli.replay_serve import report, stations_of
 from gateway.config import LineConfig, built, load
-from gateway.line.build import line_of
-from gateway.line.recorded import courses, of_units, stations_asked, timed
-from gateway.line.wire_file import LoggedPiece, LoggedValue, entries
+from gateway.parts.recording.recorded import courses, of_units, stations_asked, timed
+from gateway.parts.recording.wire_file import LoggedPiece, LoggedValue, entries
+from gateway.plant.build import line_of
 from gateway.protocols.driver import Span
 from gateway.protocols.listening import Listenable
 from gateway.protocols.vigor import Vigor

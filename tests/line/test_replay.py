@@ -5,13 +5,13 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from gateway.app import Gateway
 from gateway.config import Config, LineConfig, load
-from gateway.line.build import line_of
 from gateway.line.exchanges import samples_of
-from gateway.line.replay import Checked, Difference, Learned, Replay
-from gateway.line.wire_file import LoggedPiece, LoggedValue
 from gateway.line.wire_log import Event, Performed, Piece
+from gateway.parts.recording.replay import Checked, Difference, Learned, Replay
+from gateway.parts.recording.wire_file import LoggedPiece, LoggedValue
+from gateway.plant.build import line_of
+from gateway.plant.plant import Gateway
 from gateway.transport import Port, Receiver
 from tests.sim.virtual import on_virtual_time
 

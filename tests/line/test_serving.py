@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 
-from gateway.app import Gateway
 from gateway.cli import direct
 from gateway.config import built
 from gateway.errors import BadValue, Busy
+from gateway.plant.plant import Gateway
 from gateway.tags import Quality, Reason, Tag, WriteResult
 from gateway.transport import TcpAddress, listen
 from gateway.values import Value

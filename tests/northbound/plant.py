@@ -7,13 +7,13 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from gateway.alarms import Alarms
 from gateway.config import ZenohConfig
 from gateway.engine.requests import CommandResult, Peeked
 from gateway.errors import BadValue, Busy, GatewayError, NotSent
-from gateway.line.duty import Duty
+from gateway.line.send_permit import Duty
 from gateway.line.wire_log import WireLog
 from gateway.northbound.northbound import Northbound
+from gateway.parts.alarms import Alarms
 from gateway.protocols.driver import Address, Span, Unit
 from gateway.tags import Reason, Sample, Tag, WriteResult, WriteRule, bad, good
 from gateway.values import Layout, Value, parse_type

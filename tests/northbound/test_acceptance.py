@@ -8,8 +8,8 @@ import pytest
 
 from gateway.engine.requests import WRITE_EXPIRY
 from gateway.errors import Busy
-from gateway.line.duty import Duty
-from gateway.northbound.acceptance import Acceptance, Sender
+from gateway.line.send_permit import Duty
+from gateway.northbound.requests.acceptance import Acceptance, Sender
 
 NOW = 1_790_000_000  # seconds since 1970
 

@@ -8,15 +8,15 @@ from typing import Any
 
 import pytest
 
-from gateway.alarms import State
-from gateway.line.duty import Duty
-from gateway.northbound.acceptance import Acceptance, Sender
+from gateway.contract.keys import Family, Keys, parse_key
+from gateway.contract.payload import Failure
+from gateway.contract.signatures import sign
+from gateway.contract.writers import Writers
+from gateway.line.send_permit import Duty
 from gateway.northbound.alarms import Acknowledgements, AlarmPublisher, open_alarms
-from gateway.northbound.audit import Audit
-from gateway.northbound.keys import Family, Keys, parse_key
-from gateway.northbound.payload import Failure
-from gateway.northbound.signatures import sign
-from gateway.northbound.writers import Writers
+from gateway.northbound.requests.acceptance import Acceptance, Sender
+from gateway.northbound.requests.audit import Audit
+from gateway.parts.alarms import State
 from gateway.tags import AlarmRule, Level, Reason, bad, good
 from gateway.tags.timestamps import rfc3339
 from tests.northbound.plant import PlainDevice, PlainPlant, gateway_and_client, tag

@@ -6,8 +6,8 @@ from typing import Self, cast
 
 import zenoh
 
-from gateway.northbound.answers import REFUSALS_LIMIT, AnswerPool
-from gateway.northbound.workers import Workers
+from gateway.northbound.answering.answers import REFUSALS_LIMIT, AnswerPool
+from gateway.northbound.answering.workers import Workers
 
 PATIENCE = 60.0  # seconds; never waited for when all is well
 

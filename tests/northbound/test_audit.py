@@ -4,9 +4,9 @@ import json
 
 import structlog
 
-from gateway.northbound.audit import BURST, Audit
-from gateway.northbound.payload import Failure, Problem, WriteOutcome
-from gateway.northbound.rate_limit import RateLimit
+from gateway.contract.payload import Failure, Problem, WriteOutcome
+from gateway.contract.rate_limit import RateLimit
+from gateway.northbound.requests.audit import BURST, Audit
 from gateway.tags import WriteResult
 
 

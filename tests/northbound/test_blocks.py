@@ -3,8 +3,8 @@
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from gateway.northbound import payload
-from gateway.northbound.blocks import LONGEST_BLOCK, parts_of
+from gateway.contract import payload
+from gateway.contract.blocks import LONGEST_BLOCK, parts_of
 from gateway.tags import Reason, bad, good
 from gateway.values import Value
 from tests.northbound.test_payload import NOON, tag

@@ -6,10 +6,10 @@ import orjson
 import pytest
 from structlog.testing import capture_logs
 
-from gateway.northbound.claim_documents import ClaimDocuments
-from gateway.northbound.claims import Claim
-from gateway.northbound.keys import Keys
-from gateway.northbound.plant_secret import PlantSecret
+from gateway.contract.keys import Keys
+from gateway.northbound.group.claim_documents import ClaimDocuments
+from gateway.northbound.group.claims import Claim
+from gateway.northbound.group.plant_secret import PlantSecret
 
 SECRET = PlantSecret("a secret of twenty or more")
 CLAIM = Claim(7, "5e55", "a", None, frozenset({"mixer", "oven"}))

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.northbound.claims import RETURN_TIME, Claim, Claims
+from gateway.northbound.group.claims import RETURN_TIME, Claim, Claims
 
 
 def gateway(session: str, devices: Iterable[str] = ("mixer", "oven"), **group: str) -> Claims:

@@ -10,13 +10,13 @@ import zenoh
 from structlog.testing import capture_logs
 
 from gateway.config.commands import NotControlled
+from gateway.contract.keys import Family, Keys, parse_key
+from gateway.contract.payload import Failure, Problem
 from gateway.engine.requests import CommandResult
 from gateway.errors import LineDown
-from gateway.northbound.acceptance import Acceptance, Sender
-from gateway.northbound.audit import Audit
-from gateway.northbound.commands import Commands
-from gateway.northbound.keys import Family, Keys, parse_key
-from gateway.northbound.payload import Failure, Problem
+from gateway.northbound.requests.acceptance import Acceptance, Sender
+from gateway.northbound.requests.audit import Audit
+from gateway.northbound.requests.commands import Commands
 from tests.northbound.plant import PlainPlant, mixer
 
 KEYS = Keys("plant", "demo")

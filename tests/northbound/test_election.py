@@ -2,7 +2,7 @@
 
 import pytest
 
-from gateway.northbound.election import (
+from gateway.northbound.group.election import (
     CLAIM_TIME,
     LONGEST_PAUSE,
     QUERY_VALIDITY,

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gateway.northbound.election import (
+from gateway.northbound.group.election import (
     CLAIM_TIME,
     SETTLE_TIME,
     Election,

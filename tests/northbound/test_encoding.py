@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from gateway.northbound import payload
+from gateway.contract import payload
 from gateway.tags import Form, Reason, bad, good
 from tests.northbound.plant import PlainDevice, PlainPlant, gateway_and_client, tag
 

@@ -3,10 +3,10 @@
 import pytest
 from structlog.testing import capture_logs
 
-from gateway.northbound.election import Role, RoleToken
-from gateway.northbound.group_tokens import GroupTokens
-from gateway.northbound.keys import Keys
-from gateway.northbound.plant_secret import PlantSecret
+from gateway.contract.keys import Keys
+from gateway.northbound.group.election import Role, RoleToken
+from gateway.northbound.group.group_tokens import GroupTokens
+from gateway.northbound.group.plant_secret import PlantSecret
 
 ACTIVE = RoleToken(Role.ACTIVE, "a", "5e55")
 SECRET = PlantSecret("a secret of twenty or more")

@@ -6,15 +6,16 @@ from typing import Any
 
 import pytest
 
+from gateway.contract import payload
+from gateway.contract.keys import Keys
+from gateway.contract.parsing import LARGEST_GROUP, parse_group
+from gateway.contract.payload import Failure, GroupResult, Problem, WriteOutcome
 from gateway.errors import BadValue, Busy, NoReply, Refused
-from gateway.line.duty import Duty
-from gateway.northbound import group_writes, payload
-from gateway.northbound.acceptance import Acceptance, Sender
-from gateway.northbound.group_writes import GroupWrites
-from gateway.northbound.keys import Keys
-from gateway.northbound.parsing import LARGEST_GROUP, parse_group
-from gateway.northbound.payload import Failure, GroupResult, Problem, WriteOutcome
-from gateway.northbound.tag_index import TagIndex
+from gateway.line.send_permit import Duty
+from gateway.northbound.answering.tag_index import TagIndex
+from gateway.northbound.requests import group_writes
+from gateway.northbound.requests.acceptance import Acceptance, Sender
+from gateway.northbound.requests.group_writes import GroupWrites
 from gateway.tags import WriteRule
 from tests.northbound.plant import PlainDevice, PlainPlant, gateway_and_client, tag
 

@@ -2,7 +2,7 @@
 
 import asyncio
 
-from gateway.northbound.inbox import LIMIT, Inbox
+from gateway.northbound.requests.inbox import LIMIT, Inbox
 from tests.northbound.plant import (
     until,
 )

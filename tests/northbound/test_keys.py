@@ -4,8 +4,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gateway.contract.keys import Family, Keys, ParsedKey, max_age, parse_key
 from gateway.errors import BadValue, ConfigError
-from gateway.northbound.keys import Family, Keys, ParsedKey, max_age, parse_key
 
 KEYS = Keys("site/plant", "hall-1")
 CHUNK = st.from_regex(r"[\w.\-]{1,12}", fullmatch=True)

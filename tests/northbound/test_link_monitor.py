@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import structlog
 import zenoh
 
-from gateway.northbound.link_monitor import LinkMonitor
+from gateway.northbound.session.link_monitor import LinkMonitor
 
 
 class Transport(NamedTuple):

@@ -2,7 +2,7 @@
 
 import pytest
 
-from gateway.northbound.losses import ROUNDS, Losses
+from gateway.northbound.publishing.losses import ROUNDS, Losses
 from gateway.tags import good
 from tests.northbound.plant import tag
 

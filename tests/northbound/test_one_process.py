@@ -6,7 +6,7 @@ import sys
 import pytest
 
 from gateway.errors import GatewayError
-from gateway.northbound.one_process import only_process
+from gateway.northbound.session.one_process import only_process
 
 OWN = f"plant/@gateway/demo{os.getpid()}"
 

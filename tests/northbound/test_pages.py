@@ -3,7 +3,7 @@
 import pytest
 
 from gateway.errors import BadValue
-from gateway.northbound import pages
+from gateway.northbound.answering import pages
 from tests.northbound.plant import tag
 
 TAGS = [tag("mixer", name) for name in ("level", "recipe", "speed")]

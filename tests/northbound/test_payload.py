@@ -8,6 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gateway.contract import payload
+from gateway.contract.meta import meta
+from gateway.contract.parsing import parse_write
+from gateway.contract.payload import Failure, Problem, WriteOutcome
 from gateway.errors import (
     BadValue,
     Busy,
@@ -18,10 +22,6 @@ from gateway.errors import (
     Refused,
     Unclear,
 )
-from gateway.northbound import payload
-from gateway.northbound.meta import meta
-from gateway.northbound.parsing import parse_write
-from gateway.northbound.payload import Failure, Problem, WriteOutcome
 from gateway.protocols.driver import Address, Span, Unit
 from gateway.tags import Deadband, Reason, Tag, WriteResult, WriteRule, bad, good
 from gateway.tags.shaping import Names

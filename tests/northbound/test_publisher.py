@@ -9,9 +9,9 @@ import threading
 import time
 from typing import Any
 
-from gateway.northbound.keys import Keys
-from gateway.northbound.losses import Losses
-from gateway.northbound.publisher import EVENTS_LIMIT, Publisher
+from gateway.contract.keys import Keys
+from gateway.northbound.publishing.losses import Losses
+from gateway.northbound.publishing.publisher import EVENTS_LIMIT, Publisher
 from tests.northbound.plant import (
     PlainDevice,
     PlainPlant,

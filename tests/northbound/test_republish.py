@@ -9,12 +9,12 @@ from typing import Any
 import pytest
 
 from gateway.config import ZenohConfig, ZenohMode
-from gateway.northbound.keys import Keys
-from gateway.northbound.link_monitor import LinkMonitor
-from gateway.northbound.losses import Losses
+from gateway.contract.keys import Keys
+from gateway.northbound.answering.tag_index import TagIndex
 from gateway.northbound.northbound import Northbound
-from gateway.northbound.republish import Republisher
-from gateway.northbound.tag_index import TagIndex
+from gateway.northbound.publishing.losses import Losses
+from gateway.northbound.publishing.republish import Republisher
+from gateway.northbound.session.link_monitor import LinkMonitor
 from gateway.tags import Reason, Sample, bad
 from tests.northbound.plant import (
     PlainDevice,

@@ -10,9 +10,10 @@ import pytest
 import zenoh
 
 from gateway.config import TlsConfig, ZenohConfig
+from gateway.contract import secrets
 from gateway.errors import ConfigError
-from gateway.northbound import secrets
-from gateway.northbound.session_settings import configure
+from gateway.northbound.session import exposures
+from gateway.northbound.session.session_settings import configure
 from tests.e2e.processes import Program
 from tests.northbound.access import (
     GATEWAY_RULES,
@@ -217,7 +218,7 @@ def test_an_unprotected_endpoint_gives_a_warning(
     config = configure(ZenohConfig())
     for path, value in {"listen/endpoints": [listen], **setup}.items():
         config.insert_json5(path, json.dumps(value))
-    warnings = secrets.exposures(config)
+    warnings = exposures.exposures(config)
     assert len(warnings) == len(says)
     for sentence, words in zip(warnings, says, strict=True):
         assert words in sentence

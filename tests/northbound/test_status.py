@@ -7,13 +7,13 @@ from typing import Any
 
 import pytest
 
-from gateway.app import Gateway
 from gateway.config import load
+from gateway.contract import payload
+from gateway.contract.status import device_document, standing
 from gateway.engine.device import Device
 from gateway.errors import NoReply
 from gateway.line.line import Line
-from gateway.northbound import payload
-from gateway.northbound.status import device_document, standing
+from gateway.plant.plant import Gateway
 from tests.e2e.processes import vigor_line, write_config
 
 TAGS = {"speed": {"address": "D10"}, "door": {"address": "M12"}}

@@ -5,11 +5,11 @@ import json
 import time
 from collections.abc import Mapping
 
-from gateway.northbound.audit import Audit
-from gateway.northbound.keys import Keys
-from gateway.northbound.losses import Losses
-from gateway.northbound.publisher import Publisher
-from gateway.northbound.status_publisher import StatusPublisher
+from gateway.contract.keys import Keys
+from gateway.northbound.publishing.losses import Losses
+from gateway.northbound.publishing.publisher import Publisher
+from gateway.northbound.publishing.status_publisher import StatusPublisher
+from gateway.northbound.requests.audit import Audit
 
 KEYS = Keys("plant", "demo")
 

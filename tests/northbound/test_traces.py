@@ -7,7 +7,7 @@ import zenoh
 
 from gateway.config import ZenohConfig
 from gateway.line.wire_log import Piece
-from gateway.northbound.traces import MOST_WAITING, Tap
+from gateway.northbound.publishing.traces import MOST_WAITING, Tap
 from tests.northbound.plant import mixer, serving
 from tests.zenoh_peer import free_endpoint
 

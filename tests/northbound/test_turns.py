@@ -4,7 +4,7 @@ import threading
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 
-from gateway.northbound.turns import Pause, Rank, Turns
+from gateway.northbound.answering.turns import Pause, Rank, Turns
 
 PATIENCE = 60.0  # seconds; never waited for when all is well
 

@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from gateway.northbound import watchdog
-from gateway.northbound.watchdog import Watchdog
+from gateway.northbound.session import watchdog
+from gateway.northbound.session.watchdog import Watchdog
 
 
 class Session:

@@ -12,13 +12,12 @@ from typing import Any
 import pytest
 
 from gateway.config import ZenohConfig
+from gateway.contract.buckets import Bucket, Now
+from gateway.contract.question import Question
+from gateway.contract.signatures import sign
+from gateway.contract.writers import EARLIEST, LATEST, NotAllowed, Repeated, Writers
 from gateway.errors import ConfigError
-from gateway.history.buckets import Bucket
-from gateway.history.course import Now
-from gateway.history.question import Question
 from gateway.northbound.northbound import Northbound
-from gateway.northbound.signatures import sign
-from gateway.northbound.writers import EARLIEST, LATEST, NotAllowed, Repeated, Writers
 from gateway.tags import Sample, Tag
 from gateway.tags.recorded import Recorded, RecordedQuery
 from gateway.tags.timestamps import rfc3339

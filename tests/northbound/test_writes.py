@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from gateway.config import ZenohConfig
+from gateway.contract.keys import Keys
 from gateway.errors import (
     BadValue,
     Busy,
@@ -15,14 +16,13 @@ from gateway.errors import (
     NoReply,
     Refused,
 )
-from gateway.line.duty import Duty
-from gateway.northbound import inbox
-from gateway.northbound.acceptance import Acceptance, Sender
-from gateway.northbound.audit import Audit
-from gateway.northbound.keys import Keys
-from gateway.northbound.own_writes import OwnWrites
-from gateway.northbound.tag_index import TagIndex
-from gateway.northbound.writes import MOST_WAITING, Writes
+from gateway.line.send_permit import Duty
+from gateway.northbound.answering.tag_index import TagIndex
+from gateway.northbound.requests import inbox
+from gateway.northbound.requests.acceptance import Acceptance, Sender
+from gateway.northbound.requests.audit import Audit
+from gateway.northbound.requests.own_writes import OwnWrites
+from gateway.northbound.requests.writes import MOST_WAITING, Writes
 from tests.northbound.plant import (
     gateway_and_client,
     mixer,

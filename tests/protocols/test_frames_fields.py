@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gateway.errors import BadValue, ConfigError, Garbled
-from gateway.numerals import Scalar
 from gateway.protocols.frames import Field
+from gateway.values.numerals import Scalar
 from tests.vectors import vectors
 
 BY_ID = {v.id: v for v in vectors("noproto-vb1com", "noproto-k120s", "vigor")}

@@ -5,7 +5,7 @@ from typing import TypeVar
 
 import pytest
 
-from gateway.reload import renewal
+from gateway.service.reload import renewal
 
 T = TypeVar("T")
 

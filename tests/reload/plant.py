@@ -6,12 +6,12 @@ from contextlib import asynccontextmanager
 from copy import deepcopy
 from typing import Any
 
-from gateway.app import Gateway
 from gateway.config import built
 from gateway.config.changes import Difference, compare
 from gateway.engine.jobs import Job, Poll
-from gateway.reload import RunningLines
-from gateway.reload.renewal import Renewal
+from gateway.plant.plant import Gateway
+from gateway.service.reload import RunningLines
+from gateway.service.reload.renewal import Renewal
 from gateway.tags import Quality, Sample
 
 Data = dict[str, Any]

@@ -5,10 +5,10 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from gateway.app import Gateway
 from gateway.config import load
-from gateway.reload import LiveReload, Reloader, RunningLines
-from gateway.supervisor import Supervisor
+from gateway.plant.plant import Gateway
+from gateway.service.reload import LiveReload, Reloader, RunningLines
+from gateway.service.supervisor import Supervisor
 from tests.reload.plant import Data, file, vigor
 from tests.sim.virtual import on_virtual_time
 

@@ -6,10 +6,10 @@ from functools import cache
 from typing import Any
 
 from gateway.config import Config, built
-from gateway.line.served_line import ServedLine
-from gateway.serving.answering import Answerer, Heard
-from gateway.serving.registers import Row
-from gateway.serving.station import Station
+from gateway.parts.serving.served_line import ServedLine
+from gateway.stations.served.answering import Answerer, Heard
+from gateway.stations.served.registers import Row
+from gateway.stations.served.station import Station
 from gateway.tags import Reason, Sample, Tag, bad, good
 from gateway.values import Value
 

@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gateway.protocols.checksums import crc16, lrc
-from gateway.serving.modbus_wire import RtuReader
+from gateway.stations.served.modbus_wire import RtuReader
 from gateway.tags import Quality
 from tests.serving.bench import Bench
 

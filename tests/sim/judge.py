@@ -4,7 +4,7 @@ import asyncio
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from gateway.app import Gateway
+from gateway.plant.plant import Gateway
 from gateway.protocols.capabilities import UnnumberedReplies
 from gateway.protocols.driver import Span
 from gateway.protocols.frames import FrameDriver

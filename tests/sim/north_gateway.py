@@ -4,11 +4,11 @@ import asyncio
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from gateway.app import Gateway
 from gateway.config import Config, LineConfig
-from gateway.history import Historian
 from gateway.northbound.northbound import Northbound
-from gateway.northbound.session import off_loop
+from gateway.northbound.session.session import off_loop
+from gateway.parts.history import Historian
+from gateway.plant.plant import Gateway
 from gateway.tags import Sample
 from tests.sim.north_judge import Judge
 
@@ -16,7 +16,7 @@ CLOSE_WITHIN = 1.0  # seconds for the history
 
 
 class Process:
-    """Lines, Zenoh side and history, connected, started and ended as `service.py` does."""
+    """Lines, Zenoh side and history, connected, started and ended as `service/service.py` does."""
 
     def __init__(
         self,

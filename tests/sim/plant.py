@@ -16,8 +16,8 @@ from gateway.engine.device_settings import DeviceSettings
 from gateway.engine.engine import Engine
 from gateway.engine.health import State
 from gateway.errors import GatewayError
-from gateway.line.duty import Duty
 from gateway.line.line import Line
+from gateway.line.send_permit import Duty
 from gateway.planning.wire_timing import WireTiming
 from gateway.protocols.driver import AnyDriver, Span, Timing, Unit
 from gateway.protocols.vigor import Vigor

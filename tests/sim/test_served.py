@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 
 from gateway.config import built
-from gateway.line.served_line import ServedLine
+from gateway.parts.serving.served_line import ServedLine
 from gateway.protocols.checksums import crc16
-from gateway.serving.station import Station
+from gateway.stations.served.station import Station
 from gateway.tags import Quality, Sample
 from gateway.transport import Port, Receiver
 

@@ -11,16 +11,16 @@ from typing import Any
 import orjson
 import pytest
 
-from gateway.alarms import State
-from gateway.app import Gateway
 from gateway.config import LineConfig, built
-from gateway.line.build import OpenPort
-from gateway.northbound.audit import Audit
-from gateway.northbound.keys import Keys
-from gateway.northbound.own_writes import OwnWrites
+from gateway.contract.keys import Keys
+from gateway.northbound.requests.audit import Audit
+from gateway.northbound.requests.own_writes import OwnWrites
+from gateway.parts.alarms import State
+from gateway.parts.transfers import Transfers
+from gateway.plant.build import OpenPort
+from gateway.plant.plant import Gateway
 from gateway.stations.registry import station_of
 from gateway.stations.station import Memory, Station
-from gateway.transfers import Transfers
 from tests.sim.bench import Bench
 from tests.sim.virtual import now, on_virtual_time
 

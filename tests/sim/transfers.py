@@ -7,14 +7,14 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+from gateway.contract.keys import Keys
 from gateway.engine.device import Device
 from gateway.errors import BadValue, GatewayError, Refused
-from gateway.northbound.audit import Audit
-from gateway.northbound.keys import Keys
-from gateway.northbound.own_writes import OwnWrites
+from gateway.northbound.requests.audit import Audit
+from gateway.northbound.requests.own_writes import OwnWrites
+from gateway.parts.transfers import Transfers
 from gateway.tags import Quality, Sample, Tag, WriteResult
 from gateway.tags.transfer import TransferRule
-from gateway.transfers import Transfers
 from gateway.values import Value
 from tests.sim.arrays import shown
 from tests.sim.bus import Bus

@@ -18,11 +18,11 @@ from typing import Any
 
 import structlog
 
-from gateway.app import Gateway
 from gateway.config import LineConfig, load
 from gateway.engine.changes import Changes
 from gateway.engine.device_settings import DeviceSettings
 from gateway.engine.shorter_silences import Pace
+from gateway.plant.plant import Gateway
 from gateway.protocols.frames import FrameDriver
 from gateway.protocols.frames.driver import LISTENED
 from gateway.tags import Sample

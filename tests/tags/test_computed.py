@@ -6,11 +6,11 @@ import pytest
 
 from gateway.config import ConfigErrors, load
 from gateway.config.formulas import parse
-from gateway.numerals import Scalar
 from gateway.tags import Quality, Reason, Sample, Tag, bad, good
 from gateway.tags.formula import Formula
 from gateway.tags.mirror import Mirror
 from gateway.values import Value
+from gateway.values.numerals import Scalar
 from tests.config.test_config import M, tags
 
 FORMULAS: list[tuple[str, Scalar, Scalar, Scalar]] = [

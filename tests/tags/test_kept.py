@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from gateway.config import ConfigErrors, load
-from gateway.history.state_file import StateFile
-from gateway.northbound.meta import meta_fields
+from gateway.contract.meta import meta_fields
+from gateway.plant.state_file import StateFile
 from gateway.tags import Quality, Reason, Sample, Tag, bad, good
 from gateway.tags.kept import CounterState
 from gateway.tags.mirror import Mirror

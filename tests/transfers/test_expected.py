@@ -4,8 +4,8 @@ from typing import Any
 
 import pytest
 
-from gateway.app import Gateway
-from gateway.transfers.forecast import forecasts
+from gateway.parts.transfers.forecast import forecasts
+from gateway.plant.plant import Gateway
 from tests.reload.plant import Data, file, running, vigor
 from tests.sim.virtual import on_virtual_time
 

@@ -18,10 +18,10 @@ from gateway.errors import (
     Superseded,
     Unclear,
 )
+from gateway.parts.transfers.codes import DONE, Code, End, outcome_of
+from gateway.parts.transfers.row import Carry, Reading, Row, State
 from gateway.tags import Reason
 from gateway.tags.transfer import TransferRule
-from gateway.transfers.codes import DONE, Code, End, outcome_of
-from gateway.transfers.row import Carry, Reading, Row, State
 from gateway.values import Value
 
 BAD = Reading(None, float("inf"), Reason.NO_REPLY)

@@ -9,16 +9,16 @@ from typing import Any
 import orjson
 import pytest
 
+from gateway.contract.keys import Keys
 from gateway.errors import Busy, Unclear
-from gateway.line.duty import Duty
-from gateway.line.on_demand import OnDemand
-from gateway.northbound.audit import Audit
-from gateway.northbound.keys import Keys
-from gateway.northbound.own_writes import OwnWrites
+from gateway.line.send_permit import Duty
+from gateway.northbound.requests.audit import Audit
+from gateway.northbound.requests.own_writes import OwnWrites
+from gateway.parts.transfers import Transfers
+from gateway.plant.on_demand import OnDemand
 from gateway.tags import Tag, WriteResult, good
 from gateway.tags.mirror import Mirror
 from gateway.tags.scan import Decoder
-from gateway.transfers import Transfers
 from gateway.values import Value
 from tests.northbound.plant import mixer
 from tests.reload.plant import Data, Plant, file, running, vigor

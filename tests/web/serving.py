@@ -7,12 +7,12 @@ from contextlib import asynccontextmanager
 from typing import Any, NamedTuple
 
 from gateway.config import WebConfig
-from gateway.northbound.audit import Counts
-from gateway.northbound.payload import Failure, GroupResult, Problem
+from gateway.contract.payload import Failure, GroupResult, Problem
+from gateway.northbound.requests.audit import Counts
+from gateway.parts.web import metrics
+from gateway.parts.web.server import Server
+from gateway.parts.web.sources import Documents, Sources
 from gateway.tags import WriteResult
-from gateway.web import metrics
-from gateway.web.server import Server
-from gateway.web.sources import Documents, Sources
 from tests.e2e.processes import free_port
 from tests.northbound.plant import PlainPlant, mixer
 

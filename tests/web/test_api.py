@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
-from gateway.northbound.payload import Failure, GroupResult, Problem
+from gateway.contract.payload import Failure, GroupResult, Problem
+from gateway.parts.web.server import Server
+from gateway.parts.web.sources import Sources
 from gateway.tags import AlarmRule, Level, WriteResult, good
-from gateway.web.server import Server
-from gateway.web.sources import Sources
 from tests.history.recorded import SPEED, history
 from tests.northbound.plant import PlainDevice, PlainPlant, mixer, tag
 from tests.schema_check import violations
@@ -25,7 +25,7 @@ from tests.web.serving import (
     transfer,
 )
 
-DESCRIBED = json.loads((Path(__file__).parents[2] / "gateway/web/assets/openapi.json").read_text())
+DESCRIBED = json.loads((Path(__file__).parents[2] / "gateway/parts/web/assets/openapi.json").read_text())
 PAGE = {"/", "/page.js", "/page.css", "/openapi.json"}
 AS_JSON = {"Content_Type": "application/json", "Authorization": f"Bearer {TOKEN}"}
 
@@ -211,7 +211,7 @@ async def test_a_write_goes_on_when_its_client_leaves(tokens: Path) -> None:
 async def test_a_body_that_does_not_arrive_is_not_waited_for(
     tokens: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gateway.web.api.BODY_WITHIN", 0.05)
+    monkeypatch.setattr("gateway.parts.web.api.BODY_WITHIN", 0.05)
     async with serving(tokens_file=tokens) as client:
         address = "/api/write?tag=mixer/recipe"
         answer = await client.ask(address, "POST", b"", Content_Length="9", **AS_JSON)
@@ -266,9 +266,9 @@ async def test_a_line_is_watched_only_while_a_page_shows_it() -> None:
 
 
 async def test_a_page_that_takes_nothing_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gateway.web.events.SLOW", 0.2)
-    monkeypatch.setattr("gateway.web.events.WIRE_EVERY", 0.0)
-    monkeypatch.setattr("gateway.web.events.STATE_EVERY", 0.0)
+    monkeypatch.setattr("gateway.parts.web.events.SLOW", 0.2)
+    monkeypatch.setattr("gateway.parts.web.events.WIRE_EVERY", 0.0)
+    monkeypatch.setattr("gateway.parts.web.events.STATE_EVERY", 0.0)
     async with serving() as client:
         refused = ["D512..D519 of mixer: refused with 28 " + "x" * 1000] * 50
         known = {"standing": "up", "diagnosis": "", "refused_addresses": refused}

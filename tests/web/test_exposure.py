@@ -8,7 +8,7 @@ import pytest
 
 from gateway.config import ConfigErrors, load
 from gateway.errors import ConfigError
-from gateway.web import exposure
+from gateway.parts.web import exposure
 from tests.e2e.processes import ROOT, vigor_line, write_config
 from tests.web.serving import TOKEN
 
@@ -25,7 +25,7 @@ def warned(folder: Path, token: str = TOKEN, **web: object) -> list[str]:
 
 def test_the_web_server_is_imported_only_where_the_file_has_web() -> None:
     program = (
-        "import sys, gateway.cli.main, gateway.service, gateway.web.exposure; "
+        "import sys, gateway.cli.main, gateway.service.service, gateway.parts.web.exposure; "
         "print([name for name in ('aiohttp', 'prometheus_client') if name in sys.modules])"
     )
     done = subprocess.run(

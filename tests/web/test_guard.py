@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from gateway.errors import ConfigError
-from gateway.web.server import MOST_CONNECTIONS
+from gateway.parts.web.server import MOST_CONNECTIONS
 from tests.web.serving import TOKEN, Client, serving
 
 
@@ -48,7 +48,7 @@ async def test_other_addresses_need_a_token_for_every_value(tokens: Path) -> Non
 async def test_a_withdrawn_token_is_refused_within_a_second(
     tokens: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gateway.northbound.named_secrets._CHECK_EVERY", 0.0)
+    monkeypatch.setattr("gateway.contract.named_secrets._CHECK_EVERY", 0.0)
     async with serving(host="0.0.0.0", tokens_file=tokens) as client:
         assert (await client.ask("/metrics", Authorization=f"Bearer {TOKEN}")).status == 200
         tokens.write_text("# nobody\n")

@@ -2,10 +2,10 @@
 
 from prometheus_client.parser import text_string_to_metric_families
 
-from gateway.northbound.audit import Counts
-from gateway.northbound.payload import Failure, Problem, WriteOutcome
+from gateway.contract.payload import Failure, Problem, WriteOutcome
+from gateway.northbound.requests.audit import Counts
+from gateway.parts.web import metrics
 from gateway.tags import WriteResult
-from gateway.web import metrics
 from tests.northbound.plant import mixer
 from tests.web.serving import PlainNorth, calling, transfer
 

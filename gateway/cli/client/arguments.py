@@ -10,8 +10,8 @@ import zenoh
 from gateway.config.address import Address
 from gateway.config.messages import similar
 from gateway.errors import ConfigError
-from gateway.numerals import parse_decimal
 from gateway.values import Value
+from gateway.values.numerals import parse_decimal
 
 if TYPE_CHECKING:
     from gateway.config import Config

@@ -16,8 +16,8 @@ from gateway.cli.client.rows import Row, document, raw, reason, without_gateway
 from gateway.cli.client.tracing import traced
 from gateway.cli.client.value_pages import paged
 from gateway.config.address import Address
+from gateway.contract.keys import Keys
 from gateway.errors import GatewayError
-from gateway.northbound.keys import Keys
 from gateway.values import Value
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from gateway.cli.client.client import Client
 from gateway.config import ZenohConfig, ZenohMode
 from gateway.config.address import Address, address
 from gateway.errors import ConfigError, GatewayError
-from gateway.northbound.session_settings import configure
+from gateway.northbound.session.session_settings import configure
 
 if TYPE_CHECKING:
     from gateway.config import Config

@@ -3,8 +3,8 @@
 import os
 import time
 
+from gateway.contract.signatures import sign
 from gateway.errors import ConfigError
-from gateway.northbound.signatures import sign
 from gateway.tags.timestamps import rfc3339
 
 WRITER_VARIABLE = "PLC_GATEWAY_WRITER"

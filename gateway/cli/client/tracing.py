@@ -10,7 +10,7 @@ import orjson
 import zenoh
 
 from gateway.cli.client.rows import document
-from gateway.northbound.keys import Keys
+from gateway.contract.keys import Keys
 
 LOOK_EVERY = 0.5  # seconds; Ctrl-C does not interrupt a wait without end
 

@@ -20,7 +20,7 @@ def paged(query: Query, key: str) -> Iterator[zenoh.Sample]:
 
     Several gateways may reply, each in pages of its own.
     """
-    from gateway.northbound.pages import LARGEST  # with all about tags
+    from gateway.northbound.answering.pages import LARGEST  # with all about tags
 
     size, places = FIRST, dict[str, str]()
     unfinished: set[str] = set()

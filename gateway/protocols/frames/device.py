@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 from typing import Literal, TypeVar
 
 from gateway.errors import BadValue, ConfigError, Garbled
-from gateway.numerals import Scalar
 from gateway.protocols.driver import Cost, Talk, Timing
 from gateway.protocols.frames.bytetext import NAME, octets
 from gateway.protocols.frames.codec import FrameCodec, FrameReader
@@ -20,6 +19,7 @@ from gateway.protocols.frames.messages import Ask, Listen, Values, Write, filled
 from gateway.protocols.frames.patterns import check_pattern, longest_match
 from gateway.protocols.frames.presets import written_out
 from gateway.protocols.unsolicited import UnsolicitedFrame
+from gateway.values.numerals import Scalar
 
 T = TypeVar("T")
 

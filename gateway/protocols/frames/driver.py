@@ -4,12 +4,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from gateway.numerals import Scalar
 from gateway.protocols.driver import Address, Area, Cost, Span, Talk, Timing, Traits, Unit
 from gateway.protocols.frames.codec import FrameCodec
 from gateway.protocols.frames.device import Frames
 from gateway.protocols.frames.listener import Listener
 from gateway.protocols.typed_fields import TypedField
+from gateway.values.numerals import Scalar
 
 LISTENED, WRITTEN = "listened", "written"
 _TRAITS = Traits(baudrate=9600, format="8N1", numbered=False)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 from gateway.errors import BadValue, ConfigError, Evidence, Garbled
-from gateway.numerals import Scalar, real, shortest, whole
 from gateway.values import LONGEST_STRING, Kind, ValueType
+from gateway.values.numerals import Scalar, real, shortest, whole
 
 FieldType = Literal[
     "uint8",

@@ -5,10 +5,10 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 
 from gateway.errors import ConfigError, Evidence, Garbled, Refused
-from gateway.numerals import Scalar
 from gateway.protocols.frames.bytetext import NAME, Hole, octets, template
 from gateway.protocols.frames.fields import Field, check_writable
 from gateway.protocols.frames.patterns import pattern
+from gateway.values.numerals import Scalar
 
 Values = Mapping[str, Scalar | Garbled]
 

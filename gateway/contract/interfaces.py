@@ -1,0 +1,144 @@
+"""The parts of the gateway that the Zenoh side uses: its plant and its history."""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Literal, Protocol
+
+from gateway.contract.buckets import Bucket, Now
+from gateway.contract.question import Question
+from gateway.engine.requests import CommandResult, Peeked
+from gateway.errors import GatewayError
+from gateway.line.send_permit import Duty
+from gateway.line.wire_log import WireLog
+from gateway.parts.alarms import Alarms
+from gateway.tags import Sample, Tag, WriteResult
+from gateway.tags.recorded import Recorded, RecordedQuery
+from gateway.values import Value
+
+
+class Device(Protocol):
+    """One device and its tags."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def tags(self) -> Iterable[Tag]: ...
+
+    @property
+    def blocks(self) -> bool | Literal["only"]:
+        """True: each scan is also published as one `@block`. "only": single values are not."""
+
+
+class Lines(Protocol):
+    """The lines of the plant."""
+
+    def wire_logs(self) -> Mapping[str, WireLog]:
+        """Returns the wire logs by line."""
+
+
+class Plant(Lines, Protocol):
+    """The devices, their samples, writes and commands. All but `sample` on the event loop."""
+
+    @property
+    def duty(self) -> Duty: ...
+
+    @property
+    def alarms(self) -> Alarms: ...
+
+    def devices(self) -> Iterable[Device]: ...
+
+    def begin(self) -> None:
+        """Notes that this gateway is active now. Called before the first sample is served."""
+
+    def tag(self, key: str) -> Tag | None:
+        """Finds a tag by `device/name`."""
+
+    def sample(self, tag: Tag) -> Sample:
+        """Returns the current sample. Answering threads call it too: one look-up, nothing else.
+
+        The plant updates it before it calls `Northbound.publish`; otherwise a reader could keep
+        the older of two values.
+        """
+
+    def mark_published(self, samples: Sequence[Sample]) -> None:
+        """Notes samples that are about to be published again: later changes are measured against
+        them."""
+
+    async def write(self, tag: Tag, value: Value, within: float) -> WriteResult:
+        """Returns when the device has acknowledged. Raises `GatewayError`; `Busy` and `BadValue`
+        only when nothing was sent: after `within` seconds nothing is sent any more. Cancelled when
+        the client no longer waits."""
+
+    async def write_group(
+        self, values: Sequence[tuple[Tag, Value]], within: float, patience: float
+    ) -> Sequence[WriteResult | GatewayError]:
+        """Writes tags of one device in their order. Returns the outcome of each, at the latest
+        after `patience` seconds: what has not ended then is `Unclear`. After the first that is not
+        done the others are `NotSent`. Raises `GatewayError` when nothing was sent; `within` as in
+        `write`."""
+
+    def commands(self) -> Mapping[str, frozenset[str]]:
+        """By device: the commands of its protocol, allowed or not."""
+
+    def speaker(self, line: str) -> str:
+        """Returns the device that sends a command to all stations of a line. Raises `BadValue`."""
+
+    async def control(
+        self, device: str, command: str, argument: str, within: float
+    ) -> CommandResult:
+        """Returns the device's answer. Raises `GatewayError`; `BadValue` before anything is
+        sent."""
+
+    async def peek(self, device: str, text: str) -> Peeked:
+        """Reads any addresses once, such as `D100..D119`. Raises `GatewayError`; `BadValue` before
+        anything is sent."""
+
+    def dialling(self, device: str) -> float:
+        """Returns the seconds that a request may wait for a telephone call; 0: for none."""
+
+    def is_fresh(self, tag: Tag, max_age: float) -> bool:
+        """True if the current sample is younger than `max_age` seconds, or cannot be read now."""
+
+    async def fresh(self, tag: Tag, max_age: float) -> Sample:
+        """Returns the current sample if it `is_fresh`, otherwise reads the device. Raises `Busy`
+        when the line did not get to it in time."""
+
+    def status(self) -> Mapping[str, Mapping[str, object]]:
+        """Documents by path: `status`, `lines/<line>`, `devices/<device>`."""
+
+
+class History(Protocol):
+    """Recorded samples, found by Zenoh's time ranges. `now`: ns since 1970, when the query came."""
+
+    def samples(self, tag: Tag, time_range: str, limit: int | None, now: int) -> Iterator[Sample]:
+        """The first `limit` samples in the order of time; called from an answering thread.
+
+        Raises `BadValue` for a range that cannot be parsed, and `Busy`, also in the middle, when
+        the file cannot be read now, and `Damaged` at the end when a part of it was left out.
+        """
+
+    def buckets(
+        self, tag: Tag, question: Question, now: Now, pause: Callable[[], None]
+    ) -> Iterator[Bucket]:
+        """The buckets of a tag in the order of time. Calls `pause` often. Raises like `samples`."""
+
+    def newest(
+        self, tag: Tag, question: Question, now: int, pause: Callable[[], None]
+    ) -> Iterator[Sample]:
+        """The last samples of a tag in the order of time. Raises like `samples`."""
+
+    def as_recorded(self, query: RecordedQuery, pause: Callable[[], None]) -> Recorded:
+        """Calls `pause` at least every few milliseconds. Raises `BadValue`, `Busy`."""
+
+    def writes(self, time_range: str, limit: int | None, now: int) -> Iterator[str]:
+        """Outcomes of writes and commands, as on the `writes` key. Raises like `samples`."""
+
+    def alarms(self, time_range: str, limit: int | None, now: int) -> Iterator[str]:
+        """Changes of alarms, as JSON in the order of time. Raises like `samples`."""
+
+    def record_alarm(self, time: int, change: str) -> None:
+        """Records one change; `time`: ns since 1970. Never blocks."""
+
+    def record_write(self, time: int, outcome: str, *, refused: bool) -> None:
+        """Records one outcome, as on the `writes` key; `time`: ns since 1970. `refused`: nothing
+        was sent. Never blocks."""

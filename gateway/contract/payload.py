@@ -1,0 +1,290 @@
+"""Samples, descriptions and outcomes -> the JSON that travels on Zenoh.
+
+A value is `{"value": 12.5, "quality": "good", "time": "2026-11-20T12:00:00.123456Z"}`. An unknown
+value has `"value": null, "quality": "bad"` and a `reason`, in some cases with a sentence for people
+in `detail`. A value with a name has it in `text`. Integers stay JSON integers whatever their size:
+beyond 2**53 a reader in JavaScript must parse them itself.
+"""
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from functools import lru_cache
+
+import orjson
+
+from gateway.engine.requests import CommandResult
+from gateway.errors import (
+    BadValue,
+    Busy,
+    Damaged,
+    GatewayError,
+    LineDown,
+    NotSent,
+    Offline,
+    Refused,
+)
+from gateway.tags import Quality, Reason, Sample, WriteResult
+from gateway.tags.timestamps import rfc3339
+from gateway.values import Value
+from gateway.values.numerals import Scalar
+
+LONGEST_REASON = 300
+LOGGED_ELEMENTS = 128  # of a longer array the record has the beginning, as text
+_GOOD = Quality.GOOD  # looking up a member of an enumeration takes 0.2 µs
+
+
+class Problem(StrEnum):
+    """The error words of the contract."""
+
+    NOT_WRITABLE = "not-writable"
+    BAD_VALUE = "bad-value"
+    REFUSED = "refused"  # by the device; `code` is its own
+    UNCLEAR = "unclear"  # the device may or may not have executed it
+    LINE_DOWN = "line-down"
+    NO_REPLY = "no-reply"  # the device is silent; nothing was sent
+    BUSY = "busy"  # too many requests are waiting; nothing was done
+    UNKNOWN_TAG = "unknown-tag"
+    NOT_SENT = "not-sent"  # a tag of a group: another one was wrong, or not done before it
+    INCOMPLETE = "incomplete"  # of a group: some tags were written, and others were not
+    NOT_ALLOWED = "not-allowed"  # the client's signature is missing, wrong or too old
+    NOTHING_TO_ACKNOWLEDGE = "nothing-to-acknowledge"  # the alarm is normal, or was raised again
+    BAD_QUERY = "bad-query"  # a read with parameters that cannot be parsed
+    DAMAGED = "damaged"  # a part of the history file is lost; all the rest was answered
+    NO_HISTORY = "no-history"  # a read of the past from a gateway without history
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """A request that was not done, or whose result is unclear."""
+
+    problem: Problem
+    reason: str
+    code: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class GroupResult:
+    """The outcome of each tag of a group, by name in their order; `took` in seconds."""
+
+    tags: Mapping[str, WriteResult | Failure]
+    took: float
+
+    @property
+    def failure(self) -> Failure | None:
+        """The first tag that was not written, for the whole; None: all were.
+
+        Its own error only where certainly no tag was written.
+        """
+        failed = {name: end for name, end in self.tags.items() if isinstance(end, Failure)}
+        if not failed:
+            return None
+        causes = {n: end for n, end in failed.items() if end.problem is not Problem.NOT_SENT}
+        first = next(iter((causes or failed).values()))
+        problem, done = first.problem, len(self.tags) - len(failed)
+        if any(end.problem is Problem.UNCLEAR for end in failed.values()):
+            problem = Problem.UNCLEAR
+        elif done:
+            problem = Problem.INCOMPLETE
+        reasons = "; ".join(f"{name}: {end.reason}" for name, end in causes.items())
+        count = f"{done} of {len(self.tags)} tags were written"
+        return Failure(problem, f"{count}: {reasons}" if causes else count, first.code)
+
+
+@dataclass(frozen=True, slots=True)
+class WriteOutcome:
+    """One write or command with its result, for log, history and the `writes` key.
+
+    `key` is the key of the written value, or of the command; `value` the requested value (None if
+    it could not be parsed), or the command's argument; `time` is when it ended (ns since 1970),
+    `took` is in seconds, `by` names the client, if Zenoh or a token does.
+    """
+
+    key: str
+    value: Value | None
+    result: WriteResult | CommandResult | Failure
+    time: int
+    took: float
+    by: str | None = None
+    command: bool = False
+
+
+def failure(error: GatewayError) -> Failure:
+    """Translates an error for the client. An error after which the request may have been done is
+    unclear."""
+    reason = str(error) or type(error).__name__
+    match error:
+        case NotSent():
+            return Failure(Problem.NOT_SENT, reason)
+        case BadValue():
+            return Failure(Problem.BAD_VALUE, reason)
+        case Refused(code=code):
+            return Failure(Problem.REFUSED, reason, code)
+        case LineDown():
+            return Failure(Problem.LINE_DOWN, reason)
+        case Busy():
+            return Failure(Problem.BUSY, reason)
+        case Offline():
+            return Failure(Problem.NO_REPLY, reason)
+        case Damaged():
+            return Failure(Problem.DAMAGED, reason)
+        case _:
+            return Failure(Problem.UNCLEAR, reason)
+
+
+# -- out ---------------------------------------------------------------------------------------
+
+
+def value(sample: Sample) -> bytes:
+    """The value with quality and time. A good one in half the time that `sample_fields` takes."""
+    known = sample.value
+    if sample.quality is not _GOOD or not _has_json(known) or sample.tag.names is not None:
+        return orjson.dumps(sample_fields(sample))
+    return b'{"value":%b%b' % (orjson.dumps(known), _end_of_good(sample.time))
+
+
+@lru_cache(maxsize=256)  # the samples of one scan share one time
+def _end_of_good(time: int) -> bytes:
+    return f',"quality":"good","time":"{rfc3339(time)}"}}'.encode()
+
+
+def _has_json(known: Value | None) -> bool:
+    """JSON has no NaN and no infinity: they must not become a good null."""
+    return known is not None and not (isinstance(known, float) and not math.isfinite(known))
+
+
+def value_text(sample: Sample) -> bytes | None:
+    """The value alone, as text; None if it is unknown. `attachment` holds the rest."""
+    known = sample_fields(sample)["value"]
+    match known:
+        case None:
+            return None
+        case str():
+            return known.encode()
+        case _:
+            return orjson.dumps(known)
+
+
+def attachment(sample: Sample) -> bytes:
+    """`{"quality": "good", "time": …}`, and a `reason` when bad."""
+    return orjson.dumps(
+        {name: item for name, item in sample_fields(sample).items() if name != "value"}
+    )
+
+
+def block(samples: Iterable[Sample]) -> bytes:
+    """`{tag: {value, quality, time}}` of one device."""
+    return orjson.dumps({sample.tag.name: sample_fields(sample) for sample in samples})
+
+
+def outcome(result: WriteResult | Failure | GroupResult) -> bytes:
+    """The reply to one write or to a group, or the error reply to any query."""
+    if not isinstance(result, GroupResult):
+        return orjson.dumps(_result(result))
+    failed = result.failure
+    whole = {} if failed is None else _result(failed)
+    tags = {short(name): _result(end) for name, end in result.tags.items()}
+    return orjson.dumps({**whole, "tags": tags, "took": round(result.took, 6)})
+
+
+def failed(result: WriteResult | Failure | GroupResult) -> Failure | None:
+    """Returns the failure of a write, or of a group; None: all was written."""
+    if isinstance(result, GroupResult):
+        return result.failure
+    return result if isinstance(result, Failure) else None
+
+
+def write_outcome(ended: WriteOutcome) -> bytes:
+    """One line of the audit trail; `outcome` is its `word`."""
+    line: dict[str, object] = {
+        "key": short(ended.key),
+        "value": loggable(ended.value),
+        "time": rfc3339(ended.time),
+        "took": round(ended.took, 6),
+        "by": ended.by,
+    }
+    line["outcome"] = word(ended.result)
+    match ended.result:
+        case WriteResult(verified=verified):
+            line["verified"] = verified
+        case CommandResult(answer):
+            line["answer"] = short(answer)
+        case Failure(_, reason, code):
+            line |= {"code": code, "reason": short(reason)}
+    return orjson.dumps(line)
+
+
+def word(result: WriteResult | CommandResult | Failure) -> str:
+    """`written`, `obeyed` or a `Problem`."""
+    match result:
+        case WriteResult():
+            return "written"
+        case CommandResult():
+            return "obeyed"
+        case Failure(problem):
+            return problem.value
+
+
+def document(fields: Mapping[str, object]) -> bytes:
+    """A status document; values of types that JSON lacks are written as text."""
+    return orjson.dumps(fields, default=str, option=orjson.OPT_NON_STR_KEYS)
+
+
+def sample_fields(sample: Sample) -> dict[str, Value | None]:
+    known = sample.value
+    time = rfc3339(sample.time)
+    reason = sample.reason
+    if sample.quality is Quality.GOOD:
+        if _has_json(known):
+            if sample.tag.names is not None and (text := sample.tag.names.text(known)) is not None:
+                return {"value": known, "text": text, "quality": "good", "time": time}
+            return {"value": known, "quality": "good", "time": time}
+        reason = Reason.NOT_A_NUMBER
+    fields: dict[str, Value | None] = {
+        "value": None,
+        "quality": "bad",
+        "reason": None if reason is None else reason.value,
+        "time": time,
+    }
+    if sample.detail:
+        fields["detail"] = short(sample.detail)
+    return fields
+
+
+def _result(result: WriteResult | Failure) -> dict[str, Value | None]:
+    match result:
+        case WriteResult(known, time, took, verified, acknowledged):
+            return {
+                "value": known,
+                "time": rfc3339(time),
+                "verified": verified,
+                "acknowledged": acknowledged,
+                "took": round(took, 6),
+            }
+        case Failure(problem, reason, code):
+            return {"error": problem.value, "code": code, "reason": short(reason)}
+
+
+def loggable(requested: Value | None) -> Scalar | list[Scalar] | None:
+    """Limits a requested value to a printable size; orjson writes at most 64 bits."""
+    if isinstance(requested, tuple):
+        found = list(map(_loggable, requested))
+        return found if len(found) <= LOGGED_ELEMENTS else short(orjson.dumps(found).decode())
+    return None if requested is None else _loggable(requested)
+
+
+def _loggable(requested: Scalar) -> Scalar:
+    match requested:
+        case str():
+            return short(requested)
+        case int() if not -(2**63) <= requested < 2**64:
+            return short(str(requested))
+        case _:
+            return requested
+
+
+def short(text: str) -> str:
+    """Limits a text from a client to a printable length, and to valid UTF-8."""
+    text = text if len(text) <= LONGEST_REASON else f"{text[:LONGEST_REASON]}…"
+    return text.encode("utf-8", "replace").decode()

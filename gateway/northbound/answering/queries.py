@@ -1,0 +1,249 @@
+"""Answers or refuses each query from the network, and always finishes it.
+
+The event loop sorts them, waits for the plant where it must, and hands the replies to the
+answering threads.
+"""
+
+import asyncio
+import time
+from collections.abc import Awaitable, Callable, Coroutine, Sequence
+from functools import partial
+
+import structlog
+import zenoh
+
+from gateway.contract import payload
+from gateway.contract.interfaces import Plant
+from gateway.contract.keys import Family, ParsedKey, max_age, parse_key
+from gateway.contract.payload import Failure, GroupResult, Problem
+from gateway.contract.question import is_of_past
+from gateway.engine.requests import CommandResult, Peeked
+from gateway.errors import BadValue, Busy, GatewayError
+from gateway.northbound.alarms import Acknowledgements
+from gateway.northbound.answering.answers import Answer, AnswerPool, QueryCounters
+from gateway.northbound.answering.replies import Replies
+from gateway.northbound.answering.tag_index import TagIndex
+from gateway.northbound.requests.acceptance import sender
+from gateway.northbound.requests.commands import Commands
+from gateway.northbound.requests.writes import ANSWER_WITHIN, Writes
+from gateway.tags import Tag, WriteResult
+
+log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
+
+StatusDocuments = Callable[[], Awaitable[dict[str, bytes]]]  # by full key
+
+FRESH_LIMIT = 256  # tags that one query may have read from the devices
+_BUSY = Failure(Problem.BUSY, "too many queries are waiting; nothing was done")
+_LONGEST_RANGE = 100  # characters
+_ENDING = Failure(Problem.UNCLEAR, "the gateway is ending")
+
+
+class Queries:
+    """Takes queries on the event loop and finishes each of them."""
+
+    def __init__(
+        self,
+        plant: Plant,
+        index: TagIndex,
+        writes: Writes,
+        commands: Commands,
+        replies: Replies,
+        documents: StatusDocuments,
+        acknowledgements: Acknowledgements,
+    ) -> None:
+        self._plant = plant
+        self._index = index
+        self._writes = writes
+        self._commands = commands
+        self._replies = replies
+        self._documents = documents
+        self._acknowledgements = acknowledgements
+        self._pool = AnswerPool(partial(replies.outcome, _BUSY))
+        self._tasks: set[asyncio.Task[None]] = set()
+
+    @property
+    def counters(self) -> QueryCounters:
+        return self._pool.counters
+
+    def refuse(self, query: zenoh.Query) -> None:
+        """Called on Zenoh's thread when the inbox is full."""
+        if self._is_foreign(parse_key(str(query.key_expr))):
+            self._pool.dismiss(query)
+        else:
+            self._pool.refuse(query)
+
+    def take(self, query: zenoh.Query, at: float) -> None:
+        """Starts the answer to one query. `at`: when it arrived."""
+        parsed = parse_key(str(query.key_expr))
+        if self._is_foreign(parsed):
+            self._pool.dismiss(query)
+            return
+        if not self._pool.admit(query):
+            return
+        match parsed.family:
+            case Family.SET | Family.COMMAND | Family.PEEK:
+                self._start(self._request(query, parsed, at))
+            case Family.ALARM:
+                self._take_alarm(query, parsed, at)
+            case Family.STATUS:
+                self._take_status(query)
+            case Family.VALUE if is_of_past(query.parameters):
+                history = partial(self._replies.history, parsed, time.time_ns())
+                self._pool.answer_history(query, history)
+            case Family.VALUE if query.parameters.get("max_age") is not None:
+                self._take_fresh(query, parsed)
+            case _ if parsed.has_wildcard or parsed.family is Family.BLOCK:
+                self._pool.answer_wide(query, partial(self._replies.current, parsed))
+            case _:
+                self._pool.answer(query, partial(self._replies.current, parsed))
+
+    def _is_foreign(self, parsed: ParsedKey) -> bool:
+        """True for a write or command to a device of another gateway, or of none.
+
+        It gets no answer, not even `busy`: the other gateway may carry it out.
+        """
+        is_request = parsed.family in (Family.SET, Family.COMMAND, Family.PEEK)
+        return is_request and not parsed.has_wildcard and not self._index.owns(parsed.target)
+
+    def _take_fresh(self, query: zenoh.Query, parsed: ParsedKey) -> None:
+        if not parsed.has_wildcard:
+            self._start(self._fresh(query, parsed))
+        elif self._pool.admit_wide(query):
+            task = self._start(self._fresh(query, parsed))
+            task.add_done_callback(lambda _: self._pool.release_wide())
+
+    def _take_status(self, query: zenoh.Query) -> None:
+        if query.parameters.get("_time") is not None:
+            self._pool.answer_history(query, partial(self._replies.writes, time.time_ns()))
+        else:
+            self._start(self._status(query))
+
+    def _take_alarm(self, query: zenoh.Query, parsed: ParsedKey, at: float) -> None:
+        data = _data(query)
+        if data is not None:
+            key = str(query.key_expr)
+            result = self._acknowledgements.acknowledge(key, data, sender(query, at))
+            self._pool.answer(query, partial(self._replies.acknowledged, result))
+        elif query.parameters.get("_time") is not None:
+            self._pool.answer_history(query, partial(self._replies.past_alarms, time.time_ns()))
+        elif parsed.has_wildcard:
+            self._pool.answer_wide(query, self._replies.alarms)
+        else:
+            self._pool.answer(query, self._replies.alarms)
+
+    async def close(self) -> None:
+        """Ends the queries that wait for devices; their replies get half a second to leave."""
+        self._pool.close()
+        self._replies.end()
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await self._pool.drain()
+
+    def end(self) -> None:
+        """Ends the answering threads, after the session is closed."""
+        self._pool.end()
+
+    async def _request(self, query: zenoh.Query, parsed: ParsedKey, at: float) -> None:
+        match parsed.family:
+            case Family.SET:
+                await self._set(query, at)
+            case Family.COMMAND:
+                await self._command(query, at)
+            case _:
+                await self._peek(query, parsed)
+
+    async def _set(self, query: zenoh.Query, at: float) -> None:
+        result: WriteResult | Failure | GroupResult = _ENDING
+        key, by = str(query.key_expr), sender(query, at)
+        try:
+            result = await self._writes.write(key, _data(query), by)
+        finally:
+            self._pool.answer(query, partial(self._replies.outcome, result))
+
+    async def _command(self, query: zenoh.Query, at: float) -> None:
+        result: CommandResult | Failure = _ENDING
+        key, by = str(query.key_expr), sender(query, at)
+        try:
+            result = await self._commands.execute(key, _data(query), by)
+        finally:
+            self._pool.answer(query, partial(self._commands.reply, result))
+
+    async def _peek(self, query: zenoh.Query, parsed: ParsedKey) -> None:
+        result: Peeked | Failure = _ENDING
+        device = parsed.target.rpartition("/")[2]
+        longest = ANSWER_WITHIN + self._plant.dialling(device)
+        try:
+            text = (_data(query) or b"").decode(errors="replace")[:_LONGEST_RANGE]
+            async with asyncio.timeout(longest):
+                result = await self._plant.peek(device, text)
+        except TimeoutError:
+            result = Failure(Problem.BUSY, f"not read within {longest:g} s")
+        except BadValue as error:
+            result = Failure(Problem.BAD_QUERY, str(error))
+        except GatewayError as error:
+            result = payload.failure(error)
+        finally:
+            self._pool.answer(query, partial(self._replies.peeked, result))
+
+    async def _status(self, query: zenoh.Query) -> None:
+        documents: dict[str, bytes] = {}
+        try:
+            documents = await self._documents()
+        finally:
+            self._pool.answer(query, partial(self._replies.status, documents))
+
+    async def _fresh(self, query: zenoh.Query, parsed: ParsedKey) -> None:
+        answer: Answer = partial(self._replies.outcome, _ENDING)
+        try:
+            tags = self._index.tags_at(parsed.target)
+            unread = await self._read(tags, query.parameters.get("max_age") or "")
+            answer = partial(self._replies.fresh, tags, unread)
+        except BadValue as error:
+            answer = partial(self._replies.outcome, Failure(Problem.BAD_QUERY, str(error)))
+        finally:
+            self._pool.answer(query, answer)
+
+    async def _read(self, tags: Sequence[Tag], age_text: str) -> list[Tag]:
+        """Reads the tags that are too old or become so meanwhile, each once at most.
+
+        Returns those that could not be read in time.
+        """
+        unread = list[Tag]()
+        if not tags:
+            return unread  # another gateway's
+        age = max_age(age_text)
+        if len(tags) > FRESH_LIMIT:
+            raise BadValue(f"{len(tags)} tags are meant; max_age reads at most {FRESH_LIMIT}")
+        dialling = max(self._plant.dialling(tag.device) for tag in tags)
+        until = asyncio.get_running_loop().time() + ANSWER_WITHIN + dialling
+        left = dict.fromkeys(tags)
+        while old := [tag for tag in left if not self._plant.is_fresh(tag, age)]:
+            for tag in old:
+                del left[tag]
+            read = await asyncio.gather(*(self._read_one(tag, age, until) for tag in old))
+            unread += [tag for tag, was_read in zip(old, read, strict=True) if not was_read]
+        return unread
+
+    async def _read_one(self, tag: Tag, age: float, until: float) -> bool:
+        try:
+            async with asyncio.timeout_at(until):
+                await self._plant.fresh(tag, age)
+        except (Busy, TimeoutError):
+            return False
+        return True
+
+    def _start(self, work: Coroutine[None, None, None]) -> asyncio.Task[None]:
+        task = asyncio.get_running_loop().create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._ended)
+        return task
+
+    def _ended(self, task: asyncio.Task[None]) -> None:
+        self._tasks.discard(task)
+        if not task.cancelled() and (error := task.exception()):
+            log.error("query crashed", exc_info=error)
+
+
+def _data(query: zenoh.Query) -> bytes | None:
+    return None if query.payload is None else query.payload.to_bytes()

@@ -1,0 +1,81 @@
+"""The tags and devices that a key expression selects."""
+
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+import zenoh
+
+from gateway.contract.interfaces import Device
+from gateway.contract.keys import Keys
+from gateway.tags import Tag
+
+
+class _Entry(NamedTuple):
+    """The tags of one device, under `area`: `<prefix>/<device>/**`."""
+
+    device: Device
+    area: zenoh.KeyExpr
+    tags: tuple[tuple[str, Tag], ...]  # with their value keys
+
+
+class TagIndex:
+    """A dict for concrete keys, and one entry per device for wildcards. Read by many threads."""
+
+    def __init__(self, keys: Keys, devices: Iterable[Device]) -> None:
+        self._keys = keys
+        self._entries = [
+            _Entry(
+                device,
+                zenoh.KeyExpr(f"{keys.device(device.name)}/**"),
+                tuple((keys.value(tag.key), tag) for tag in device.tags),
+            )
+            for device in devices
+        ]
+        self._by_key = {key: tag for entry in self._entries for key, tag in entry.tags}
+        self.tags: Sequence[Tag] = list(self._by_key.values())
+        modes = {entry.device.name: entry.device.blocks for entry in self._entries}
+        self.names = frozenset(modes)
+        self.with_blocks = frozenset(name for name, mode in modes.items() if mode)
+        self.only_blocks = frozenset(name for name, mode in modes.items() if mode == "only")
+
+    def become(self, other: "TagIndex") -> None:
+        """Takes over the devices of another index. Each look-up sees the old or the new ones."""
+        vars(self).update(vars(other))
+
+    def tag_at(self, value_key: str) -> Tag | None:
+        return self._by_key.get(value_key)
+
+    def is_device(self, key: str) -> bool:
+        """True for the key of one of our devices: no tag, no wildcard."""
+        return self._keys.tag(key) in self.names
+
+    def owns(self, key: str) -> bool:
+        """True if `key` lies under one of our devices or under our status keys.
+
+        Other gateways may share the prefix.
+        """
+        device = (self._keys.tag(key) or "").partition("/")[0]
+        return device in self.names or key.startswith(f"{self._keys.own}/")
+
+    def tags_at(self, expression: str) -> list[Tag]:
+        """Returns the tags whose value keys intersect `expression`."""
+        if "*" not in expression:
+            tag = self._by_key.get(expression)
+            return [] if tag is None else [tag]
+        selector = zenoh.KeyExpr(expression)
+        found: list[Tag] = []
+        for entry in self._entries:
+            if selector.includes(entry.area):
+                found.extend(tag for _, tag in entry.tags)
+            elif selector.intersects(entry.area):
+                found.extend(tag for key, tag in entry.tags if selector.intersects(key))
+        return found
+
+    def devices_at(self, expression: str) -> list[Device]:
+        """Returns the devices whose own key, `<prefix>/<device>`, intersects `expression`."""
+        selector = zenoh.KeyExpr(expression)
+        return [
+            entry.device
+            for entry in self._entries
+            if selector.intersects(self._keys.device(entry.device.name))
+        ]

@@ -1,0 +1,1 @@
+"""Gateways beside this one: claims of devices, and standby groups."""

@@ -1,0 +1,207 @@
+"""Claims the devices of this gateway on Zenoh, and observes the claims of others.
+
+A claim is a document below the gateway's status keys, and a liveliness token on the same key.
+`claims` has the rules.
+"""
+
+import asyncio
+import time
+from collections.abc import Iterable, Mapping
+
+import structlog
+import zenoh
+
+from gateway.contract.keys import Keys
+from gateway.northbound.group.claim_documents import ClaimDocuments
+from gateway.northbound.group.claims import Claims
+from gateway.northbound.group.plant_secret import PlantSecret
+from gateway.northbound.requests.inbox import Inbox
+from gateway.northbound.session.second_session import SecondSession
+from gateway.northbound.session.session import off_loop
+
+log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
+
+# Seconds that the start waits for the network. Without it the gateway serves all its devices, and
+# claims them when the network is there.
+NETWORK_WITHIN = 3.0
+_QUERY_TIMEOUT = 0.7  # seconds
+_LOOK_EVERY = 0.5  # seconds, where an event was lost or a gateway did not answer
+_MOST_LOGGED = 10  # devices in one log entry
+
+
+class Claiming:
+    """Leaves devices that belong to other gateways to them: they are `withheld`."""
+
+    def __init__(
+        self,
+        keys: Keys,
+        group: str | None,
+        secret: PlantSecret | None,
+        devices: Iterable[str],
+        admitted: asyncio.Event,
+        refused: asyncio.Event,
+    ) -> None:
+        """`group`: the standby group. Sets `admitted` when the gateway may serve, `refused` when it
+        must start over with other devices `withheld`."""
+        self._admitted = admitted
+        self._refused = refused
+        self.withheld: Mapping[str, str] = {}  # with the gateways that serve them
+        self.namesake = False  # another gateway with this name serves
+        self._keys = keys
+        self._group = group
+        self._devices = frozenset(devices)
+        self._claims: Claims | None = None
+        self._documents = ClaimDocuments(keys, secret)
+        self._unanswered: set[str] = set()  # keys of claims that were seen but not read
+        self._changed = asyncio.Event()
+        # Zenoh undeclares an object without a reference.
+        self._token: tuple[zenoh.Session, zenoh.LivelinessToken] | None = None
+        self._declared: list[object] = []
+
+    def withhold(self, devices: Mapping[str, str]) -> None:
+        """Leaves devices to other gateways. Call it before `run`."""
+        self.withheld = devices
+        self._devices |= devices.keys()
+
+    def taken(self, devices: Iterable[str]) -> Mapping[str, str]:
+        """Returns those of the devices that other gateways serve, with their names."""
+        return {} if self._claims is None else self._claims.taken(devices)
+
+    async def change(self, devices: Iterable[str]) -> None:
+        """Claims these devices, and no others any more. The token is declared again: then other
+        gateways read the claim again."""
+        self._devices = frozenset(devices)
+        self.withheld = {name: g for name, g in self.withheld.items() if name in self._devices}
+        if self._claims is None:
+            return
+        before = self._claims.own
+        self._claims.change(self._devices, self.withheld)
+        if self._claims.own != before and self._token is not None:
+            session, token = self._token
+            await off_loop(token.undeclare)
+            await self._declare(session)
+
+    def documents(self) -> dict[str, dict[str, object]]:
+        """The own claim, by its path."""
+        own = None if self._claims is None else self._claims.own
+        if own is None:
+            return {}
+        return {f"claim/{own.session}": self._documents.document(own)}
+
+    def status(self) -> dict[str, object]:
+        """The fields of the gateway's status document."""
+        return {"refused_devices": self.withheld, "refused_claims": self._documents.refused}
+
+    async def run(self, session: zenoh.Session, second: SecondSession) -> None:
+        """Claims, then observes until cancelled. `session` is the gateway's own."""
+        claims = self._claims = Claims(
+            str(session.zid()), self._keys.gateway, self._group, self._devices
+        )
+        try:
+            async with asyncio.timeout(NETWORK_WITHIN):
+                view = await second.session()
+                await self._look(view, self._keys.claims)
+                if not self._must_start_over(claims):
+                    await self._claim(session, claims)
+                    if second.needed:
+                        await self._until_seen(view, claims)
+        except TimeoutError:
+            log.warning("own claim not seen", so="other gateways with these devices go unnoticed")
+        if claims.own is None and not (claims.taken() or claims.namesake()):
+            await self._claim(session, claims)
+        if not self._must_start_over(claims):
+            self._admitted.set()
+        await self._observe(await second.session(), claims)
+
+    async def _claim(self, session: zenoh.Session, claims: Claims) -> None:
+        claims.claim(time.time_ns(), self.withheld)
+        await self._declare(session)
+
+    async def _declare(self, session: zenoh.Session) -> None:
+        key = self._keys.claim(str(session.zid()))
+        self._token = session, await off_loop(session.liveliness().declare_token, key)
+
+    async def _until_seen(self, view: zenoh.Session, claims: Claims) -> None:
+        """Waits until the own claim comes back: every later gateway sees it too."""
+        own = claims.own
+        while own is not None and self._keys.claim(own.session) not in await self._look(
+            view, self._keys.claims
+        ):
+            await asyncio.sleep(0.05)
+
+    async def _observe(self, view: zenoh.Session, claims: Claims) -> None:
+        def token_changed(sample: zenoh.Sample, _at: float) -> None:
+            key = str(sample.key_expr)
+            if claims.own is not None and key == self._keys.claim(claims.own.session):
+                return
+            if sample.kind == zenoh.SampleKind.PUT:
+                self._unanswered.add(key)
+            else:
+                self._unanswered.discard(key)
+                claims.lost(key.rpartition("/")[2])
+                self._documents.forget(key)
+            self._changed.set()
+
+        tokens = zenoh.handlers.Callback(Inbox(token_changed, lambda _: None), indirect=False)
+        self._declared.append(
+            await off_loop(
+                lambda: view.liveliness().declare_subscriber(
+                    self._keys.claims, tokens, history=True
+                )
+            )
+        )
+        while not self._must_start_over(claims):
+            self._admitted.set()
+            try:
+                async with asyncio.timeout(_LOOK_EVERY):
+                    await self._changed.wait()
+            except TimeoutError:
+                pass
+            self._changed.clear()
+            for key in tuple(self._unanswered):
+                self._unanswered -= await self._look(view, key)
+
+    def _must_start_over(self, claims: Claims) -> bool:
+        if self._refused.is_set():
+            return True
+        if claims.namesake():
+            self.namesake = True
+            self.withheld = claims.taken()
+            self._refused.set()
+            return True
+        if not claims.changed(self.withheld, time.monotonic()):
+            return False
+        taken = claims.taken()
+        for device in sorted(taken.keys() - self.withheld.keys())[:_MOST_LOGGED]:
+            log.error("device refused", device=device, why=f"gateway {taken[device]} serves it")
+        for device in sorted(self.withheld.keys() - taken.keys())[:_MOST_LOGGED]:
+            log.info("device free", device=device, so="this gateway serves it again")
+        self.withheld = taken
+        self._refused.set()
+        return True
+
+    async def _look(self, view: zenoh.Session, key: str) -> set[str]:
+        """Reads claims. Returns the keys of those that were answered."""
+        replies = await off_loop(_query, view, key)
+        found = {}
+        for reply in replies:
+            if reply.ok is None:
+                continue
+            key, data = str(reply.ok.key_expr), reply.ok.payload.to_bytes()
+            if (claim := self._documents.parse(key, data, time.monotonic())) is not None:
+                found[key] = claim
+        for claim in found.values():
+            if self._claims is not None:
+                self._claims.found(claim)
+        return set(found)
+
+
+def _query(view: zenoh.Session, key: str) -> list[zenoh.Reply]:
+    return list(
+        view.get(
+            key,
+            timeout=_QUERY_TIMEOUT,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            allowed_destination=zenoh.Locality.REMOTE,
+        )
+    )

@@ -1,0 +1,287 @@
+"""The one thread that puts on Zenoh, fed by a map that holds only the last value of each tag.
+
+A put can block for as long as the network is congested, so the event loop never does one. The
+queue is bounded by the number of tags: a newer value replaces one that is still waiting.
+Every entry gets its time stamp when it is queued and leaves in that order, because Zenoh's
+AdvancedSubscriber discards a sample with an older stamp than the last one of the same session.
+
+Keys are not declared to Zenoh. A put on a plain key is compared with every declaration beside it,
+level by level, so nothing is declared for a single device there (keys.py). A put on a declared key
+is not compared. But with 50,000 declared keys the session takes 14 s to close, queries take three
+times as long, and for a moment after a link has returned puts on declared keys reach no subscriber.
+"""
+
+import asyncio
+import threading
+import time
+from collections.abc import Callable, Hashable, Iterable, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from itertools import count
+
+import structlog
+import zenoh
+
+from gateway.contract import payload
+from gateway.contract.blocks import parts_of
+from gateway.contract.keys import Keys
+from gateway.northbound.answering.tag_index import TagIndex
+from gateway.northbound.publishing import encoding
+from gateway.northbound.publishing.losses import Losses
+from gateway.tags import Reason, Sample, Tag
+
+log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
+
+EVENTS_LIMIT = 10_000  # waiting puts that no newer one may replace
+
+
+@dataclass(slots=True)
+class Published:
+    """Counters since the start."""
+
+    published: int = 0  # handed to Zenoh
+    superseded: int = 0  # replaced by a newer value before they went out
+    dropped: int = 0  # events and documents: the queue was full, or no session was open yet
+
+
+# A bool declares or undeclares the liveliness token, a dict holds the samples of a block, and a
+# function makes a document.
+_Data = Sample | bytes | bool | dict[str, Sample] | Callable[[], bytes]
+# One put. A plain tuple: creating a named tuple takes as long as queueing it.
+_Entry = tuple[zenoh.Timestamp | None, str, _Data]
+
+
+class Publisher:
+    """The queue (event loop) and the thread that empties it."""
+
+    def __init__(self, keys: Keys, losses: Losses) -> None:
+        self.counters = Published()
+        self.ended = asyncio.Event()  # the thread has ended, expected or not
+        self._keys = keys
+        self._losses = losses
+        self._online: dict[str, bool] = {}  # by device
+        self._session: zenoh.Session | None = None
+        self._tokens: dict[str, zenoh.LivelinessToken] = {}
+        self._waiting: dict[Hashable, _Entry] = {}
+        self._serial = count()
+        self._value_keys: dict[Tag, str] = {}  # cached: building one takes as long as queueing it
+        self._waiting_events = 0
+        self._closing = False
+        self._filled = threading.Condition()
+        self._thread: threading.Thread | None = None
+
+    # -- event loop --
+
+    def counts(self) -> dict[str, int]:
+        """Counters since the start, by their names in the status."""
+        return asdict(self.counters) | {"congested": self._losses.congested}
+
+    def start(self, session: zenoh.Session) -> None:
+        self._session = session
+        for device, online in self._online.items():
+            self.set_online(device, online)
+        self._thread = threading.Thread(
+            target=self._run,
+            args=(session, asyncio.get_running_loop()),
+            name="zenoh publisher",
+            daemon=True,
+        )
+        self._thread.start()
+
+    def values(self, samples: Iterable[Sample]) -> None:
+        """Queues samples; each is published unless a newer sample of its tag replaces it.
+
+        Before the session is open samples are dropped: opening publishes all current values.
+        """
+        if self._session is None or self._closing:
+            return
+        stamp = self._session.new_timestamp
+        with self._filled:
+            for sample in samples:
+                key = self._value_keys.get(sample.tag) or self._value_key(sample)
+                # Removed first, so that the entry moves to the end: stamps leave in order.
+                if self._waiting.pop(key, None) is not None:
+                    self.counters.superseded += 1
+                self._waiting[key] = (stamp(), key, sample)
+            self._filled.notify()
+
+    def _value_key(self, sample: Sample) -> str:
+        key = self._keys.value(sample.tag.key)
+        if sample.reason is not Reason.DISABLED:  # otherwise its tag may have gone already
+            self._value_keys[sample.tag] = key
+        return key
+
+    def block(self, device: str, samples: Sequence[Sample]) -> None:
+        """Queues the changed samples of one scan of a device, merged with a waiting block.
+
+        A long block goes out in parts: many clients drop long messages.
+        """
+        if self._session is None or self._closing:
+            return
+        key = self._keys.block(device)
+        merged: dict[str, Sample] = {}
+        with self._filled:
+            for part in range(len(self._waiting)):
+                older = self._waiting.pop((key, part), None)
+                if older is None or not isinstance(older[2], dict):
+                    break
+                merged |= older[2]
+            merged |= {sample.tag.name: sample for sample in samples}
+            for part, some in enumerate(parts_of(merged)):
+                self._waiting[key, part] = (self._session.new_timestamp(), key, some)
+            self._filled.notify()
+
+    def events(self, samples: Iterable[Sample]) -> None:
+        """Queues samples that all go out, in order (bar codes). Drops those beyond the limit."""
+        for sample in samples:
+            self._queue_event(self._keys.value(sample.tag.key), sample)
+
+    def document(self, key: str, document: bytes) -> None:
+        """Queues a status document or the outcome of a write."""
+        self._queue_event(key, document)
+
+    def latest(self, key: str, make: Callable[[], bytes]) -> None:
+        """Queues a document that the publishing thread makes: only the latest of each key is put.
+
+        Opening a session publishes all of them.
+        """
+        if self._session is None or self._closing:
+            return
+        with self._filled:
+            self._waiting.pop(key, None)
+            self._waiting[key] = (self._session.new_timestamp(), key, make)
+            self._filled.notify()
+
+    def set_online(self, device: str, online: bool) -> None:
+        """Declares or undeclares the device's liveliness token."""
+        self._online[device] = online
+        if self._session is None:
+            return
+        key = self._keys.alive(device)
+        with self._filled:
+            self._waiting[("token", device)] = (None, key, online)
+            self._filled.notify()
+
+    def forget(self, devices: Iterable[str], tags: Iterable[Tag]) -> None:
+        """Forgets devices and tags that the gateway no longer has. Their tokens end first."""
+        for device in devices:
+            self._online.pop(device, None)
+        for tag in tags:
+            self._value_keys.pop(tag, None)
+
+    def _queue_event(self, key: str, data: Sample | bytes) -> None:
+        with self._filled:
+            if self._session is None or self._closing or self._waiting_events >= EVENTS_LIMIT:
+                self.counters.dropped += 1
+                return
+            self._waiting_events += 1
+            self._waiting[next(self._serial)] = (self._session.new_timestamp(), key, data)
+            self._filled.notify()
+
+    # -- any thread --
+
+    def stop(self, within: float) -> None:
+        """Ends the thread once the queue is empty; waits at most `within` seconds for that."""
+        with self._filled:
+            self._closing = True
+            self._filled.notify()
+        if self._thread is not None:
+            self._thread.join(within)
+
+    # -- the publishing thread --
+
+    def _run(self, session: zenoh.Session, loop: asyncio.AbstractEventLoop) -> None:
+        try:
+            self._send_all(session)
+        finally:
+            with suppress(RuntimeError):  # the loop is closed already
+                loop.call_soon_threadsafe(self.ended.set)
+
+    def _send_all(self, session: zenoh.Session) -> None:
+        while batch := self._next_batch():
+            before = time.monotonic()
+            while batch:
+                stamp, key, data = batch.pop()
+                try:
+                    self._send(session, stamp, key, data)
+                except zenoh.ZError as error:
+                    if session.is_closed():
+                        return
+                    log.warning("Zenoh put failed", key=key, error=str(error))
+                now = time.monotonic()
+                self._losses.sent(_samples(data), now - before, now)
+                before = now
+
+    def _next_batch(self) -> list[_Entry]:
+        """Returns all waiting entries, the first at the end; empty only when the publisher ends.
+
+        The caller frees the entries one by one: freeing 50,000 at once holds up the loop for 5 ms.
+        """
+        with self._filled:
+            while not self._waiting and not self._closing:
+                self._filled.wait()
+            waiting, self._waiting = self._waiting, {}
+            self._waiting_events = 0
+        batch = list(waiting.values())
+        batch.reverse()
+        return batch
+
+    def _send(
+        self,
+        session: zenoh.Session,
+        stamp: zenoh.Timestamp | None,
+        key: str,
+        data: _Data,
+    ) -> None:
+        if isinstance(data, Sample):
+            encoding.put(session, key, data, stamp)
+        elif isinstance(data, bytes):
+            encoding.put_json(session, key, data, stamp)
+        elif isinstance(data, dict):
+            encoding.put_json(session, key, payload.block(data.values()), stamp)
+        elif isinstance(data, bool):
+            self._set_token(session, key, declared=data)
+            return
+        else:
+            encoding.put_json(session, key, data(), stamp)
+        self.counters.published += 1
+
+    def _set_token(self, session: zenoh.Session, key: str, *, declared: bool) -> None:
+        if not declared:
+            if token := self._tokens.pop(key, None):
+                token.undeclare()  # type: ignore[no-untyped-call]  # Zenoh's stub lacks it
+        elif key not in self._tokens:
+            self._tokens[key] = session.liveliness().declare_token(key)
+
+
+def _samples(data: _Data) -> Iterable[Sample]:
+    if isinstance(data, Sample):
+        return (data,)
+    return data.values() if isinstance(data, dict) else ()
+
+
+class ScanBatches:
+    """Sorts the samples of a scan by how they are published. Event loop only; never blocks."""
+
+    def __init__(self, publisher: Publisher, index: TagIndex) -> None:
+        self._publisher = publisher
+        self._index = index
+
+    def publish(self, samples: Sequence[Sample]) -> None:
+        """One call is one scan. Samples of event tags all go out, in order, none replaced."""
+        values = samples
+        if any(sample.tag.event for sample in samples):
+            self._publisher.events(sample for sample in samples if sample.tag.event)
+            values = [sample for sample in samples if not sample.tag.event]
+        if only_blocks := self._index.only_blocks:
+            values = [sample for sample in values if sample.tag.device not in only_blocks]
+        self._publisher.values(values)
+        with_blocks = self._index.with_blocks
+        if not with_blocks:
+            return
+        scans: dict[str, list[Sample]] = {}
+        for sample in samples:
+            if sample.tag.device in with_blocks:
+                scans.setdefault(sample.tag.device, []).append(sample)
+        for device, changed in scans.items():
+            self._publisher.block(device, changed)

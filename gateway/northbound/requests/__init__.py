@@ -1,0 +1,1 @@
+"""Writes and commands from Zenoh: accepted, passed on, audited."""

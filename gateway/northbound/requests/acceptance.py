@@ -1,0 +1,86 @@
+"""Decides if a write or command is accepted, before its key and value are looked at."""
+
+import asyncio
+import time
+from collections.abc import Callable
+from datetime import datetime
+from typing import NamedTuple
+
+import orjson
+import zenoh
+
+from gateway.contract.signatures import LONGEST
+from gateway.contract.writers import Writers
+from gateway.engine.requests import WRITE_EXPIRY
+from gateway.errors import Busy
+from gateway.line.send_permit import Duty
+
+
+class Sender(NamedTuple):
+    """The client of a query or put. `arrived`: when it reached the process, by the loop's clock."""
+
+    session: str | None = None  # Zenoh's id, if the client sends it
+    attachment: bytes | None = None
+    arrived: float = 0.0
+
+
+class Accepted(NamedTuple):
+    """`by`: the client, if known. After `within` seconds the request must not be sent any more."""
+
+    by: str | None
+    within: float
+
+
+class Acceptance:
+    """Refuses what is too old, and what comes from no writer."""
+
+    def __init__(
+        self, duty: Duty, writers: Writers | None, wall: Callable[[], int] = time.time_ns
+    ) -> None:
+        """Without `writers` Zenoh alone decides who may write. `wall`: ns since 1970."""
+        self._duty = duty
+        self._writers = writers
+        self._wall = wall
+
+    def begin(self) -> None:
+        """Call it when the gateway becomes active."""
+        if self._writers is not None:
+            self._writers.begin()
+
+    def accept(self, key: str, data: bytes | None, sender: Sender) -> Accepted:
+        """`key` and `data` as received. Raises `NotAllowed`, `Repeated`, and `Busy` for a request
+        of the past."""
+        now = asyncio.get_running_loop().time()
+        if why := self._duty.why_not(sender.arrived, now):
+            raise Busy(why)
+        by = sender.session
+        if self._writers is not None:
+            by = self._writers.writer(key, data or b"", sender.attachment)
+        waited = now - sender.arrived
+        if (made := _time_of(sender.attachment)) is not None:
+            waited = max(waited, self._wall() / 1e9 - made)
+        if waited >= WRITE_EXPIRY:
+            raise Busy(f"it is {waited:.1f} s old; not sent")
+        return Accepted(by, WRITE_EXPIRY - waited)
+
+
+def sender(message: zenoh.Query | zenoh.Sample, arrived: float) -> Sender:
+    """Returns what is known of the client: most clients send neither session nor attachment."""
+    source, attached = message.source_info, message.attachment
+    return Sender(
+        None if source is None else str(source.source_id.zid),
+        None if attached is None or len(attached) > LONGEST else attached.to_bytes(),
+        arrived,
+    )
+
+
+def _time_of(attachment: bytes | None) -> float | None:
+    """Returns the client's own time, in seconds since 1970, if it sends one."""
+    try:
+        found = None if attachment is None else orjson.loads(attachment)
+        match found:
+            case {"time": str(text)}:
+                return datetime.fromisoformat(text).timestamp()
+    except ValueError:
+        return None
+    return None

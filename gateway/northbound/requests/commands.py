@@ -1,0 +1,120 @@
+"""Commands that come over Zenoh: checked, passed to the plant, answered and audited.
+
+<prefix>/<device>/@run, @stop, @loopback, @model        one device, named in full
+<prefix>/@gateway/<name>/lines/<line>/global            all stations of a line: on, off
+"""
+
+import asyncio
+import time
+from collections.abc import Callable
+
+import orjson
+import zenoh
+
+from gateway.config.commands import TO_ALL, NotControlled
+from gateway.contract import payload
+from gateway.contract.interfaces import Plant
+from gateway.contract.keys import Keys
+from gateway.contract.payload import Failure, Problem, WriteOutcome
+from gateway.contract.writers import NotAllowed, Repeated
+from gateway.engine.requests import CommandResult
+from gateway.errors import BadValue, GatewayError
+from gateway.northbound.publishing import encoding
+from gateway.northbound.requests.acceptance import Acceptance, Sender
+from gateway.northbound.requests.writes import ANSWER_WITHIN
+from gateway.tags.timestamps import rfc3339
+
+_LONGEST_ARGUMENT = 1000  # bytes; a loopback takes 254 characters at most
+
+
+class Commands:
+    """Bounded by the open queries and by the requests that may wait for a line."""
+
+    def __init__(
+        self,
+        keys: Keys,
+        plant: Plant,
+        stamp: Callable[[], zenoh.Timestamp],
+        audit: Callable[[WriteOutcome], None],
+        acceptance: Acceptance,
+    ) -> None:
+        """`audit` gets every outcome."""
+        self._keys = keys
+        self._plant = plant
+        self._stamp = stamp
+        self._audit = audit
+        self._acceptance = acceptance
+
+    async def execute(
+        self, key: str, data: bytes | None, sender: Sender
+    ) -> CommandResult | Failure:
+        """`key` is as received, wildcards included; `data` is the argument as text."""
+        by, argument = sender.session, ""
+        started = time.monotonic()
+        refused: Failure | None = None  # instead of `result` in the audit
+        result: CommandResult | Failure = Failure(Problem.UNCLEAR, "the gateway is ending")
+        longest = ANSWER_WITHIN
+        try:
+            by, within = self._acceptance.accept(key, data, sender)
+            argument = _argument(data)
+            device, command = self._target(key)
+            dialling = self._plant.dialling(device)
+            longest += dialling
+            async with asyncio.timeout(longest):
+                result = await self._plant.control(device, command, argument, within + dialling)
+        except TimeoutError:
+            reason = f"not answered within {longest:g} s: it may yet be done"
+            result = Failure(Problem.UNCLEAR, reason)
+        except NotAllowed as error:
+            result = Failure(Problem.NOT_ALLOWED, str(error))
+        except Repeated as error:
+            result = Failure(Problem.UNCLEAR, str(error))
+            refused = Failure(Problem.NOT_ALLOWED, str(error))
+        except NotControlled as error:
+            result = Failure(Problem.NOT_WRITABLE, str(error))
+        except GatewayError as error:
+            result = payload.failure(error)
+        finally:
+            took = time.monotonic() - started
+            value = argument or None
+            told = refused or result
+            self._audit(WriteOutcome(key, value, told, time.time_ns(), took, by, command=True))
+        return result
+
+    def reply(self, result: CommandResult | Failure, query: zenoh.Query) -> None:
+        """Called on an answering thread."""
+        match result:
+            case CommandResult(answer, at, took):
+                fields = {"answer": answer, "time": rfc3339(at), "took": round(took, 6)}
+                data = orjson.dumps(fields)
+                encoding.reply_json(query, str(query.key_expr), data, self._stamp())
+            case Failure():
+                data = payload.outcome(result)
+                query.reply_err(data, encoding=zenoh.Encoding.APPLICATION_JSON)
+
+    def _target(self, key: str) -> tuple[str, str]:
+        """Returns device and command. Raises `BadValue`."""
+        if "*" in key:
+            raise BadValue(f"{payload.short(key)} has a wildcard: a command names one, in full")
+        if (line := _line_of(key, self._keys.own)) is not None:
+            return self._plant.speaker(line), TO_ALL
+        stem, _, last = key.rpartition("/")
+        return self._keys.tag(stem) or stem, last.removeprefix("@")
+
+
+def _argument(data: bytes | None) -> str:
+    """Raises `BadValue`."""
+    if data is not None and len(data) > _LONGEST_ARGUMENT:
+        raise BadValue(f"the argument has {len(data)} bytes, more than {_LONGEST_ARGUMENT}")
+    try:
+        return (data or b"").decode()
+    except UnicodeDecodeError:
+        raise BadValue("the argument is no UTF-8 text") from None
+
+
+def _line_of(key: str, own: str) -> str | None:
+    """The line that a key `<own>/lines/<line>/global` names."""
+    match key.removeprefix(f"{own}/").split("/"):
+        case ["lines", line, "global"]:
+            return line
+    return None

@@ -1,0 +1,268 @@
+"""All alarms of a gateway: judges each read, ends delays, reports changes. On the event loop.
+
+A scan whose tags have no alarm costs nothing: `Gateway.samples` sees that at the scan.
+"""
+
+import asyncio
+import time
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from typing import NamedTuple
+
+import structlog
+
+from gateway.parts.alarms.machine import Alarm, Event, NothingToAcknowledge, State, Status
+from gateway.tags import AlarmRule, Quality, Sample, Tag
+from gateway.tags.scan import Scan
+from gateway.values import Value
+
+log: structlog.stdlib.BoundLogger = structlog.get_logger("gateway")
+
+LOOK_EVERY = 1.0  # seconds between two looks at lines and devices
+
+
+class Reading(NamedTuple):
+    """The state of a line or a device. `alarm`: None if it is not known."""
+
+    alarm: bool | None
+    why: str = ""  # one sentence for people, or empty
+
+
+class Entry:
+    """One alarm. `key`: `device/tag`, `device`, or `line:name`. `tag`: None for the last two."""
+
+    __slots__ = ("alarm", "counted", "key", "look", "reading", "tag", "timer")
+
+    def __init__(
+        self,
+        key: str,
+        rule: AlarmRule,
+        tag: Tag | None = None,
+        look: Callable[[], Reading] | None = None,
+    ) -> None:
+        self.key = key
+        self.alarm = Alarm(rule)
+        self.counted = State.NORMAL
+        self.tag = tag
+        self.look = look  # only for lines and devices
+        self.reading = Reading(None)  # what it returned last
+        self.timer: asyncio.TimerHandle | None = None  # of the delay
+
+    @property
+    def status(self) -> Status:
+        return self.alarm.status
+
+
+# Receives each change of an alarm. Event None: only the quality of the value has changed.
+Sink = Callable[[Entry, Event | None], None]
+
+
+class Alarms:
+    """The alarms of tags, and those of lines and devices that `watch` adds."""
+
+    def __init__(self, tags: Iterable[Tag], wall: Callable[[], int] = time.time_ns) -> None:
+        """`wall`: ns since 1970."""
+        self.entries: dict[str, Entry] = {}
+        self.open: dict[str, Entry] = {}  # those that are not normal
+        self.changed = asyncio.Event()  # something is to be saved
+        self._by_tag: dict[Tag, Entry] = {}
+        self._watched: list[Entry] = []
+        self._counts: Counter[State] = Counter()
+        self._sinks: list[Sink] = []
+        self._wall = wall
+        for tag in tags:
+            if tag.alarm is not None:
+                self._by_tag[tag] = self._add(Entry(tag.key, tag.alarm, tag))
+        self.of_tags = bool(self._by_tag)  # then samples are to be judged
+
+    def watch(self, key: str, rule: AlarmRule, look: Callable[[], Reading]) -> None:
+        """Adds the alarm of a line or a device. `look` returns its present state."""
+        if (known := self.entries.get(key)) is not None:  # another line or device has its place
+            known.look = look
+            return
+        self._watched.append(self._add(Entry(key, rule, look=look)))
+
+    # -- a changed file --
+
+    def take_over(self, tags: Iterable[Tag], gone: Iterable[Tag]) -> None:
+        """Follows changed tags. The alarm of a tag with the same rule goes on."""
+        for tag in tags:
+            if tag.alarm is None:
+                continue
+            entry = self.entries.get(tag.key)
+            if entry is None or entry.tag is None or entry.tag.alarm != tag.alarm:
+                if entry is not None:
+                    self._remove(entry)
+                entry = self._add(Entry(tag.key, tag.alarm, tag))
+            entry.tag = tag
+            self._by_tag[tag] = entry
+        for tag in gone:
+            entry = self._by_tag.pop(tag, None)
+            if entry is not None and entry.tag is tag:
+                self._remove(entry)
+        self.of_tags = bool(self._by_tag)
+
+    @property
+    def watched(self) -> Collection[str]:
+        """The keys of the alarms that `watch` added."""
+        return [entry.key for entry in self._watched]
+
+    def unwatch(self, keys: Collection[str]) -> None:
+        """Ends alarms that `watch` added."""
+        for entry in [entry for entry in self._watched if entry.key in keys]:
+            self._watched.remove(entry)
+            self._remove(entry)
+
+    def _remove(self, entry: Entry) -> None:
+        if entry.timer is not None:
+            entry.timer.cancel()
+        if self.entries.get(entry.key) is entry:
+            del self.entries[entry.key]
+            self.open.pop(entry.key, None)
+            self._counts[entry.counted] -= 1
+            self.changed.set()
+
+    def _add(self, entry: Entry) -> Entry:
+        self.entries[entry.key] = entry
+        self._counts[State.NORMAL] += 1
+        return entry
+
+    def subscribe(self, sink: Sink) -> None:
+        self._sinks.append(sink)
+
+    def counts(self) -> Mapping[str, int]:
+        """The status document: alarms by state."""
+        return {state.value: self._counts[state] for state in State}
+
+    # -- from the lines --
+
+    def judge(self, samples: Sequence[Sample]) -> None:
+        """Judges samples that the mirror has stored."""
+        if type(samples) is Scan and samples.latest.alarmed is not None:
+            tags, values = samples.tags, samples.values
+            for place in samples.latest.alarmed:
+                self._apply(self._by_tag[tags[place]], values[place], samples.time)
+            return
+        for sample in samples:
+            if sample.tag.alarm is not None:
+                known = sample.value if sample.quality is Quality.GOOD else None
+                self._apply(self._by_tag[sample.tag], known, sample.time)
+
+    def _apply(self, entry: Entry, value: Value | None, at: int) -> None:
+        """Applies a value; None: it is bad."""
+        alarm = entry.alarm
+        was_good = alarm.good
+        if value is None and not was_good:
+            return
+        if value is not None and was_good and value == alarm.value:
+            return  # the timer ends a delay
+        now = asyncio.get_running_loop().time()
+        if (event := alarm.elapse(now, at)) is not None:
+            self._report(entry, event)
+        event = None
+        if value is None:
+            alarm.suspend(now)
+        else:
+            event = alarm.judge(value, now, at)
+        if event is not None or alarm.good is not was_good:
+            self._report(entry, event)
+        self._set_timer(entry)
+
+    def _set_timer(self, entry: Entry) -> None:
+        due, timer = entry.alarm.due, entry.timer
+        if timer is not None and timer.when() != due:
+            timer.cancel()
+            entry.timer = timer = None
+        if due is not None and timer is None:
+            loop = asyncio.get_running_loop()
+            entry.timer = loop.call_at(due, self._elapse, entry)
+
+    def _elapse(self, entry: Entry) -> None:
+        entry.timer = None
+        now = asyncio.get_running_loop().time()
+        if (event := entry.alarm.elapse(now, self._wall())) is not None:
+            self._report(entry, event)
+        self._set_timer(entry)
+
+    def _report(self, entry: Entry, event: Event | None) -> None:
+        if event is not None:
+            self._count(entry)
+            self.changed.set()
+            _log(entry, event)
+        for sink in self._sinks:
+            sink(entry, event)
+
+    def _count(self, entry: Entry) -> None:
+        self._counts[entry.counted] -= 1
+        entry.counted = entry.status.state
+        self._counts[entry.counted] += 1
+        if entry.counted is State.NORMAL:
+            self.open.pop(entry.key, None)
+        else:
+            self.open[entry.key] = entry
+
+    # -- from operators --
+
+    def acknowledge(
+        self, key: str, by: str, via: str | None = None, raised: int | None = None
+    ) -> Entry:
+        """Acknowledges an alarm. Returns it, also for a repeat. Raises `NothingToAcknowledge`, and
+        `KeyError` where there is no such alarm."""
+        entry = self.entries[key]
+        try:
+            event = entry.alarm.acknowledge(by, self._wall(), via, raised)
+        except NothingToAcknowledge as error:
+            raise NothingToAcknowledge(f"alarm {key}: {error}") from None
+        if event is not None:
+            self._report(entry, event)
+        return entry
+
+    # -- life --
+
+    def restore(self, known: Mapping[str, Status]) -> None:
+        """Takes over the alarms before a restart. Call it before the lines begin."""
+        for key, status in known.items():
+            if (entry := self.entries.get(key)) is not None:
+                entry.alarm.restore(status)
+                self._count(entry)
+            else:
+                log.info("alarm left out", alarm=key, why="the configuration has no such alarm")
+
+    def statuses(self) -> Mapping[str, Status]:
+        """Returns the alarms that a restart must not lose."""
+        return {key: entry.status for key, entry in self.open.items()}
+
+    async def run(self) -> None:
+        """Looks at lines and devices until cancelled."""
+        while True:
+            for entry in self._watched:
+                self._look(entry)
+            await asyncio.sleep(LOOK_EVERY)
+
+    def _look(self, entry: Entry) -> None:
+        if entry.look is not None:
+            entry.reading = entry.look()
+            self._apply(entry, entry.reading.alarm, self._wall())
+
+    def close(self) -> None:
+        """Cancels the delays."""
+        for entry in self.entries.values():
+            if entry.timer is not None:
+                entry.timer.cancel()
+                entry.timer = None
+
+
+def _log(entry: Entry, event: Event) -> None:
+    status, rule = entry.status, entry.alarm.rule
+    fields: dict[str, object] = {"alarm": entry.key, "state": status.state.value}
+    if event is Event.ACKNOWLEDGED and status.acknowledged is not None:
+        by = status.acknowledged
+        log.info("alarm acknowledged", **fields, by=by.by, via=by.via)
+        return
+    fields["text"] = rule.text
+    if entry.tag is not None:
+        fields["value"] = status.value
+    if event is Event.RAISED:
+        log.warning("alarm raised", **fields, limit=str(status.level))
+    else:
+        log.info(f"alarm {event.value}", **fields)

@@ -1,0 +1,50 @@
+"""The alarms that need no setting: devices that do not reply, lines that are down."""
+
+from collections.abc import Iterable
+from functools import partial
+
+from gateway.config import AlarmsConfig
+from gateway.engine.device import Device
+from gateway.engine.health import State
+from gateway.line.line import Line
+from gateway.parts.alarms.board import Alarms, Reading
+from gateway.tags import AlarmRule, Level
+
+# Seconds that a line is down before it is an alarm: an adapter that is plugged again, or a device
+# server that starts again, is back earlier.
+LINE_DELAY = 3.0
+# Begin the key of the alarm of a line or a transfer; no device has a colon in its name.
+LINE, TRANSFER = "line:", "transfer:"
+
+
+def watch(alarms: Alarms, lines: Iterable[Line], config: AlarmsConfig) -> None:
+    """Adds the alarms of lines and of their devices, and ends those of others."""
+    lines = [*lines]
+    names = {device.name for line in lines for device in line.engine.devices}
+    names |= {f"{LINE}{line.engine.name}" for line in lines}
+    known = (key for key in alarms.watched if not key.startswith(TRANSFER))
+    alarms.unwatch({key for key in known if key not in names})
+    for line in lines:
+        name = line.engine.name
+        if config.lines:
+            rule = AlarmRule({Level.DOWN: True}, delay=LINE_DELAY, text=f"line {name} is down")
+            alarms.watch(f"{LINE}{name}", rule, partial(_line, line))
+        for device in line.engine.devices if config.devices else ():
+            rule = AlarmRule({Level.OFFLINE: True}, text=f"{device.name} does not reply")
+            alarms.watch(device.name, rule, partial(_device, device))
+
+
+def _line(line: Line) -> Reading:
+    if line.engine.is_open:
+        return Reading(False)
+    # A line that was not tried yet is not down.
+    return Reading(True if line.tried.is_set() else None, line.engine.record.trouble)
+
+
+def _device(device: Device) -> Reading:
+    """Not known while the line is down, or before the first probes have ended."""
+    state = device.health.state
+    if state is State.STARTING:
+        return Reading(None)
+    is_offline = state is State.OFFLINE
+    return Reading(is_offline, device.diagnosis() if is_offline else "")

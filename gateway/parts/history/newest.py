@@ -1,0 +1,58 @@
+"""The newest samples of a tag, found from the end of the history."""
+
+from collections.abc import Callable, Iterator
+from operator import itemgetter
+
+from gateway.contract.timerange import TimeRange
+from gateway.parts.history.damage import Damage
+from gateway.parts.history.reader import Reader
+from gateway.parts.history.recent import Recent
+from gateway.parts.history.rows import from_row
+from gateway.parts.history.search import StoredRuns
+from gateway.tags import Sample, Tag
+from gateway.tags.sample import has_value
+
+_ORDER = itemgetter(0, 1)
+
+
+class Newest:
+    """Used by the answering threads."""
+
+    def __init__(self, recent: Recent, reader: Reader, damage: Damage) -> None:
+        self._recent = recent
+        self._reader = reader
+        self._damage = damage
+
+    def of(
+        self, tag: Tag, period: TimeRange, count: int, pause: Callable[[], None], *, only_good: bool
+    ) -> Iterator[Sample]:
+        """Yields the newest samples of the period, in the order of time. Raises `Damaged` at the
+        end."""
+        file, sorted_runs, newest = self._recent.find(tag.key)
+        stored = StoredRuns(self._reader, self._damage, file, period)
+        runs = stored.of(sorted_runs)
+        numbers = stored.numbers({tag.key: tag}, runs)
+        # The order of recording decides between samples of one time.
+        found = [
+            (sample.time, len(runs) + place, sample)
+            for place, run in enumerate(newest)
+            for sample in run
+            if period.first <= sample.time <= period.last and (has_value(sample) or not only_good)
+        ]
+        found = sorted(found, key=_ORDER)[-count:]
+        for place, run in sorted(enumerate(runs), key=lambda run: run[1].last, reverse=True):
+            if len(found) == count and found[0][0] > run.last:
+                break
+            for rows in stored.rows(run, numbers):
+                found += [
+                    (time, place, sample)
+                    for number, time, _, value, kind, bad in rows or ()
+                    if number in numbers and period.first <= time <= period.last
+                    if has_value(sample := from_row(tag, time, value, kind, bad)) or not only_good
+                ]
+                pause()
+            found = sorted(found, key=_ORDER)[-count:]
+        for _, _, sample in found:
+            yield sample
+        if (lost := stored.lost()) is not None:
+            raise lost

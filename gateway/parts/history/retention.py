@@ -1,0 +1,64 @@
+"""Limits the size of the history file and the age of its samples, on the history thread."""
+
+import time
+from collections.abc import Callable
+
+from gateway.parts.history.file import HistoryFile
+from gateway.parts.history.outcomes import Ring
+from gateway.parts.history.recent import Recent, SortedRun
+
+_ROOM_OF_OUTCOME = 1024  # bytes in the file; of writes and alarms a tenth each
+# Runs that may expire between two checks. Few, because the wall clock may be wrong for a while.
+_MOST_EXPIRED = 2
+
+
+class Retention:
+    """Drops the oldest runs from a file that is too large, and those that are too old."""
+
+    def __init__(self, keep: float, max_size: int, recent: Recent, wall: Callable[[], int]) -> None:
+        """`keep`: seconds; `max_size`: bytes; `wall`: ns since 1970."""
+        self.size = 0  # bytes, as last measured
+        self._keep = int(keep * 1e9)
+        self._max_size = max_size
+        self._recent = recent
+        self._wall = wall
+        self._may_expire = _MOST_EXPIRED
+        self._next_check = 0.0
+
+    def most_outcomes(self, ring: Ring) -> int:
+        """Outcomes of writes that the file keeps."""
+        most = self._max_size // 10 // _ROOM_OF_OUTCOME
+        return max(100, most // 10 if ring is Ring.REFUSED else most)
+
+    def run_was_sorted(self) -> None:
+        """Checks the age of the runs at the next call of `make_room`."""
+        self._may_expire = _MOST_EXPIRED
+
+    def make_room(self, file: HistoryFile) -> None:
+        """Drops at most one run, so that new samples do not wait for long."""
+        if file.log_size() > file.log_limit:
+            file.empty_log()
+            if file.log_size() > max(file.log_limit, self._max_size // 4):
+                raise BlockingIOError(0, "another program reads the file and does not end")
+        now = time.monotonic()
+        if now >= self._next_check:
+            self._next_check = now + min(10.0, self._keep / 1e9 / 20)
+            self._may_expire = _MOST_EXPIRED
+            file.shrink()
+        self.size = file.size()
+        if self.size > self._max_size:
+            file.shrink()
+        runs = self._recent.sorted_runs
+        if runs and file.used() > self._max_size - 3 * file.log_limit:
+            self._drop(file, runs[0])
+        elif self._may_expire:
+            self._may_expire -= 1
+            before = self._wall() - self._keep
+            file.drop_writes(before)
+            old = (run for run in runs if max(run.last, run.closed) < before)
+            if (expired := next(old, None)) is not None:
+                self._drop(file, expired)
+
+    def _drop(self, file: HistoryFile, dropped: SortedRun) -> None:
+        self._recent.set_sorted(run for run in self._recent.sorted_runs if run is not dropped)
+        file.drop(dropped.number)

@@ -1,0 +1,91 @@
+"""Moves samples and outcomes from memory to the open history file, on the history thread."""
+
+import sqlite3
+from collections.abc import Callable, Sequence
+
+from gateway.parts.history.file import HistoryFile
+from gateway.parts.history.outcomes import Outcomes
+from gateway.parts.history.recent import Recent, Run
+from gateway.parts.history.retention import Retention
+
+BATCH_SIZE = 8192  # samples in one transaction
+
+
+class Transfer:
+    """Stores runs in the order of arrival, and sorts each in the file once it is closed."""
+
+    def __init__(
+        self,
+        recent: Recent,
+        outcomes: Sequence[Outcomes],
+        retention: Retention,
+        wall: Callable[[], int],
+    ) -> None:
+        """`wall`: ns since 1970."""
+        self.stored = 0  # samples since the start
+        self._recent = recent
+        self._outcomes = outcomes
+        self._retention = retention
+        self._wall = wall
+        self._unsorted: list[Run] = []  # runs with a number in the file
+
+    @property
+    def waiting(self) -> int:
+        """Samples that are not in the file."""
+        return self._recent.waiting
+
+    @property
+    def is_unfinished(self) -> bool:
+        return bool(self._recent.waiting or any(self._outcomes))
+
+    def opened(self, file: HistoryFile) -> None:
+        """Compares memory with the file, which may be another one than before."""
+        unsorted = file.unsorted_runs()
+        self._recent.opened(file.identity, file.sorted_runs(), unsorted)
+        for outcomes in self._outcomes:
+            outcomes.opened(file.identity, file.last_write(outcomes.ring))
+        self._unsorted = [run for run in self._recent.runs() if run.number]
+        in_memory = {run.number for run in self._unsorted}
+        for number in unsorted:
+            if number not in in_memory:  # left by an earlier process, or dropped from memory
+                file.sort(number, self._wall())
+        self._recent.set_sorted(file.sorted_runs())
+
+    def run(self, file: HistoryFile) -> None:
+        """Stores everything that waits. Raises `sqlite3.Error` and `OSError`."""
+        for outcomes in self._outcomes:
+            self._store_outcomes(file, outcomes)
+        self._recent.close_old()
+        for run in self._recent.runs():
+            self._store_samples(file, run)
+            self._sort_closed(file)
+            self._retention.make_room(file)
+
+    def _store_samples(self, file: HistoryFile, run: Run) -> None:
+        while (count := len(run.samples)) > run.stored:
+            if not run.number:
+                run.number = file.new_run()
+                self._unsorted.append(run)
+            end = min(count, run.stored + BATCH_SIZE)
+            file.store(run.number, run.stored, run.samples[run.stored : end])
+            self.stored += end - run.stored
+            self._recent.stored(run, end)
+
+    def _store_outcomes(self, file: HistoryFile, outcomes: Outcomes) -> None:
+        if not outcomes:
+            return
+        ring = outcomes.ring
+        waiting = outcomes.begin_storing(file.last_write(ring))
+        try:
+            last = file.store_writes(ring, waiting, self._retention.most_outcomes(ring))
+        except sqlite3.Error:
+            outcomes.not_stored()
+            raise
+        outcomes.are_stored(last)
+
+    def _sort_closed(self, file: HistoryFile) -> None:
+        for run in list(self._unsorted):
+            if run.dropped or (run.closed and run.stored == len(run.samples)):
+                self._recent.sorted_on_disk(run, file.sort(run.number, self._wall()))
+                self._unsorted.remove(run)
+                self._retention.run_was_sorted()

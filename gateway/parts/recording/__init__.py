@@ -1,0 +1,1 @@
+"""Recordings of lines: written, read again, replayed."""

@@ -1,0 +1,1 @@
+"""Served lines: the gateway is a station of another master."""

@@ -1,0 +1,112 @@
+"""One master on one port of a served line: its bytes, and the reply that waits."""
+
+import asyncio
+from typing import Protocol
+
+from gateway.errors import CallEnded, LineDown
+from gateway.stations.served.answering import NOISE, Answerer, Heard
+from gateway.transport import Port
+
+
+class Answered(Protocol):
+    """The served line of a conversation."""
+
+    unsent: int  # replies that later bytes have followed
+
+    def machine(self) -> Answerer: ...
+
+    def why_not(self, now: float) -> str: ...
+
+    def heard(self, data: bytes) -> None: ...
+
+    def sent(self, data: bytes) -> None: ...
+
+    def take(self, heard: Heard, now: float) -> None: ...
+
+    def ended(self) -> None: ...
+
+    def call_began(self) -> None: ...
+
+    def call_ended(self) -> None: ...
+
+
+class Conversation:
+    """One master on one port: a wire, or one TCP connection."""
+
+    def __init__(self, line: Answered, *, network: bool = False) -> None:
+        """`network`: one of several connections."""
+        self.trouble = ""
+        self._line = line
+        self._network = network
+        self._machine = line.machine()
+        self._port: Port | None = None
+        self._reply: asyncio.TimerHandle | None = None
+        self._closing: asyncio.Task[None] | None = None
+        self._following = 0  # bytes since the request of the waiting reply
+
+    def opened(self, port: Port) -> None:
+        self._port = port
+
+    def received(self, data: bytes) -> None:
+        line, now = self._line, asyncio.get_running_loop().time()
+        line.heard(data)
+        if self._port is None:
+            return
+        if line.why_not(now):  # what waited in the system while this process was held
+            self._begin_again()
+            return
+        self._following += len(data)
+        if self._following > NOISE:
+            self._cancel()
+        heard = self._machine.hear(data, now)
+        if heard.reply:
+            self._following = 0
+            if heard.delay:
+                loop = asyncio.get_running_loop()
+                self._reply = loop.call_at(now + heard.delay, self._send, heard.reply)
+            else:
+                self._send(heard.reply)
+        line.take(heard, now)
+        if heard.lost:
+            self._begin_again()
+
+    def _begin_again(self) -> None:
+        """Drops what was received. A connection is closed: its next frame begins anywhere."""
+        self._cancel()
+        self._machine = self._line.machine()
+        if self._network and self._port is not None:
+            self._closing = asyncio.create_task(self._port.close())
+            self._port = None
+
+    def _send(self, reply: bytes) -> None:
+        self._reply = None
+        if self._port is None:
+            return
+        self._line.sent(reply)
+        try:
+            self._port.write(reply)
+        except LineDown as error:
+            self.lost(error)
+
+    def _cancel(self) -> None:
+        if self._reply is not None:
+            self._reply.cancel()
+            self._reply = None
+            self._line.unsent += 1
+
+    def call_began(self) -> None:
+        self._line.call_began()
+
+    def lost(self, error: Exception) -> None:
+        if isinstance(error, CallEnded):  # the next call is another master's
+            self._begin_again()
+            self._line.call_ended()
+            return
+        self.close()
+        self.trouble = str(error)
+        if not self._network:
+            self._line.ended()
+
+    def close(self) -> None:
+        self._cancel()
+        self._port = None

@@ -1,0 +1,121 @@
+"""The served lines of a gateway, and the values that clients write for their masters."""
+
+import asyncio
+import time
+from collections.abc import Callable, Sequence
+
+import structlog
+
+from gateway.config import Config
+from gateway.errors import BadValue
+from gateway.line.send_permit import Duty
+from gateway.parts.serving.held_file import HeldFile
+from gateway.parts.serving.served_line import ServedLine, ServedSink
+from gateway.stations.served.registers import Registers, Row
+from gateway.stations.served.station import Station
+from gateway.tags import Sample, Tag, WriteResult, good
+from gateway.values import Value
+
+log = structlog.get_logger("gateway")
+
+
+class Serving:
+    """All served lines, and the held values."""
+
+    def __init__(
+        self,
+        config: Config,
+        sink: ServedSink,
+        sample_of: Callable[[str], Sample | None],
+        *,
+        wall: Callable[[], int] = time.time_ns,
+        duty: Duty | None = None,
+    ) -> None:
+        """`sample_of`: the present sample of a tag by `device/tag`. `wall`: ns since 1970."""
+
+        def sample(row: Row) -> Sample | None:
+            return sample_of(row.source or row.tag.key)
+
+        self.lines = [
+            ServedLine(line, sink, sample, wall=wall, duty=duty)
+            for line in config.lines
+            if line.serve and any(device.enabled for device in line.devices)
+        ]
+        self._sink = sink
+        self._wall = wall
+        self._file = None if config.held_file is None else HeldFile(config.held_file)
+        self._saving = asyncio.Lock()
+        self._rows = {row.tag: row for one in self.stations for row in one.registers.served.rows}
+        self._retained: dict[Tag, Value] = {}
+        # By source: the stations that answer with its last good value.
+        self.remembering: dict[str, list[tuple[Registers, Row]]] = {}
+        for station in self.stations:
+            for row in station.registers.served.rows:
+                if row.source is not None and row.hold_last:
+                    kept = self.remembering.setdefault(row.source, [])
+                    kept.append((station.registers, row))
+
+    @property
+    def stations(self) -> Sequence[Station]:
+        return [station for line in self.lines for station in line.stations.values()]
+
+    def remember(self, samples: Sequence[Sample]) -> None:
+        """Keeps the good samples of the sources with `hold_last`."""
+        for sample in samples:
+            for registers, row in self.remembering.get(sample.tag.key, ()):
+                registers.remember(row, sample)
+
+    # Held values
+
+    def holds(self, tag: Tag) -> bool:
+        """True for a value that clients write and a master reads."""
+        return tag in self._rows
+
+    async def write(self, tag: Tag, value: Value) -> WriteResult:
+        """Holds a value for the master. Returns when it is kept.
+
+        Raises `BadValue` and `Busy` before anything changed.
+        """
+        [result] = await self.write_group([(tag, value)])
+        return result
+
+    async def write_group(self, values: Sequence[tuple[Tag, Value]]) -> list[WriteResult]:
+        """Holds several values, all at once, as `write`."""
+        loop = asyncio.get_running_loop()
+        started, held = loop.time(), dict[Tag, Value]()
+        for tag, value in values:
+            if tag not in self._rows or self._rows[tag].tag.write is None:
+                raise BadValue(f"{tag.key} is written by the master")
+            real = tag.from_units(tag.encode(value))
+            if real is None:
+                raise BadValue(f"{value!r} cannot be read back after the write")
+            held[tag] = real
+        async with self._saving:  # writes keep their order
+            retained = {tag: real for tag, real in held.items() if self._rows[tag].retain}
+            if retained and self._file is not None:
+                changed = self._retained | retained
+                await asyncio.to_thread(self._file.save, changed)
+                self._retained = changed
+            at = self._wall()
+            self._sink.samples([good(tag, real, at) for tag, real in held.items()])
+        took = loop.time() - started
+        return [
+            WriteResult(real, at, took, verified=tag.write is not None and tag.write.verify)
+            for tag, real in held.items()
+        ]
+
+    def restore(self) -> None:
+        """Publishes the held values of before the start."""
+        if self._file is None:
+            return
+        retained = [tag for tag, row in self._rows.items() if row.retain]
+        for tag, value in self._file.load(retained).items():
+            try:
+                real = tag.from_units(tag.encode(value))
+            except BadValue as error:
+                log.warning("held value dropped", tag=tag.key, why=str(error))
+                continue
+            if real is not None:
+                self._retained[tag] = real
+        at = self._wall()
+        self._sink.samples([good(tag, value, at) for tag, value in self._retained.items()])

@@ -1,0 +1,283 @@
+"""Runs the transfers: each row is one task that waits for its source and writes to its target."""
+
+import asyncio
+import math
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from contextlib import suppress
+from functools import partial
+from typing import Protocol
+
+import structlog
+
+from gateway.errors import GatewayError
+from gateway.parts.alarms import Alarms, Reading
+from gateway.parts.alarms.watched import TRANSFER
+from gateway.parts.transfers import row as rows
+from gateway.parts.transfers.codes import DONE, End, Outcome, outcome_of
+from gateway.parts.transfers.row import Row, State
+from gateway.tags import AlarmRule, Level, Quality, Sample, Tag, WriteResult
+from gateway.tags.timestamps import rfc3339
+from gateway.tags.transfer import TransferRule
+from gateway.values import Value
+
+log: structlog.stdlib.BoundLogger = structlog.get_logger("gateway")
+
+FOLDER = "transfers"  # of the status documents
+ALARM_DELAY = 3.0  # seconds
+Document = Mapping[str, object]
+
+
+class Plant(Protocol):
+    """The samples of the gateway, and its status."""
+
+    @property
+    def alarms(self) -> Alarms: ...
+
+    def tag(self, key: str) -> Tag | None: ...
+
+    def target(self, key: str) -> Tag | None:
+        """Finds a tag to be written: also one that is never read."""
+
+    def sample(self, tag: Tag) -> Sample: ...
+
+    def age(self, tag: Tag) -> float:
+        """Returns the seconds since the last read; infinite if there was none."""
+
+    def add_document(self, path: str, document: Callable[[], Document]) -> None: ...
+
+    def drop_document(self, path: str) -> None: ...
+
+
+class Write(Protocol):
+    """Writes as a client does, for `by`. After `within` seconds nothing is sent any more.
+
+    Raises `GatewayError`.
+    """
+
+    def __call__(self, tag: Tag, value: Value, by: str, within: float) -> Awaitable[WriteResult]:
+        """Returns when the device has acknowledged."""
+
+
+class _Running:
+    """A row with its tags and its task."""
+
+    __slots__ = ("carried", "row", "rule", "source", "target", "task", "wake")
+
+    def __init__(self, rule: TransferRule, now: float) -> None:
+        self.rule = rule
+        self.row = Row(rule, now)
+        self.source: Tag | None = None
+        self.target: Tag | None = None
+        self.carried: WriteResult | None = None  # the last one
+        self.wake = asyncio.Event()
+        self.task: asyncio.Task[None] | None = None
+
+    @property
+    def name(self) -> str:
+        return f"transfer {self.rule.number}"
+
+
+class Transfers:
+    """The rows of the file, a `Subscriber` of the gateway. Belongs to the event loop."""
+
+    def __init__(
+        self,
+        plant: Plant,
+        write: Write,
+        rules: Sequence[TransferRule],
+        *,
+        alarms: bool = True,
+    ) -> None:
+        """`alarms`: a row that does not work is an alarm."""
+        self._plant = plant
+        self._write = write
+        self._rules = rules
+        self._alarms = alarms
+        self._running: list[_Running] = []
+        self._by_source: dict[Tag, list[_Running]] = {}
+        self._ending: set[asyncio.Task[None]] = set()
+
+    # -- life --
+
+    def start(self) -> None:
+        """Starts the rows. Call it when this gateway is active, before its lines begin."""
+        self.renew(self._rules, {})
+
+    def renew(self, rules: Sequence[TransferRule], renewed: Mapping[Tag, Tag]) -> None:
+        """Takes over the rows of a changed file.
+
+        A row goes on if it says the same and its tags go on: the same ones, or those that `renewed`
+        gives for them. Every other row begins again.
+        """
+        for one in self._running:
+            self._plant.drop_document(f"{FOLDER}/{one.rule.number}")
+        before, self._running, self._by_source = self._running, [], {}
+        for rule in rules:
+            source, target = self._plant.tag(rule.source), self._plant.target(rule.target)
+            if source is None or target is None:
+                continue  # of a device that another gateway serves
+            known = next(
+                (one for one in before if _goes_on(one, rule, source, target, renewed)), None
+            )
+            if known is None:
+                self._begin(rule, source, target)
+            else:
+                before.remove(known)
+                known.rule = rule  # its number may be another one
+                self._add(known, source, target)
+        for one in before:
+            self._leave(one)
+        self._watch()
+
+    def _begin(self, rule: TransferRule, source: Tag, target: Tag) -> None:
+        now = asyncio.get_running_loop().time()
+        one = _Running(rule, now)
+        self._add(one, source, target)
+        self._plant.age(source)  # from now on it is known
+        self.publish([self._plant.sample(source)])
+        one.task = asyncio.create_task(self._run(one), name=one.name)
+        one.task.add_done_callback(partial(_report, one))
+
+    def _add(self, one: _Running, source: Tag, target: Tag) -> None:
+        one.source, one.target = source, target
+        self._running.append(one)
+        self._by_source.setdefault(source, []).append(one)
+        path = f"{FOLDER}/{one.rule.number}"
+        self._plant.add_document(path, partial(self._document, one))
+
+    def _leave(self, one: _Running) -> None:
+        """Ends a row. A write that is under way ends first: its outcome is recorded."""
+        one.source = None
+        one.wake.set()
+        if one.task is not None:
+            self._ending.add(one.task)
+            one.task.add_done_callback(self._ending.discard)
+
+    def _watch(self) -> None:
+        """Has one alarm for each row."""
+        if not self._alarms:
+            return
+        alarms, wanted = self._plant.alarms, {}
+        for one in self._running:
+            source, target = one.rule.text
+            text = f"{one.name} from {source} to {target} does not work"
+            rule = AlarmRule({Level.STOPPED: True}, delay=ALARM_DELAY, text=text)
+            wanted[f"{TRANSFER}{one.rule.number}"] = rule, partial(self._look, one)
+        for key in alarms.watched:
+            same = key in wanted and alarms.entries[key].alarm.rule == wanted[key][0]
+            if key.startswith(TRANSFER) and not same:
+                alarms.unwatch([key])
+        for key, (rule, look) in wanted.items():
+            alarms.watch(key, rule, look)
+
+    async def stop(self) -> None:
+        """Ends all rows at once. A write that is under way is reported as unclear."""
+        tasks = [one.task for one in self._running if one.task is not None]
+        tasks += self._ending
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+    # -- from the gateway --
+
+    def publish(self, samples: Sequence[Sample]) -> None:
+        """Wakes the rows of changed sources."""
+        if not self._by_source:
+            return
+        for sample in samples:
+            for one in self._by_source.get(sample.tag, ()):
+                if sample.quality is Quality.GOOD and sample.value is not None:
+                    one.row.changed(sample.value)
+                one.wake.set()
+
+    def set_online(self, device: str, online: bool) -> None:
+        """Wakes the rows whose target replies again."""
+        for one in self._running:
+            if online and one.target is not None and one.target.device == device:
+                one.row.target_online(asyncio.get_running_loop().time())
+                one.wake.set()
+
+    # -- one row --
+
+    async def _run(self, one: _Running) -> None:
+        loop = asyncio.get_running_loop()
+        while one.source is not None:
+            one.wake.clear()
+            carry = one.row.next(self._reading(one.source), loop.time())
+            if carry is not None:
+                outcome = await self._carry(one, carry)
+                one.row.ended(outcome, loop.time())
+                continue
+            with suppress(TimeoutError):
+                at = one.row.wake(loop.time())
+                async with asyncio.timeout_at(None if at == math.inf else at):
+                    await one.wake.wait()
+
+    def _reading(self, source: Tag) -> rows.Reading:
+        sample = self._plant.sample(source)
+        known = sample.value if sample.quality is Quality.GOOD else None
+        return rows.Reading(known, self._plant.age(source), sample.reason, sample.detail)
+
+    async def _carry(self, one: _Running, carry: rows.Carry) -> Outcome:
+        target, value = one.target, carry.value
+        if target is None:
+            raise AssertionError(f"{one.name} has no target")
+        if not carry.substitute:
+            found = one.rule.value(value, whole=target.is_whole)
+            if found is None:
+                return Outcome(End.REFUSED, None, f"{value} x {one.rule.scale} is too large")
+            value = found
+        try:
+            one.carried = await self._write(target, value, one.name, carry.within)
+        except GatewayError as error:
+            return outcome_of(error)
+        return DONE
+
+    # -- status --
+
+    def _look(self, one: _Running) -> Reading:
+        if one.source is None:
+            return Reading(None)
+        state, _, why = one.row.verdict(self._reading(one.source))
+        return Reading(None if state is State.STARTING else state is not State.CARRIED, why)
+
+    def _document(self, one: _Running) -> Document:
+        source = one.source
+        if source is None:
+            raise AssertionError(f"{one.name} has ended")
+        reading = self._reading(source)
+        state, code, why = one.row.verdict(reading)
+        counts, carried, at = one.row.counts, one.carried, one.row.carried_at
+        now = asyncio.get_running_loop().time()
+        return {
+            "from": one.rule.text[0],
+            "to": one.rule.text[1],
+            "when": one.rule.when,
+            "state": state.value,
+            "code": None if code is None else code.value,
+            "meaning": "" if code is None else code.sentence,
+            "why": why,
+            "value": None if carried is None else carried.value,
+            "time": None if carried is None else rfc3339(carried.time),
+            "last_carried": None if at is None else round(now - at, 1),
+            "age": round(reading.age, 3) if reading.age < math.inf else None,
+            "carried": counts[End.DONE],
+            "not_done": counts[End.NOT_DONE],
+            "refused": counts[End.REFUSED],
+            "unclear": counts[End.UNCLEAR],
+        }
+
+
+def _goes_on(
+    one: _Running, rule: TransferRule, source: Tag, target: Tag, renewed: Mapping[Tag, Tag]
+) -> bool:
+    if one.source is None or one.target is None or not one.rule.says_same(rule):
+        return False
+    both = (one.source, source), (one.target, target)
+    return all(old is new or renewed.get(old) is new for old, new in both)
+
+
+def _report(one: _Running, task: asyncio.Task[None]) -> None:
+    if not task.cancelled() and (error := task.exception()) is not None:
+        one.row.last = Outcome(End.UNCLEAR, None, f"internal error: {error!r}")
+        log.error("transfer failed", transfer=task.get_name(), exc_info=error)

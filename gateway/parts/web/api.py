@@ -1,0 +1,242 @@
+"""The JSON API: tags, devices, lines, history, writes. `openapi.json` describes it.
+
+Lists come in pages: `limit` items, and `next` for the parameter `after` of the next page. Answers
+are made on threads, because those of a large plant take long.
+"""
+
+import asyncio
+import time
+from collections.abc import Mapping, Sequence
+from functools import partial
+from itertools import islice
+from typing import Any
+
+from aiohttp import web
+
+from gateway.contract import bucket_documents as buckets
+from gateway.contract import past, payload
+from gateway.contract.buckets import Now
+from gateway.contract.faults import below, faults, transfers, warnings
+from gateway.contract.interfaces import History
+from gateway.contract.meta import meta_fields
+from gateway.contract.payload import Problem
+from gateway.contract.question import question
+from gateway.errors import BadValue, Busy, GatewayError
+from gateway.northbound.session.session import off_loop
+from gateway.parts.web.guard import BY, answer
+from gateway.parts.web.replies import BODY_WITHIN, as_json, json_off_loop, raw
+from gateway.parts.web.replies import limit as limit_of
+from gateway.parts.web.sources import Documents, Sources
+from gateway.tags import Tag
+from gateway.tags.sample import has_value
+
+STATE_AGE = 2.0  # seconds that the state of lines and devices may be old
+MOST_ITEMS = 1000  # of one page
+MOST_SAMPLES = 10_000
+_ITEMS = 200
+_SAMPLES = 1000
+HISTORY_WITHIN = 20.0  # seconds for one query
+HISTORY_AT_ONCE = 4  # queries; they read the disk
+# 200 only for an acknowledged write. 502 and above: it was sent, or the device cannot be reached.
+_STATUS = {
+    Problem.BAD_VALUE: 400,
+    Problem.NOT_WRITABLE: 403,
+    Problem.NOT_ALLOWED: 403,
+    Problem.UNKNOWN_TAG: 404,
+    Problem.REFUSED: 502,
+    Problem.LINE_DOWN: 503,
+    Problem.NO_REPLY: 503,
+    Problem.BUSY: 503,
+    Problem.UNCLEAR: 504,
+    Problem.INCOMPLETE: 502,
+}
+
+
+class Api:
+    """The handlers."""
+
+    def __init__(self, sources: Sources) -> None:
+        self._plant = sources.plant
+        self._north = sources.north
+        self._history = sources.history
+        self._known: tuple[object, Mapping[str, Sequence[Tag]]] = (None, {})
+        self._history_turns = asyncio.Semaphore(HISTORY_AT_ONCE)
+
+    def routes(self) -> list[web.RouteDef]:
+        return [
+            web.get("/api/status", self._status),
+            web.get("/api/lines", self._lines),
+            web.get("/api/transfers", self._transfers),
+            web.get("/api/devices", self._device_page),
+            web.get("/api/devices/{device}", self._device),
+            web.get("/api/tags", self._tags),
+            web.get("/api/history", self._samples),
+            web.post("/api/write", self._write),
+        ]
+
+    @property
+    def _devices(self) -> Mapping[str, Sequence[Tag]]:
+        """The tags by device, made again after a reload."""
+        devices = self._plant.devices()
+        if self._known[0] is not devices:
+            self._known = devices, {device.name: tuple(device.tags) for device in devices}
+        return self._known[1]
+
+    async def _status(self, _: web.Request) -> web.Response:
+        return as_json(overview(await self._north.documents(STATE_AGE)))
+
+    async def _lines(self, _: web.Request) -> web.Response:
+        documents = await self._north.documents(STATE_AGE)
+        return await json_off_loop(lambda: {"lines": dict(below("lines/", documents))})
+
+    async def _transfers(self, request: web.Request) -> web.Response:
+        limit, after = limit_of(request, _ITEMS, MOST_ITEMS), request.query.get("after", "0")
+        if not after.isdecimal():
+            return answer(400, f"after={payload.short(after)} is no number of a transfer")
+        documents = await self._north.documents(STATE_AGE)
+
+        def page() -> object:
+            found = [one for one in transfers(documents) if int(one[0]) > int(after)]
+            shown = [{"transfer": int(number), **one} for number, one in found[:limit]]
+            return {"transfers": shown, "next": found[limit - 1][0] if found[limit:] else None}
+
+        return await json_off_loop(page)
+
+    async def _device_page(self, request: web.Request) -> web.Response:
+        limit, after = limit_of(request, _ITEMS, MOST_ITEMS), request.query.get("after", "")
+        line = request.query.get("line")
+        documents = await self._north.documents(STATE_AGE)
+
+        def page() -> object:
+            names = [name for name, _ in below("devices/", documents) if name > after]
+            if line is not None:
+                names = [name for name in names if name in _devices_of(line, documents)]
+            shown = {name: _without_requests(documents, name) for name in names[:limit]}
+            return {"devices": shown, "next": names[limit - 1] if len(names) > limit else None}
+
+        return await json_off_loop(page)
+
+    async def _device(self, request: web.Request) -> web.Response:
+        documents = await self._north.documents(STATE_AGE)
+        name = request.match_info["device"]
+        if (document := documents.get(f"devices/{name}")) is None:
+            return answer(404, f"there is no device {payload.short(name)}")
+        return as_json(document)
+
+    async def _tags(self, request: web.Request) -> web.Response:
+        limit, after = limit_of(request, _ITEMS, MOST_ITEMS), request.query.get("after")
+        device, find = request.query.get("device"), request.query.get("find", "").lower()
+        if device is not None and device not in self._devices:
+            return answer(404, f"there is no device {payload.short(device)}")
+
+        def page() -> object:
+            found = self.select(device, find, after, limit + 1)
+            more = len(found) > limit
+            tags = [{"tag": tag.key, **self._fields(tag)} for tag in found[:limit]]
+            return {"tags": tags, "next": tags[-1]["tag"] if more else None}
+
+        return await json_off_loop(page)
+
+    def select(self, device: str | None, find: str, after: str | None, limit: int) -> list[Tag]:
+        """Returns tags in the order of the file, after the tag `after`."""
+        known = self._devices
+        names = [*known] if device is None else [device]
+        if after is not None and (start := after.partition("/")[0]) in names:
+            names = names[names.index(start) :]
+        tags = (tag for name in names for tag in known.get(name, ()))
+        if after is not None:
+            for tag in tags:
+                if tag.key == after:
+                    break
+        matching = (tag for tag in tags if find in tag.key.lower())
+        return list(islice(matching if find else tags, limit))
+
+    def _fields(self, tag: Tag) -> Mapping[str, object]:
+        return {**payload.sample_fields(self._plant.sample(tag)), **meta_fields(tag)}
+
+    async def _samples(self, request: web.Request) -> web.Response:
+        key = request.query.get("tag", "")
+        tag, history = self._plant.tag(key), self._history
+        if tag is None:
+            return answer(404, f"there is no tag {payload.short(key)}")
+        if history is None or not tag.history:
+            return answer(404, f"no history is kept of {tag.key}: it needs `history: true`")
+        limit = limit_of(request, _SAMPLES, MOST_SAMPLES)
+        find = partial(_found, history, tag, dict(request.query), limit)
+        is_valid = has_value(self._plant.sample(tag))
+
+        def read() -> object:
+            try:
+                return find(Now(time.time_ns(), is_valid=is_valid))
+            except GatewayError as error:
+                return error
+
+        async with self._history_turns:
+            found = await off_loop(read)
+        if isinstance(found, GatewayError):
+            return answer(400 if isinstance(found, BadValue) else 503, str(found))
+        return await json_off_loop(lambda: found)
+
+    async def _write(self, request: web.Request) -> web.Response:
+        arrived = asyncio.get_running_loop().time()
+        if request.content_type != "application/json":
+            return answer(415, "send the value as Content-Type: application/json")
+        try:
+            async with asyncio.timeout(BODY_WITHIN):
+                key, data = request.query.get("tag", ""), await request.read()
+        except TimeoutError:
+            return answer(408, f"the body did not arrive within {BODY_WITHIN:g} s")
+        # The server does not cancel this when the client leaves: the write may be on the wire.
+        result = await self._north.write(key, data, f"web {request[BY]}", arrived)
+        failed = payload.failed(result)
+        status = 200 if failed is None else _STATUS.get(failed.problem, 500)
+        return raw(payload.outcome(result), status)
+
+
+def _found(
+    history: History, tag: Tag, parameters: Mapping[str, str], limit: int, now: Now
+) -> dict[str, object]:
+    """Returns the samples or buckets of one tag. Raises `GatewayError`."""
+    asked = question({"time": "[now(-1h)..]", **parameters}, time="time")
+    until = time.monotonic() + HISTORY_WITHIN
+
+    def pause() -> None:
+        if time.monotonic() > until:
+            raise Busy(f"this takes more than {HISTORY_WITHIN:g} s: ask for a shorter time")
+
+    if asked.bucket is not None:
+        whole = [
+            buckets.fields(bucket, asked.aggregates)
+            for bucket in history.buckets(tag, asked, now, pause)
+            if bucket.quality == "good" or not asked.only_good
+        ]
+        return {"tag": tag.key, "buckets": whole, "complete": True}
+    most = asked.last or limit
+    if most > MOST_SAMPLES:
+        raise BadValue(f"last={asked.last} is no count from 1 to {MOST_SAMPLES}")
+    samples = list[object]()
+    for sample in past.samples(history, tag, asked, limit, now.time, pause):
+        samples.append(payload.sample_fields(sample))
+        pause()
+    complete = asked.last is not None or len(samples) < limit
+    return {"tag": tag.key, "samples": samples, "complete": complete}
+
+
+def overview(documents: Documents) -> dict[str, Any]:
+    """Returns the state of the gateway, and sentences about what is wrong."""
+    parts = ("status", "zenoh", "outcomes", "history", "standby", "alarms")
+    return {
+        **{name: documents[name] for name in parts if name in documents},
+        "faults": [*faults(documents)],
+        "warnings": [*warnings(documents)],
+    }
+
+
+def _devices_of(line: str, documents: Documents) -> Mapping[str, Any]:
+    known: Mapping[str, Any] = documents.get(f"lines/{line}", {}).get("devices", {})
+    return known
+
+
+def _without_requests(documents: Documents, name: str) -> Mapping[str, Any]:
+    document = documents[f"devices/{name}"]
+    return {field: value for field, value in document.items() if field != "requests"}

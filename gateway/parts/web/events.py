@@ -1,0 +1,255 @@
+"""Server-sent events for the status page: state, values of one device, exchanges of one line.
+
+Nothing is queued for a client. Each event is made from the current state when the client has taken
+the one before, so a slow client gets fewer events, and none that is old. A client that takes
+nothing for `SLOW` seconds is dropped.
+"""
+
+import asyncio
+import json
+import time
+from collections import deque
+from collections.abc import Mapping, Sequence
+from itertools import islice
+from typing import Any
+
+import orjson
+from aiohttp import ClientConnectionResetError, web
+
+from gateway.contract import payload
+from gateway.contract.faults import below, transfers
+from gateway.parts.web.alarms import alarms_shown
+from gateway.parts.web.api import Api, overview
+from gateway.parts.web.guard import answer
+from gateway.parts.web.sources import Documents, Sources
+from gateway.parts.web.wire import Recorder, Wires, as_fields
+from gateway.tags import Quality, Sample, Tag
+
+MOST_PAGES = 16
+SLOW = 5.0  # seconds
+WIRE_EVERY = 0.25  # seconds between two events with exchanges
+VALUES_EVERY = 1.0
+STATE_EVERY = 2.0
+LOAD_EVERY = 5.0  # as often as the status is published: it costs nothing more
+KEPT_LOADS = 360  # half an hour
+TAGS_SHOWN = 200  # of one device
+_BY_NAME = ("devices", "transfers")  # of the state: a page gets their changes
+MOST_SENTENCES = 50  # about what is wrong, and about what to look at
+
+
+class Loads:
+    """The load of each line in the last half hour."""
+
+    def __init__(self, sources: Sources) -> None:
+        self._north = sources.north
+        self._last: Mapping[str, float] = {}
+        self._at = 0.0
+        self._loads: dict[str, deque[float]] = {}
+        self.number = 0  # of measurements
+
+    async def run(self) -> None:
+        """Runs until cancelled."""
+        while True:
+            self._take(await self._north.documents(LOAD_EVERY))
+            await asyncio.sleep(LOAD_EVERY)
+
+    def since(self, number: int) -> dict[str, list[float]]:
+        """Returns the loads of each line after that measurement."""
+        new = min(self.number - number, KEPT_LOADS)
+        return {
+            name: [*islice(loads, max(0, len(loads) - new), None)]
+            for name, loads in self._loads.items()
+        }
+
+    def _take(self, documents: Documents) -> None:
+        up = documents["status"]["up"]
+        busy = {name: one["busy_time"] for name, one in below("lines/", documents)}
+        if (passed := up - self._at) <= 0:
+            return  # the same documents
+        for name, seconds in busy.items():
+            if (before := self._last.get(name)) is not None:
+                load = min(1.0, max(0.0, (seconds - before) / passed))
+                self._loads.setdefault(name, deque(maxlen=KEPT_LOADS)).append(round(load, 3))
+        self.number += 1
+        self._last, self._at = busy, up
+
+
+class Events:
+    """The handler of `/api/events`."""
+
+    def __init__(self, sources: Sources, api: Api, loads: Loads) -> None:
+        self._sources = sources
+        self._api = api
+        self.loads = loads
+        self.wires = Wires(sources.plant)
+        self._pages = 0
+        self._state: tuple[Documents, dict[str, Any]] = ({}, {})
+
+    def state(self, documents: Documents) -> dict[str, Any]:
+        """Returns the state as all pages get it; made once for the same documents."""
+        if self._state[0] is not documents:
+            alarms = alarms_shown(self._sources)
+            self._state = documents, {**_state(documents), "alarms": alarms}
+        return self._state[1]
+
+    async def handle(self, request: web.Request) -> web.StreamResponse:
+        """`line`: with its exchanges. `device`: with its values, from after the tag `after`."""
+        if self._pages >= MOST_PAGES:
+            return answer(503, f"{MOST_PAGES} pages are open already")
+        query = request.query
+        device = query.get("device")
+        tags = None
+        if device:
+            tags = self._api.select(device, "", query.get("after"), TAGS_SHOWN)
+        self._pages += 1
+        try:
+            with self.wires.watched(query.get("line", "")) as recorder:
+                response = web.StreamResponse(headers={"Content-Type": "text/event-stream"})
+                response.headers["X-Accel-Buffering"] = "no"  # a proxy passes events on at once
+                await response.prepare(request)
+                page = Page(self._sources, self, tags, recorder)
+                await _send(request, response, page)
+        finally:
+            self._pages -= 1
+        return response
+
+
+async def _send(request: web.Request, response: web.StreamResponse, page: "Page") -> None:
+    while True:
+        data = await page.next()
+        try:
+            async with asyncio.timeout(SLOW):
+                await response.write(data)
+        except (TimeoutError, ClientConnectionResetError):
+            if request.transport is not None:
+                request.transport.abort()
+            return
+        await asyncio.sleep(WIRE_EVERY)
+
+
+class Page:
+    """The events of one client: notes what it has, and makes what it gets next."""
+
+    def __init__(
+        self,
+        sources: Sources,
+        events: Events,
+        tags: Sequence[Tag] | None,
+        recorder: Recorder | None,
+    ) -> None:
+        self._sources = sources
+        self._events = events
+        self._tags = tags
+        self._recorder = recorder
+        self._exchange = 0  # the number of the last one
+        self._load = 0  # the number of the last measurement
+        self._sent: dict[Tag, Sample] = {}
+        self._shown: Mapping[str, Mapping[str, object]] = {}  # by the names `_BY_NAME`
+        self._values_due = self._state_due = 0.0
+
+    async def next(self) -> bytes:
+        """Returns the events that are due; at least the time."""
+        loop = asyncio.get_running_loop()
+        events = []
+        if self._state_due <= loop.time():
+            documents = await self._sources.north.documents(STATE_EVERY)
+            self._state_due = loop.time() + STATE_EVERY
+            events.append(_event("state", self._state(documents)))
+            loads = self._events.loads
+            if self._load < loads.number:
+                events.append(_event("loads", loads.since(self._load)))
+                self._load = loads.number
+        if self._tags is not None and self._values_due <= loop.time():
+            self._values_due = loop.time() + VALUES_EVERY
+            events.append(_event("values", self._values(self._tags)))
+        if self._recorder is not None and (new := self._recorder.since(self._exchange)):
+            missed = new[0].number - self._exchange - 1 if self._exchange else 0
+            self._exchange = new[-1].number
+            exchanges = [as_fields(exchange) for exchange in new]
+            events.append(_event("wire", {"missed": missed, "exchanges": exchanges}))
+        # The second one is steady: the page finds out by it that events are late.
+        events.append(_event("time", [round(time.time() * 1000), round(loop.time() * 1000)]))
+        return b"".join(events)
+
+    def _state(self, documents: Documents) -> dict[str, Any]:
+        whole = self._events.state(documents)
+        changed = {name: _changes(self._shown.get(name, {}), whole[name]) for name in _BY_NAME}
+        self._shown = {name: whole[name] for name in _BY_NAME}
+        return {**whole, "ready": self._sources.ready(), **changed}
+
+    def _values(self, tags: Sequence[Tag]) -> list[list[object]]:
+        """Returns the values that changed, or were read again: the text of the value as in JSON,
+        because a browser rounds large integers."""
+        found = []
+        for tag in tags:
+            sample = self._sources.plant.sample(tag)
+            if self._sent.get(tag) == sample:
+                continue
+            self._sent[tag] = sample
+            fields = payload.sample_fields(sample)
+            known = fields["value"]
+            if isinstance(known, tuple):
+                text = json.dumps(known)  # with spaces: a browser breaks the line there
+            else:
+                text = known if isinstance(known, str) else orjson.dumps(known).decode()
+            if name := fields.get("text"):
+                text = f"{name} ({text})"
+            good = fields["quality"] == Quality.GOOD
+            why = "" if good else f"{fields['reason'] or ''} {fields.get('detail') or ''}".strip()
+            found.append([tag.name, text if good else "", good, sample.time // 10**6, why])
+        return found
+
+
+def _state(documents: Documents) -> dict[str, Any]:
+    known = overview(documents)
+    line_of = {name: line for line, one in below("lines/", documents) for name in one["devices"]}
+    return {
+        **{name: known["status"][name] for name in ("name", "version", "up", "tags")},
+        "links": known["zenoh"]["to"],
+        "writes": known["outcomes"]["counts"],
+        "history": known.get("history", {}).get("state"),
+        "standby": known.get("standby", {}).get("stand"),
+        **{name: known[name][:MOST_SENTENCES] for name in ("faults", "warnings")},
+        "more": sum(max(0, len(known[name]) - MOST_SENTENCES) for name in ("faults", "warnings")),
+        "lines": [
+            [
+                *(name, one["open"], one["trouble"], one["expected"]["load"]),
+                one["measured"]["requests_per_second"],
+            ]
+            for name, one in below("lines/", documents)
+        ],
+        "calls": _calls(documents),
+        "transfers": {number: _transfer(one) for number, one in transfers(documents)},
+        "devices": {
+            name: [line_of.get(name, ""), one["standing"], one["diagnosis"]]
+            for name, one in below("devices/", documents)
+        },
+    }
+
+
+def _calls(documents: Documents) -> list[list[object]]:
+    """Returns the lines with a modem."""
+    fields = ("state", "since", "next", "last_result", "made", "failed")
+    return [
+        [name, *(calls[field] for field in fields)]
+        for name, one in below("lines/", documents)
+        if (calls := one.get("calls"))
+    ]
+
+
+def _transfer(one: Mapping[str, Any]) -> list[object]:
+    """Returns what the page shows of a row: it changes only when something happens."""
+    code = "" if one["code"] is None else f"{one['code']}: {one['meaning']}"
+    works = one["state"] == "carried"
+    why = "" if works else one["why"]
+    return [one["from"], one["to"], one["state"], code, one["time"], why]
+
+
+def _changes(known: Mapping[str, object], now: Mapping[str, object]) -> dict[str, object]:
+    """Returns what a page has to take over; None: it is gone."""
+    changed = {name: one for name, one in now.items() if known.get(name) != one}
+    return changed | dict.fromkeys(known.keys() - now.keys())
+
+
+def _event(kind: str, data: object) -> bytes:
+    return b"event: %b\ndata: %b\n\n" % (kind.encode(), orjson.dumps(data, default=str))

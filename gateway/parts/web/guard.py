@@ -1,0 +1,119 @@
+"""Decides which HTTP requests are answered: by address, origin and token.
+
+A page of another site must not reach the gateway through the browser of an operator. DNS rebinding
+gives such a page our address under its own name, so that only known names count. A token is sent
+in a header, never in an address: addresses are kept in logs and histories.
+"""
+
+import hmac
+import socket
+from ipaddress import ip_address
+from urllib.parse import urlsplit
+
+from aiohttp import web
+from aiohttp.typedefs import Handler, Middleware
+
+from gateway.config import WebConfig
+from gateway.contract.named_secrets import NamedSecrets
+
+# Without a token at every address: the page itself holds no value.
+OPEN = frozenset({"/", "/page.js", "/page.css", "/openapi.json", "/healthz", "/readyz"})
+BY = web.RequestKey("by", str)  # the name of the token; empty without a valid one
+MOST_OPEN = 64  # requests at once; beyond, 503
+_HEADERS = {
+    "Content-Security-Policy": (
+        "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
+        "img-src 'self' data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    ),
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cache-Control": "no-store",
+    "Server": "plc-gateway",
+}
+
+
+class Guard:
+    """The middleware before every handler. Raises `ConfigError` for a bad tokens file."""
+
+    def __init__(self, config: WebConfig) -> None:
+        self._tokens = None
+        if config.tokens_file is not None:
+            self._tokens = NamedSecrets(config.tokens_file, "web.tokens_file")
+        self._reads_need_token = not config.is_local
+        self._names = {"localhost", socket.gethostname().lower(), *config.names}
+        self._open = 0
+
+    def middleware(self) -> Middleware:
+        @web.middleware
+        async def guarded(request: web.Request, handler: Handler) -> web.StreamResponse:
+            if (refusal := self._refusal(request)) is not None:
+                return refusal
+            self._open += 1
+            try:
+                return await handler(request)
+            except web.HTTPException as error:
+                return answer(error.status, error.reason)
+            finally:
+                self._open -= 1
+
+        return guarded
+
+    def _refusal(self, request: web.Request) -> web.Response | None:
+        if not self._is_known(request.host):
+            return answer(421, f"unknown name {request.host[:100]!r}: see web.names")
+        if not _is_same_site(request):
+            return answer(403, "pages of other sites may not use the gateway")
+        request[BY] = self._name(request)
+        needs_token = request.method != "GET" or self._reads_need_token
+        if needs_token and request.path not in OPEN and not request[BY]:
+            if self._tokens is None:
+                return answer(403, "nothing can be written here: the file has no web.tokens_file")
+            refusal = answer(401, "a token is needed: send Authorization: Bearer <token>")
+            refusal.headers["WWW-Authenticate"] = "Bearer"
+            return refusal
+        if self._open >= MOST_OPEN:
+            return answer(503, f"{MOST_OPEN} requests are open already")
+        return None
+
+    def _is_known(self, host: str) -> bool:
+        """True for an address, and for a name of this machine: rebinding needs a foreign name."""
+        try:
+            name = urlsplit(f"//{host}").hostname or ""
+        except ValueError:
+            return False
+        try:
+            ip_address(name)
+        except ValueError:
+            return name in self._names
+        return True
+
+    def _name(self, request: web.Request) -> str:
+        """Returns the name of the client's token; empty without a valid one."""
+        kind, _, token = request.headers.get("Authorization", "").partition(" ")
+        if self._tokens is None or kind.lower() != "bearer":
+            return ""
+        sent, found = token.strip().encode(), ""
+        for name, secret in self._tokens.current().items():
+            if hmac.compare_digest(sent, secret):
+                found = name
+        return found
+
+
+def _is_same_site(request: web.Request) -> bool:
+    if request.headers.get("Sec-Fetch-Site", "none") not in ("none", "same-origin"):
+        return request.method == "GET" and request.path == "/"  # a link to the page
+    origin = request.headers.get("Origin")
+    if origin is None:
+        return True
+    scheme, _, host = origin.partition("://")
+    return scheme in ("http", "https") and host.lower() == request.host.lower()
+
+
+async def add_headers(_: web.Request, response: web.StreamResponse) -> None:
+    """Called before the headers of each answer are sent."""
+    response.headers.update(_HEADERS)
+
+
+def answer(status: int, error: str) -> web.Response:
+    """Returns an error as JSON."""
+    return web.json_response({"error": error}, status=status)

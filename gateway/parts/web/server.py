@@ -1,0 +1,147 @@
+"""The HTTP server: binds the address, and serves until it is cancelled.
+
+Whatever its clients do, the lines go on: connections and requests are limited, slow clients are
+dropped, and answers of a large plant are made on threads.
+"""
+
+import asyncio
+import socket
+from contextlib import suppress
+
+import structlog
+from aiohttp import web
+
+from gateway.config import WebConfig
+from gateway.northbound.session.session import off_loop
+from gateway.parts.web import assets, metrics
+from gateway.parts.web.alarms import AlarmApi
+from gateway.parts.web.api import Api
+from gateway.parts.web.events import Events, Loads
+from gateway.parts.web.guard import Guard, add_headers
+from gateway.parts.web.sources import Sources
+
+log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
+
+MOST_CONNECTIONS = 128
+IDLE = 15.0  # seconds without a whole request until a connection is closed
+AGAIN = 10.0  # seconds until the address is tried again
+SCRAPE_AGE = 1.0  # seconds that the state in the metrics may be old
+_HEADER = 8190  # bytes of one line
+_ENDS_WITHIN = 0.2  # seconds for requests in progress when the gateway ends
+_LINGERS = 0.5  # seconds for the rest of a refused body
+_BUFFER = 64 * 1024  # bytes that the system keeps for a client: a slow one must not get old values
+
+
+class Server:
+    """The HTTP side of one gateway. Raises `ConfigError` for a bad tokens file."""
+
+    def __init__(self, config: WebConfig, sources: Sources) -> None:
+        self._config = config
+        self._sources = sources
+        self._api = Api(sources)
+        self._loads = Loads(sources)
+        self._app = web.Application(
+            middlewares=[Guard(config).middleware()], client_max_size=64 * 1024
+        )
+        self._app.on_response_prepare.append(add_headers)
+        self._app.add_routes(
+            [
+                *self._api.routes(),
+                *AlarmApi(sources).routes(),
+                *assets.routes(),
+                web.get("/api/events", Events(sources, self._api, self._loads).handle),
+                web.get("/healthz", self._health),
+                web.get("/readyz", self._ready),
+                web.get("/metrics", self._metrics),
+            ]
+        )
+
+    def addresses(self) -> list[tuple[str, str]]:
+        """Returns each path that is answered, with its method."""
+        routes = self._app.router.routes()
+        return [(one.resource.canonical, one.method) for one in routes if one.resource is not None]
+
+    async def run(self) -> None:
+        """Serves until cancelled. Tries again if the address cannot be used: lines are more
+        important than the page."""
+        runner = web.AppRunner(
+            self._app,
+            handle_signals=False,
+            access_log=None,
+            keepalive_timeout=IDLE,
+            shutdown_timeout=_ENDS_WITHIN,
+            lingering_time=_LINGERS,
+            max_line_size=_HEADER,
+            max_field_size=_HEADER,
+        )
+        await runner.setup()
+        loads = asyncio.create_task(self._loads.run(), name="loads")
+        try:
+            server = await self._bound(runner)
+            try:
+                log.info("web page ready", at=self._address)
+                await asyncio.Event().wait()
+            finally:
+                server.close()
+        finally:
+            loads.cancel()
+            await runner.cleanup()
+
+    @property
+    def _address(self) -> str:
+        host = f"[{self._config.host}]" if ":" in self._config.host else self._config.host
+        return f"http://{host}:{self._config.port}/"
+
+    async def _bound(self, runner: web.AppRunner) -> asyncio.AbstractServer:
+        handlers = runner.server
+        if handlers is None:
+            raise AssertionError("the runner is not set up")
+
+        def connection() -> asyncio.Protocol:
+            return handlers() if len(handlers.connections) < MOST_CONNECTIONS else _Refused()
+
+        logged = ""
+        while True:
+            try:
+                server = await asyncio.get_running_loop().create_server(
+                    connection, self._config.host, self._config.port, backlog=MOST_CONNECTIONS
+                )
+            except OSError as error:
+                if (why := error.strerror or str(error)) != logged:
+                    log.error("web page not served", at=self._address, why=why)  # noqa: TRY400
+                logged = why
+                await asyncio.sleep(AGAIN)
+                continue
+            for bound in server.sockets:
+                with suppress(OSError):
+                    bound.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER)
+            return server
+
+    # -- probes and metrics --
+
+    async def _health(self, _: web.Request) -> web.Response:
+        """The event loop turns."""
+        return web.Response(text="ok\n")
+
+    async def _ready(self, _: web.Request) -> web.Response:
+        if self._sources.ready():
+            return web.Response(text="ready\n")
+        return web.Response(status=503, text="not ready: the gateway does not serve its plant\n")
+
+    async def _metrics(self, _: web.Request) -> web.Response:
+        documents = await self._sources.north.documents(SCRAPE_AGE)
+        ready = self._sources.ready()
+        plant = self._sources.plant
+
+        def text() -> bytes:
+            return metrics.exposition(documents, plant, ready=ready)
+
+        body = await off_loop(text)
+        return web.Response(body=body, headers={"Content-Type": metrics.CONTENT_TYPE})
+
+
+class _Refused(asyncio.Protocol):
+    """Closes a connection beyond the limit."""
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        transport.close()

@@ -1,0 +1,337 @@
+"""Connects the lines of a configuration with the last sample of every tag, without Zenoh."""
+
+import asyncio
+import itertools
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Protocol
+
+from gateway import __version__
+from gateway.config import Config, LineConfig
+from gateway.config.changes import DeviceChange
+from gateway.config.commands import check_command, every_command, speaker
+from gateway.contract.status import Document, device_document, line_document, standing
+from gateway.engine.device import Device
+from gateway.engine.device_settings import DeviceSettings
+from gateway.engine.forecast import LineForecast, forecast
+from gateway.engine.requests import WRITE_EXPIRY, CommandResult, Peeked
+from gateway.errors import GatewayError
+from gateway.line.line import Line
+from gateway.line.send_permit import Duty
+from gateway.line.wire_log import WireLog
+from gateway.parts.alarms import Alarms
+from gateway.parts.alarms.watched import watch
+from gateway.parts.serving.served_lines import Serving
+from gateway.parts.serving.status import served_documents
+from gateway.parts.transfers.expected import Expected
+from gateway.plant.build import OpenPort, line_of, opener
+from gateway.plant.on_demand import OnDemand
+from gateway.plant.write_path import Requests
+from gateway.stations.served.station import Station
+from gateway.tags import Reason, Sample, Tag, WriteResult, bad
+from gateway.tags.mirror import Mirror
+from gateway.tags.scan import Scan
+from gateway.tags.timestamps import rfc3339
+from gateway.values import Value
+
+REMOVED = "removed from the file"
+
+
+class Subscriber(Protocol):
+    """Receives the samples to publish and the device states, on the event loop."""
+
+    def publish(self, samples: Sequence[Sample]) -> None: ...
+
+    def set_online(self, device: str, online: bool) -> None: ...
+
+
+class Gateway:
+    """The lines of one configuration, and the last sample of every tag."""
+
+    def __init__(
+        self,
+        config: Config,
+        wall: Callable[[], int] = time.time_ns,
+        open_line: Callable[[LineConfig], OpenPort] = opener,
+        duty: Duty | None = None,
+        *,
+        plan_now: bool = True,
+    ) -> None:
+        """`wall`: nanoseconds since 1970. `open_line`: returns the opener of a line's port.
+
+        Without `plan_now` each line needs `plan` and `planned` before it runs.
+        """
+        self.config, self._devices = config, config.devices
+        self.duty = duty or Duty()
+        self.mirror = Mirror((tag for device in config.devices for tag in device.tags), wall())
+        self.lines: list[Line] = []
+        self._wall = wall
+        self._started = time.monotonic()  # the wall clock may be set back
+        self._subscribers: list[Subscriber] = []
+        self._documents: dict[str, Callable[[], Document]] = {}  # of other parts, in the status
+        self._tags = {tag.key: tag for device in config.devices for tag in device.tags}
+        self._places: dict[str, tuple[Line, Device]] = {}
+        self._open_line, self._seeds = open_line, itertools.count()
+        self._expected = Expected(lambda: self.config)
+        self._on_demand = OnDemand(self._places.get, self.sample)
+        self.alarms = Alarms(self._tags.values(), wall)
+        self.add_document("alarms", self.alarms.counts)
+        self.serving = Serving(config, self, self._find_sample, wall=wall, duty=self.duty)
+        self._requests = Requests(self._places, self._tags, self.serving, wall)
+        for line in config.lines:
+            if not line.serve:
+                self.add_line(line)
+        watch(self.alarms, self.lines, config.alarms)
+        if plan_now:
+            for made in self.lines:
+                self.planned(made, self.plan(made))
+        for device in config.devices:
+            if not device.enabled:
+                self.mirror.update(bad(tag, Reason.DISABLED, wall()) for tag in device.tags)
+
+    def begin(self) -> None:
+        """Stamps the first samples again: this gateway may have been in standby for months."""
+        if self.config.standby is not None:
+            self.mirror.begin(self._wall())
+
+    def add_line(self, config: LineConfig) -> Line:
+        """Makes a line, which needs `plan` and `planned` before it runs."""
+        line = line_of(
+            config,
+            [device for device in config.devices if device.enabled],
+            self,
+            open_port=self._open_line(config),
+            wall=self._wall,
+            seed=next(self._seeds),
+            duty=self.duty,
+            plan_now=False,
+        )
+        self.lines.append(line)
+        for device in line.engine.devices:
+            self._places[device.name] = (line, device)
+        return line
+
+    def remove_line(self, line: Line) -> None:
+        """Removes a line that has ended, and has no devices any more."""
+        self.lines.remove(line)
+        self._expected.drop(line.engine.name)
+
+    @staticmethod
+    def plan(line: Line) -> LineForecast:
+        """Plans the devices of a line. A thread may do it before `planned`: it takes long."""
+        engine = line.engine
+        for device in engine.devices:
+            device.plan()
+        return forecast(engine.name, engine.devices, engine.wire)
+
+    def planned(self, line: Line, expected: LineForecast) -> None:
+        """Takes over the plans of a line: it may run now."""
+        self.expect(expected)
+        for device in line.engine.devices:
+            line.engine.schedule.plan(device, 0.0)
+
+    def expect(self, line: LineForecast) -> None:
+        """Takes over the forecast of a line."""
+        self._expected.take(line)
+
+    def take_over(self, changes: Iterable[DeviceChange]) -> None:
+        """Takes over the tags of changed devices: their first, next or last samples."""
+        now, gone = self._wall(), list[Tag]()
+        for change in changes:
+            enabled = change.new is not None and change.new.enabled
+            reason = Reason.STARTING if enabled else Reason.DISABLED
+            started = [bad(tag, reason, now) for tag in change.started]
+            self.mirror.add(started, change.renewed)
+            if change.new is not None:
+                self._tags.update((tag.key, tag) for tag in change.new.wire_tags)
+            left = change.gone
+            ended = [tag for tag in left if self._tags[tag.key] is tag]
+            for tag in ended:
+                del self._tags[tag.key]
+            self.mirror.forget(left)  # last: other threads find the new tag instead
+            self.alarms.take_over([*change.started, *change.renewed.values()], left)
+            self.alarms.judge(started)
+            last = [bad(tag, Reason.DISABLED, now, REMOVED) for tag in ended]
+            self._publish([*started, *last])
+            gone += left
+        self._on_demand.changed(gone)
+
+    def compute(self, new: Sequence[Tag], gone: Sequence[Tag]) -> None:
+        """Takes over the computed tags, when all their inputs are taken over."""
+        if not (gone or new):
+            return
+        now = self._wall()
+        enabled = {device.name for device in self._devices if device.enabled}
+        self._tags.update((tag.key, tag) for tag in new)
+        first = [
+            bad(tag, Reason.STARTING if tag.device in enabled else Reason.DISABLED, now)
+            for tag in new
+        ]
+        self.alarms.take_over(new, gone)
+        found = self.mirror.compute(first, gone)
+        self.alarms.judge(found)
+        ended = [tag for tag in gone if self._tags.get(tag.key) is tag]
+        for tag in ended:
+            del self._tags[tag.key]
+        self._publish([*found, *(bad(tag, Reason.DISABLED, now, REMOVED) for tag in ended)])
+
+    def configure(self, config: Config) -> None:
+        """Has this configuration, after its changes are taken over."""
+        self.config, self._devices = config, config.devices
+        watch(self.alarms, self.lines, config.alarms)
+
+    def move(self, gone: Iterable[str], line: Line, devices: Iterable[Device] = ()) -> None:
+        """Notes the devices that the line has no longer, and those that it has now."""
+        for name in gone:
+            self._places.pop(name, None)
+        self._places |= {device.name: (line, device) for device in devices}
+
+    def subscribe(self, subscriber: Subscriber) -> None:
+        """Adds a subscriber. It receives each sample after the earlier subscribers."""
+        self._subscribers.append(subscriber)
+
+    def add_document(self, path: str, document: Callable[[], Document]) -> None:
+        """Adds a document of another part to the status."""
+        self._documents[path] = document
+
+    def drop_document(self, path: str) -> None:
+        """Removes a document of another part."""
+        self._documents.pop(path, None)
+
+    def wire_logs(self) -> Mapping[str, WireLog]:
+        polled = {line.engine.name: line.wire_log for line in self.lines}
+        return polled | {line.name: line.wire_log for line in self.serving.lines}
+
+    @property
+    def enabled_devices(self) -> Sequence[Device]:
+        return [device for _, device in self._places.values()]
+
+    # From the lines
+
+    def samples(self, samples: Sequence[Sample]) -> None:
+        changed = self.mirror.update(samples)
+        if self.alarms.of_tags and not (type(samples) is Scan and samples.latest.alarmed == ()):
+            self.alarms.judge(samples)
+        if self.serving.remembering:
+            self.serving.remember(samples)
+        if self._on_demand.arrived:
+            self._on_demand.note(samples)
+        if self._on_demand.waiting:
+            self._on_demand.answer_all(samples)
+        if self.mirror.derives and (changed or self.mirror.pending):
+            changed = self.mirror.follow(changed)
+            if self.alarms.of_tags:
+                self.alarms.judge([sample for sample in changed if sample.tag.inputs])
+            if self.serving.remembering:
+                self.serving.remember(changed)
+        if changed:
+            self._publish(changed)
+
+    def online(self, device: Device | Station, online: bool) -> None:
+        for subscriber in self._subscribers:
+            subscriber.set_online(device.name, online)
+
+    def _publish(self, samples: Sequence[Sample]) -> None:
+        for subscriber in self._subscribers:
+            subscriber.publish(samples)
+
+    # For the Zenoh side
+
+    def devices(self) -> Iterable[DeviceSettings]:
+        return self._devices  # the same object until a reload
+
+    def tag(self, key: str) -> Tag | None:
+        return self._tags.get(key)
+
+    def target(self, key: str) -> Tag | None:
+        """Finds a tag that a transfer writes: also one that no client sees."""
+        others = (tag for device in self._devices for tag in device.targets)
+        return self._tags.get(key) or next((tag for tag in others if tag.key == key), None)
+
+    def sample(self, tag: Tag) -> Sample:
+        try:
+            return self.mirror[tag]
+        except KeyError:  # a reload removed it, or another tag has its place
+            current = self._tags.get(tag.key)
+            if current is None:
+                return bad(tag, Reason.DISABLED, self._wall(), REMOVED)
+            return self.mirror[current]
+
+    def _find_sample(self, key: str) -> Sample | None:
+        """Returns the sample of `device/tag`; None: no such tag in this process."""
+        tag = self._tags.get(key)
+        return None if tag is None else self.sample(tag)
+
+    def mark_published(self, samples: Sequence[Sample]) -> None:
+        if changed := self.mirror.mark_published(samples):
+            self._publish(changed)  # history keeps it too
+
+    async def write(self, tag: Tag, value: Value, within: float = WRITE_EXPIRY) -> WriteResult:
+        return await self._requests.write(tag, value, within)
+
+    async def write_group(
+        self,
+        values: Sequence[tuple[Tag, Value]],
+        within: float = WRITE_EXPIRY,
+        patience: float = WRITE_EXPIRY,
+    ) -> Sequence[WriteResult | GatewayError]:
+        return await self._requests.write_group(values, within, patience)
+
+    async def control(
+        self, device: str, command: str, argument: str = "", within: float = WRITE_EXPIRY
+    ) -> CommandResult:
+        check_command(self.config, device, command)
+        return await self._requests.control(device, command, argument, within)
+
+    async def peek(self, device: str, text: str) -> Peeked:
+        return await self._requests.peek(device, text)
+
+    def dialling(self, device: str) -> float:
+        return self._requests.dialling(device)
+
+    def commands(self) -> Mapping[str, frozenset[str]]:
+        return every_command(self.config)
+
+    def speaker(self, line: str) -> str:
+        return speaker(self.config, line)
+
+    def is_fresh(self, tag: Tag, max_age: float) -> bool:
+        """True if the last read is younger than `max_age` seconds, or no read is possible now."""
+        return self._on_demand.is_fresh(tag, max_age)
+
+    def age(self, tag: Tag) -> float:
+        """Returns the seconds since the last good read; infinite if there was none."""
+        return self._on_demand.age(tag)
+
+    async def fresh(self, tag: Tag, max_age: float) -> Sample:
+        """Returns the last sample if it `is_fresh`, otherwise that of the next read. Raises
+        `Busy`."""
+        return await self._on_demand.fresh(tag, max_age)
+
+    def status(self) -> Mapping[str, Document]:
+        """Returns documents by path: `status`, `lines/<line>`, `devices/<device>`."""
+        now = asyncio.get_running_loop().time()
+        documents: dict[str, Document] = {
+            "status": {
+                "name": self.config.name,
+                "version": __version__,
+                "time": rfc3339(self._wall()),
+                "up": round(time.monotonic() - self._started, 1),
+                "tags": len(self._tags),
+                "lines": {line.engine.name: line.engine.is_open for line in self.lines}
+                | {line.name: line.is_open for line in self.serving.lines},
+                "devices": {name: standing(d) for name, (_, d) in self._places.items()}
+                | {station.name: station.presence.value for station in self.serving.stations},
+            }
+        }
+        forecasts = self._expected.lines()
+        for line in self.lines:
+            engine = line.engine
+            if (expected := forecasts.get(engine.name)) is None:
+                continue  # not planned yet
+            documents[f"lines/{engine.name}"] = line_document(engine, expected, line.calls, now)
+        for name, (line, device) in self._places.items():
+            polls = line.engine.schedule.polls(device)
+            documents[f"devices/{name}"] = device_document(device, polls, now)
+        documents |= served_documents(self.serving.lines, now)
+        return documents | {path: document() for path, document in self._documents.items()}

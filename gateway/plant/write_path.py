@@ -1,0 +1,105 @@
+"""The requests of clients: found a line, checked, and passed to it."""
+
+import asyncio
+from collections.abc import Callable, Mapping, Sequence
+
+from gateway.engine.device import Device
+from gateway.engine.requests import WRITE_EXPIRY, CommandResult, Peeked
+from gateway.errors import BadValue, Busy, ConfigError, GatewayError, Offline
+from gateway.line.groups import ended
+from gateway.line.line import Line
+from gateway.parts.serving.served_lines import Serving
+from gateway.protocols.driver import Address
+from gateway.protocols.ranges import addresses, spans
+from gateway.tags import Tag, WriteResult
+from gateway.values import Value
+
+MOST_PEEKED = 256  # addresses of one peek
+
+
+class Requests:
+    """Writes, commands and peeks. Each raises `BadValue` before anything is sent, and otherwise a
+    `GatewayError`."""
+
+    def __init__(
+        self,
+        places: Mapping[str, tuple[Line, Device]],
+        tags: Mapping[str, Tag],
+        serving: Serving,
+        wall: Callable[[], int],
+    ) -> None:
+        """`places`: of each device; `tags`: by key. Both change with a reload."""
+        self._places = places
+        self._tags = tags
+        self._serving = serving
+        self._wall = wall
+
+    async def write(self, tag: Tag, value: Value, within: float = WRITE_EXPIRY) -> WriteResult:
+        """Returns when the device has acknowledged."""
+        if self._tags.get(tag.key) is not tag:  # its scale or limits may be others now
+            place = self._places.get(tag.device)
+            if place is None or tag not in place[1].settings.targets:
+                raise Busy(f"the file was reloaded, and {tag.key} with it; not sent")
+        if self._serving.holds(tag):
+            return await self._serving.write(tag, value)
+        line, device = self._place(tag.device)
+        return await line.write(device, tag, tag.encode(value), within)
+
+    async def write_group(
+        self,
+        values: Sequence[tuple[Tag, Value]],
+        within: float = WRITE_EXPIRY,
+        patience: float = WRITE_EXPIRY,
+    ) -> Sequence[WriteResult | GatewayError]:
+        """Writes tags of one device in their order; returns the outcome of each.
+
+        What has not ended after `patience` seconds is `Unclear`. It raises when nothing was sent.
+        """
+        name = values[0][0].device
+        if any(self._tags.get(tag.key) is not tag for tag, _ in values):
+            raise Busy(f"the file was reloaded, and {name} with it; not sent")
+        if self._serving.holds(values[0][0]):
+            return await self._serving.write_group(values)
+        line, device = self._place(name)
+        units = [(tag, tag.encode(value)) for tag, value in values]
+        return await ended(line.write_group(device, units, within), patience)
+
+    async def control(
+        self, device: str, command: str, argument: str, within: float
+    ) -> CommandResult:
+        """Returns the reply of the device."""
+        line, receiver = self._place(device)
+        loop = asyncio.get_running_loop()
+        started = loop.time()
+        answer = await line.command(receiver, command, argument, within)
+        return CommandResult(answer, self._wall(), loop.time() - started)
+
+    async def peek(self, device: str, text: str) -> Peeked:
+        """Reads any addresses once, such as `D100..D119`."""
+        if device not in self._places:
+            raise Offline(f"no device {device} is polled here; nothing was sent")
+        line, receiver = self._places[device]
+        try:
+            area, numbers = addresses(receiver.driver, text, MOST_PEEKED)
+            parts = list(spans(receiver.driver, area, numbers))
+        except ConfigError as error:
+            raise BadValue(str(error)) from None
+        loop = asyncio.get_running_loop()
+        started, units = loop.time(), list[int]()
+        within = WRITE_EXPIRY + line.dialling
+        for part in parts:
+            if self._places.get(device) != (line, receiver):
+                raise Busy(f"the file was reloaded, and {device} with it; read it again")
+            units += map(int, (await line.peek(receiver, part, within)).split())
+        first = receiver.driver.spell(Address(area, numbers.start))
+        return Peeked(first, units, self._wall(), loop.time() - started)
+
+    def dialling(self, device: str) -> float:
+        """Returns the seconds that a request may wait for a telephone call; 0: for none."""
+        place = self._places.get(device)
+        return 0.0 if place is None else place[0].dialling
+
+    def _place(self, device: str) -> tuple[Line, Device]:
+        if device not in self._places:
+            raise Offline(f"device {device} is disabled; nothing was sent")
+        return self._places[device]

@@ -1,0 +1,95 @@
+"""Reloads the file of a running gateway, whenever that is wanted."""
+
+import asyncio
+import gc
+from collections.abc import Callable, Mapping, Sequence
+
+from gateway.config import Config
+from gateway.config.changes import Difference, compare
+from gateway.northbound.northbound import Northbound
+from gateway.northbound.session.session import off_loop
+from gateway.plant.plant import Gateway
+from gateway.service.reload.lines import RunningLines
+from gateway.service.reload.reloader import Reloader
+from gateway.service.reload.renewal import Renewal
+from gateway.service.supervisor import Supervisor
+from gateway.tags import Tag
+from gateway.tags.transfer import TransferRule
+
+
+class LiveReload:
+    """The reloads of one gateway, one after another."""
+
+    def __init__(
+        self,
+        reloader: Reloader,
+        gateway: Gateway,
+        northbound: Northbound,
+        lines: RunningLines,
+        plans: Sequence[asyncio.Task[None]],
+        supervisor: Supervisor,
+        renew: Callable[[Sequence[TransferRule], Mapping[Tag, Tag]], None],
+    ) -> None:
+        """`plans` end when every line is planned. `renew` takes over the transfers."""
+        self._reloader = reloader
+        self._gateway = gateway
+        self._northbound = northbound
+        self._lines = lines
+        self._plans = plans
+        self._supervisor = supervisor
+        self._renew = renew
+
+    async def run(self) -> None:
+        """Runs until cancelled. A gateway that is not active starts over with a good file."""
+        watching = asyncio.create_task(self._reloader.watch(), name="watch")
+        try:
+            while True:
+                file = await self._reloader.next()
+                if file is not None and not self._lines.started:
+                    self._reloader.accept(file)
+                    self._northbound.replaced.set()
+                    return
+                if file is not None:
+                    await self._reload(file)
+                self._supervisor.says(self._reloader.says)
+                self._supervisor.ready()
+        finally:
+            watching.cancel()
+
+    async def _reload(self, file: Config) -> None:
+        gateway, northbound = self._gateway, self._northbound
+        config = file.without(northbound.withheld)
+        if taken := northbound.taken(device.name for device in config.devices):
+            self._reloader.refuse(
+                [f"device {name} belongs to gateway {other}" for name, other in taken.items()]
+            )
+            return
+        if self._plans:
+            await asyncio.wait(self._plans)
+        difference = await off_loop(compare, gateway.config, config)
+        if difference:
+            await self._take_over(difference, file)
+        else:
+            gateway.configure(difference.config)
+        self._renew(difference.config.transfers, difference.renewed)
+        self._reloader.accept(file, difference)
+
+    async def _take_over(self, difference: Difference, file: Config) -> None:
+        northbound = self._northbound
+        names = {device.name for device in file.devices}
+        index = await off_loop(northbound.index, difference.config.devices)
+        # A device is claimed before its first request, and until after its last one.
+        await northbound.claim(names.union(d.name for d in self._reloader.current.devices))
+        await Renewal(self._gateway, self._lines, difference).run()
+        gone = [tag for change in difference.devices.values() for tag in change.gone]
+        await northbound.change(index, [*gone, *difference.computed.gone])
+        await northbound.claim(names)
+        _collect()
+
+
+def _collect() -> None:
+    """Frees the objects of ended lines and devices: they refer to each other, and collections of
+    all objects are rare. Takes 10 ms with 50,000 tags."""
+    gc.unfreeze()
+    gc.collect()
+    gc.freeze()  # as after the start: later collections skip the tags

@@ -1,0 +1,110 @@
+"""Reads the changed file, refuses a bad one, and tells what became of it."""
+
+import asyncio
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import structlog
+
+from gateway.config import Config, ConfigErrors, load
+from gateway.config.changes import Difference, needs_restart
+from gateway.northbound.session.session import off_loop
+from gateway.service.reload.watch import LOOK_EVERY, Watch
+from gateway.tags.timestamps import rfc3339
+
+log = structlog.get_logger("gateway")
+
+_SO = "the gateway goes on with the file as it was"
+_MOST_LOGGED = 20  # mistakes
+
+
+class Reloader:
+    """The file of the gateway. `current` is the content that the gateway has taken over."""
+
+    def __init__(self, path: Path, current: Config, wall: Callable[[], int] = time.time_ns) -> None:
+        self.current = current
+        self._path = path
+        self._wall = wall
+        self._wanted = asyncio.Event()
+        self._watch = Watch()
+        self._loaded = wall()
+        self._count = 0
+        self._refused: tuple[int, Sequence[str]] | None = None
+
+    def want(self) -> None:
+        """Reads the file again as soon as the reload before has ended."""
+        self._wanted.set()
+
+    async def watch(self) -> None:
+        """Runs until cancelled: wants a reload after each change, if the file says so."""
+        await off_loop(self._watch.note, self._files())
+        while True:
+            await asyncio.sleep(LOOK_EVERY)
+            if self.current.watch:
+                files, now = self._files(), time.monotonic()
+                if await off_loop(self._watch.changed, files, now):
+                    self.want()
+
+    async def next(self) -> Config | None:
+        """Waits until a reload is wanted. Returns the content of the file; None: it is refused."""
+        await self._wanted.wait()
+        self._wanted.clear()
+        found = await off_loop(self._read)
+        if isinstance(found, Config):
+            return found
+        self.refuse(found)
+        return None
+
+    def refuse(self, why: Sequence[str]) -> None:
+        """Notes that the file changes nothing, with a sentence for each mistake."""
+        self._refused = self._wall(), why
+        for sentence in why[:_MOST_LOGGED]:
+            log.error("file refused", why=sentence, so=_SO)
+        if len(why) > _MOST_LOGGED:
+            log.error("file refused", why=f"and {len(why) - _MOST_LOGGED} more mistakes", so=_SO)
+
+    def accept(self, config: Config, difference: Difference | None = None) -> None:
+        """Notes that the gateway has taken over the file."""
+        self.current, self._refused = config, None
+        self._loaded = self._wall()
+        self._count += 1
+        changes = () if difference is None else difference.devices.values()
+        log.info(
+            "file reloaded",
+            file=str(self._path),
+            added=[change.name for change in changes if change.old is None],
+            changed=[change.name for change in changes if change.old and change.new],
+            removed=[change.name for change in changes if change.new is None],
+        )
+
+    @property
+    def says(self) -> str:
+        """The state in one line, for the supervisor."""
+        if self._refused is None:
+            return f"serving {len(self.current.devices)} devices"
+        return f"the changed file was refused: {self._refused[1][0]}"
+
+    def document(self) -> Mapping[str, object]:
+        """Returns the state of the file, for the status."""
+        at, why = self._refused or (None, ())
+        return {
+            "file": str(self._path),
+            "loaded": rfc3339(self._loaded),
+            "reloads": self._count,
+            "refused": None if at is None else rfc3339(at),
+            "why": [*why[:_MOST_LOGGED]],
+        }
+
+    def _files(self) -> list[Path]:
+        return list(dict.fromkeys([self._path, *(sheet.file for sheet in self.current.sheets)]))
+
+    def _read(self) -> Config | list[str]:
+        """Returns the content of the file, or what is wrong with it."""
+        self._watch.note(self._files())
+        try:
+            config = load(self._path)
+        except ConfigErrors as error:
+            return str(error).splitlines()
+        changed = needs_restart(self.current, config)
+        return [f"{self._path}: {one} changed: this needs a restart" for one in changed] or config

@@ -1,0 +1,146 @@
+"""Takes over the difference between two configurations, while all other devices go on.
+
+Everything that takes long is made on a thread. Each line takes over its changes between two
+transactions. First the changed devices leave their lines, then they arrive: one may move.
+"""
+
+import asyncio
+from collections.abc import Mapping
+
+from gateway.config import LineConfig
+from gateway.config.changes import DeviceChange, Difference
+from gateway.engine.changes import Changes
+from gateway.engine.device import Device
+from gateway.engine.forecast import forecast
+from gateway.line.line import Line
+from gateway.northbound.session.session import off_loop
+from gateway.planning.bad_addresses import KnownBad
+from gateway.plant.plant import Gateway
+from gateway.service.reload.lines import RunningLines
+from gateway.tags import Tag
+
+
+class Renewal:
+    """One reload of a running gateway."""
+
+    def __init__(self, gateway: Gateway, lines: RunningLines, difference: Difference) -> None:
+        self._gateway = gateway
+        self._lines = lines
+        self._difference = difference
+        self._source = {
+            d.name: line.engine.name for line in gateway.lines for d in line.engine.devices
+        }
+        self._target = {
+            device.name: line.name
+            for line in difference.config.lines
+            for device in line.devices
+            if device.enabled
+        }
+        self._made: Mapping[str, Device] = {}  # with a plan, for lines that stay open
+
+    async def run(self) -> None:
+        """Returns when every line has taken over its changes."""
+        gateway, difference = self._gateway, self._difference
+        running = {device.name: device for line in gateway.lines for device in line.engine.devices}
+        known = {
+            change.name: (running[change.name], running[change.name].bad_addresses.known())
+            for change in difference.devices.values()
+            if change.continues
+        }
+        self._made = await off_loop(self._make, known)
+        gateway.take_over(
+            [
+                change
+                for change in difference.devices.values()
+                if change.name not in self._source and change.name not in self._target
+            ]
+        )
+        await asyncio.gather(*[self._leave(line) for line in gateway.lines])
+        stay = [*gateway.lines]
+        await asyncio.gather(
+            *(self._arrive(line) for line in stay), *(self._open(one) for one in difference.opened)
+        )
+        gateway.configure(difference.config)
+        gateway.compute(difference.computed.started, difference.computed.gone)
+
+    def _make(self, known: Mapping[str, tuple[Device, KnownBad]]) -> Mapping[str, Device]:
+        """Makes and plans the devices of lines that stay open. On a thread."""
+        wires = {line.engine.name: line.engine.wire for line in self._gateway.lines}
+        for one in self._difference.opened:
+            wires.pop(one.name, None)
+        made = {}
+        for change in self._difference.devices.values():
+            wire = wires.get(self._target.get(change.name, ""))
+            if change.new is None or wire is None:
+                continue
+            if change.continues:
+                old, bad = known[change.name]
+                device = old.successor(change.new, bad)
+            else:
+                device = Device(change.new, wire, plan_now=False)
+            device.plan()
+            made[change.name] = device
+        return made
+
+    async def _leave(self, line: Line) -> None:
+        """Takes the changed devices off the line. Those that stay on it come back at once."""
+        name = line.engine.name
+        closed = name in self._difference.closed
+        removed, added, replaced = list[Device](), list[Device](), list[tuple[Device, Device]]()
+        changes = list[DeviceChange]()
+        for device in line.engine.devices:
+            if (change := self._difference.devices.get(device.name)) is None:
+                continue
+            changes.append(change)
+            if change.continues:
+                replaced.append((device, self._made[device.name]))
+                continue
+            removed.append(device)
+            if not closed and self._target.get(device.name) == name:
+                added.append(self._made[device.name])
+        if changes:
+            await self._change(line, changes, Changes(removed, added, replaced, _renewed(changes)))
+        if closed:
+            await self._lines.end(line)
+            self._gateway.remove_line(line)
+
+    async def _arrive(self, line: Line) -> None:
+        """Adds the devices that were on no line, or on another one."""
+        name = line.engine.name
+        arriving = [c for c in self._on(name) if self._source.get(c.name) != name]
+        if arriving:
+            added = [self._made[change.name] for change in arriving]
+            await self._change(line, self._new(arriving), Changes(added=added))
+
+    async def _open(self, config: LineConfig) -> None:
+        gateway = self._gateway
+        gateway.take_over(self._new(self._on(config.name)))
+        line = gateway.add_line(config)
+        gateway.planned(line, await off_loop(gateway.plan, line))
+        self._lines.start(line, config.name, line.run())
+
+    async def _change(self, line: Line, tags: list[DeviceChange], changes: Changes) -> None:
+        gateway, engine = self._gateway, line.engine
+        here = [*changes.added, *(new for _, new in changes.replaced)]
+
+        def applied() -> None:
+            gateway.move([device.name for device in changes.removed], line, here)
+            gateway.take_over(tags)
+
+        settings = {one.name: one.devices for one in self._difference.config.lines}
+        await line.change(changes, settings.get(engine.name, ()), applied)
+        devices = [*engine.devices]
+        gateway.expect(await off_loop(forecast, engine.name, devices, engine.wire))
+
+    def _on(self, line: str) -> list[DeviceChange]:
+        """Returns the changes of enabled devices that the line has from now on."""
+        changes = self._difference.devices.values()
+        return [change for change in changes if self._target.get(change.name) == line]
+
+    def _new(self, changes: list[DeviceChange]) -> list[DeviceChange]:
+        """Returns the changes whose tags were not taken over when their device left a line."""
+        return [change for change in changes if change.name not in self._source]
+
+
+def _renewed(changes: list[DeviceChange]) -> dict[Tag, Tag]:
+    return {old: new for change in changes for old, new in change.renewed.items()}

@@ -1,0 +1,64 @@
+"""The contract of an answering machine: bytes of the wire in, at most one reply out."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+from gateway.protocols.driver import AnyDriver
+from gateway.stations.served.registers import Registers, Written
+
+# Fewer bytes behind a request are noise of the wire; more are the beginning of the next request.
+NOISE = 2
+
+
+class Done(NamedTuple):
+    """One request of the master to a station of this line."""
+
+    station: int
+    refused: str = ""  # the code of the error reply
+    write: bool = False
+    written: Written = ()  # the tags that it changed, with their values
+
+
+class Heard(NamedTuple):
+    """The result of some bytes. A reply is sent `delay` seconds after them, if nothing follows."""
+
+    reply: bytes = b""
+    delay: float = 0.0
+    done: tuple[Done, ...] = ()
+    stale: int = 0  # requests that later bytes have followed: neither carried out nor answered
+    lost: bool = False  # where the next frame begins cannot be found any more
+
+
+SILENCE = Heard()
+
+
+class Answerer(Protocol):
+    """The stations of one line, towards one master. Synchronous; does no I/O.
+
+    It ignores what is addressed to other stations and what they reply. A request that other
+    bytes follow is not carried out: the master no longer waits for its reply, and would take it
+    for the reply to a later request.
+    """
+
+    def hear(self, data: bytes, now: float) -> Heard:
+        """Takes any piece of the bytes on the wire. `now`: seconds, by any clock."""
+
+
+class Answering(NamedTuple):
+    """One station: its settings and its data."""
+
+    driver: AnyDriver
+    registers: Registers
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Wire:
+    """The properties of the wire. Times in seconds."""
+
+    character: float  # the duration of one character
+    silence: float = 0.0  # before a reply
+    echo: bool | None = None  # the port receives its own bytes; None: not known
+
+
+Stations = Mapping[int, Answering]

@@ -1,0 +1,45 @@
+"""The answering machines, by the name of their protocol."""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+from gateway.stations.served import modbus_wire
+from gateway.stations.served.answering import Answerer, Stations, Wire
+from gateway.stations.served.computer_link import computer_link
+from gateway.stations.served.vigor import vigor
+
+MakeAnswerer = Callable[[Stations, Wire], Answerer]
+
+
+class _Served(NamedTuple):
+    """`make` returns the machine for the stations of a line; they share the `common` settings."""
+
+    make: MakeAnswerer
+    common: Sequence[str] = ()
+
+
+_SERVED: dict[str, _Served] = {
+    "modbus-tcp": _Served(modbus_wire.tcp),
+    "modbus-rtu": _Served(modbus_wire.rtu),
+    "modbus-ascii": _Served(modbus_wire.ascii_line),
+    "vigor": _Served(vigor),
+    "computer-link": _Served(computer_link, ("frame_format", "sum_check")),
+}
+
+
+def can_serve(protocol: str) -> bool:
+    return protocol in _SERVED
+
+
+def served_protocols() -> list[str]:
+    return list(_SERVED)
+
+
+def common_settings(protocol: str) -> Sequence[str]:
+    """Returns the settings that are the same for all stations of a line."""
+    return _SERVED[protocol].common if can_serve(protocol) else ()
+
+
+def answerer(protocol: str, stations: Stations, wire: Wire) -> Answerer:
+    """Returns a new machine."""
+    return _SERVED[protocol].make(stations, wire)

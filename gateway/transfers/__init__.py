@@ -1,5 +1,0 @@
-"""Transfers: values that the gateway reads from one PLC and writes to another."""
-
-from gateway.transfers.runner import Transfers
-
-__all__ = ["Transfers"]

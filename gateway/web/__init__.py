@@ -1,4 +1,0 @@
-"""The HTTP side of the gateway: status page, JSON API, metrics and probes.
-
-Nothing here is imported unless the file has `web`: `gateway.web.server` needs aiohttp.
-"""
