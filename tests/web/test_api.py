@@ -25,7 +25,9 @@ from tests.web.serving import (
     transfer,
 )
 
-DESCRIBED = json.loads((Path(__file__).parents[2] / "gateway/parts/web/assets/openapi.json").read_text())
+DESCRIBED = json.loads(
+    (Path(__file__).parents[2] / "gateway/parts/web/assets/openapi.json").read_text()
+)
 PAGE = {"/", "/page.js", "/page.css", "/openapi.json"}
 AS_JSON = {"Content_Type": "application/json", "Authorization": f"Bearer {TOKEN}"}
 
