@@ -6,13 +6,13 @@ from collections.abc import Callable
 from datetime import datetime
 from typing import NamedTuple
 
-import orjson
 import zenoh
 
+from gateway.contract.foreign import Foreign
 from gateway.contract.signatures import LONGEST
 from gateway.contract.writers import Writers
 from gateway.engine.requests import WRITE_EXPIRY
-from gateway.errors import Busy
+from gateway.errors import BadValue, Busy
 from gateway.line.send_permit import Duty
 
 
@@ -77,10 +77,7 @@ def sender(message: zenoh.Query | zenoh.Sample, arrived: float) -> Sender:
 def _time_of(attachment: bytes | None) -> float | None:
     """Returns the client's own time, in seconds since 1970, if it sends one."""
     try:
-        found = None if attachment is None else orjson.loads(attachment)
-        match found:
-            case {"time": str(text)}:
-                return datetime.fromisoformat(text).timestamp()
-    except ValueError:
+        made = Foreign.parse(attachment or b"", LONGEST).text("time", LONGEST)
+        return datetime.fromisoformat(made).timestamp()
+    except (BadValue, ValueError, OverflowError):
         return None
-    return None
