@@ -239,7 +239,7 @@ class Line:
     def begin(self, port: Port) -> Channel:
         """Begins to use an open port, or the next telephone call."""
         channel = self._channel = self._new_channel(port)
-        channel.unanswered = self.engine.jobs.unanswered
+        channel.unanswered = self.engine.schedule.unanswered
         return channel
 
     def end_call(self, calls: DialSchedule, why: CallEnded | None) -> None:
