@@ -2202,7 +2202,7 @@ MUTANTS = (
     ),
     Mutant(
         "a formula is calculated in binary fractions",
-        "tags/formula.py",
+        "values/numerals.py",
         "Decimal(repr(value)) if",
         "Decimal(value) if",
         "tests/tags/test_computed.py",
