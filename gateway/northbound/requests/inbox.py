@@ -17,24 +17,25 @@ _BATCH_SIZE = 16  # taken in one turn of the loop, so that other tasks get their
 
 
 class Inbox(Generic[T]):
-    """Hands every arrival to `sink` on the event loop; beyond `limit` to `refuse` at once.
+    """Hands every arrival to `sink` on the event loop; beyond `LIMIT` to `refuse` at once.
 
     `sink` also gets the time of the arrival, by the clock of the loop.
     """
 
     def __init__(
-        self, sink: Callable[[T, float], None], refuse: Callable[[T], None], limit: int = LIMIT
+        self, sink: Callable[[T, float], None], refuse: Callable[[T], None], more: int = 0
     ) -> None:
+        """`more`: arrivals beyond `LIMIT` that may wait too."""
         self._loop = asyncio.get_running_loop()
         self._sink = sink
         self._refuse = refuse
-        self._limit = limit
+        self._more = more
         self._queue: deque[tuple[T, float]] = deque()
         self._drain_scheduled = False
 
     def __call__(self, arrival: T) -> None:
         """Called on Zenoh's thread."""
-        if len(self._queue) >= self._limit:
+        if len(self._queue) >= LIMIT + self._more:
             self._refuse(arrival)
             return
         self._queue.append((arrival, self._loop.time()))
