@@ -80,7 +80,8 @@ async def play(gateway: Gateway, seconds: float, made: list[float] | None) -> No
 async def show(sources: Sources, made: list[float]) -> None:
     """Makes the events of one page. Adds the processor time of each to `made`."""
     api, loads = Api(sources), Loads(sources)
-    events, measuring = Events(sources, api, loads), asyncio.create_task(loads.run())
+    events = Events(sources, api, loads, lambda _: True)
+    measuring = asyncio.create_task(loads.run())
     try:
         with events.wires.watched("line0") as recorder:
             page = Page(sources, events, api.select("d0-0", "", None, 200), recorder)

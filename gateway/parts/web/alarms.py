@@ -11,8 +11,8 @@ from gateway.contract import payload
 from gateway.contract.payload import Failure, Problem
 from gateway.northbound.alarms import alarm_fields, open_alarms
 from gateway.parts.alarms import Entry, State
-from gateway.parts.web.guard import BY, answer
-from gateway.parts.web.replies import BODY_WITHIN, json_off_loop, limit, raw
+from gateway.parts.web.guard import BY
+from gateway.parts.web.replies import answer, body, json_off_loop, limit, raw
 from gateway.parts.web.sources import Sources
 
 MOST_ITEMS = 1000  # of one page
@@ -71,11 +71,7 @@ class AlarmApi:
         arrived = asyncio.get_running_loop().time()
         if request.content_type != "application/json":
             return answer(415, "send the operator's name as Content-Type: application/json")
-        try:
-            async with asyncio.timeout(BODY_WITHIN):
-                name, data = request.query.get("alarm", ""), await request.read()
-        except TimeoutError:
-            return answer(408, f"the body did not arrive within {BODY_WITHIN:g} s")
+        name, data = request.query.get("alarm", ""), await body(request)
         result = self._north.acknowledge(name, data, f"web {request[BY]}", arrived)
         if isinstance(result, Failure):
             return raw(payload.outcome(result), _STATUS.get(result.problem, 503))
