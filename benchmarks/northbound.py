@@ -35,7 +35,7 @@ import structlog
 import zenoh
 
 from gateway.config import ZenohConfig, ZenohMode
-from gateway.engine.requests import CommandResult, Peeked
+from gateway.engine.jobs.requests import CommandResult, Peeked
 from gateway.errors import GatewayError
 from gateway.line.send_permit import Duty
 from gateway.line.wire_log import WireLog

@@ -45,7 +45,7 @@ from gateway.config.validate import (
     section,
     unknown,
 )
-from gateway.engine.device_settings import DeviceSettings
+from gateway.engine.device.device_settings import DeviceSettings
 from gateway.errors import ConfigError
 from gateway.protocols.driver import AnyDriver, Timing
 from gateway.protocols.registry import PROTOCOLS

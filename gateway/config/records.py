@@ -7,7 +7,7 @@ from pathlib import Path
 
 from gateway.config.sheet_tags import SheetUse
 from gateway.config.zenoh_records import ZenohConfig
-from gateway.engine.device_settings import DeviceSettings
+from gateway.engine.device.device_settings import DeviceSettings
 from gateway.planning.wire_timing import WireTiming
 from gateway.tags import Tag
 from gateway.tags.transfer import TransferRule

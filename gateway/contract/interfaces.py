@@ -5,7 +5,7 @@ from typing import Literal, Protocol
 
 from gateway.contract.buckets import Bucket, Now
 from gateway.contract.question import Question
-from gateway.engine.requests import CommandResult, Peeked
+from gateway.engine.jobs.requests import CommandResult, Peeked
 from gateway.errors import GatewayError
 from gateway.line.send_permit import Duty
 from gateway.line.wire_log import WireLog

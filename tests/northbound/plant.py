@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from gateway.config import ZenohConfig
-from gateway.engine.requests import CommandResult, Peeked
+from gateway.engine.jobs.requests import CommandResult, Peeked
 from gateway.errors import BadValue, Busy, GatewayError, NotSent
 from gateway.line.send_permit import Duty
 from gateway.line.wire_log import WireLog

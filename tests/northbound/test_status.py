@@ -10,7 +10,7 @@ import pytest
 from gateway.config import load
 from gateway.contract import payload
 from gateway.contract.status import device_document, standing
-from gateway.engine.device import Device
+from gateway.engine.device.device import Device
 from gateway.errors import NoReply
 from gateway.line.line import Line
 from gateway.plant.plant import Gateway

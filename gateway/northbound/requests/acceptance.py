@@ -12,7 +12,7 @@ from gateway.contract.foreign import Foreign
 from gateway.contract.parsing import check_encoding
 from gateway.contract.signatures import LONGEST
 from gateway.contract.writers import Writers
-from gateway.engine.requests import WRITE_EXPIRY
+from gateway.engine.jobs.requests import WRITE_EXPIRY
 from gateway.errors import BadValue, Busy
 from gateway.line.send_permit import Duty
 from gateway.northbound.requests.accepted import AcceptedUntil

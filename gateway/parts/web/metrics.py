@@ -19,7 +19,7 @@ from prometheus_client.process_collector import ProcessCollector
 from prometheus_client.registry import Collector, CollectorRegistry
 
 from gateway.contract.faults import below, faults, transfers, warnings
-from gateway.engine.records import COMPLETE
+from gateway.engine.device.records import COMPLETE
 from gateway.parts.web.sources import Documents, Plant
 from gateway.tags import Quality
 

@@ -3,14 +3,14 @@
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
 
-from gateway.engine.changes import Changes
-from gateway.engine.device import Device
-from gateway.engine.health import PAUSE_LONGEST, State
-from gateway.engine.jobs import EXPEDITED, NOT_QUEUED, ON_DEMAND, Idle, LastRead, Poll, Probe
-from gateway.engine.poll_queue import PollQueue
-from gateway.engine.probe_schedule import ProbeSchedule
-from gateway.engine.requests import Request, RequestQueue
-from gateway.engine.unanswered import Unanswered
+from gateway.engine.device.changes import Changes
+from gateway.engine.device.device import Device
+from gateway.engine.device.health import PAUSE_LONGEST, State
+from gateway.engine.jobs.jobs import EXPEDITED, NOT_QUEUED, ON_DEMAND, Idle, LastRead, Poll, Probe
+from gateway.engine.jobs.requests import Request, RequestQueue
+from gateway.engine.jobs.unanswered import Unanswered
+from gateway.engine.schedule.poll_queue import PollQueue
+from gateway.engine.schedule.probe_schedule import ProbeSchedule
 from gateway.planning.planner import Block
 from gateway.tags import Tag
 
@@ -47,7 +47,7 @@ class Schedule:
 
     def __init__(self, devices: Sequence[Device], now: float, seed: int = 0) -> None:
         self.devices = devices
-        self.dials = False  # a modem reaches the devices: docs/modem.md
+        self.reaches_by_modem = False  # a modem reaches the devices: docs/modem.md
         self.requests = RequestQueue()
         self.unanswered = Unanswered()
         # The share of its period by which each poll begins early.
@@ -299,7 +299,7 @@ class Schedule:
             device.record.count_overruns(behind)
             poll.counts.overruns += behind
         poll.due = (poll.asked if behind or poll.missed else poll.due) + every
-        if not (poll.phased or self.dials):  # one call reads all that is due at a time
+        if not (poll.phased or self.reaches_by_modem):  # one call reads all that is due at a time
             poll.phased = True
             poll.due -= every * next(self._phases)
         if poll.last.at is None and block.span not in device.bad_addresses.bad:

@@ -2,10 +2,10 @@
 
 from collections.abc import Sequence
 
-from gateway.engine.device import Device
-from gateway.engine.health import State
-from gateway.engine.jobs import Reopen, Result, Sent, Settled
-from gateway.engine.schedule import Schedule
+from gateway.engine.device.device import Device
+from gateway.engine.device.health import State
+from gateway.engine.jobs.jobs import Reopen, Result, Sent, Settled
+from gateway.engine.schedule.schedule import Schedule
 from gateway.errors import (
     BadValue,
     DeviceError,

@@ -2,17 +2,17 @@
 
 import math
 
-from gateway.engine.device import ANSWERS_TWICE, Device
+from gateway.engine.device.device import ANSWERS_TWICE, Device
+from gateway.engine.device.health import Heard, State
 from gateway.engine.effects import Effects
-from gateway.engine.health import State
-from gateway.engine.schedule import Schedule
-from gateway.engine.staleness import Staleness
+from gateway.engine.results.staleness import Staleness
+from gateway.engine.schedule.schedule import Schedule
 from gateway.errors import DeviceError, Offline
 from gateway.protocols.driver import Span
 from gateway.tags import Reason
 
 
-class Results:
+class HealthRules:
     """The rules for every reply and every unclear end, of polls, probes and requests."""
 
     def __init__(
@@ -88,7 +88,7 @@ class Results:
         retries = max(device.timing.retries, suspect)
         if not unknown and health.consecutive_failures <= retries:
             return
-        if short and before is State.STARTING and health.heard is not False:
+        if short and before is State.STARTING and health.heard is not Heard.GAVE_UP:
             return
         if device.broadcast:  # only its own frames can make it online again
             device.restart()

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from gateway.engine.device import Device
+from gateway.engine.device.device import Device
 from gateway.tags import Tag
 
 

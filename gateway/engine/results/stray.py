@@ -3,10 +3,10 @@
 from collections.abc import Iterable, Sequence
 from typing import Any, cast
 
-from gateway.engine.changes import Changes
-from gateway.engine.device import Device
+from gateway.engine.device.changes import Changes
+from gateway.engine.device.device import Device
 from gateway.engine.effects import Effects
-from gateway.engine.results import Results
+from gateway.engine.results.health_rules import HealthRules
 from gateway.errors import Garbled
 from gateway.protocols.capabilities import StrayFrames, UnnumberedReplies
 from gateway.protocols.driver import Codec
@@ -23,7 +23,7 @@ class Stray:
     """
 
     def __init__(
-        self, line: str, devices: Sequence[Device], results: Results, effects: Effects
+        self, line: str, devices: Sequence[Device], results: HealthRules, effects: Effects
     ) -> None:
         self._line = line
         self._devices = devices

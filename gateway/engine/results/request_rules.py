@@ -2,10 +2,10 @@
 
 from collections.abc import Sequence
 
-from gateway.engine.device import Device
+from gateway.engine.device.device import Device
+from gateway.engine.device.health import State
 from gateway.engine.effects import Effects, RequestEnded
-from gateway.engine.health import State
-from gateway.engine.jobs import (
+from gateway.engine.jobs.jobs import (
     Answer,
     Confirm,
     HeldTogether,
@@ -21,10 +21,10 @@ from gateway.engine.jobs import (
     requests_of,
     span_of,
 )
-from gateway.engine.requests import Command, Group, Outcome, Request, Write, after_failed
-from gateway.engine.results import Results
-from gateway.engine.runs import own_units, verified
-from gateway.engine.schedule import Schedule
+from gateway.engine.jobs.requests import Command, Group, Outcome, Request, Write, after_failed
+from gateway.engine.jobs.runs import own_units, verified
+from gateway.engine.results.health_rules import HealthRules
+from gateway.engine.schedule.schedule import Schedule
 from gateway.errors import Busy, DeviceError, GatewayError, LineDown, Refusal, Refused, Unclear
 from gateway.protocols.driver import Span
 from gateway.tags import Tag
@@ -38,13 +38,13 @@ class Differs(Unclear):
     """The write was acknowledged, but the device holds another value."""
 
 
-class RequestResults:
+class RequestRules:
     """The rules for results of writes and commands.
 
     After an unclear end, the rule of the tag decides if a write is sent again.
     """
 
-    def __init__(self, schedule: Schedule, results: Results, effects: Effects) -> None:
+    def __init__(self, schedule: Schedule, results: HealthRules, effects: Effects) -> None:
         self._schedule = schedule
         self._results = results
         self._effects = effects

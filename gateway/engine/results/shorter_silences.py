@@ -4,11 +4,11 @@ import math
 from collections.abc import Hashable, Sequence
 from typing import NamedTuple
 
-from gateway.engine.device import Device
+from gateway.engine.device.device import Device
+from gateway.engine.device.health import State
+from gateway.engine.device.station_silence import MOST_DOUBLED
 from gateway.engine.effects import Effects
-from gateway.engine.health import State
-from gateway.engine.jobs import Idle, Job, Poll, Reopen
-from gateway.engine.station_silence import MOST_DOUBLED
+from gateway.engine.jobs.jobs import Idle, Job, Poll, Reopen
 from gateway.errors import Garbled, NoReply, Refusal, Refused
 from gateway.protocols.unsolicited import Unsolicited
 

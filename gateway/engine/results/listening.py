@@ -5,15 +5,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, cast
 
-from gateway.engine.changes import Changes
-from gateway.engine.device import Device
+from gateway.engine.device.changes import Changes
+from gateway.engine.device.device import Device
+from gateway.engine.device.health import State
 from gateway.engine.effects import Effects
-from gateway.engine.health import State
-from gateway.engine.jobs import Idle
-from gateway.engine.results import Results
+from gateway.engine.jobs.jobs import Idle
+from gateway.engine.results.health_rules import HealthRules
 from gateway.errors import Evidence, Garbled, Unclear
 from gateway.planning.wire_timing import WireTiming
-from gateway.protocols.driver import AnyDriver
 from gateway.protocols.listening import Asked, Learn, Listenable, Noise, Pairing, Told
 from gateway.tags import Reason, Tag
 from gateway.tags.scan import Decoder
@@ -34,13 +33,6 @@ def listens(devices: Sequence[Device]) -> bool:
 def stale_after(tag: Tag) -> float:
     """Returns the seconds after which a learned value is too old."""
     return max(SHORTEST, INTERVALS * tag.every)
-
-
-def why_not_learned(driver: AnyDriver, tag: Tag) -> str:
-    """Returns why no traffic can bring the value; empty if it can be learned."""
-    if not driver.areas[tag.span.area].readable:
-        return "it cannot be read, so no reply holds it"
-    return ""
 
 
 @dataclass(slots=True, eq=False)
@@ -112,7 +104,7 @@ class Listening:
     """Takes the place of `UnsolicitedFrames` on a listen-only line."""
 
     def __init__(
-        self, devices: Sequence[Device], wire: WireTiming, results: Results, effects: Effects
+        self, devices: Sequence[Device], wire: WireTiming, results: HealthRules, effects: Effects
     ) -> None:
         self.speakers = devices
         self._results = results

@@ -3,14 +3,14 @@
 from collections.abc import Sequence
 from typing import Any
 
-from gateway.engine.changes import Changes
-from gateway.engine.device import Device
+from gateway.engine.device.changes import Changes
+from gateway.engine.device.device import Device
+from gateway.engine.device.health import State
 from gateway.engine.effects import Effects, Samples
-from gateway.engine.health import State
-from gateway.engine.jobs import Poll
-from gateway.engine.plans import Plans
-from gateway.engine.results import Results
-from gateway.engine.schedule import Schedule
+from gateway.engine.jobs.jobs import Poll
+from gateway.engine.results.health_rules import HealthRules
+from gateway.engine.schedule.replan_budget import ReplanBudget
+from gateway.engine.schedule.schedule import Schedule
 from gateway.errors import (
     DeviceError,
     Evidence,
@@ -29,19 +29,19 @@ OF_OTHERS = (Evidence.STATION, Evidence.SHAPE, Evidence.ECHO)  # they say nothin
 BUSY_PAUSE = 0.2  # seconds of pause for a busy device, doubled each time
 
 
-class PollResults:
+class PollRules:
     """The rules for results of polls: good, refused, or without a reply."""
 
-    def __init__(self, schedule: Schedule, results: Results, effects: Effects) -> None:
+    def __init__(self, schedule: Schedule, results: HealthRules, effects: Effects) -> None:
         self._schedule = schedule
         self._results = results
         self._effects = effects
-        self._plans = Plans(schedule)
+        self._replans = ReplanBudget(schedule)
 
     def change(self, changes: Changes) -> None:
         """Takes over changed devices: they have a new plan."""
         for device in changes.left:
-            self._plans.forget(device)
+            self._replans.forget(device)
 
     def read(self, poll: Poll, units: Sequence[int], now: float, time: int) -> None:
         """Applies a good read of a block."""
@@ -68,17 +68,17 @@ class PollResults:
         self._schedule.polled(poll, now)
         if not device.bad_addresses.clear:
             self._read_beside_bad(device, block, now)
-        plans = self._plans
-        if now >= plans.next_at:
-            plans.look(now)
-        if device.record.exchanges >= device.turnaround.look_at and now >= plans.allowed_from:
+        replans = self._replans
+        if now >= replans.next_at:
+            replans.look(now)
+        if device.record.exchanges >= device.turnaround.look_at and now >= replans.allowed_from:
             self._learn(device, now)
 
     def _learn(self, device: Device, now: float) -> None:
         """Compares the plan with the measured turnaround."""
         if device.bad_addresses.searching or (found := device.learn_turnaround()) is None:
             return
-        self._plans.spent(device.planning_seconds(device.tags), now)
+        self._replans.spent(device.planning_seconds(device.tags), now)
         if found:
             expected = device.turnaround.expected
             self._effects.info("plan updated", device=device.name, turnaround=expected)
@@ -92,9 +92,9 @@ class PollResults:
             self._effects.info("address returned", device=device.name, block=describe(block))
             self._schedule.try_soon(device, now + RETRIES[0])
             # The others may return as well: one plan for all.
-            self._plans.want(device, now, TOGETHER if bad.bad else 0.0)
+            self._replans.want(device, now, TOGETHER if bad.bad else 0.0)
         elif bad.rejoin(now):
-            self._plans.want(device, now)
+            self._replans.want(device, now)
         self._end_search(device, now)
 
     def _samples(self, poll: Poll, units: Sequence[int], time: int) -> Sequence[Sample]:
@@ -216,7 +216,7 @@ class PollResults:
     def _end_search(self, device: Device, now: float) -> None:
         if device.bad_addresses.settle(now):
             device.monitor.allow(True)  # the bad address in the list may be known now
-            self._plans.want(device, now)
+            self._replans.want(device, now)
 
     def unread(
         self, poll: Poll, error: DeviceError, now: float, time: int, *, alone: bool = True

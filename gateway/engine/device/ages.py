@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from statistics import fmean
 from typing import NamedTuple
 
-from gateway.engine.device import Device
+from gateway.engine.device.device import Device
 from gateway.planning.planner import Block
 
 

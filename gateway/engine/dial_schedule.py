@@ -5,12 +5,12 @@ Synchronous and pure, like the engine. A line without a modem has no `Calls`.
 
 from dataclasses import dataclass
 
-from gateway.engine.device import Device
+from gateway.engine.device.device import Device
+from gateway.engine.device.health import State
+from gateway.engine.device.records import COMPLETE, CallState
 from gateway.engine.effects import Effect, LogEvent
 from gateway.engine.engine import Engine
-from gateway.engine.health import State
-from gateway.engine.jobs import Poll
-from gateway.engine.records import COMPLETE, CallState
+from gateway.engine.jobs.jobs import Poll
 from gateway.errors import CallEnded, LineDown
 
 NEVER = float("inf")
@@ -25,7 +25,7 @@ class CallRules:
     idle: float = 5.0  # without an exchange, until the call is ended
 
 
-class Calls:
+class DialSchedule:
     """The rules of the calls of one line.
 
     * A poll that is due, a request and a read on demand dial. A call reads all blocks that are due
@@ -42,7 +42,7 @@ class Calls:
     def __init__(self, engine: Engine, rules: CallRules) -> None:
         self.failed = 0  # calls in a row
         self.record = engine.record.telephone()
-        engine.schedule.dials = True
+        engine.schedule.reaches_by_modem = True
         self._engine = engine
         self._rules = rules
         self._ended = -NEVER  # the last call, or the last try of a call

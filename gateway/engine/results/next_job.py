@@ -1,9 +1,9 @@
 """Applies the result of a job that is no good read, and decides what follows it."""
 
-from gateway.engine.changes import Changes
+from gateway.engine.device.changes import Changes
+from gateway.engine.device.health import State
 from gateway.engine.effects import Effects
-from gateway.engine.health import State
-from gateway.engine.jobs import (
+from gateway.engine.jobs.jobs import (
     Answer,
     Confirm,
     InFlight,
@@ -22,20 +22,20 @@ from gateway.engine.jobs import (
     WriteTogether,
     span_of,
 )
-from gateway.engine.line_silence import LineSilence
-from gateway.engine.poll_results import PollResults
-from gateway.engine.request_results import RequestResults
-from gateway.engine.requests import Command, Write
-from gateway.engine.results import Results
-from gateway.engine.shorter_silences import ShorterSilences
-from gateway.engine.together import Together
+from gateway.engine.jobs.requests import Command, Write
+from gateway.engine.results.health_rules import HealthRules
+from gateway.engine.results.line_silence import LineSilence
+from gateway.engine.results.pipelining import Pipelining
+from gateway.engine.results.poll_rules import PollRules
+from gateway.engine.results.request_rules import RequestRules
+from gateway.engine.results.shorter_silences import ShorterSilences
 from gateway.errors import BadValue, DeviceError, Garbled, LineDown, Refused, Unclear, Unsteady
 from gateway.protocols.driver import EVERY_REQUEST
 
 NEVER_QUIET = "the line is never quiet, the order of replies is unknown: noise, or another master"
 
 
-class Conclusions:
+class NextJob:
     """The rules that lead from one job to the next of the same transaction.
 
     An unclear end is followed by `Settle`, a write whose tag says so by `Confirm` and `Repeat`, a
@@ -45,9 +45,9 @@ class Conclusions:
     def __init__(
         self,
         in_flight: InFlight,
-        results: Results,
-        polls: PollResults,
-        requests: RequestResults,
+        results: HealthRules,
+        polls: PollRules,
+        requests: RequestRules,
         shorter: ShorterSilences,
         effects: Effects,
         gap: float,
@@ -55,7 +55,7 @@ class Conclusions:
         """`gap`: seconds without a byte that end a run of noise."""
         self.silence = LineSilence()
         self.shorter = shorter
-        self.together = Together(effects)
+        self.pipelining = Pipelining(effects)
         # An earlier process may have left requests in a device server, until the wire was quiet.
         self.inherits = False
         self._in_flight = in_flight
@@ -69,7 +69,7 @@ class Conclusions:
         """Takes over changed devices."""
         self.shorter.change(now)
         for device in changes.left:
-            self.together.forget(device)
+            self.pipelining.forget(device)
 
     def poll_failed(self, poll: Poll, result: Exception, now: float, time: int) -> None:
         """Applies the result of a poll without units."""
@@ -95,7 +95,7 @@ class Conclusions:
         failed = self._in_flight.failed
         if last.device.window > 1:
             polls = [poll for poll, _ in failed]
-            self.together.concluded(last, self._in_flight.together, polls, now)
+            self.pipelining.concluded(last, self._in_flight.together, polls, now)
         if failed:
             self.unclear(*failed[0], traffic, now, time)
 

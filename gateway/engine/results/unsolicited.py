@@ -5,11 +5,11 @@ from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from gateway.engine.changes import Changes
-from gateway.engine.device import Device
+from gateway.engine.device.changes import Changes
+from gateway.engine.device.device import Device
 from gateway.engine.effects import Effects
-from gateway.engine.jobs import Answer, Idle
-from gateway.engine.results import Results
+from gateway.engine.jobs.jobs import Answer, Idle
+from gateway.engine.results.health_rules import HealthRules
 from gateway.errors import BadValue, Garbled
 from gateway.protocols.unsolicited import (
     Stale,
@@ -49,16 +49,6 @@ class _Sender:
         return [tag for name in fields for tag in self.tags.get(name, ())]
 
 
-def unsolicited_tags(device: Device) -> list[Tag]:
-    """Returns the tags whose values arrive without a request."""
-    driver = device.driver
-    if device.settings.listen_only:
-        return [*device.tags]
-    if not isinstance(driver, Unsolicited):
-        return []
-    return [tag for tag in device.tags if driver.unsolicited_only(tag.span)]
-
-
 def _senders(device: Device, now: float) -> list[_Sender]:
     """Returns the sender of the device, if it sends unsolicited frames."""
     driver = device.driver
@@ -70,7 +60,7 @@ def _senders(device: Device, now: float) -> list[_Sender]:
 class UnsolicitedFrames:
     """The listeners of one line: one for each device that sends unsolicited frames."""
 
-    def __init__(self, devices: Sequence[Device], results: Results, effects: Effects) -> None:
+    def __init__(self, devices: Sequence[Device], results: HealthRules, effects: Effects) -> None:
         self.speakers: list[_Sender] = []
         self._devices = devices
         self._results = results

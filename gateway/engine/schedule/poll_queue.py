@@ -6,8 +6,8 @@ from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 
-from gateway.engine.device import Device
-from gateway.engine.jobs import EXPEDITED, NOT_QUEUED, ON_DEMAND, Poll
+from gateway.engine.device.device import Device
+from gateway.engine.jobs.jobs import EXPEDITED, NOT_QUEUED, ON_DEMAND, Poll
 
 ROOM = 16  # entries of a heap in addition to twice the valid ones
 NO_PLACE, LATE = -1, -2  # places of a device: nothing is due; its first poll is late

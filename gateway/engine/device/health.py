@@ -7,7 +7,7 @@ import math
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from enum import StrEnum
+from enum import Enum, StrEnum
 
 from gateway.errors import DeviceError, Evidence, Garbled, GatewayError, LineDown, NoReply
 from gateway.protocols.driver import Span
@@ -35,6 +35,14 @@ class Event(StrEnum):
     UNCLEAR = "unclear"  # a transaction ended without a reply
     GAVE_UP = "gave up"  # more transactions ended without a reply than `retries` allows
     RESTARTED = "restarted"  # the line was opened, or lost
+
+
+class Heard(Enum):
+    """The last that was heard of a device, also before the line was opened again."""
+
+    NEVER = 0  # it has not replied yet
+    REPLIED = 1
+    GAVE_UP = 2  # it replied no longer
 
 
 _S, _E = State, Event
@@ -73,7 +81,7 @@ class Health:
     needs_resync: bool = field(init=False)  # the next frame may answer an older request
     outstanding: Span | None = None  # the request whose reply may still arrive
     trouble: GatewayError | None = None
-    heard: bool | None = None  # True: it has replied; False: it gave up after that
+    heard: Heard = Heard.NEVER
     pause: float = 0.0  # seconds until the next probe of an offline device
     next_probe: float = 0.0
     short_probes: int = 0  # since the last patient one, or the last reply
@@ -106,7 +114,7 @@ class Health:
             self._extra = False
         self._move(Event.ANSWERED)
         self.consecutive_failures = self.short_probes = 0
-        self.heard, self.trouble = True, None
+        self.heard, self.trouble = Heard.REPLIED, None
         self.pause = 0.0
         if not self._extra:
             self.needs_resync = False
@@ -159,7 +167,7 @@ class Health:
         `spread`: a random factor near 1, so that many devices are not probed at once.
         """
         self._move(Event.GAVE_UP)
-        self.heard = False
+        self.heard = Heard.GAVE_UP
         self.pause = min(max(2 * self.pause, PAUSE_FIRST), PROBE_PAUSE)
         self.next_probe = now + self.pause * spread
         self._last_probe = now

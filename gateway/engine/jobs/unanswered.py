@@ -9,8 +9,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from gateway.engine.device import Device
-from gateway.engine.health import State
+from gateway.engine.device.device import Device
+from gateway.engine.device.health import State
 from gateway.errors import DeviceError
 
 FIRST_WAIT, LONGEST_WAIT = 3.0, 10.0  # seconds of a bridge for a dead unit: expected, at most

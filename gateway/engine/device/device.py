@@ -4,13 +4,13 @@ import math
 from collections.abc import Sequence
 from dataclasses import InitVar, dataclass, field
 
-from gateway.engine.device_settings import DeviceSettings
-from gateway.engine.health import Health, State, diagnosis
-from gateway.engine.monitor_list import MonitorList
-from gateway.engine.records import Record
-from gateway.engine.reply_shapes import ReplyShapes, reply_shapes
-from gateway.engine.station_silence import StationSilence
-from gateway.engine.turnaround import Turnaround
+from gateway.engine.device.device_settings import DeviceSettings
+from gateway.engine.device.health import Health, State, diagnosis
+from gateway.engine.device.monitor_list import MonitorList
+from gateway.engine.device.records import Record
+from gateway.engine.device.reply_shapes import ReplyShapes, reply_shapes
+from gateway.engine.device.station_silence import StationSilence
+from gateway.engine.device.turnaround import Turnaround
 from gateway.errors import Garbled, LineDown
 from gateway.planning.bad_addresses import RETRIES, BadAddresses, KnownBad
 from gateway.planning.monitor_lists import with_monitor_list

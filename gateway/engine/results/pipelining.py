@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass, field
 
-from gateway.engine.device import Device
+from gateway.engine.device.device import Device
 from gateway.engine.effects import Effects
-from gateway.engine.jobs import Poll
+from gateway.engine.jobs.jobs import Poll
 from gateway.protocols.driver import Span
 
 PROOFS = 3  # requests that were answered alone and not beside others
@@ -23,7 +23,7 @@ class _Window:
     apart_until: float = 0.0
 
 
-class Together:
+class Pipelining:
     """Decides how many polls of a device share a transaction.
 
     A poll without a reply beside others is polled alone. A reply then proves that the device lost

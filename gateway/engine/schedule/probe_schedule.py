@@ -3,10 +3,10 @@
 import random
 from collections.abc import Sequence
 
-from gateway.engine.device import Device
-from gateway.engine.health import PROBE_SPREAD, State
-from gateway.engine.jobs import Probe
-from gateway.engine.probes import (
+from gateway.engine.device.device import Device
+from gateway.engine.device.health import PROBE_SPREAD, State
+from gateway.engine.jobs.jobs import Probe
+from gateway.engine.schedule.probes import (
     OFFLINE_SHARE,
     PATIENT_AFTER,
     order_of_start,

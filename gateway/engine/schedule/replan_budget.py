@@ -2,13 +2,13 @@
 
 import math
 
-from gateway.engine.device import Device
-from gateway.engine.schedule import Schedule
+from gateway.engine.device.device import Device
+from gateway.engine.schedule.schedule import Schedule
 
 PLANNING_SHARE = 0.01  # of the time, for all devices of a line together
 
 
-class Plans:
+class ReplanBudget:
     """The devices of a line that wait for a plan. A plan of many changes is made in pieces."""
 
     def __init__(self, schedule: Schedule) -> None:

@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass, field
 
-from gateway.engine.records import Record
+from gateway.engine.device.records import Record
 
 LEARN_EVERY = 50  # requests between two comparisons with the measured turnaround
 MOST_PATIENCE = 128  # times LEARN_EVERY, between two plans that change nothing

@@ -2,13 +2,13 @@
 
 from collections.abc import Iterator, Sequence
 
-from gateway.engine.ages import polled_block, worst_ages
-from gateway.engine.changes import Changes
-from gateway.engine.device import Device
+from gateway.engine.device.ages import polled_block, worst_ages
+from gateway.engine.device.changes import Changes
+from gateway.engine.device.device import Device
+from gateway.engine.device.health import State
 from gateway.engine.effects import Effects
-from gateway.engine.health import State
-from gateway.engine.jobs import Poll
-from gateway.engine.schedule import Schedule
+from gateway.engine.jobs.jobs import Poll
+from gateway.engine.schedule.schedule import Schedule
 from gateway.planning.planner import describe
 from gateway.tags import Reason
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 from itertools import takewhile
 from typing import NamedTuple
 
-from gateway.engine.device import Device
-from gateway.engine.long_writes import LongWrite, long_write
-from gateway.engine.runs import run_of
+from gateway.engine.device.device import Device
+from gateway.engine.device.long_writes import LongWrite, long_write
+from gateway.engine.jobs.runs import run_of
 from gateway.errors import GatewayError, NotSent
 from gateway.protocols.capabilities import Controllable, ScatteredWriter
 from gateway.protocols.driver import AnyDriver, Span

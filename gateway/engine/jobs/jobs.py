@@ -5,12 +5,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import cast
 
-from gateway.engine.device import Device
-from gateway.engine.health import PAUSE_FIRST, PAUSE_LONGEST, State
-from gateway.engine.records import PollRecord
-from gateway.engine.reply_shapes import ReplyShapes
-from gateway.engine.requests import Command, Request, Resyncs, Write
-from gateway.engine.runs import needs_read, together
+from gateway.engine.device.device import Device
+from gateway.engine.device.health import PAUSE_FIRST, PAUSE_LONGEST, State
+from gateway.engine.device.records import PollRecord
+from gateway.engine.device.reply_shapes import ReplyShapes
+from gateway.engine.jobs.requests import Command, Request, Resyncs, Write
+from gateway.engine.jobs.runs import needs_read, together
 from gateway.errors import BadValue, Busy, DeviceError, LineDown, Refused, Unclear
 from gateway.planning.planner import Block
 from gateway.protocols.capabilities import UnnumberedReplies

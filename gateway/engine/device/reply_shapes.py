@@ -8,8 +8,8 @@ addresses more. An extra reply then arrives as a stray frame.
 
 from collections.abc import Hashable, Sequence
 
-from gateway.engine.long_writes import LongWrite
-from gateway.engine.longer_reads import MOST_CHOICES, LongerReads
+from gateway.engine.device.long_writes import LongWrite
+from gateway.engine.device.longer_reads import MOST_CHOICES, LongerReads
 from gateway.planning.bad_addresses import BadAddresses
 from gateway.planning.planner import Block
 from gateway.protocols.capabilities import UnnumberedReplies

@@ -7,12 +7,12 @@ are written, and no address between them.
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from gateway.engine.long_writes import writes_around
+from gateway.engine.device.long_writes import writes_around
 from gateway.protocols.driver import Span
 from gateway.tags import Tag
 
 if TYPE_CHECKING:
-    from gateway.engine.requests import Write
+    from gateway.engine.jobs.requests import Write
 
 _WHOLE = -1  # all bits of an address
 
