@@ -68,7 +68,9 @@ async def test_a_signed_write_counts_once_after_a_power_cut_and_a_clock_that_is_
         assert not program.has_said("tag written")
 
 
-async def test_a_clock_that_was_a_day_ahead_locks_no_writer_out(tmp_path: Path) -> None:
+async def test_a_clock_of_the_gateway_that_was_a_day_ahead_locks_no_writer_out(
+    tmp_path: Path,
+) -> None:
     endpoint = f"tcp/127.0.0.1:{(port := free_port())}"
     path = plant(tmp_path, port)
     with await asyncio.to_thread(run, path, 0, DAY) as program:
