@@ -12,12 +12,19 @@ from gateway.contract.payload import Failure, Problem
 from gateway.northbound.alarms import alarm_fields, open_alarms
 from gateway.parts.alarms import Entry, State
 from gateway.parts.web.guard import BY
-from gateway.parts.web.replies import answer, body, json_off_loop, limit, raw
+from gateway.parts.web.replies import answer, body, json_off_loop, raw
+from gateway.parts.web.routes import LIMIT, Choice, Route, Word
+from gateway.parts.web.schemas import ref
 from gateway.parts.web.sources import Sources
 
-MOST_ITEMS = 1000  # of one page
-_ITEMS = 200
 MOST_SHOWN = 50  # on the status page
+_STATE = Choice(
+    "state",
+    "open, if left out: all that are not normal; all; or one state",
+    ("open", "all", *(state.value for state in State)),
+)
+_AFTER = Word("after", "Last alarm of the page before")
+_ALARM = Word("alarm", "device/tag, device, or line:name", required=True)
 _STATUS = {
     Problem.BAD_VALUE: 400,
     Problem.NOT_ALLOWED: 403,
@@ -33,18 +40,44 @@ class AlarmApi:
         self._plant = sources.plant
         self._north = sources.north
 
-    def routes(self) -> list[web.RouteDef]:
+    def routes(self) -> list[Route]:
         return [
-            web.get("/api/alarms", self._alarms),
-            web.post("/api/alarms/acknowledge", self._acknowledge),
+            Route(
+                path="/api/alarms",
+                handler=self._alarms,
+                name="alarms",
+                about="Alarms, those without acknowledgement first, in pages",
+                parameters=(_STATE, _AFTER, LIMIT),
+                reply=ref("Alarms"),
+                errors={400: "A wrong state or limit"},
+            ),
+            Route(
+                path="/api/alarms/acknowledge",
+                handler=self._acknowledge,
+                name="acknowledge",
+                about="Acknowledges one alarm for an operator; a repeat gets the same answer",
+                method="post",
+                parameters=(_ALARM,),
+                body=ref("Acknowledgement"),
+                reply=ref("Alarm"),
+                done="It is acknowledged",
+                errors={
+                    403: "No token",
+                    408: "The body did not arrive",
+                    415: "No application/json",
+                },
+                failures={
+                    400: "bad-value: no name of an operator",
+                    404: "unknown-tag: no such alarm",
+                    409: "nothing-to-acknowledge: it is normal, or was raised again",
+                    503: "busy: this gateway is the standby, or stood still",
+                },
+            ),
         ]
 
     async def _alarms(self, request: web.Request) -> web.Response:
         """Without `state` all that are not normal; `state=all` returns those too."""
-        most, after = limit(request, _ITEMS, MOST_ITEMS), request.query.get("after")
-        state = request.query.get("state", "open")
-        if state not in ("open", "all", *State):
-            return answer(400, f"state is none of open, all, {', '.join(State)}")
+        most, after, state = LIMIT.of(request), _AFTER.of(request), _STATE.of(request)
 
         def page() -> object:
             found = self._select(state)
@@ -71,7 +104,7 @@ class AlarmApi:
         arrived = asyncio.get_running_loop().time()
         if request.content_type != "application/json":
             return answer(415, "send the operator's name as Content-Type: application/json")
-        name, data = request.query.get("alarm", ""), await body(request)
+        name, data = _ALARM.of(request) or "", await body(request)
         result = self._north.acknowledge(name, data, f"web {request[BY]}", arrived)
         if isinstance(result, Failure):
             return raw(payload.outcome(result), _STATUS.get(result.problem, 503))
