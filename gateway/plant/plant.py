@@ -127,8 +127,7 @@ class Gateway:
     def planned(self, line: Line, expected: LineForecast) -> None:
         """Takes over the plans of a line: it may run now."""
         self.expect(expected)
-        for device in line.engine.devices:
-            line.engine.schedule.plan(device, 0.0)
+        line.engine.planned(0.0)
 
     def expect(self, line: LineForecast) -> None:
         """Takes over the forecast of a line."""
@@ -331,7 +330,7 @@ class Gateway:
                 continue  # not planned yet
             documents[f"lines/{engine.name}"] = line_document(engine, expected, line.calls, now)
         for name, (line, device) in self._places.items():
-            polls = line.engine.schedule.polls(device)
+            polls = line.engine.polls(device)
             documents[f"devices/{name}"] = device_document(device, polls, now)
         documents |= served_documents(self.serving.lines, now)
         return documents | {path: document() for path, document in self._documents.items()}

@@ -151,7 +151,7 @@ async def test_the_age_of_a_value_counts_from_its_last_read() -> None:
         await asyncio.sleep(2)
         poll = line.engine.schedule.reader(line.engine.devices[0], tag)
         assert poll is not None
-        poll.last.at = now() - 2.5
+        poll.reads.at = now() - 2.5
         count = len(made.written)
         await asyncio.sleep(5)
         assert len(made.written) <= count + 1
