@@ -6,7 +6,7 @@ from typing import Any
 
 from gateway.config import Config, LineConfig
 from gateway.northbound.northbound import Northbound
-from gateway.northbound.session.session import off_loop
+from gateway.plant.threads import off_loop
 from gateway.parts.history import Historian
 from gateway.plant.plant import Gateway
 from gateway.tags import Sample

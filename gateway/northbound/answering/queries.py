@@ -13,18 +13,18 @@ import structlog
 import zenoh
 
 from gateway.contract import payload
-from gateway.contract.interfaces import Plant
-from gateway.contract.keys import Family, ParsedKey, max_age, parse_key
+from gateway.contract.interfaces import Parts, Plant
+from gateway.contract.keys import Family, ParsedKey, max_age, parse_key, part_of
 from gateway.contract.payload import Failure, GroupResult, Problem
 from gateway.contract.question import is_of_past
 from gateway.engine.requests import CommandResult, Peeked
 from gateway.errors import BadValue, Busy, GatewayError
-from gateway.northbound.alarms import Acknowledgements
 from gateway.northbound.answering.answers import Answer, AnswerPool, QueryCounters
 from gateway.northbound.answering.replies import Replies
 from gateway.northbound.answering.tag_index import TagIndex
 from gateway.northbound.requests.acceptance import sender
 from gateway.northbound.requests.commands import Commands
+from gateway.northbound.requests.orders import Orders
 from gateway.northbound.requests.writes import ANSWER_WITHIN, Writes
 from gateway.tags import Tag, WriteResult
 
@@ -49,7 +49,8 @@ class Queries:
         commands: Commands,
         replies: Replies,
         documents: StatusDocuments,
-        acknowledgements: Acknowledgements,
+        orders: Orders,
+        parts: Parts,
     ) -> None:
         self._plant = plant
         self._index = index
@@ -57,7 +58,8 @@ class Queries:
         self._commands = commands
         self._replies = replies
         self._documents = documents
-        self._acknowledgements = acknowledgements
+        self._orders = orders
+        self._parts = parts
         self._pool = AnswerPool(partial(replies.outcome, _BUSY))
         self._tasks: set[asyncio.Task[None]] = set()
 
@@ -83,8 +85,8 @@ class Queries:
         match parsed.family:
             case Family.SET | Family.COMMAND | Family.PEEK:
                 self._start(self._request(query, parsed, at))
-            case Family.ALARM:
-                self._take_alarm(query, parsed, at)
+            case Family.STATUS if self._parts.has_keys(part := part_of(parsed.target)):
+                self._take_keyed(query, part, parsed, at)
             case Family.STATUS:
                 self._take_status(query)
             case Family.VALUE if is_of_past(query.parameters):
@@ -118,18 +120,16 @@ class Queries:
         else:
             self._start(self._status(query))
 
-    def _take_alarm(self, query: zenoh.Query, parsed: ParsedKey, at: float) -> None:
-        data = _data(query)
-        if data is not None:
-            key = str(query.key_expr)
-            result = self._acknowledgements.acknowledge(key, data, sender(query, at))
-            self._pool.answer(query, partial(self._replies.acknowledged, result))
+    def _take_keyed(self, query: zenoh.Query, part: str, parsed: ParsedKey, at: float) -> None:
+        if query.payload is not None:
+            self._start(self._order(query, part, at))
         elif query.parameters.get("_time") is not None:
-            self._pool.answer_history(query, partial(self._replies.past_alarms, time.time_ns()))
+            past = partial(self._replies.past_entries, part, time.time_ns())
+            self._pool.answer_history(query, past)
         elif parsed.has_wildcard:
-            self._pool.answer_wide(query, self._replies.alarms)
+            self._pool.answer_wide(query, partial(self._replies.entries, part))
         else:
-            self._pool.answer(query, self._replies.alarms)
+            self._pool.answer(query, partial(self._replies.entries, part))
 
     async def close(self) -> None:
         """Ends the queries that wait for devices; their replies get half a second to leave."""
@@ -160,6 +160,14 @@ class Queries:
             result = await self._writes.write(key, _data(query), by)
         finally:
             self._pool.answer(query, partial(self._replies.outcome, result))
+
+    async def _order(self, query: zenoh.Query, part: str, at: float) -> None:
+        result: bytes | Failure = _ENDING
+        key, by = str(query.key_expr), sender(query, at)
+        try:
+            result = await self._orders.execute(part, key, _data(query) or b"", by)
+        finally:
+            self._pool.answer(query, partial(self._replies.ordered, result))
 
     async def _command(self, query: zenoh.Query, at: float) -> None:
         result: CommandResult | Failure = _ENDING

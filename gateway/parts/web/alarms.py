@@ -1,23 +1,19 @@
 """Alarms in the JSON API: the list, and the acknowledgement with a token."""
 
 import asyncio
-from collections.abc import Mapping
-from itertools import islice
-from typing import Any
+from functools import partial
 
 from aiohttp import web
 
 from gateway.contract import payload
 from gateway.contract.payload import Failure, Problem
-from gateway.northbound.alarms import alarm_fields, open_alarms
-from gateway.parts.alarms import Entry, State
+from gateway.errors import BadValue
 from gateway.parts.web.guard import BY, answer
 from gateway.parts.web.replies import BODY_WITHIN, json_off_loop, limit, raw
-from gateway.parts.web.sources import Sources
+from gateway.plant.part import Core, Listed
 
 MOST_ITEMS = 1000  # of one page
 _ITEMS = 200
-MOST_SHOWN = 50  # on the status page
 _STATUS = {
     Problem.BAD_VALUE: 400,
     Problem.NOT_ALLOWED: 403,
@@ -29,9 +25,9 @@ _STATUS = {
 class AlarmApi:
     """The handlers."""
 
-    def __init__(self, sources: Sources) -> None:
-        self._plant = sources.plant
-        self._north = sources.north
+    def __init__(self, core: Core) -> None:
+        self._north = core.north
+        self._others = core.others
 
     def routes(self) -> list[web.RouteDef]:
         return [
@@ -43,29 +39,13 @@ class AlarmApi:
         """Without `state` all that are not normal; `state=all` returns those too."""
         most, after = limit(request, _ITEMS, MOST_ITEMS), request.query.get("after")
         state = request.query.get("state", "open")
-        if state not in ("open", "all", *State):
-            return answer(400, f"state is none of open, all, {', '.join(State)}")
-
-        def page() -> object:
-            found = self._select(state)
-            if after is not None:
-                keys = [entry.key for entry in found]
-                found = found[keys.index(after) + 1 :] if after in keys else []
-            shown = [alarm_fields(one, self._plant.sample) for one in islice(found, most)]
-            more = len(found) > most
-            return {
-                "alarms": shown,
-                "counts": self._plant.alarms.counts(),
-                "next": found[most - 1].key if more else None,
-            }
-
-        return await json_off_loop(page)
-
-    def _select(self, state: str) -> list[Entry]:
-        if state == "open":
-            return open_alarms(self._plant)
-        entries = list(self._plant.alarms.entries.values())
-        return [one for one in entries if state in ("all", one.status.state.value)]
+        lists = self._others.each(Listed)
+        if not lists:
+            return answer(503, "the alarms do not work now: see `faults` of /api/status")
+        try:
+            return await json_off_loop(partial(lists[0].page, state, after, most))
+        except BadValue as error:
+            return answer(400, str(error))
 
     async def _acknowledge(self, request: web.Request) -> web.Response:
         arrived = asyncio.get_running_loop().time()
@@ -76,14 +56,7 @@ class AlarmApi:
                 name, data = request.query.get("alarm", ""), await request.read()
         except TimeoutError:
             return answer(408, f"the body did not arrive within {BODY_WITHIN:g} s")
-        result = self._north.acknowledge(name, data, f"web {request[BY]}", arrived)
+        result = await self._north.order("alarms", name, data, f"web {request[BY]}", arrived)
         if isinstance(result, Failure):
             return raw(payload.outcome(result), _STATUS.get(result.problem, 503))
         return raw(result)
-
-
-def alarms_shown(sources: Sources) -> Mapping[str, Any]:
-    """Returns the counts, and the first alarms that are not normal."""
-    found = open_alarms(sources.plant)
-    shown = [alarm_fields(entry, sources.plant.sample) for entry in found[:MOST_SHOWN]]
-    return {"shown": shown, "more": max(0, len(found) - MOST_SHOWN)}

@@ -8,7 +8,7 @@ nothing for `SLOW` seconds is dropped.
 import asyncio
 import json
 import time
-from collections import deque
+from collections import ChainMap, deque
 from collections.abc import Mapping, Sequence
 from itertools import islice
 from typing import Any
@@ -17,12 +17,11 @@ import orjson
 from aiohttp import ClientConnectionResetError, web
 
 from gateway.contract import payload
-from gateway.contract.faults import below, transfers
-from gateway.parts.web.alarms import alarms_shown
+from gateway.contract.faults import Documents, below, transfers
 from gateway.parts.web.api import Api, overview
 from gateway.parts.web.guard import answer
-from gateway.parts.web.sources import Documents, Sources
 from gateway.parts.web.wire import Recorder, Wires, as_fields
+from gateway.plant.part import Core, Shown
 from gateway.tags import Quality, Sample, Tag
 
 MOST_PAGES = 16
@@ -40,8 +39,8 @@ MOST_SENTENCES = 50  # about what is wrong, and about what to look at
 class Loads:
     """The load of each line in the last half hour."""
 
-    def __init__(self, sources: Sources) -> None:
-        self._north = sources.north
+    def __init__(self, core: Core) -> None:
+        self._north = core.north
         self._last: Mapping[str, float] = {}
         self._at = 0.0
         self._loads: dict[str, deque[float]] = {}
@@ -77,19 +76,19 @@ class Loads:
 class Events:
     """The handler of `/api/events`."""
 
-    def __init__(self, sources: Sources, api: Api, loads: Loads) -> None:
-        self._sources = sources
+    def __init__(self, core: Core, api: Api, loads: Loads) -> None:
+        self._core = core
         self._api = api
         self.loads = loads
-        self.wires = Wires(sources.plant)
+        self.wires = Wires(core.plant)
         self._pages = 0
         self._state: tuple[Documents, dict[str, Any]] = ({}, {})
 
     def state(self, documents: Documents) -> dict[str, Any]:
         """Returns the state as all pages get it; made once for the same documents."""
         if self._state[0] is not documents:
-            alarms = alarms_shown(self._sources)
-            self._state = documents, {**_state(documents), "alarms": alarms}
+            shown = ChainMap(*[part.shown() for part in self._core.others.each(Shown)])
+            self._state = documents, {**_state(documents), **shown}
         return self._state[1]
 
     async def handle(self, request: web.Request) -> web.StreamResponse:
@@ -107,7 +106,7 @@ class Events:
                 response = web.StreamResponse(headers={"Content-Type": "text/event-stream"})
                 response.headers["X-Accel-Buffering"] = "no"  # a proxy passes events on at once
                 await response.prepare(request)
-                page = Page(self._sources, self, tags, recorder)
+                page = Page(self._core, self, tags, recorder)
                 await _send(request, response, page)
         finally:
             self._pages -= 1
@@ -132,12 +131,12 @@ class Page:
 
     def __init__(
         self,
-        sources: Sources,
+        core: Core,
         events: Events,
         tags: Sequence[Tag] | None,
         recorder: Recorder | None,
     ) -> None:
-        self._sources = sources
+        self._core = core
         self._events = events
         self._tags = tags
         self._recorder = recorder
@@ -152,7 +151,7 @@ class Page:
         loop = asyncio.get_running_loop()
         events = []
         if self._state_due <= loop.time():
-            documents = await self._sources.north.documents(STATE_EVERY)
+            documents = await self._core.north.documents(STATE_EVERY)
             self._state_due = loop.time() + STATE_EVERY
             events.append(_event("state", self._state(documents)))
             loads = self._events.loads
@@ -175,14 +174,14 @@ class Page:
         whole = self._events.state(documents)
         changed = {name: _changes(self._shown.get(name, {}), whole[name]) for name in _BY_NAME}
         self._shown = {name: whole[name] for name in _BY_NAME}
-        return {**whole, "ready": self._sources.ready(), **changed}
+        return {**whole, "ready": self._core.north.is_ready, **changed}
 
     def _values(self, tags: Sequence[Tag]) -> list[list[object]]:
         """Returns the values that changed, or were read again: the text of the value as in JSON,
         because a browser rounds large integers."""
         found = []
         for tag in tags:
-            sample = self._sources.plant.sample(tag)
+            sample = self._core.plant.sample(tag)
             if self._sent.get(tag) == sample:
                 continue
             self._sent[tag] = sample

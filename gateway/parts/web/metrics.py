@@ -18,9 +18,9 @@ from prometheus_client.exposition import CONTENT_TYPE_LATEST, generate_latest
 from prometheus_client.process_collector import ProcessCollector
 from prometheus_client.registry import Collector, CollectorRegistry
 
-from gateway.contract.faults import below, faults, transfers, warnings
+from gateway.contract.faults import Documents, below, faults, transfers, warnings
 from gateway.engine.records import COMPLETE
-from gateway.parts.web.sources import Documents, Plant
+from gateway.plant.plant import Plant
 from gateway.tags import Quality
 
 CONTENT_TYPE = CONTENT_TYPE_LATEST
@@ -100,7 +100,7 @@ def _metrics(documents: Documents, plant: Plant, *, ready: bool) -> Iterator[Met
         yield _one(name, text, {}, documents["zenoh"].get(field, 0))
     yield from _transfers(documents)
     alarms = _family("alarms", "Alarms by state", "state")
-    for state, count in documents["alarms"].items():
+    for state, count in documents.get("alarms", {}).items():
         alarms.add_metric([state], count)
     yield alarms
     if (clock := documents.get("clock")) is not None:

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import orjson
 from aiohttp import web
 
-from gateway.northbound.session.session import off_loop
+from gateway.plant.threads import off_loop
 
 BODY_WITHIN = 5.0  # seconds
 

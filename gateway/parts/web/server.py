@@ -12,13 +12,13 @@ import structlog
 from aiohttp import web
 
 from gateway.config import WebConfig
-from gateway.northbound.session.session import off_loop
 from gateway.parts.web import assets, metrics
 from gateway.parts.web.alarms import AlarmApi
 from gateway.parts.web.api import Api
 from gateway.parts.web.events import Events, Loads
 from gateway.parts.web.guard import Guard, add_headers
-from gateway.parts.web.sources import Sources
+from gateway.plant.part import Core, Routed
+from gateway.plant.threads import off_loop
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 
@@ -35,11 +35,11 @@ _BUFFER = 64 * 1024  # bytes that the system keeps for a client: a slow one must
 class Server:
     """The HTTP side of one gateway. Raises `ConfigError` for a bad tokens file."""
 
-    def __init__(self, config: WebConfig, sources: Sources) -> None:
+    def __init__(self, config: WebConfig, core: Core) -> None:
         self._config = config
-        self._sources = sources
-        self._api = Api(sources)
-        self._loads = Loads(sources)
+        self._core = core
+        self._api = Api(core)
+        self._loads = Loads(core)
         self._app = web.Application(
             middlewares=[Guard(config).middleware()], client_max_size=64 * 1024
         )
@@ -47,9 +47,10 @@ class Server:
         self._app.add_routes(
             [
                 *self._api.routes(),
-                *AlarmApi(sources).routes(),
+                *AlarmApi(core).routes(),
+                *(route for part in core.others.each(Routed) for route in part.routes()),
                 *assets.routes(),
-                web.get("/api/events", Events(sources, self._api, self._loads).handle),
+                web.get("/api/events", Events(core, self._api, self._loads).handle),
                 web.get("/healthz", self._health),
                 web.get("/readyz", self._ready),
                 web.get("/metrics", self._metrics),
@@ -124,14 +125,14 @@ class Server:
         return web.Response(text="ok\n")
 
     async def _ready(self, _: web.Request) -> web.Response:
-        if self._sources.ready():
+        if self._core.north.is_ready:
             return web.Response(text="ready\n")
         return web.Response(status=503, text="not ready: the gateway does not serve its plant\n")
 
     async def _metrics(self, _: web.Request) -> web.Response:
-        documents = await self._sources.north.documents(SCRAPE_AGE)
-        ready = self._sources.ready()
-        plant = self._sources.plant
+        documents = await self._core.north.documents(SCRAPE_AGE)
+        ready = self._core.north.is_ready
+        plant = self._core.plant
 
         def text() -> bytes:
             return metrics.exposition(documents, plant, ready=ready)
