@@ -2,6 +2,7 @@
 
 import math
 import struct
+from fractions import Fraction
 
 import pytest
 from hypothesis import given
@@ -18,7 +19,7 @@ from gateway.values import (
     swapped,
     to_words,
 )
-from gateway.values.numerals import Scalar
+from gateway.values.numerals import Scalar, are_apart, as_decimal
 
 LOW, HIGH = Order.LOW_FIRST, Order.HIGH_FIRST
 INTEGERS = {
@@ -239,3 +240,26 @@ def test_a_shorter_text_clears_the_rest() -> None:
 def test_swapping_twice_changes_nothing(word: int) -> None:
     assert swapped(swapped(word)) == word
     assert swapped(word) == int.from_bytes(word.to_bytes(2, "big"), "little")
+
+
+# Numbers as plants have them: a few digits, of any size.
+NUMBERS = st.builds(
+    lambda digits, places: digits / 10**places, st.integers(-(10**6), 10**6), st.integers(0, 9)
+)
+
+
+@given(NUMBERS | st.integers(-(2**63), 2**64), NUMBERS | st.floats(-1e15, 1e15), st.booleans())
+def test_a_distance_is_that_of_the_decimals(one: float, least: float, up: bool) -> None:
+    """Also of numbers that differ by exactly this distance, and by a digit more or less."""
+    for digit in (-1, 0, 1):
+        exact = abs(Fraction(repr(least))) + digit * Fraction(1, 10**6)
+        other = float(Fraction(repr(one)) + (exact if up else -exact))
+        real = abs(Fraction(repr(other)) - Fraction(repr(one)))
+        assert are_apart(one, other, abs(least)) is (real >= abs(Fraction(repr(least))))
+
+
+@given(NUMBERS, st.integers(1, 100))
+def test_a_percentage_is_that_of_the_first_number(one: float, percent: int) -> None:
+    other = float(as_decimal(one) + as_decimal(abs(one)) * percent / 100)
+    assert are_apart(one, other, percent, percent=True)
+    assert are_apart(one, other, percent + 0.001, percent=True) is (one == 0)

@@ -239,7 +239,7 @@ class ZenohPeer:
         **options: str,
     ) -> list[Reply]:
         """Sends one query. `options`: `target="ALL"`, `consolidation="NONE"`,
-        `accept_replies="ANY"`."""
+        `accept_replies="ANY"`, `encoding="application/cbor"`."""
         if attachment is not None:
             options["attachment"] = base64.b64encode(attachment).decode()
         [replies] = await self.many([(selector, payload)], timeout, **options)
@@ -268,9 +268,15 @@ class ZenohPeer:
         ]
 
     async def put(
-        self, key: str, payload: bytes, attachment: bytes | None = None, times: int = 1
+        self,
+        key: str,
+        payload: bytes,
+        attachment: bytes | None = None,
+        times: int = 1,
+        encoding: str = "zenoh/bytes",
     ) -> None:
         sent = {"payload": _text(payload), "attachment": _text(attachment), "times": times}
+        sent["encoding"] = encoding
         await self._request("put", key=key, **sent)
 
     async def delete(self, key: str) -> None:
@@ -392,6 +398,8 @@ def _get(
         options["accept_replies"] = getattr(zenoh.ReplyKeyExpr, extra["accept_replies"])
     if "attachment" in extra:
         options["attachment"] = _bytes_of(extra["attachment"])
+    if "encoding" in extra:
+        options["encoding"] = zenoh.Encoding(extra["encoding"])
     found: list[list[zenoh.Reply]] = [[] for _ in queries]
     ends = [threading.Event() for _ in queries]
     for (selector, payload), replies, end in zip(queries, found, ends, strict=True):
@@ -431,8 +439,11 @@ def _execute(session: zenoh.Session, kept: list[object], request: dict[str, Any]
         case {"do": "put", "key": key, "payload": payload, "attachment": attachment}:
             block = zenoh.CongestionControl.BLOCK
             data, token = _bytes_of(payload) or b"", _bytes_of(attachment)
+            encoding = zenoh.Encoding(request["encoding"])
             for _ in range(request["times"]):
-                session.put(key, data, congestion_control=block, attachment=token)
+                session.put(
+                    key, data, encoding=encoding, congestion_control=block, attachment=token
+                )
         case {"do": "delete", "key": key}:
             session.delete(key)
         case _:

@@ -5,6 +5,7 @@ from itertools import pairwise
 from typing import Any, Protocol
 
 from gateway.tags import AlarmRule, Level
+from gateway.tags.scaling import decimal
 from gateway.values import Kind, ValueType
 
 _RISING = (Level.LOW_LOW, Level.LOW, Level.HIGH, Level.HIGH_HIGH)
@@ -38,7 +39,7 @@ def check_alarm(settings: Mapping[str, Any]) -> None:
     below = [level for level in given if level in (Level.LOW_LOW, Level.LOW)]
     above = [level for level in given if level not in below]
     if below and above:
-        gap = settings[above[0]] - settings[below[-1]]
+        gap = float(decimal(settings[above[0]]) - decimal(settings[below[-1]]))
         if settings["hysteresis"] >= gap:
             raise ValueError(
                 f"hysteresis must be less than {gap:.15g}, the distance of {below[-1]} and"

@@ -12,6 +12,19 @@ from gateway.values.numerals import Scalar, parse_decimal
 
 LONGEST_WRITE = 64 * 1024  # bytes; a tag holds 250 characters or 2000 elements at most
 LARGEST_GROUP = 256  # tags
+# Most clients name no encoding: Zenoh's default is `zenoh/bytes`.
+_TEXTS = frozenset(
+    {"", "zenoh/bytes", "zenoh/string", "text/plain", "text/json", "application/json"}
+)
+
+
+def check_encoding(name: str) -> None:
+    """Raises `BadValue` for an encoding that is not JSON: CBOR's -22 is the byte of JSON's 5.
+
+    `name`: as Zenoh prints it, with a schema or without.
+    """
+    if name.partition(";")[0].strip().lower() not in _TEXTS:
+        raise BadValue(f"the encoding {name[:60]!r} is not supported: send application/json")
 
 
 def parse_write(payload: bytes) -> Value:

@@ -13,6 +13,9 @@ from typing import NamedTuple
 
 import orjson
 
+from gateway.contract.foreign import Foreign
+from gateway.errors import BadValue
+
 LONGEST = 1000  # bytes of an attachment
 _NAME = re.compile(r"[\w.\-]{1,60}\Z")
 _NONCE = re.compile(r"[\w.\-]{16,64}\Z")
@@ -45,19 +48,15 @@ def sign(by: str, secret: str, time: str, key: str, data: bytes) -> bytes:
 def parse(attachment: bytes | None) -> Signed | None:
     """Returns None where the attachment is no signature of this form."""
     try:
-        found = None if attachment is None else orjson.loads(attachment)
-        match found:
-            case {
-                "by": str(by),
-                "time": str(time),
-                "nonce": str(nonce),
-                "signature": str(signature),
-            } if _NAME.match(by) and _NONCE.match(nonce) and signature.isascii():
-                aware = datetime.fromisoformat(time).tzinfo is not None
-                return Signed(by, time, nonce, signature) if aware and "\n" not in time else None
-    except ValueError:
+        found = Foreign.parse(attachment or b"", LONGEST)
+        by, time, nonce, signature = (found.text(name, LONGEST) for name in Signed._fields)
+        aware = datetime.fromisoformat(time).tzinfo is not None
+    except (BadValue, ValueError):
         return None
-    return None
+    wrong = "\n" in time or not (aware and signature.isascii())
+    if wrong or not (_NAME.match(by) and _NONCE.match(nonce)):
+        return None
+    return Signed(by, time, nonce, signature)
 
 
 def _signature(secret: bytes, signed: Signed, key: str, data: bytes) -> str:

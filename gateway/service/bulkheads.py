@@ -255,7 +255,7 @@ class Bulkheads:
         followers = list[tuple[Bulkhead, Follows]]()
         for one in self._all:
             if isinstance(one.part, Follows):
-                followers.append((one, one.part))  # noqa: PERF401  (mypy narrows no comprehension)
+                followers.append((one, one.part))
         self._followers = followers
         self._plant.stores[:] = self.each(Stores)
         self._plant.logs[:] = [part.wire_logs for part in self.each(Logged)]

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from decimal import Context, Decimal, DivisionByZero, InvalidOperation, Overflow
 
-from gateway.values.numerals import Scalar
+from gateway.values.numerals import Scalar, as_decimal
 
 # A part of a formula: it is calculated from the values of the inputs, in their order.
 Term = Callable[[Sequence[Decimal]], Decimal]
@@ -40,7 +40,7 @@ class Formula:
         Raises `ArithmeticError` with a sentence where there is none.
         """
         try:
-            result = self.term([_decimal(value) for value in inputs])
+            result = self.term([as_decimal(value) for value in inputs])
         except (DivisionByZero, InvalidOperation):
             raise ArithmeticError("division by zero") from None
         except Overflow:
@@ -51,7 +51,3 @@ class Formula:
         if self.whole or not math.isfinite(number):
             raise ArithmeticError("the result is too large")
         return number
-
-
-def _decimal(value: Scalar) -> Decimal:
-    return Decimal(repr(value)) if isinstance(value, float) else Decimal(int(value))

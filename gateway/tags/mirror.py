@@ -10,6 +10,7 @@ from gateway.tags.computed import Dependents, computed
 from gateway.tags.kept import Counted, CounterState, kept, memory_of
 from gateway.tags.scan import Latest, Samples, Scan
 from gateway.values import Value
+from gateway.values.numerals import are_apart
 
 
 class Mirror:
@@ -254,10 +255,8 @@ def _changed(tag: Tag, old: Value | None, new: Value | None) -> bool:
         return old != new
     if isinstance(old, (bool, str, tuple)) or isinstance(new, (bool, str, tuple)):
         return old != new and (tag.element is None or _one_changed(tag.element, old, new))
-    band = tag.deadband.amount
-    if tag.deadband.percent:
-        band = abs(old) * band / 100
-    return old != new and abs(new - old) >= band
+    band = tag.deadband
+    return old != new and are_apart(old, new, band.amount, percent=band.percent)
 
 
 def _one_changed(element: Tag, old: Any, new: Any) -> bool:

@@ -1,8 +1,8 @@
-"""Numbers as people write them: the shortest digits of a float, whole numbers, decimals of JSON."""
+"""Numbers as people write them: shortest digits, whole numbers, decimals of JSON, distances."""
 
 import math
 import struct
-from decimal import Decimal
+from decimal import Context, Decimal
 
 from gateway.errors import BadValue
 
@@ -12,6 +12,8 @@ _TOO_LARGE_SINGLE = 2.0**128 - 2.0**103  # from here on a float of 32 bits is in
 _NORMAL_SINGLE = 2.0**-126  # floats of 32 bits below have fewer than six digits
 _WHOLE_FLOATS = 2.0**53  # from here on floats skip whole numbers
 _WHOLE_SINGLES = 2.0**24  # the same for floats of 32 bits
+_DECIMALS = Context(prec=60)  # more digits than two floats of one plant have together
+_FLOAT_ERROR = 2.0**-50  # of a difference of two floats, as a part of them; eight times the most
 
 
 def shortest(value: float) -> float | None:
@@ -60,3 +62,23 @@ def real(value: Scalar) -> float:
     if not math.isfinite(number):
         raise BadValue(f"{value} is not a finite number")
     return number
+
+
+def as_decimal(value: Scalar) -> Decimal:
+    """Returns the number as people write it. Bits count 0 and 1."""
+    return Decimal(repr(value)) if isinstance(value, float) else Decimal(int(value))
+
+
+def are_apart(one: float, other: float, least: float, *, percent: bool = False) -> bool:
+    """Returns True if two numbers differ by `least` or more, as people write all three.
+
+    0.3 and 0.2 differ by 0.1: their floats differ by less. `percent`: of `one`.
+    """
+    band = abs(one) * least / 100 if percent else least
+    difference = abs(other - one)
+    if abs(difference - band) > (abs(one) + abs(other)) * _FLOAT_ERROR:
+        return difference > band  # far from `least`: no digit behind decides
+    first, exact = as_decimal(one), as_decimal(least)
+    if percent:
+        exact = _DECIMALS.multiply(first.copy_abs(), _DECIMALS.divide(exact, Decimal(100)))
+    return _DECIMALS.subtract(as_decimal(other), first).copy_abs() >= exact

@@ -618,7 +618,8 @@ TAGS = [
              "e: {address: M2, alarm: {on: true, off: true}}",
              "f: {address: D4, alarm: {high: 5, low: 4, hysteresis: 1}}",
              "g: {address: D5, alarm: {high: 5, hysteresis: -1}}",
-             'h: {address: D6, type: "string[2]", alarm: {high: 5}}'),
+             'h: {address: D6, type: "string[2]", alarm: {high: 5}}',
+             "i: {address: D7, alarm: {high: 0.8, low: 0.7, hysteresis: 0.1}}"),
         f"8: {M}.tags.a.alarm: an alarm needs a limit, such as high: 80, or for a bit on: true",
         f"9: {M}.tags.b.alarm: low 7 is not below high 5",
         f"10: {M}.tags.c.alarm: a int16 has limits, such as high: 80; only a bit has on and off",
@@ -627,6 +628,7 @@ TAGS = [
         f"13: {M}.tags.f.alarm: hysteresis must be less than 1, the distance of low and high",
         f"14: {M}.tags.g.alarm.hysteresis: -1 is no distance: it is zero or more",
         f"15: {M}.tags.h.alarm: a string[2] has no alarm: only numbers and bits have",
+        f"16: {M}.tags.i.alarm: hysteresis must be less than 0.1, the distance of low and high",
     ),
     bad(
         "scale of a bit",

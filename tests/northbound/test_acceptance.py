@@ -40,7 +40,10 @@ async def test_a_write_ages_from_its_arrival_or_from_its_own_time() -> None:
             await within(open_to_all(), waited, attachment)
 
 
-@pytest.mark.parametrize("attachment", [b"", b"no JSON", b"[]", b'{"time": 5}', b'{"time": "x"}'])
+@pytest.mark.parametrize(
+    "attachment",
+    [b"", b"no JSON", b"[]", b'{"time": 5}', b'{"time": "x"}', b'{"time": "0001-01-01T00:00:00"}'],
+)
 async def test_an_attachment_without_a_time_says_nothing(attachment: bytes) -> None:
     assert await within(open_to_all(), 0.0, attachment) == pytest.approx(WRITE_EXPIRY, abs=0.5)
 

@@ -8,7 +8,7 @@ from structlog.testing import capture_logs
 
 from gateway.contract.keys import Keys
 from gateway.northbound.group.claim_documents import ClaimDocuments
-from gateway.northbound.group.claims import Claim
+from gateway.northbound.group.claims import LAST_TICKET, Claim
 from gateway.northbound.group.plant_secret import PlantSecret
 
 SECRET = PlantSecret("a secret of twenty or more")
@@ -59,11 +59,31 @@ def test_without_a_secret_every_claim_counts() -> None:
         assert without.parse(KEY, orjson.dumps(document), 0.0) == CLAIM
 
 
-@pytest.mark.parametrize("data", [b"", b"[]", b"7", b'{"ticket": 7}', b'{"ticket": "7"}'])
-def test_a_document_that_is_no_claim_is_none(data: bytes) -> None:
-    documents = other()
-    assert documents.parse(KEY, data, 0.0) is None
-    assert documents.refused == []
+WRONG = {
+    "no JSON": b"",
+    "a list": b"[]",
+    "no devices": b'{"ticket": 7}',
+    "a text as ticket": b'{"ticket": "7", "devices": []}',
+    "a truth value as ticket": b'{"ticket": true, "devices": []}',
+    "a ticket below 0": b'{"ticket": -1, "devices": []}',
+    "the largest 64 bits": b'{"ticket": 18446744073709551615, "devices": []}',
+    "more than 64 bits": b'{"ticket": 18446744073709551616, "devices": []}',
+    "one after the last": b'{"ticket": %d, "devices": []}' % (LAST_TICKET + 1),
+    "a group of lists": b'{"ticket": 7, "group": [], "devices": []}',
+    "a device of another type": b'{"ticket": 7, "devices": ["mixer", 7]}',
+    "a device without an end": b'{"ticket": 7, "devices": ["%b"]}' % (b"x" * 1000),
+    "too many devices": orjson.dumps({"ticket": 7, "devices": ["a"] * 10_001}),
+    "too long": b'{"ticket": 7, "devices": [], "more": "%b"}' % (b"x" * 300_000),
+    "nested without an end": b"[" * 100_000,
+}
+
+
+@pytest.mark.parametrize("data", WRONG.values(), ids=WRONG)
+def test_a_document_that_is_no_claim_is_refused_and_named(data: bytes) -> None:
+    for secret in (None, SECRET):
+        documents = other(secret)
+        assert documents.parse(KEY, data, 0.0) is None
+        assert documents.refused == [KEY]
 
 
 def test_a_flood_of_forged_claims_is_told_a_few_times() -> None:

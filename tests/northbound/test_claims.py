@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.northbound.group.claims import RETURN_TIME, Claim, Claims
+from gateway.northbound.group.claims import LAST_TICKET, MOST_OTHERS, RETURN_TIME, Claim, Claims
 
 
 def gateway(session: str, devices: Iterable[str] = ("mixer", "oven"), **group: str) -> Claims:
@@ -85,3 +85,23 @@ def test_the_own_claim_takes_nothing() -> None:
     own = gateway("1")
     own.found(Claim(0, "1", "other", None, frozenset({"mixer"})))
     assert own.taken() == {}
+
+
+def test_the_last_ticket_of_another_keeps_nobody_from_claiming() -> None:
+    first, second = gateway("2"), gateway("1", ["press"])
+    first.found(Claim(LAST_TICKET, "0", "other", None, frozenset({"lamp"})))
+    second.found(first.claim(1000, ()))
+    assert first.own is not None
+    assert first.own.ticket == LAST_TICKET
+    assert second.claim(1000, ()).ticket == LAST_TICKET
+
+
+def test_claims_without_an_end_take_no_memory_and_hide_no_known_gateway() -> None:
+    first, second = gateway("s"), gateway("t")
+    second.found(first.claim(1000, ()))
+    for number in range(2 * MOST_OTHERS):
+        second.found(Claim(1, f"forged-{number}", "forged", None, frozenset({"lamp"})))
+    assert second.taken(["lamp"]) == {"lamp": "forged"}
+    assert second.taken().keys() == {"mixer", "oven"}
+    second.lost("s")
+    assert second.taken() == {}

@@ -5,6 +5,7 @@ import pytest
 from gateway.northbound.group.election import (
     CLAIM_TIME,
     LONGEST_PAUSE,
+    MOST_TOKENS,
     QUERY_VALIDITY,
     SETTLE_TIME,
     Election,
@@ -154,3 +155,16 @@ def test_a_gateway_that_saw_the_active_one_through_a_router_waits_for_a_router()
     election.link_changed("router", up=False, router=True, now=2.0)
     with pytest.raises(AssertionError, match="still waiting"):
         until(election, State.CLAIMING, 2.0, 60.0)
+
+
+def test_tokens_without_an_end_hide_no_active_gateway_that_was_seen_before() -> None:
+    election, other = alone(), RoleToken(Role.ACTIVE, "b", "s2")
+    election.token_changed(other, True)
+    for number in range(2 * MOST_TOKENS):
+        election.token_changed(RoleToken(Role.CLAIM, "z", str(number)), True)
+        election.token_found(RoleToken(Role.CLAIM, "z", str(number)), 0.0)
+    assert election.decide(30.0) is State.STANDBY
+    for number in range(2 * MOST_TOKENS):
+        election.token_changed(RoleToken(Role.CLAIM, "z", str(number)), False)
+    election.token_changed(other, False)
+    until(election, State.ACTIVE, 30.0, 33.0)

@@ -1920,8 +1920,8 @@ MUTANTS = (
     Mutant(
         "an alarm ends within the hysteresis",
         "parts/alarms/machine.py",
-        "is_left = value < self._limit and value <= self._limit - self._hysteresis",
-        "is_left = value < self._limit",
+        "is_below and (self._waited is None or are_apart(self._limit, value, self._hysteresis))",
+        "is_below",
         "tests/alarms/test_machine.py",
     ),
     Mutant(

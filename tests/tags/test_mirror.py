@@ -1,5 +1,6 @@
 """The choice of samples to publish: one test for each rule in the mirror's docstring."""
 
+from decimal import Decimal
 from typing import Any
 
 import pytest
@@ -61,6 +62,26 @@ def test_a_deadband_in_percent_is_of_the_last_published_value() -> None:
         110,
         121,
     ]
+
+
+@pytest.mark.parametrize(
+    ("kind", "deadband"),
+    [("int16", Deadband(0.1)), ("int16", Deadband(0.3)), ("float32", Deadband(0.7))],
+)
+def test_steps_of_exactly_the_deadband_are_published(kind: str, deadband: Deadband) -> None:
+    """The steps and the deadband are decimals: 0.3 and 0.2 differ by 0.1, their floats by less."""
+    steps = [float(Decimal(repr(deadband.amount)) * step) for step in range(-100, 100)]
+    assert values(make_tag("D0", type=kind, scale=0.1, deadband=deadband), *steps) == steps
+
+
+def test_steps_of_less_than_the_deadband_are_not_published() -> None:
+    tag = make_tag("D0", scale=0.001, deadband=Deadband(0.1))
+    assert values(tag, 0.3, 0.201, 0.399, 0.2, 0.299, 0.3) == [0.3, 0.2, 0.3]
+
+
+def test_steps_of_exactly_the_percentage_are_published() -> None:
+    tag = make_tag("D0", scale=0.01, deadband=Deadband(10, percent=True))
+    assert values(tag, 0.7, 0.63, 0.7, 0.77, 0.7) == [0.7, 0.63, 0.7, 0.77]
 
 
 def test_at_zero_a_deadband_in_percent_publishes_every_change() -> None:

@@ -15,6 +15,7 @@ import zenoh
 from gateway.contract import payload
 from gateway.contract.interfaces import Parts, Plant
 from gateway.contract.keys import Family, ParsedKey, max_age, parse_key, part_of
+from gateway.contract.parsing import check_encoding
 from gateway.contract.payload import Failure, GroupResult, Problem
 from gateway.contract.question import is_of_past
 from gateway.engine.requests import CommandResult, Peeked
@@ -22,7 +23,7 @@ from gateway.errors import BadValue, Busy, GatewayError
 from gateway.northbound.answering.answers import Answer, AnswerPool, QueryCounters
 from gateway.northbound.answering.replies import Replies
 from gateway.northbound.answering.tag_index import TagIndex
-from gateway.northbound.requests.acceptance import sender
+from gateway.northbound.requests.acceptance import encoding_of, sender
 from gateway.northbound.requests.commands import Commands
 from gateway.northbound.requests.orders import Orders
 from gateway.northbound.requests.writes import ANSWER_WITHIN, Writes
@@ -182,6 +183,7 @@ class Queries:
         device = parsed.target.rpartition("/")[2]
         longest = ANSWER_WITHIN + self._plant.dialling(device)
         try:
+            check_encoding(encoding_of(query))
             text = (_data(query) or b"").decode(errors="replace")[:_LONGEST_RANGE]
             async with asyncio.timeout(longest):
                 result = await self._plant.peek(device, text)

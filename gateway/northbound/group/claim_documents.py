@@ -8,13 +8,18 @@ The signature covers the key too, which has the names of the gateway and of its 
 import orjson
 import structlog
 
+from gateway.contract.foreign import Foreign
 from gateway.contract.keys import Keys
 from gateway.contract.rate_limit import RateLimit
-from gateway.northbound.group.claims import Claim
+from gateway.errors import BadValue
+from gateway.northbound.group.claims import LAST_TICKET, Claim
 from gateway.northbound.group.plant_secret import PlantSecret
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 
+_LONGEST = 256 * 1024  # bytes of a document; Zenoh drops longer messages
+_MOST_DEVICES = 10_000
+_LONGEST_NAME = 300  # characters
 _MOST_REFUSED = 10  # claims in the status
 _SHOWN = 300  # characters of a refused key
 
@@ -46,38 +51,38 @@ class ClaimDocuments:
         return document
 
     def parse(self, key: str, data: bytes, now: float) -> Claim | None:
-        """Returns None for a document that is no claim, and for one that is not signed. Logs the
-        latter once."""
-        *_, name, _, session = key.split("/")
+        """Returns None for a document that is no claim, and for one that is not signed. Logs it
+        once."""
         try:
-            document = orjson.loads(data)
-        except orjson.JSONDecodeError:
+            claim = self._signed(key, Foreign.parse(data, _LONGEST))
+        except BadValue as error:
+            self._refuse(key, str(error), now)
             return None
-        match document:
-            case {"ticket": int(ticket), "group": str() | None as group, "devices": list(devices)}:
-                known = frozenset(device for device in devices if isinstance(device, str))
-                claim = Claim(ticket, session, name, group, known)
-            case _:
-                return None
-        if self._secret is not None:
-            signature = document.get("signature")
-            text = _text(key, _unsigned(claim))
-            if not (isinstance(signature, str) and self._secret.signed(text, signature)):
-                self._refuse(key, now)
-                return None
         self.forget(key)
         return claim
 
-    def _refuse(self, key: str, now: float) -> None:
+    def _signed(self, key: str, document: Foreign) -> Claim:
+        """Raises `BadValue`."""
+        *_, name, _, session = key.split("/")
+        claim = Claim(
+            document.number("ticket", 0, LAST_TICKET),
+            session,
+            name,
+            document.text_or_none("group", _LONGEST_NAME),
+            document.texts("devices", _MOST_DEVICES, _LONGEST_NAME),
+        )
+        if self._secret is not None:
+            signature = document.text_or_none("signature", _LONGEST_NAME) or ""
+            if not self._secret.signed(_text(key, _unsigned(claim)), signature):
+                raise BadValue("it is not signed with the secret of this gateway")
+        return claim
+
+    def _refuse(self, key: str, why: str, now: float) -> None:
         if key in self._refused or len(self._refused) >= _MOST_REFUSED:
             return
         self._refused[key] = None
         if self._log_limit.allows(now):
-            log.error(
-                "claim refused",
-                claim=key[:_SHOWN],
-                why="it is not signed with the secret of this gateway",
-            )
+            log.error("claim refused", claim=key[:_SHOWN], why=why)
 
 
 def _unsigned(claim: Claim) -> dict[str, object]:

@@ -7,13 +7,14 @@ A claim is a document below the gateway's status keys, and a liveliness token on
 import asyncio
 import time
 from collections.abc import Iterable, Mapping
+from itertools import islice
 
 import structlog
 import zenoh
 
 from gateway.contract.keys import Keys
 from gateway.northbound.group.claim_documents import ClaimDocuments
-from gateway.northbound.group.claims import Claims
+from gateway.northbound.group.claims import MOST_OTHERS, Claims
 from gateway.northbound.group.plant_secret import PlantSecret
 from gateway.northbound.requests.inbox import Inbox
 from gateway.northbound.session.second_session import SecondSession
@@ -25,7 +26,11 @@ log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 # claims them when the network is there.
 NETWORK_WITHIN = 3.0
 _QUERY_TIMEOUT = 0.7  # seconds
-_LOOK_EVERY = 0.5  # seconds, where an event was lost or a gateway did not answer
+_LOOK_EVERY = 0.5  # seconds, where an event was lost
+# Seconds between two queries: any client can declare tokens, and answer none of the queries.
+_FIRST_PAUSE, _LONGEST_PAUSE = 0.5, 30.0
+_MOST_EVENTS = 20_000  # of tokens, that wait for the event loop
+_SETTLE = 0.05  # seconds in which more changes may arrive, to be treated together
 _MOST_LOGGED = 10  # devices in one log entry
 
 
@@ -130,19 +135,26 @@ class Claiming:
             await asyncio.sleep(0.05)
 
     async def _observe(self, view: zenoh.Session, claims: Claims) -> None:
+        def seen(sample: zenoh.Sample) -> None:
+            if len(self._unanswered) < MOST_OTHERS:
+                self._unanswered.add(str(sample.key_expr))
+
         def token_changed(sample: zenoh.Sample, _at: float) -> None:
             key = str(sample.key_expr)
             if claims.own is not None and key == self._keys.claim(claims.own.session):
                 return
             if sample.kind == zenoh.SampleKind.PUT:
-                self._unanswered.add(key)
+                seen(sample)
+                looks.begin()
             else:
                 self._unanswered.discard(key)
                 claims.lost(key.rpartition("/")[2])
                 self._documents.forget(key)
             self._changed.set()
 
-        tokens = zenoh.handlers.Callback(Inbox(token_changed, lambda _: None), indirect=False)
+        looks = _Looks()
+        inbox = Inbox(token_changed, seen, _MOST_EVENTS)
+        tokens = zenoh.handlers.Callback(inbox, indirect=False)
         self._declared.append(
             await off_loop(
                 lambda: view.liveliness().declare_subscriber(
@@ -157,9 +169,10 @@ class Claiming:
                     await self._changed.wait()
             except TimeoutError:
                 pass
+            await asyncio.sleep(_SETTLE)
             self._changed.clear()
-            for key in tuple(self._unanswered):
-                self._unanswered -= await self._look(view, key)
+            if self._unanswered and looks.is_due(time.monotonic()):
+                self._unanswered -= await self._look(view, self._keys.claims)
 
     def _must_start_over(self, claims: Claims) -> bool:
         if self._refused.is_set():
@@ -196,12 +209,31 @@ class Claiming:
         return set(found)
 
 
+class _Looks:
+    """Decides when claims are read again: soon after a new token, then ever more rarely."""
+
+    def __init__(self) -> None:
+        self._pause = 0.0
+        self._last = -_LONGEST_PAUSE
+
+    def begin(self) -> None:
+        """A new token was seen."""
+        self._pause = min(self._pause, _FIRST_PAUSE)
+
+    def is_due(self, now: float) -> bool:
+        if now - self._last < self._pause:
+            return False
+        self._last = now
+        self._pause = min(max(2 * self._pause, _FIRST_PAUSE), _LONGEST_PAUSE)
+        return True
+
+
 def _query(view: zenoh.Session, key: str) -> list[zenoh.Reply]:
-    return list(
-        view.get(
-            key,
-            timeout=_QUERY_TIMEOUT,
-            consolidation=zenoh.ConsolidationMode.NONE,
-            allowed_destination=zenoh.Locality.REMOTE,
-        )
+    """Returns at most `MOST_OTHERS` replies."""
+    replies = view.get(
+        key,
+        timeout=_QUERY_TIMEOUT,
+        consolidation=zenoh.ConsolidationMode.NONE,
+        allowed_destination=zenoh.Locality.REMOTE,
     )
+    return list(islice(replies, MOST_OTHERS))

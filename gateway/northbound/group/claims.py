@@ -4,7 +4,8 @@ Each gateway claims its devices before it opens a line. A ticket orders the clai
 but always later than every ticket that its gateway saw. When two claims name one device, the
 device belongs to the earlier ticket, or to the smaller session id of equal tickets. So a gateway
 that comes second never displaces the first, whatever the clocks say, and two gateways that see
-both claims decide alike. The other gateway *withholds* the device: no polls, values or writes.
+both claims decide alike. No ticket is later than `LAST_TICKET`. The other gateway *withholds* the
+device: no polls, values or writes.
 
 The members of a standby group have the same devices. Their election decides, not the claims. Of
 two gateways with one name only the first serves, whatever their devices are.
@@ -18,6 +19,8 @@ from typing import NamedTuple
 # A device that no other gateway claims any more is claimed again after this time, so that a
 # gateway that restarts gets its devices back.
 RETURN_TIME = 10.0
+LAST_TICKET = 2**62  # the year 2116; every JSON library knows such an integer
+MOST_OTHERS = 1000  # claims of others that are known at once
 
 
 class Claim(NamedTuple):
@@ -49,7 +52,8 @@ class Claims:
 
     def found(self, claim: Claim) -> None:
         """Another gateway claims, or our own claim was seen."""
-        if claim.session != self._session:
+        known = claim.session in self._others or len(self._others) < MOST_OTHERS
+        if claim.session != self._session and known:
             self._others[claim.session] = claim
 
     def lost(self, session: str) -> None:
@@ -58,7 +62,8 @@ class Claims:
 
     def claim(self, now: int, withheld: Iterable[str]) -> Claim:
         """Makes the own claim. `now` in ns since 1970."""
-        ticket = max([now, *(other.ticket + 1 for other in self._others.values())])
+        latest = max([now, *(other.ticket + 1 for other in self._others.values())])
+        ticket = min(latest, LAST_TICKET)
         devices = self._devices.difference(withheld)
         self.own = Claim(ticket, self._session, self._name, self._group, devices)
         return self.own

@@ -21,6 +21,7 @@ SETTLE_TIME = 10.0
 QUERY_VALIDITY = 0.8
 # After a longer pause of its process, a gateway may have lost its tokens (the lease is 3 s).
 LONGEST_PAUSE = 2.0
+MOST_TOKENS = 1000  # of others; without a secret any client can declare as many as it likes
 
 
 class Role(StrEnum):
@@ -118,15 +119,15 @@ class Election:
         """Another gateway has declared or undeclared a token."""
         if token.session == self.session:
             return
-        if present:
+        if present and len(self._tokens) < MOST_TOKENS:
             self._tokens.add(token)
-        else:
+        elif not present:
             self._tokens.discard(token)
             self._found.pop(token, None)
 
     def token_found(self, token: RoleToken, now: float) -> None:
         """A query has found a token of another gateway."""
-        if token.session != self.session:
+        if token.session != self.session and len(self._found) < MOST_TOKENS:
             self._found[token] = now
 
     def link_changed(self, session: str, up: bool, router: bool, now: float) -> None:
@@ -137,6 +138,7 @@ class Election:
         """Updates the state. Call it several times a second, and after every change."""
         paused = now - self._decided > LONGEST_PAUSE
         self._decided = now
+        self._found = {t: at for t, at in self._found.items() if now - at <= QUERY_VALIDITY}
         for token in self._tokens:
             if token.role is Role.ACTIVE:
                 self._links.saw(token.session)
@@ -144,7 +146,7 @@ class Election:
             case State.REPLACED:
                 pass
             case State.ACTIVE:
-                self.replaced_by = self._seen(Role.ACTIVE, now, before_me=True)
+                self.replaced_by = self._seen(Role.ACTIVE, before_me=True)
                 if paused or self.replaced_by is not None:
                     self.state = State.REPLACED
             case _ if not self._may_claim(now):
@@ -171,16 +173,14 @@ class Election:
         return sorted(token.name for token in self._tokens if token.role is Role.ACTIVE)
 
     def _may_claim(self, now: float) -> bool:
-        if self._seen(Role.ACTIVE, now) or self._seen(Role.CLAIM, now, before_me=True):
+        if self._seen(Role.ACTIVE) or self._seen(Role.CLAIM, before_me=True):
             return False
         if self._links.are_up:
             return self._links.are_settled(now)
         return self._alone is not None and now - self._links.lost >= max(self._alone, SETTLE_TIME)
 
-    def _seen(self, role: Role, now: float, *, before_me: bool = False) -> RoleToken | None:
-        seen = self._tokens | {
-            token for token, found in self._found.items() if now - found <= QUERY_VALIDITY
-        }
+    def _seen(self, role: Role, *, before_me: bool = False) -> RoleToken | None:
+        seen = self._tokens | self._found.keys()
         mine = RoleToken(role, self.name, self.session)
         found = (token for token in seen if token.role is role and (not before_me or token < mine))
         return min(found, default=None)

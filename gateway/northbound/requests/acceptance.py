@@ -6,22 +6,27 @@ from collections.abc import Callable
 from datetime import datetime
 from typing import NamedTuple
 
-import orjson
 import zenoh
 
+from gateway.contract.foreign import Foreign
+from gateway.contract.parsing import check_encoding
 from gateway.contract.signatures import LONGEST
 from gateway.contract.writers import Writers
 from gateway.engine.requests import WRITE_EXPIRY
-from gateway.errors import Busy
+from gateway.errors import BadValue, Busy
 from gateway.line.send_permit import Duty
 
 
 class Sender(NamedTuple):
-    """The client of a query or put. `arrived`: when it reached the process, by the loop's clock."""
+    """The client of a query or put. `arrived`: when it reached the process, by the loop's clock.
+
+    `encoding`: of the payload, as Zenoh names it; empty for none.
+    """
 
     session: str | None = None  # Zenoh's id, if the client sends it
     attachment: bytes | None = None
     arrived: float = 0.0
+    encoding: str = ""
 
 
 class Accepted(NamedTuple):
@@ -48,8 +53,9 @@ class Acceptance:
             self._writers.begin()
 
     def accept(self, key: str, data: bytes | None, sender: Sender) -> Accepted:
-        """`key` and `data` as received. Raises `NotAllowed`, `Repeated`, and `Busy` for a request
-        of the past."""
+        """`key` and `data` as received. Raises `NotAllowed`, `Repeated`, `BadValue` for another
+        encoding than JSON, and `Busy` for a request of the past."""
+        check_encoding(sender.encoding)
         now = asyncio.get_running_loop().time()
         if why := self._duty.why_not(sender.arrived, now):
             raise Busy(why)
@@ -71,16 +77,19 @@ def sender(message: zenoh.Query | zenoh.Sample, arrived: float) -> Sender:
         None if source is None else str(source.source_id.zid),
         None if attached is None or len(attached) > LONGEST else attached.to_bytes(),
         arrived,
+        encoding_of(message),
     )
+
+
+def encoding_of(message: zenoh.Query | zenoh.Sample) -> str:
+    """Returns Zenoh's name of the payload's encoding; empty for a query without a payload."""
+    return "" if message.encoding is None else str(message.encoding)
 
 
 def _time_of(attachment: bytes | None) -> float | None:
     """Returns the client's own time, in seconds since 1970, if it sends one."""
     try:
-        found = None if attachment is None else orjson.loads(attachment)
-        match found:
-            case {"time": str(text)}:
-                return datetime.fromisoformat(text).timestamp()
-    except ValueError:
+        made = Foreign.parse(attachment or b"", LONGEST).text("time", LONGEST)
+        return datetime.fromisoformat(made).timestamp()
+    except (BadValue, ValueError, OverflowError):
         return None
-    return None

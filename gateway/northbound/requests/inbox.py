@@ -22,16 +22,20 @@ class Inbox(Generic[T]):
     `sink` also gets the time of the arrival, by the clock of the loop.
     """
 
-    def __init__(self, sink: Callable[[T, float], None], refuse: Callable[[T], None]) -> None:
+    def __init__(
+        self, sink: Callable[[T, float], None], refuse: Callable[[T], None], more: int = 0
+    ) -> None:
+        """`more`: arrivals beyond `LIMIT` that may wait too."""
         self._loop = asyncio.get_running_loop()
         self._sink = sink
         self._refuse = refuse
+        self._more = more
         self._queue: deque[tuple[T, float]] = deque()
         self._drain_scheduled = False
 
     def __call__(self, arrival: T) -> None:
         """Called on Zenoh's thread."""
-        if len(self._queue) >= LIMIT:
+        if len(self._queue) >= LIMIT + self._more:
             self._refuse(arrival)
             return
         self._queue.append((arrival, self._loop.time()))

@@ -11,6 +11,7 @@ from typing import NamedTuple
 from gateway.errors import NothingToAcknowledge
 from gateway.tags.alarm import BELOW, AlarmRule, Level
 from gateway.values import Value
+from gateway.values.numerals import are_apart
 
 
 class State(StrEnum):
@@ -95,8 +96,8 @@ class _Condition:
 
     def judge(self, value: float, now: float) -> None:
         value *= self._sign
-        is_left = value < self._limit and value <= self._limit - self._hysteresis
-        if is_left or (self._waited is None and value < self._limit):
+        is_below = value < self._limit
+        if is_below and (self._waited is None or are_apart(self._limit, value, self._hysteresis)):
             self._waited = self._since = None
             self.active = False
             return
