@@ -11,8 +11,8 @@ from gateway.errors import (
     ConfigError,
 )
 from gateway.northbound.session.session import open_session
-from gateway.plant.threads import off_loop
 from gateway.northbound.session.session_settings import configure
+from gateway.plant.threads import off_loop
 from tests.zenoh_peer import ZenohPeer, free_endpoint
 
 

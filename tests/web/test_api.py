@@ -10,7 +10,6 @@ import pytest
 
 from gateway.contract.payload import Failure, GroupResult, Problem
 from gateway.parts.web.server import Server
-from gateway.parts.web.sources import Sources
 from gateway.tags import AlarmRule, Level, WriteResult, good
 from tests.history.recorded import SPEED, history
 from tests.northbound.plant import PlainDevice, PlainPlant, mixer, tag
@@ -20,6 +19,7 @@ from tests.web.serving import (
     Client,
     PlainNorth,
     calling,
+    core_of,
     local,
     serving,
     transfer,
@@ -44,7 +44,7 @@ def schema(path: str, status: int, method: str = "get") -> dict[str, Any]:
 
 
 async def test_the_description_has_every_address_and_no_other() -> None:
-    server = Server(local(), Sources(mixer(), PlainNorth(), None, lambda: True))
+    server = Server(local(), core_of(mixer(), PlainNorth()))
     served = {(path, method.lower()) for path, method in server.addresses() if method != "HEAD"}
     described = {(path, method) for path, one in DESCRIBED["paths"].items() for method in one}
     assert served - {(path, "get") for path in PAGE} == described

@@ -8,6 +8,7 @@ import structlog
 from gateway.contract.interfaces import History
 from gateway.parts.history.historian import Historian
 from gateway.plant.part import Core, Kind, Part, Phase, Remembers
+from gateway.plant.plant import Plant
 from gateway.plant.threads import off_loop
 from gateway.tags import Sample
 
@@ -18,8 +19,8 @@ CLOSE_WITHIN = 0.7  # seconds for the last samples
 class HistoryPart:
     """Records samples before the event loop takes the query of a client that received them."""
 
-    def __init__(self, core: Core, historian: Historian) -> None:
-        self._mirror = core.plant.mirror
+    def __init__(self, plant: Plant, historian: Historian) -> None:
+        self._plant = plant
         self._historian = historian
 
     @property
@@ -33,7 +34,7 @@ class HistoryPart:
         """History keeps no device states."""
 
     def activate(self) -> None:
-        self._historian.record(self._mirror.samples())  # "starting" marks the restart
+        self._historian.record(self._plant.mirror.samples())  # "starting" marks the restart
 
     def documents(self) -> Mapping[str, Mapping[str, object]]:
         return {"history": self._historian.document()}
@@ -51,7 +52,7 @@ def _make(core: Core) -> Part | None:
     kept = core.config.history
     if kept is None:
         return None
-    return HistoryPart(core, Historian(kept.path, kept.keep, kept.max_size))
+    return HistoryPart(core.plant, Historian(kept.path, kept.keep, kept.max_size))
 
 
 KIND = Kind(_make, Phase.KEEPING, serves=Remembers)

@@ -24,6 +24,7 @@ class ServingPart:
         )
         self.holds, self.write_group = served.holds, served.write_group
         self.seen = served.remember
+        self.lines = served.lines
 
     @property
     def wants(self) -> bool:
@@ -34,14 +35,14 @@ class ServingPart:
 
     async def run(self) -> None:
         async with asyncio.TaskGroup() as tasks:
-            for line in self._served.lines:
+            for line in self.lines:
                 tasks.create_task(line.run(), name=line.name)
 
     def wire_logs(self) -> Mapping[str, WireLog]:
-        return {line.name: line.wire_log for line in self._served.lines}
+        return {line.name: line.wire_log for line in self.lines}
 
     def documents(self) -> Mapping[str, Mapping[str, object]]:
-        return served_documents(self._served.lines, asyncio.get_running_loop().time())
+        return served_documents(self.lines, asyncio.get_running_loop().time())
 
 
 def _make(core: Core) -> Part | None:

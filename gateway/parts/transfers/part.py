@@ -19,7 +19,7 @@ class TransferPart:
         self._rows = rows = Transfers(
             core.plant, core.north.write_own, config.transfers, alarms=config.alarms.transfers
         )
-        core.plant.adjust_forecasts(_with_writes)
+        core.plant.adjust_forecasts(with_writes)
         self.publish, self.set_online = rows.publish, rows.set_online
         self.documents = rows.documents
 
@@ -36,7 +36,8 @@ class TransferPart:
         self._rows.renew(config.transfers, renewed)
 
 
-def _with_writes(config: Config, polls: Sequence[LineForecast]) -> Sequence[LineForecast]:
+def with_writes(config: Config, polls: Sequence[LineForecast]) -> Sequence[LineForecast]:
+    """Returns the forecasts with the writes of the rows."""
     lines = [*polls]
     return with_transfers(lines, transfer_forecasts(config, lines))
 

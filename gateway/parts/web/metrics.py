@@ -19,8 +19,8 @@ from prometheus_client.process_collector import ProcessCollector
 from prometheus_client.registry import Collector, CollectorRegistry
 
 from gateway.contract.faults import Documents, below, faults, transfers, warnings
+from gateway.contract.interfaces import Plant
 from gateway.engine.records import COMPLETE
-from gateway.plant.plant import Plant
 from gateway.tags import Quality
 
 CONTENT_TYPE = CONTENT_TYPE_LATEST
