@@ -83,7 +83,7 @@ async def play(gateway: Plant, seconds: float, made: list[float] | None) -> None
 class Nothing(NoParts):
     """No other part works."""
 
-    def each(self, capability: type[object]) -> Sequence[object]:
+    def each(self, capability: type[object]) -> list[object]:
         return []
 
 
@@ -95,7 +95,8 @@ def core_of(gateway: Plant, north: Any) -> Core:
 async def show(core: Core, made: list[float]) -> None:
     """Makes the events of one page. Adds the processor time of each to `made`."""
     api, loads = Api(core), Loads(core)
-    events, measuring = Events(core, api, loads), asyncio.create_task(loads.run())
+    events = Events(core, api, loads, lambda _: True)
+    measuring = asyncio.create_task(loads.run())
     try:
         with events.wires.watched("line0") as recorder:
             page = Page(core, events, api.select("d0-0", "", None, 200), recorder)

@@ -1,9 +1,9 @@
 """The files that the gateway writes are no other file of it: it would move that file aside."""
 
 from collections.abc import Iterator
-from os.path import realpath
 from pathlib import Path as FilePath
 
+from gateway import files
 from gateway.config.messages import Mistakes, Path
 from gateway.config.records import Config
 
@@ -28,7 +28,7 @@ def check_files(config: Config, own: FilePath, mistakes: Mistakes) -> None:
                 for tail in its
             ]
         for what, other in others:
-            if any(_same(FilePath(f"{file}{tail}"), other) for tail in tails):
+            if any(files.are_same(FilePath(f"{file}{tail}"), other) for tail in tails):
                 mistakes.add(
                     path, f"{file.name} is {what}: name another file, such as {_MEANT[path]}"
                 )
@@ -52,7 +52,7 @@ def _written(config: Config) -> Iterator[tuple[Path, FilePath, tuple[str, ...]]]
 
 def _read(config: Config, own: FilePath) -> Iterator[tuple[str, FilePath]]:
     zenoh, tls = config.zenoh, config.zenoh.tls
-    files = {
+    read = {
         "the configuration file": own,
         "zenoh.config_file": zenoh.config_file,
         "zenoh.password_file": zenoh.password_file,
@@ -62,14 +62,7 @@ def _read(config: Config, own: FilePath) -> Iterator[tuple[str, FilePath]]:
         "web.tokens_file": None if config.web is None else config.web.tokens_file,
     }
     if tls is not None:
-        files |= {"zenoh.tls.ca": tls.ca, "zenoh.tls.key": tls.key}
-        files |= {"zenoh.tls.certificate": tls.certificate}
-    yield from ((what, file) for what, file in files.items() if file is not None)
+        read |= {"zenoh.tls.ca": tls.ca, "zenoh.tls.key": tls.key}
+        read |= {"zenoh.tls.certificate": tls.certificate}
+    yield from ((what, file) for what, file in read.items() if file is not None)
     yield from (("a sheet of tags", sheet.file) for sheet in config.sheets)
-
-
-def _same(file: FilePath, other: FilePath) -> bool:
-    """True for one file with two names too."""
-    if realpath(file) == realpath(other):
-        return True
-    return file.exists() and other.exists() and file.samefile(other)

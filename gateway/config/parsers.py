@@ -13,6 +13,7 @@ from typing import Literal
 
 from gateway.config.messages import one_of, shown
 from gateway.errors import ConfigError
+from gateway.files import is_name
 from gateway.transport.port import MODEM, PortAddress, SerialPath, parse_port
 from gateway.values import Order, ValueType, parse_type
 
@@ -201,6 +202,8 @@ def port(text: object) -> PortAddress:
     if _HOST.match(text):
         raise ConfigError(f"{text} is no port: write tcp://{text}:4001, with its port number")
     found = parse_port(text)
+    if isinstance(found, SerialPath) and not is_name(found.path):
+        raise ConfigError(f"{text!r} is no port: no file can have this name")
     if isinstance(found, SerialPath) and os.name == "posix" and "/" not in text:
         if _WINDOWS.match(text):
             raise ConfigError(f"{text} is a port of Windows: here it is a path like /dev/ttyUSB0")
@@ -246,7 +249,7 @@ def blocks(value: object) -> bool | Literal["only"]:
 
 
 def path(text: object) -> Path:
-    if not isinstance(text, str) or not text.strip() or "\0" in text:
+    if not isinstance(text, str) or not text.strip() or not is_name(text):
         raise ConfigError(f"{shown(text)} is no file name")
     return Path(text)
 

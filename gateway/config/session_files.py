@@ -5,6 +5,7 @@ from pathlib import Path as FilePath
 
 from gateway.config.messages import Mistakes, Path
 from gateway.config.zenoh_records import ZenohConfig
+from gateway.files import is_file
 
 
 def with_files(found: ZenohConfig, folder: FilePath, mistakes: Mistakes) -> ZenohConfig:
@@ -37,6 +38,6 @@ def existing_file(
     if name is None:
         return None
     file = folder / name
-    if not file.is_file():
+    if not is_file(file):
         mistakes.add(path, f"there is no file {file}")
     return file

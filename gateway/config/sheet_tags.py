@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path as FilePath
 from typing import NamedTuple
 
+from gateway import files
 from gateway.config.device_tags import DeviceTags
 from gateway.config.messages import Mistakes, Path, dotted, one_of
 from gateway.config.model import TagDefaults, TagSection
@@ -87,7 +88,7 @@ class SheetTags:
         if file not in self._grids:
             self._grids[file] = None
             try:
-                self._grids[file] = read_grid(file.read_bytes())
+                self._grids[file] = read_grid(files.read(file))
             except ConfigError as error:
                 self.mistakes.add(path, f"{file.name}: {error}")
             except OSError as error:

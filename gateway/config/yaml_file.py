@@ -12,6 +12,7 @@ from typing import Any
 
 import yaml
 
+from gateway import files
 from gateway.config.messages import ConfigErrors, Mistakes, Path, dotted
 from gateway.config.yaml_events import plain_data
 from gateway.config.yaml_scalars import scalar
@@ -221,7 +222,7 @@ def compose(name: str, text: str) -> yaml.MappingNode:
 
 def file_text(path: FilePath) -> str:
     try:
-        data = path.read_bytes()
+        data = files.read(path)
     except FileNotFoundError:
         raise ConfigErrors([f"{path}: there is no such file"]) from None
     except IsADirectoryError:

@@ -8,6 +8,7 @@ import re
 import stat
 from pathlib import Path
 
+from gateway import files
 from gateway.errors import ConfigError
 
 PASSWORD_VARIABLE = "PLC_GATEWAY_ZENOH_PASSWORD"  # noqa: S105  (the name of a variable)
@@ -31,7 +32,7 @@ def readable_secret(path: Path, called: str) -> str:
     """Returns the text of a file that is closed to others. Raises `ConfigError`."""
     closed_to_others(path, called)
     try:
-        return path.read_text(encoding="utf-8")
+        return files.read(path, files.MOST_OF_SECRETS).decode()
     except OSError as error:
         raise ConfigError(f"{called} {path}: {error.strerror}") from None
     except UnicodeDecodeError:

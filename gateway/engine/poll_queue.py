@@ -157,6 +157,8 @@ class PollQueue:
         if len(heap) > own.most:
             heap[:] = [entry for entry in heap if _is_valid(entry)]
             own.most = _tidy(heap)
+            if not heap:  # its device went offline while it waited, as did all others
+                return
         if self._shared and own.place != LATE and heap[0][2] is poll:
             self._place(own)
 

@@ -3,6 +3,7 @@
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from itertools import takewhile
 from typing import NamedTuple
 
 from gateway.engine.device import Device
@@ -15,7 +16,8 @@ from gateway.tags import Tag, WriteResult
 from gateway.values import Value
 
 WRITE_EXPIRY = 5.0  # seconds after which a waiting request is no longer sent
-MOST_WAITING = 1000  # requests
+MOST_WAITING = 1000  # writes and commands
+MOST_PEEKS = 16  # any client that may read can send them
 
 
 class Peeked(NamedTuple):
@@ -152,6 +154,10 @@ def why_not_commanded(driver: AnyDriver, command: str, *, control: bool) -> str:
     return "" if control else "`control: true` is missing in the file"
 
 
+def _is_peek(request: Request) -> bool:
+    return isinstance(request, Command) and request.span is not None
+
+
 class Companions(NamedTuple):
     """Writes that share one request. `run`: the addresses that they fill; None: scattered."""
 
@@ -177,7 +183,10 @@ def _scattered(writes: Sequence[Write]) -> int:
 
 
 class RequestQueue:
-    """The waiting requests of one line. Requests to one device keep their order."""
+    """The waiting requests of one line. Requests to one device keep their order.
+
+    Peeks wait behind all others, and have places of their own.
+    """
 
     def __init__(self) -> None:
         self.waiting: deque[Request] = deque()
@@ -195,10 +204,17 @@ class RequestQueue:
         return None
 
     def submit(self, request: Request) -> bool:
-        """Adds a request. Returns False if too many requests wait already."""
-        if len(self.waiting) >= MOST_WAITING:
+        """Adds a request. Returns False if too many of its kind wait already."""
+        peeks = self._peeks()
+        others = len(self.waiting) - peeks
+        if _is_peek(request):
+            if peeks >= MOST_PEEKS:
+                return False
+            self.waiting.append(request)
+            return True
+        if others >= MOST_WAITING:
             return False
-        self.waiting.append(request)
+        self.waiting.insert(others, request)
         return True
 
     def superseded(self, write: Write) -> list[Request]:
@@ -259,7 +275,11 @@ class RequestQueue:
         return found
 
     def has_room(self, count: int) -> bool:
-        return len(self.waiting) + count <= MOST_WAITING
+        return len(self.waiting) - self._peeks() + count <= MOST_WAITING
+
+    def _peeks(self) -> int:
+        """Counts from the end, where all of them are."""
+        return sum(1 for _ in takewhile(_is_peek, reversed(self.waiting)))
 
     def expired(self, now: float) -> list[Request]:
         """Takes out the requests that have waited too long."""

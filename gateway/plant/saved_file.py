@@ -10,6 +10,8 @@ from typing import TypeVar
 import orjson
 import structlog
 
+from gateway import files
+
 log = structlog.get_logger("gateway")
 T = TypeVar("T")
 
@@ -79,7 +81,7 @@ class SavedFile:
         """Returns the parsed content; None without a file. Moves a file aside that `parse` refuses
         by ValueError, TypeError, KeyError or AttributeError."""
         try:
-            data = self._path.read_bytes()
+            data = files.read(self._path)
         except FileNotFoundError:
             return None
         except OSError as error:

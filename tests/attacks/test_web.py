@@ -3,6 +3,7 @@
 import json
 import re
 import signal
+import socket
 import subprocess
 import urllib.error
 import urllib.request
@@ -14,6 +15,7 @@ from typing import Any, NamedTuple
 import pytest
 import yaml
 
+from gateway.parts.web.connections import MOST_CONNECTIONS
 from tests.conftest import needs
 from tests.e2e.processes import (
     ROOT,
@@ -145,6 +147,17 @@ def test_a_write_over_http_is_done_and_recorded_with_its_name(page: Page) -> Non
     page.program.says("tag written", "web alice", "mixer/recipe")
     written = re.compile(r'writes_total{outcome="written"} [1-9]')
     until(lambda: bool(written.search(page.ask("/metrics")[1])), "the write is counted")
+
+
+def test_connections_that_send_nothing_close_the_page_to_nobody(page: Page) -> None:
+    with ExitStack() as stack:
+        idle = [
+            stack.enter_context(socket.create_connection(("127.0.0.1", page.port), timeout=10))
+            for _ in range(MOST_CONNECTIONS + 50)
+        ]
+        assert [page.ask(path)[0] for path in ("/healthz", "/readyz", "/metrics", "/")] == 4 * [200]
+        assert [one.recv(1) for one in idle[:50]] == 50 * [b""]  # those were the idlest
+    assert page.program.running
 
 
 VALUES = '[...document.querySelectorAll("#values tr")].map((row) => row.cells[1].textContent)'

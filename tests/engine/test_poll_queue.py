@@ -3,6 +3,9 @@
 import random
 
 import pytest
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, rule
 
 from gateway.engine.device import Device
 from gateway.engine.jobs import EXPEDITED, NOT_QUEUED, Poll
@@ -149,3 +152,91 @@ def test_late_polls_go_by_use_of_the_wire_and_others_by_deadline(seed: int) -> N
             each.ticket = NOT_QUEUED
             each.due = now + chance.choice((0.0, 0.5, 4.0))
             made.push(each)
+
+
+class AnyOrder(RuleBasedStateMachine):
+    """The calls of a schedule to its queue, in any order, and what must be due after each."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.now = 0.0
+        self.devices = [online(1), online(2)]
+        self.polls = [poll for of in self.devices for poll in polls(of, *[0.0] * (ROOM + 4))]
+        self.taken: list[Poll] = []
+        self.queue = queue(*self.polls)
+
+    @rule(which=st.integers(0, 99), pause=st.sampled_from([0.0, 0.5, 4.0]), times=st.integers(1, 9))
+    def add(self, which: int, pause: float, times: int) -> None:
+        poll = self.polls[which % len(self.polls)]
+        for _ in range(times):
+            poll.due = self.now + pause
+            self.queue.push(poll)
+
+    @rule(pause=st.sampled_from([0.0, 0.3, 1.5, 9.0]))
+    def ripen(self, pause: float) -> None:
+        self.now += pause
+        assert self.queue.ripen(self.now) is bool(self.due() or self.queue.expedited)
+        due, late = self.due(), [poll for poll in self.due() if poll.deadline < self.now]
+        found = self.queue.due
+        assert (found is not None) is bool(due)
+        if found is not None and late:
+            assert found.deadline == min(p.deadline for p in late if p.device is found.device)
+            assert found.device.use == min(poll.device.use for poll in late)
+        elif found is not None:
+            assert found.deadline == min(poll.deadline for poll in due)
+
+    @rule(took=st.sampled_from([0.02, 0.6]), together=st.integers(0, 3))
+    def take(self, took: float, together: int) -> None:
+        self.ripen(0.0)
+        poll = self.queue.due
+        if poll is None:
+            return
+        poll.ticket = NOT_QUEUED
+        for each in (poll, *self.queue.more(poll.device, together)):
+            each.ticket = NOT_QUEUED
+            self.taken.append(each)
+        poll.device.used(self.now + took, self.now)
+        self.now += took
+
+    @rule(pause=st.sampled_from([0.0, 1.0]))
+    def put_back(self, pause: float) -> None:
+        for poll in self.taken:
+            poll.due = self.now + pause
+            self.queue.push(poll)
+        self.taken.clear()
+
+    @rule(which=st.integers(0, 1))
+    def goes_offline(self, which: int) -> None:
+        if self.devices[which].health.online:
+            self.devices[which].health.gave_up(self.now, 1.0)
+
+    @rule(which=st.integers(0, 1))
+    def comes_online(self, which: int) -> None:
+        of = self.devices[which]
+        if of.health.answered():
+            self.replace(of, polls(of, *[self.now] * (ROOM + 4)))
+
+    @rule(which=st.integers(0, 1), count=st.integers(1, 3))
+    def planned(self, which: int, count: int) -> None:
+        self.replace(self.devices[which], polls(self.devices[which], *[self.now] * count))
+
+    @rule()
+    def changed(self) -> None:
+        expedited = list(self.queue.expedited)
+        self.queue = queue(*self.polls)
+        self.queue.expedited.extend(expedited)
+
+    def replace(self, of: Device, new: list[Poll]) -> None:
+        for poll in self.polls:
+            poll.live = poll.live and poll.device is not of
+        self.polls = [poll for poll in self.polls if poll.live] + new
+        self.taken = [poll for poll in self.taken if poll.live]
+        self.queue.push_all(new)
+
+    def due(self) -> list[Poll]:
+        ready = (poll for poll in self.polls if poll.device.health.online)
+        return [p for p in ready if p.due <= self.now and p.ticket > NOT_QUEUED]
+
+
+AnyOrder.TestCase.settings = settings(max_examples=80, stateful_step_count=30, deadline=None)
+TestAnyOrder = AnyOrder.TestCase

@@ -1113,8 +1113,8 @@ MUTANTS = (
     Mutant(
         "the history may be any file of the gateway",
         "config/file_rules.py",
-        "            if any(_same(",
-        "            if False and any(_same(",
+        "            if any(files.are_same(",
+        "            if False and any(files.are_same(",
         "tests/attacks/test_own_files.py",
     ),
     Mutant(
@@ -2202,7 +2202,7 @@ MUTANTS = (
     ),
     Mutant(
         "a formula is calculated in binary fractions",
-        "tags/formula.py",
+        "values/numerals.py",
         "Decimal(repr(value)) if",
         "Decimal(value) if",
         "tests/tags/test_computed.py",

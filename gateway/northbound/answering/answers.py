@@ -22,7 +22,7 @@ log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 
 Answer = Callable[[zenoh.Query], None]
 
-OPEN_LIMIT = 1024  # queries taken and not finished
+OPEN_LIMIT = 1024  # queries of one kind, reads or requests, taken and not finished
 WIDE_LIMIT = 64  # of these, wildcards
 HISTORY_LIMIT = 16  # of these, history
 _NARROW_THREADS = 32
@@ -40,7 +40,7 @@ class QueryCounters:
 
 
 class AnswerPool:
-    """Bounds the open queries and sends every reply on a thread."""
+    """Bounds the open queries of one kind and sends every reply on a thread."""
 
     def __init__(self, refuse: Answer) -> None:
         """`refuse` replies that the gateway is busy; it is called on an answering thread."""

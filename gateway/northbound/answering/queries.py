@@ -25,6 +25,7 @@ from gateway.northbound.answering.replies import Replies
 from gateway.northbound.answering.tag_index import TagIndex
 from gateway.northbound.requests.acceptance import encoding_of, sender
 from gateway.northbound.requests.commands import Commands
+from gateway.northbound.requests.inbox import Inbox
 from gateway.northbound.requests.orders import Orders
 from gateway.northbound.requests.writes import ANSWER_WITHIN, Writes
 from gateway.tags import Tag, WriteResult
@@ -61,27 +62,43 @@ class Queries:
         self._documents = documents
         self._orders = orders
         self._parts = parts
-        self._pool = AnswerPool(partial(replies.outcome, _BUSY))
+        busy = partial(replies.outcome, _BUSY)
+        # Reads take neither the places nor the threads of writes.
+        self._reads, self._requests = AnswerPool(busy), AnswerPool(busy)
         self._tasks: set[asyncio.Task[None]] = set()
 
     @property
     def counters(self) -> QueryCounters:
-        return self._pool.counters
+        one, other = self._reads.counters, self._requests.counters
+        return QueryCounters(one.queries + other.queries, one.refused + other.refused)
+
+    def inbox(self) -> Callable[[zenoh.Query], None]:
+        """Returns the entry for Zenoh's thread: reads wait for the loop apart from requests."""
+        reads, requests = (Inbox(self.take, self.refuse) for _ in range(2))
+
+        def taken(query: zenoh.Query) -> None:
+            is_request = _is_request(query, parse_key(str(query.key_expr)))
+            (requests if is_request else reads)(query)
+
+        return taken
 
     def refuse(self, query: zenoh.Query) -> None:
         """Called on Zenoh's thread when the inbox is full."""
-        if self._is_foreign(parse_key(str(query.key_expr))):
-            self._pool.dismiss(query)
+        parsed = parse_key(str(query.key_expr))
+        pool = self._pool(query, parsed)
+        if self._is_foreign(parsed):
+            pool.dismiss(query)
         else:
-            self._pool.refuse(query)
+            pool.refuse(query)
 
     def take(self, query: zenoh.Query, at: float) -> None:
         """Starts the answer to one query. `at`: when it arrived."""
         parsed = parse_key(str(query.key_expr))
+        pool = self._pool(query, parsed)
         if self._is_foreign(parsed):
-            self._pool.dismiss(query)
+            pool.dismiss(query)
             return
-        if not self._pool.admit(query):
+        if not pool.admit(query):
             return
         match parsed.family:
             case Family.SET | Family.COMMAND | Family.PEEK:
@@ -92,13 +109,16 @@ class Queries:
                 self._take_status(query)
             case Family.VALUE if is_of_past(query.parameters):
                 history = partial(self._replies.history, parsed, time.time_ns())
-                self._pool.answer_history(query, history)
+                self._reads.answer_history(query, history)
             case Family.VALUE if query.parameters.get("max_age") is not None:
                 self._take_fresh(query, parsed)
             case _ if parsed.has_wildcard or parsed.family is Family.BLOCK:
-                self._pool.answer_wide(query, partial(self._replies.current, parsed))
+                self._reads.answer_wide(query, partial(self._replies.current, parsed))
             case _:
-                self._pool.answer(query, partial(self._replies.current, parsed))
+                self._reads.answer(query, partial(self._replies.current, parsed))
+
+    def _pool(self, query: zenoh.Query, parsed: ParsedKey) -> AnswerPool:
+        return self._requests if _is_request(query, parsed) else self._reads
 
     def _is_foreign(self, parsed: ParsedKey) -> bool:
         """True for a write or command to a device of another gateway, or of none.
@@ -111,13 +131,13 @@ class Queries:
     def _take_fresh(self, query: zenoh.Query, parsed: ParsedKey) -> None:
         if not parsed.has_wildcard:
             self._start(self._fresh(query, parsed))
-        elif self._pool.admit_wide(query):
+        elif self._reads.admit_wide(query):
             task = self._start(self._fresh(query, parsed))
-            task.add_done_callback(lambda _: self._pool.release_wide())
+            task.add_done_callback(lambda _: self._reads.release_wide())
 
     def _take_status(self, query: zenoh.Query) -> None:
         if query.parameters.get("_time") is not None:
-            self._pool.answer_history(query, partial(self._replies.writes, time.time_ns()))
+            self._reads.answer_history(query, partial(self._replies.writes, time.time_ns()))
         else:
             self._start(self._status(query))
 
@@ -126,24 +146,26 @@ class Queries:
             self._start(self._order(query, part, at))
         elif query.parameters.get("_time") is not None:
             past = partial(self._replies.past_entries, part, time.time_ns())
-            self._pool.answer_history(query, past)
+            self._reads.answer_history(query, past)
         elif parsed.has_wildcard:
-            self._pool.answer_wide(query, partial(self._replies.entries, part))
+            self._reads.answer_wide(query, partial(self._replies.entries, part))
         else:
-            self._pool.answer(query, partial(self._replies.entries, part))
+            self._reads.answer(query, partial(self._replies.entries, part))
 
     async def close(self) -> None:
         """Ends the queries that wait for devices; their replies get half a second to leave."""
-        self._pool.close()
+        self._reads.close()
+        self._requests.close()
         self._replies.end()
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
-        await self._pool.drain()
+        await asyncio.gather(self._reads.drain(), self._requests.drain())
 
     def end(self) -> None:
         """Ends the answering threads, after the session is closed."""
-        self._pool.end()
+        self._reads.end()
+        self._requests.end()
 
     async def _request(self, query: zenoh.Query, parsed: ParsedKey, at: float) -> None:
         match parsed.family:
@@ -160,7 +182,7 @@ class Queries:
         try:
             result = await self._writes.write(key, _data(query), by)
         finally:
-            self._pool.answer(query, partial(self._replies.outcome, result))
+            self._requests.answer(query, partial(self._replies.outcome, result))
 
     async def _order(self, query: zenoh.Query, part: str, at: float) -> None:
         result: bytes | Failure = _ENDING
@@ -168,7 +190,7 @@ class Queries:
         try:
             result = await self._orders.execute(part, key, _data(query) or b"", by)
         finally:
-            self._pool.answer(query, partial(self._replies.ordered, result))
+            self._requests.answer(query, partial(self._replies.ordered, result))
 
     async def _command(self, query: zenoh.Query, at: float) -> None:
         result: CommandResult | Failure = _ENDING
@@ -176,7 +198,7 @@ class Queries:
         try:
             result = await self._commands.execute(key, _data(query), by)
         finally:
-            self._pool.answer(query, partial(self._commands.reply, result))
+            self._requests.answer(query, partial(self._commands.reply, result))
 
     async def _peek(self, query: zenoh.Query, parsed: ParsedKey) -> None:
         result: Peeked | Failure = _ENDING
@@ -194,14 +216,14 @@ class Queries:
         except GatewayError as error:
             result = payload.failure(error)
         finally:
-            self._pool.answer(query, partial(self._replies.peeked, result))
+            self._reads.answer(query, partial(self._replies.peeked, result))
 
     async def _status(self, query: zenoh.Query) -> None:
         documents: dict[str, bytes] = {}
         try:
             documents = await self._documents()
         finally:
-            self._pool.answer(query, partial(self._replies.status, documents))
+            self._reads.answer(query, partial(self._replies.status, documents))
 
     async def _fresh(self, query: zenoh.Query, parsed: ParsedKey) -> None:
         answer: Answer = partial(self._replies.outcome, _ENDING)
@@ -212,7 +234,7 @@ class Queries:
         except BadValue as error:
             answer = partial(self._replies.outcome, Failure(Problem.BAD_QUERY, str(error)))
         finally:
-            self._pool.answer(query, answer)
+            self._reads.answer(query, answer)
 
     async def _read(self, tags: Sequence[Tag], age_text: str) -> list[Tag]:
         """Reads the tags that are too old or become so meanwhile, each once at most.
@@ -253,6 +275,13 @@ class Queries:
         self._tasks.discard(task)
         if not task.cancelled() and (error := task.exception()):
             log.error("query crashed", exc_info=error)
+
+
+def _is_request(query: zenoh.Query, parsed: ParsedKey) -> bool:
+    """True for a write, a command, and an order to a part."""
+    if parsed.family is Family.STATUS:
+        return query.payload is not None and part_of(parsed.target) != ""
+    return parsed.family in (Family.SET, Family.COMMAND)
 
 
 def _data(query: zenoh.Query) -> bytes | None:

@@ -96,10 +96,9 @@ class Incoming:
             self._parts,
         )
         self._puts = PutWrites(writes, self._index)
-        queries = Inbox(self._queries.take, self._queries.refuse)
         puts = Inbox(self._puts.take, self._puts.refuse)
         self._declarations = Declarations(
-            session, self._keys, self._plant, self._index, queries, puts
+            session, self._keys, self._plant, self._index, self._queries.inbox(), puts
         )
         return self._declarations
 
@@ -143,7 +142,7 @@ class Declarations:
         keys: Keys,
         plant: Plant,
         index: TagIndex,
-        queries: Inbox[zenoh.Query],
+        queries: Callable[[zenoh.Query], None],
         puts: Inbox[zenoh.Sample],
     ) -> None:
         self._session = session

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import zenoh
 
+from gateway import files
 from gateway.config import TlsConfig, ZenohConfig, ZenohMode, parsers
 from gateway.contract import secrets
 from gateway.errors import ConfigError
@@ -107,7 +108,7 @@ def _from_file(path: Path) -> zenoh.Config:
     called = "zenoh config_file"
     text = ""
     try:
-        text = path.read_text(encoding="utf-8")
+        text = files.read(path, files.MOST_OF_SECRETS).decode()
         config = zenoh.Config.from_json5(text)
     except OSError as error:
         raise ConfigError(f"{called} {path}: {error.strerror}") from None

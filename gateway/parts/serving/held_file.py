@@ -6,6 +6,7 @@ from pathlib import Path
 
 import structlog
 
+from gateway import files
 from gateway.errors import Busy
 from gateway.stations.served.held import from_text, to_text
 from gateway.tags import Tag
@@ -23,7 +24,7 @@ class HeldFile:
     def load(self, tags: Iterable[Tag]) -> dict[Tag, Value]:
         """Returns the values of the tags. Moves a file aside that cannot be parsed."""
         try:
-            return from_text(self._path.read_bytes(), tags)
+            return from_text(files.read(self._path), tags)
         except FileNotFoundError:
             return {}
         except OSError as error:

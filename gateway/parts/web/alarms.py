@@ -8,8 +8,8 @@ from aiohttp import web
 from gateway.contract import payload
 from gateway.contract.payload import Failure, Problem
 from gateway.errors import BadValue
-from gateway.parts.web.guard import BY, answer
-from gateway.parts.web.replies import BODY_WITHIN, json_off_loop, limit, raw
+from gateway.parts.web.guard import BY
+from gateway.parts.web.replies import answer, body, json_off_loop, limit, raw
 from gateway.plant.part import Core, Listed
 
 MOST_ITEMS = 1000  # of one page
@@ -51,11 +51,7 @@ class AlarmApi:
         arrived = asyncio.get_running_loop().time()
         if request.content_type != "application/json":
             return answer(415, "send the operator's name as Content-Type: application/json")
-        try:
-            async with asyncio.timeout(BODY_WITHIN):
-                name, data = request.query.get("alarm", ""), await request.read()
-        except TimeoutError:
-            return answer(408, f"the body did not arrive within {BODY_WITHIN:g} s")
+        name, data = request.query.get("alarm", ""), await body(request)
         result = await self._north.order("alarms", name, data, f"web {request[BY]}", arrived)
         if isinstance(result, Failure):
             return raw(payload.outcome(result), _STATUS.get(result.problem, 503))

@@ -22,8 +22,10 @@ from gateway.contract.meta import meta_fields
 from gateway.contract.payload import Problem
 from gateway.contract.question import question
 from gateway.errors import BadValue, Busy, GatewayError
-from gateway.parts.web.guard import BY, answer
-from gateway.parts.web.replies import BODY_WITHIN, as_json, json_off_loop, raw
+from gateway.parts.web.connections import client_of
+from gateway.parts.web.guard import BY
+from gateway.parts.web.places import Places
+from gateway.parts.web.replies import answer, as_json, body, count, json_off_loop, raw
 from gateway.parts.web.replies import limit as limit_of
 from gateway.plant.part import Core
 from gateway.plant.threads import off_loop
@@ -37,6 +39,9 @@ _ITEMS = 200
 _SAMPLES = 1000
 HISTORY_WITHIN = 20.0  # seconds for one query
 HISTORY_AT_ONCE = 4  # queries; they read the disk
+HISTORY_WAITING = 16  # queries at once and waiting, and of one client; beyond, 503
+HISTORY_OF_CLIENT = 12
+MOST_NUMBER = 10**8  # of a transfer
 # 200 only for an acknowledged write. 502 and above: it was sent, or the device cannot be reached.
 _STATUS = {
     Problem.BAD_VALUE: 400,
@@ -61,6 +66,7 @@ class Api:
         self._core = core
         self._known: tuple[object, Mapping[str, Sequence[Tag]]] = (None, {})
         self._history_turns = asyncio.Semaphore(HISTORY_AT_ONCE)
+        self._history_places = Places(HISTORY_WAITING, HISTORY_OF_CLIENT, "queries of history")
 
     def routes(self) -> list[web.RouteDef]:
         return [
@@ -90,13 +96,12 @@ class Api:
         return await json_off_loop(lambda: {"lines": dict(below("lines/", documents))})
 
     async def _transfers(self, request: web.Request) -> web.Response:
-        limit, after = limit_of(request, _ITEMS, MOST_ITEMS), request.query.get("after", "0")
-        if not after.isdecimal():
-            return answer(400, f"after={payload.short(after)} is no number of a transfer")
+        limit = limit_of(request, _ITEMS, MOST_ITEMS)
+        after = count(request, "after", 0, 0, MOST_NUMBER)
         documents = await self._north.documents(STATE_AGE)
 
         def page() -> object:
-            found = [one for one in transfers(documents) if int(one[0]) > int(after)]
+            found = [one for one in transfers(documents) if int(one[0]) > after]
             shown = [{"transfer": int(number), **one} for number, one in found[:limit]]
             return {"transfers": shown, "next": found[limit - 1][0] if found[limit:] else None}
 
@@ -175,8 +180,9 @@ class Api:
             except GatewayError as error:
                 return error
 
-        async with self._history_turns:
-            found = await off_loop(read)
+        with self._history_places.taken(client_of(request.transport)):
+            async with self._history_turns:
+                found = await off_loop(read)
         if isinstance(found, GatewayError):
             return answer(400 if isinstance(found, BadValue) else 503, str(found))
         return await json_off_loop(lambda: found)
@@ -185,11 +191,7 @@ class Api:
         arrived = asyncio.get_running_loop().time()
         if request.content_type != "application/json":
             return answer(415, "send the value as Content-Type: application/json")
-        try:
-            async with asyncio.timeout(BODY_WITHIN):
-                key, data = request.query.get("tag", ""), await request.read()
-        except TimeoutError:
-            return answer(408, f"the body did not arrive within {BODY_WITHIN:g} s")
+        key, data = request.query.get("tag", ""), await body(request)
         # The server does not cancel this when the client leaves: the write may be on the wire.
         result = await self._north.write(key, data, f"web {request[BY]}", arrived)
         failed = payload.failed(result)

@@ -9,22 +9,25 @@ import asyncio
 import json
 import time
 from collections import ChainMap, deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import islice
 from typing import Any
 
 import orjson
-from aiohttp import ClientConnectionResetError, web
+from aiohttp import web
 
 from gateway.contract import payload
 from gateway.contract.faults import Documents, below, transfers
 from gateway.parts.web.api import Api, overview
-from gateway.parts.web.guard import answer
+from gateway.parts.web.connections import client_of
+from gateway.parts.web.places import Places
+from gateway.parts.web.replies import drop
 from gateway.parts.web.wire import Recorder, Wires, as_fields
 from gateway.plant.part import Core, Shown
 from gateway.tags import Quality, Sample, Tag
 
-MOST_PAGES = 16
+MOST_PAGES = 20  # and of one client
+MOST_PAGES_OF_CLIENT = 16
 SLOW = 5.0  # seconds
 WIRE_EVERY = 0.25  # seconds between two events with exchanges
 VALUES_EVERY = 1.0
@@ -76,12 +79,16 @@ class Loads:
 class Events:
     """The handler of `/api/events`."""
 
-    def __init__(self, core: Core, api: Api, loads: Loads) -> None:
+    def __init__(
+        self, core: Core, api: Api, loads: Loads, allowed: Callable[[web.Request], bool]
+    ) -> None:
+        """`allowed`: False when the token of a request was withdrawn."""
         self._core = core
         self._api = api
         self.loads = loads
+        self._allowed = allowed
         self.wires = Wires(core.plant)
-        self._pages = 0
+        self._pages = Places(MOST_PAGES, MOST_PAGES_OF_CLIENT, "pages")
         self._state: tuple[Documents, dict[str, Any]] = ({}, {})
 
     def state(self, documents: Documents) -> dict[str, Any]:
@@ -93,35 +100,37 @@ class Events:
 
     async def handle(self, request: web.Request) -> web.StreamResponse:
         """`line`: with its exchanges. `device`: with its values, from after the tag `after`."""
-        if self._pages >= MOST_PAGES:
-            return answer(503, f"{MOST_PAGES} pages are open already")
         query = request.query
         device = query.get("device")
         tags = None
         if device:
             tags = self._api.select(device, "", query.get("after"), TAGS_SHOWN)
-        self._pages += 1
-        try:
-            with self.wires.watched(query.get("line", "")) as recorder:
-                response = web.StreamResponse(headers={"Content-Type": "text/event-stream"})
-                response.headers["X-Accel-Buffering"] = "no"  # a proxy passes events on at once
-                await response.prepare(request)
-                page = Page(self._core, self, tags, recorder)
-                await _send(request, response, page)
-        finally:
-            self._pages -= 1
+        with (
+            self._pages.taken(client_of(request.transport)),
+            self.wires.watched(query.get("line", "")) as recorder,
+        ):
+            response = web.StreamResponse(headers={"Content-Type": "text/event-stream"})
+            response.headers["X-Accel-Buffering"] = "no"  # a proxy passes events on at once
+            await response.prepare(request)
+            page = Page(self._core, self, tags, recorder)
+            await _send(request, response, page, self._allowed)
         return response
 
 
-async def _send(request: web.Request, response: web.StreamResponse, page: "Page") -> None:
-    while True:
+async def _send(
+    request: web.Request,
+    response: web.StreamResponse,
+    page: "Page",
+    allowed: Callable[[web.Request], bool],
+) -> None:
+    """Sends until the client leaves, takes nothing, or has no valid token any more."""
+    while allowed(request):
         data = await page.next()
         try:
             async with asyncio.timeout(SLOW):
                 await response.write(data)
-        except (TimeoutError, ClientConnectionResetError):
-            if request.transport is not None:
-                request.transport.abort()
+        except (TimeoutError, ConnectionError):
+            drop(request)
             return
         await asyncio.sleep(WIRE_EVERY)
 

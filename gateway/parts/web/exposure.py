@@ -17,8 +17,4 @@ def check(config: Config) -> list[str]:
         f"other machines can reach web.listen {web.host}:{web.port}: each request needs a token, "
         "but tokens and values are not encrypted; see docs/page.md"
     )
-    warning = (
-        f"other machines can reach web.listen {web.host}:{web.port}: each request needs a token, "
-        "but tokens and values are not encrypted; see docs/page.md"
-    )
     return [warning]

@@ -15,11 +15,17 @@ from aiohttp.typedefs import Handler, Middleware
 
 from gateway.config import WebConfig
 from gateway.contract.named_secrets import NamedSecrets
+from gateway.parts.web.connections import Connections, client_of
+from gateway.parts.web.places import Places
+from gateway.parts.web.replies import answer, send
 
 # Without a token at every address: the page itself holds no value.
 OPEN = frozenset({"/", "/page.js", "/page.css", "/openapi.json", "/healthz", "/readyz"})
 BY = web.RequestKey("by", str)  # the name of the token; empty without a valid one
-MOST_OPEN = 64  # requests at once; beyond, 503
+MOST_OPEN = 64  # requests at once, and of one client; beyond, 503
+MOST_OF_CLIENT = 40
+MOST_SCRAPES = 8
+MOST_SCRAPES_OF_CLIENT = 4
 _HEADERS = {
     "Content-Security-Policy": (
         "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
@@ -35,45 +41,63 @@ _HEADERS = {
 class Guard:
     """The middleware before every handler. Raises `ConfigError` for a bad tokens file."""
 
-    def __init__(self, config: WebConfig) -> None:
+    def __init__(self, config: WebConfig, connections: Connections) -> None:
         self._tokens = None
         if config.tokens_file is not None:
             self._tokens = NamedSecrets(config.tokens_file, "web.tokens_file")
         self._reads_need_token = not config.is_local
         self._names = {"localhost", socket.gethostname().lower(), *config.names}
-        self._open = 0
+        self._connections = connections
+        self._requests = Places(MOST_OPEN, MOST_OF_CLIENT, "requests")
+        self._scrapes = Places(MOST_SCRAPES, MOST_SCRAPES_OF_CLIENT, "scrapes")
 
     def middleware(self) -> Middleware:
         @web.middleware
         async def guarded(request: web.Request, handler: Handler) -> web.StreamResponse:
-            if (refusal := self._refusal(request)) is not None:
-                return refusal
-            self._open += 1
-            try:
-                return await handler(request)
-            except web.HTTPException as error:
-                return answer(error.status, error.reason)
-            finally:
-                self._open -= 1
+            with self._connections.busy(request.transport):
+                return await self._answered(request, handler)
 
         return guarded
+
+    async def _answered(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+        """Answers in a place of its kind: none is free of it until its client has the answer.
+
+        Files and probes need none, because they wait for nothing.
+        """
+        if (refusal := self._refusal(request)) is not None:
+            return await send(request, refusal)
+        if request.path in OPEN:
+            return await send(request, await _outcome(request, handler))
+        places = self._scrapes if request.path == "/metrics" else self._requests
+        try:
+            with places.taken(client_of(request.transport)):
+                return await send(request, await _outcome(request, handler))
+        except web.HTTPServiceUnavailable as error:
+            return await send(request, answer(error.status, error.reason))
 
     def _refusal(self, request: web.Request) -> web.Response | None:
         if not self._is_known(request.host):
             return answer(421, f"unknown name {request.host[:100]!r}: see web.names")
         if not _is_same_site(request):
             return answer(403, "pages of other sites may not use the gateway")
+        if not request.headers.get("Authorization", "").isascii():
+            return answer(400, "Authorization is no ASCII text")
         request[BY] = self._name(request)
-        needs_token = request.method != "GET" or self._reads_need_token
-        if needs_token and request.path not in OPEN and not request[BY]:
+        if self._needs_token(request) and not request[BY]:
             if self._tokens is None:
                 return answer(403, "nothing can be written here: the file has no web.tokens_file")
             refusal = answer(401, "a token is needed: send Authorization: Bearer <token>")
             refusal.headers["WWW-Authenticate"] = "Bearer"
             return refusal
-        if self._open >= MOST_OPEN:
-            return answer(503, f"{MOST_OPEN} requests are open already")
         return None
+
+    def allows(self, request: web.Request) -> bool:
+        """False when the token of a request was withdrawn since."""
+        return not self._needs_token(request) or bool(self._name(request))
+
+    def _needs_token(self, request: web.Request) -> bool:
+        needs_token = request.method != "GET" or self._reads_need_token
+        return needs_token and request.path not in OPEN
 
     def _is_known(self, host: str) -> bool:
         """True for an address, and for a name of this machine: rebinding needs a foreign name."""
@@ -99,6 +123,13 @@ class Guard:
         return found
 
 
+async def _outcome(request: web.Request, handler: Handler) -> web.StreamResponse:
+    try:
+        return await handler(request)
+    except web.HTTPException as error:
+        return answer(error.status, error.reason)
+
+
 def _is_same_site(request: web.Request) -> bool:
     if request.headers.get("Sec-Fetch-Site", "none") not in ("none", "same-origin"):
         return request.method == "GET" and request.path == "/"  # a link to the page
@@ -112,8 +143,3 @@ def _is_same_site(request: web.Request) -> bool:
 async def add_headers(_: web.Request, response: web.StreamResponse) -> None:
     """Called before the headers of each answer are sent."""
     response.headers.update(_HEADERS)
-
-
-def answer(status: int, error: str) -> web.Response:
-    """Returns an error as JSON."""
-    return web.json_response({"error": error}, status=status)

@@ -1,5 +1,6 @@
 """Replies of the JSON API, and the limits of its requests."""
 
+import asyncio
 from collections.abc import Callable
 
 import orjson
@@ -8,13 +9,63 @@ from aiohttp import web
 from gateway.plant.threads import off_loop
 
 BODY_WITHIN = 5.0  # seconds
+PIECE_WITHIN = 15.0  # seconds in which a client takes a piece of an answer
+_PIECE = 64 * 1024
 
 
 def limit(request: web.Request, default: int, most: int) -> int:
-    text = request.query.get("limit", str(default))
-    if not (text.isascii() and text.isdigit() and len(text) < 9 and 1 <= int(text) <= most):
-        raise web.HTTPBadRequest(reason=f"limit is no count from 1 to {most}")
+    return count(request, "limit", default, 1, most)
+
+
+def count(request: web.Request, name: str, default: int, least: int, most: int) -> int:
+    """Returns the number that a parameter gives. Raises `HTTPBadRequest`."""
+    text = request.query.get(name, str(default))
+    if not (text.isascii() and text.isdigit() and len(text) < 10 and least <= int(text) <= most):
+        raise web.HTTPBadRequest(reason=f"{name} is no number from {least} to {most}")
     return int(text)
+
+
+async def body(request: web.Request) -> bytes:
+    """Returns the body of a request. Raises `HTTPException`."""
+    try:
+        async with asyncio.timeout(BODY_WITHIN):
+            return await request.read()
+    except TimeoutError:
+        reason = f"the body did not arrive within {BODY_WITHIN:g} s"
+        raise web.HTTPRequestTimeout(reason=reason) from None
+    except web.RequestPayloadError:
+        raise web.HTTPBadRequest(reason="the body is not what its headers say") from None
+
+
+async def send(request: web.Request, found: web.StreamResponse) -> web.StreamResponse:
+    """Sends an answer in pieces. Closes the connection of a client that does not take one."""
+    if found.prepared or not isinstance(found, web.Response):
+        return found  # it was sent
+    data = memoryview(found.body if isinstance(found.body, bytes) else b"")
+    sent = web.StreamResponse(status=found.status, headers=found.headers)
+    sent.content_length = len(data)
+    loop = asyncio.get_running_loop()
+    try:
+        async with asyncio.timeout(PIECE_WITHIN) as limit:
+            await sent.prepare(request)
+            for start in range(0, len(data) if request.method != "HEAD" else 0, _PIECE):
+                await sent.write(data[start : start + _PIECE])
+                limit.reschedule(loop.time() + PIECE_WITHIN)
+            await sent.write_eof()
+    except (TimeoutError, ConnectionError):
+        drop(request)
+    return sent
+
+
+def drop(request: web.Request) -> None:
+    """Closes the connection at once."""
+    if request.transport is not None:
+        request.transport.abort()
+
+
+def answer(status: int, error: str) -> web.Response:
+    """Returns an error as JSON."""
+    return web.json_response({"error": error}, status=status)
 
 
 async def json_off_loop(make: Callable[[], object]) -> web.Response:

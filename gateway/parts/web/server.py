@@ -5,16 +5,19 @@ dropped, and answers of a large plant are made on threads.
 """
 
 import asyncio
+import logging
 import socket
 from contextlib import suppress
 
 import structlog
 from aiohttp import web
+from aiohttp.http_exceptions import HttpProcessingError
 
 from gateway.config import WebConfig
 from gateway.parts.web import assets, metrics
 from gateway.parts.web.alarms import AlarmApi
 from gateway.parts.web.api import Api
+from gateway.parts.web.connections import Connections
 from gateway.parts.web.events import Events, Loads
 from gateway.parts.web.guard import Guard, add_headers
 from gateway.plant.part import Core, Routed
@@ -22,14 +25,24 @@ from gateway.plant.threads import off_loop
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 
-MOST_CONNECTIONS = 128
 IDLE = 15.0  # seconds without a whole request until a connection is closed
 AGAIN = 10.0  # seconds until the address is tried again
 SCRAPE_AGE = 1.0  # seconds that the state in the metrics may be old
+_BACKLOG = 128  # connections that the system keeps until they are accepted
 _HEADER = 8190  # bytes of one line
 _ENDS_WITHIN = 0.2  # seconds for requests in progress when the gateway ends
 _LINGERS = 0.5  # seconds for the rest of a refused body
 _BUFFER = 64 * 1024  # bytes that the system keeps for a client: a slow one must not get old values
+
+
+def _is_fault_of_ours(record: logging.LogRecord) -> bool:
+    """False for bytes that are no HTTP: they may hold a token."""
+    found = record.exc_info and record.exc_info[1]
+    return not isinstance(found, HttpProcessingError | web.RequestPayloadError)
+
+
+_FAULTS = logging.getLogger(__name__)
+_FAULTS.addFilter(_is_fault_of_ours)
 
 
 class Server:
@@ -40,9 +53,9 @@ class Server:
         self._core = core
         self._api = Api(core)
         self._loads = Loads(core)
-        self._app = web.Application(
-            middlewares=[Guard(config).middleware()], client_max_size=64 * 1024
-        )
+        self._connections = Connections()
+        guard = Guard(config, self._connections)
+        self._app = web.Application(middlewares=[guard.middleware()], client_max_size=64 * 1024)
         self._app.on_response_prepare.append(add_headers)
         self._app.add_routes(
             [
@@ -50,7 +63,7 @@ class Server:
                 *AlarmApi(core).routes(),
                 *(route for part in core.others.each(Routed) for route in part.routes()),
                 *assets.routes(),
-                web.get("/api/events", Events(core, self._api, self._loads).handle),
+                web.get("/api/events", Events(core, self._api, self._loads, guard.allows).handle),
                 web.get("/healthz", self._health),
                 web.get("/readyz", self._ready),
                 web.get("/metrics", self._metrics),
@@ -69,6 +82,7 @@ class Server:
             self._app,
             handle_signals=False,
             access_log=None,
+            logger=_FAULTS,
             keepalive_timeout=IDLE,
             shutdown_timeout=_ENDS_WITHIN,
             lingering_time=_LINGERS,
@@ -99,13 +113,13 @@ class Server:
             raise AssertionError("the runner is not set up")
 
         def connection() -> asyncio.Protocol:
-            return handlers() if len(handlers.connections) < MOST_CONNECTIONS else _Refused()
+            return self._connections.wrapped(handlers())
 
         logged = ""
         while True:
             try:
                 server = await asyncio.get_running_loop().create_server(
-                    connection, self._config.host, self._config.port, backlog=MOST_CONNECTIONS
+                    connection, self._config.host, self._config.port, backlog=_BACKLOG
                 )
             except OSError as error:
                 if (why := error.strerror or str(error)) != logged:
@@ -139,10 +153,3 @@ class Server:
 
         body = await off_loop(text)
         return web.Response(body=body, headers={"Content-Type": metrics.CONTENT_TYPE})
-
-
-class _Refused(asyncio.Protocol):
-    """Closes a connection beyond the limit."""
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        transport.close()

@@ -4,6 +4,8 @@ import hashlib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
+from gateway import files as disk
+
 STILL = 1.0  # seconds
 LOOK_EVERY = 0.5  # seconds
 
@@ -49,6 +51,6 @@ def _state(file: Path) -> _State | None:
 
 def _digest(file: Path) -> bytes:
     try:
-        return hashlib.sha256(file.read_bytes()).digest()
+        return hashlib.sha256(disk.read(file)).digest()
     except OSError:
         return b""

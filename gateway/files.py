@@ -1,0 +1,60 @@
+"""Files that people write: read without waiting, whatever they are, and never without a limit."""
+
+import os
+import stat
+from errno import EFBIG, EINVAL
+from pathlib import Path
+
+MOST = 32 * 2**20  # bytes; a plant of 50,000 tags has 5 MB
+MOST_OF_SECRETS = 2**20
+LONGEST_NAME, LONGEST_PATH = 255, 4000  # bytes: what file systems take
+
+
+def read(path: Path, most: int = MOST) -> bytes:
+    """Returns the content of a regular file.
+
+    Raises `OSError` for everything else, with a sentence in `strerror`. A pipe without a writer
+    would wait for ever; a device may have no end.
+    """
+    try:
+        with open(path, "rb", opener=_without_waiting) as file:
+            found = os.fstat(file.fileno())
+            if not stat.S_ISREG(found.st_mode):
+                raise OSError(EINVAL, "this is no regular file")
+            data = b"" if found.st_size > most else file.read(most + 1)
+    except ValueError:
+        raise OSError(EINVAL, "no file can have this name") from None
+    if found.st_size > most or len(data) > most:
+        raise OSError(EFBIG, f"it has more than {most // 2**20} MB")
+    return data
+
+
+def is_file(path: Path) -> bool:
+    """Returns True for a regular file. No name of a file raises an error."""
+    try:
+        return stat.S_ISREG(path.stat().st_mode)
+    except (OSError, ValueError):
+        return False
+
+
+def are_same(one: Path, other: Path) -> bool:
+    """Returns True for one file, also with two names. Each may be replaced at any moment."""
+    try:
+        return os.path.realpath(one) == os.path.realpath(other) or one.samefile(other)
+    except (OSError, ValueError):
+        return False
+
+
+def is_name(path: str) -> bool:
+    """Returns True if a file can have this name on some file system."""
+    try:
+        octets = os.fsencode(path)
+    except ValueError:
+        return False
+    if len(octets) > LONGEST_PATH or b"\0" in octets or Path(path).name in ("", ".."):
+        return False
+    return max(map(len, octets.split(os.sep.encode()))) <= LONGEST_NAME
+
+
+def _without_waiting(path: str, flags: int) -> int:
+    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))

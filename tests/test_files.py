@@ -1,0 +1,72 @@
+"""Reading files that people write: no kind of file blocks, ends the process or fills the memory."""
+
+import os
+import socket
+from pathlib import Path
+
+import pytest
+
+from gateway import files
+
+
+def test_a_regular_file_is_read(tmp_path: Path) -> None:
+    file = tmp_path / "a"
+    file.write_bytes(b"12345")
+    assert (files.read(file), files.read(file, 5)) == (b"12345", b"12345")
+    assert files.is_file(file)
+
+
+def test_a_file_over_the_limit_is_refused_before_it_is_read(tmp_path: Path) -> None:
+    file = tmp_path / "a"
+    with file.open("wb") as sparse:
+        sparse.truncate(700 * 2**20)
+    with pytest.raises(OSError, match="it has more than 32 MB"):
+        files.read(file)
+
+
+def test_a_file_that_does_not_say_its_size_is_read_up_to_the_limit() -> None:
+    file = Path("/proc/self/status")
+    assert file.stat().st_size == 0
+    assert files.read(file)
+    with pytest.raises(OSError, match="it has more than 0 MB"):
+        files.read(file, 10)
+
+
+def test_anything_else_is_refused_at_once(tmp_path: Path) -> None:
+    """A pipe has no writer here: opened to be read it would wait for one."""
+    pipe, folder, loop, sock = (tmp_path / name for name in ("pipe", "folder", "loop", "socket"))
+    os.mkfifo(pipe)
+    folder.mkdir()
+    loop.symlink_to(loop)
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(str(sock))
+        others = (pipe, folder, loop, sock, tmp_path / "missing", Path("/dev/zero"))
+        for other in (*others, tmp_path / ("a" * 300), Path("a\0b"), Path("\ud800")):
+            with pytest.raises(OSError, match=r"\w"):
+                files.read(other)
+            assert not files.is_file(other)
+            assert not files.are_same(tmp_path / "one", other)
+
+
+def test_one_file_with_two_names_is_one(tmp_path: Path) -> None:
+    file, link, hard = tmp_path / "a", tmp_path / "b", tmp_path / "c"
+    file.touch()
+    link.symlink_to(file)
+    hard.hardlink_to(file)
+    assert files.are_same(file, link)
+    assert files.are_same(hard, file)
+    file.unlink()
+    assert not files.are_same(hard, file)
+    assert files.are_same(file, link), "it would be one, when it is written"
+
+
+@pytest.mark.parametrize(
+    "name", ["", ".", "/", "..", "a/..", "a\0b", "a" * 256, "a/" * 2001, "\ud800"]
+)
+def test_names_that_no_file_has(name: str) -> None:
+    assert not files.is_name(name)
+
+
+@pytest.mark.parametrize("name", ["a", "/a/b", "../a", "a" * 255, "~/x", "übung é"])
+def test_names_that_a_file_can_have(name: str) -> None:
+    assert files.is_name(name)
