@@ -62,7 +62,7 @@ class Bulkhead:
         self._core = core
         self._changed = changed
         self._pause = PAUSE_FIRST
-        self._since = 0.0
+        self._since = self._again_at = 0.0  # by the loop's clock
         self._work: asyncio.Task[None] | None = None
         self._keeper: asyncio.Task[None] | None = None
         self._activated: Part | None = None
@@ -140,6 +140,7 @@ class Bulkhead:
                 await self._run(self.part)
                 if asyncio.get_running_loop().time() - self._since > WORKED:
                     self._pause = PAUSE_FIRST
+            self._again_at = asyncio.get_running_loop().time() + self._pause
             await asyncio.sleep(self._pause)
             self._pause = min(2 * self._pause, PAUSE_LONGEST)
 
@@ -173,7 +174,12 @@ class Bulkhead:
         return self.part
 
     def document(self) -> Mapping[str, object]:
-        return {"works": not self.why, "why": self.why, "failures": self.failures}
+        """`again`: seconds until a stopped part is tried again."""
+        again = None
+        if self.why:
+            now = asyncio.get_running_loop().time()
+            again = max(0, round(self._again_at - now))
+        return {"why": self.why, "again": again, "failures": self.failures}
 
 
 class Bulkheads:

@@ -99,6 +99,10 @@ def _metrics(documents: Documents, plant: Plant, *, ready: bool) -> Iterator[Met
     for name, field, text in _ZENOH:
         yield _one(name, text, {}, documents["zenoh"].get(field, 0))
     yield from _transfers(documents)
+    parts = _family("part_working", "1: the part of the gateway works", "part")
+    for name, part in documents.get("parts", {}).items():
+        parts.add_metric([name], not part["why"])
+    yield parts
     alarms = _family("alarms", "Alarms by state", "state")
     for state, count in documents.get("alarms", {}).items():
         alarms.add_metric([state], count)
