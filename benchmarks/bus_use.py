@@ -27,8 +27,8 @@ from typing import NamedTuple
 import structlog
 
 from benchmarks.words import words
-from gateway.engine.device import Device
-from gateway.engine.device_settings import DeviceSettings
+from gateway.engine.device.device import Device
+from gateway.engine.device.device_settings import DeviceSettings
 from gateway.engine.engine import Engine
 from gateway.engine.forecast import forecast
 from gateway.errors import GatewayError

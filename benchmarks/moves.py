@@ -21,11 +21,11 @@ import structlog
 import gateway
 from benchmarks.transactions import VIGOR_STATION, process, tcp_opener
 from benchmarks.words import words
-from gateway.engine.device import Device
-from gateway.engine.device_settings import DeviceSettings
+from gateway.engine.device.device import Device
+from gateway.engine.device.device_settings import DeviceSettings
 from gateway.engine.engine import Engine
-from gateway.engine.jobs import Job, Poll
-from gateway.engine.requests import Write
+from gateway.engine.jobs.jobs import Job, Poll
+from gateway.engine.jobs.requests import Write
 from gateway.line.line import Line
 from gateway.planning.wire_timing import NETWORK_BAUD, WireTiming
 from gateway.protocols.vigor import Vigor

@@ -36,7 +36,7 @@ import zenoh
 
 from gateway.config import ZenohConfig, ZenohMode
 from gateway.contract.interfaces import NoParts
-from gateway.engine.requests import CommandResult, Peeked
+from gateway.engine.jobs.requests import CommandResult, Peeked
 from gateway.errors import GatewayError
 from gateway.line.send_permit import Duty
 from gateway.line.wire_log import WireLog

@@ -26,8 +26,8 @@ from pymodbus.client import AsyncModbusSerialClient, AsyncModbusTcpClient
 
 from benchmarks import bus_use, peers_requests, transactions
 from benchmarks.words import words
-from gateway.engine.device import Device
-from gateway.engine.device_settings import DeviceSettings
+from gateway.engine.device.device import Device
+from gateway.engine.device.device_settings import DeviceSettings
 from gateway.engine.engine import Engine
 from gateway.errors import GatewayError
 from gateway.line.line import Line

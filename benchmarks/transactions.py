@@ -30,8 +30,8 @@ import structlog
 from pymodbus.client import AsyncModbusSerialClient, AsyncModbusTcpClient
 
 from benchmarks.words import words
-from gateway.engine.device import Device
-from gateway.engine.device_settings import DeviceSettings
+from gateway.engine.device.device import Device
+from gateway.engine.device.device_settings import DeviceSettings
 from gateway.engine.engine import Engine
 from gateway.line.line import Line
 from gateway.planning.wire_timing import NETWORK_BAUD, WireTiming

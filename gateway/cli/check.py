@@ -14,8 +14,7 @@ from gateway.cli.progress import progress
 from gateway.cli.served_plan import served_plan
 from gateway.cli.terminal import FAILED, ConfigPath, err, out
 from gateway.config import Config, expanded_text, load, state_folder
-from gateway.engine.forecast import LineForecast
-from gateway.engine.listening import why_not_learned
+from gateway.engine.forecast import LineForecast, why_not_learned
 from gateway.northbound.northbound import check as zenoh_warnings
 from gateway.parts.history.place import trouble
 from gateway.parts.transfers.forecast import TransferForecast, forecasts, transfer_forecasts

@@ -14,9 +14,9 @@ from typing import Any, TypeVar
 from gateway.cli.logs import LogFormat, LogLevel, set_up
 from gateway.config import Config, LineConfig
 from gateway.config.commands import check_command, line_of
-from gateway.engine.device import Device
-from gateway.engine.requests import WRITE_EXPIRY, CommandResult
-from gateway.engine.unsolicited import unsolicited_tags
+from gateway.engine.device.device import Device
+from gateway.engine.forecast import unsolicited_tags
+from gateway.engine.jobs.requests import WRITE_EXPIRY, CommandResult
 from gateway.errors import BadValue, GatewayError, LineDown
 from gateway.line.groups import ended
 from gateway.line.line import Line, SampleSink

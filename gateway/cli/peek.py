@@ -20,7 +20,7 @@ from gateway.cli.peek_table import Cell, change_text, table_of
 from gateway.cli.terminal import FAILED, end, err, out
 from gateway.config import Config, built, load, parsers
 from gateway.config.yaml_scalars import scalar
-from gateway.engine.device import Device
+from gateway.engine.device.device import Device
 from gateway.errors import ConfigError, GatewayError
 from gateway.protocols.driver import Address, AnyDriver, Unit
 from gateway.protocols.ranges import addresses

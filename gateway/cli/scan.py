@@ -5,8 +5,8 @@ from dataclasses import dataclass, field, replace
 from itertools import product
 
 from gateway.config import parsers
-from gateway.engine.device import Device
-from gateway.engine.device_settings import DeviceSettings
+from gateway.engine.device.device import Device
+from gateway.engine.device.device_settings import DeviceSettings
 from gateway.errors import ConfigError, Garbled, LineDown, Refused, Unclear
 from gateway.line.channel import Channel, Echo
 from gateway.line.transaction import Transaction

@@ -7,7 +7,7 @@ from rich.table import Table
 from rich.text import Text
 
 from gateway.config import LineConfig
-from gateway.engine.device_settings import DeviceSettings
+from gateway.engine.device.device_settings import DeviceSettings
 from gateway.protocols.driver import Address, Span
 from gateway.stations.served.registers import Row, Served
 

@@ -15,7 +15,7 @@ from gateway.config.zenoh_records import LISTEN, NAME, TlsConfig, ZenohConfig, Z
 from gateway.errors import ConfigError
 
 if TYPE_CHECKING:
-    from gateway.engine.device_settings import DeviceSettings
+    from gateway.engine.device.device_settings import DeviceSettings
 
 T = TypeVar("T")
 

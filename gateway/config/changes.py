@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any
 
 from gateway.config.records import Config, LineConfig
-from gateway.engine.device_settings import DeviceSettings
+from gateway.engine.device.device_settings import DeviceSettings
 from gateway.tags import Tag
 
 # Parts of a configuration that a reload takes over. All others need a restart.

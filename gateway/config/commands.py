@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 
 from gateway.config import Config, LineConfig
-from gateway.engine.device_settings import DeviceSettings
-from gateway.engine.requests import why_not_commanded
+from gateway.engine.device.device_settings import DeviceSettings
+from gateway.engine.jobs.requests import why_not_commanded
 from gateway.errors import BadValue
 from gateway.protocols.capabilities import Controllable
 

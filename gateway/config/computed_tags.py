@@ -10,7 +10,7 @@ from gateway.config.messages import Mistakes, similar
 from gateway.config.records import LineConfig
 from gateway.config.shaping_rules import computed_shaping
 from gateway.config.tag_rules import inherit
-from gateway.engine.device_settings import DeviceSettings
+from gateway.engine.device.device_settings import DeviceSettings
 from gateway.errors import ConfigError
 from gateway.protocols.driver import Address, Span, Unit
 from gateway.tags import Tag

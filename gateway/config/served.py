@@ -10,7 +10,7 @@ from gateway.config import parsers
 from gateway.config.messages import Mistakes, Path, one_of, shown
 from gateway.config.model import DeviceSection, LineSection, TagDefaults
 from gateway.config.records import LineConfig
-from gateway.engine.device_settings import DeviceSettings
+from gateway.engine.device.device_settings import DeviceSettings
 from gateway.errors import ConfigError
 from gateway.protocols.driver import Address, AnyDriver, Area, Cost, Span, Timing, Traits
 from gateway.stations.served.registers import STALE_AFTER, Row, Served, cells_of

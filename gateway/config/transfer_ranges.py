@@ -12,7 +12,7 @@ from gateway.config.messages import Mistakes, Path, meant
 from gateway.config.model import TagDefaults, TagSection
 from gateway.config.records import LineConfig
 from gateway.config.tag_rules import TagSource, build_tag
-from gateway.engine.device_settings import DeviceSettings
+from gateway.engine.device.device_settings import DeviceSettings
 from gateway.errors import ConfigError
 from gateway.protocols.driver import Unit
 from gateway.protocols.ranges import addresses

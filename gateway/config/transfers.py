@@ -11,7 +11,7 @@ from gateway.config.served import sort_of
 from gateway.config.transfer_ranges import Ranges, is_range
 from gateway.config.transfer_settings import TransferSection
 from gateway.config.validate import section
-from gateway.engine.device_settings import DeviceSettings
+from gateway.engine.device.device_settings import DeviceSettings
 from gateway.errors import BadValue
 from gateway.protocols.driver import AnyDriver
 from gateway.protocols.unsolicited import Unsolicited

@@ -6,7 +6,7 @@ from typing import Any, Literal, Protocol, runtime_checkable
 from gateway.contract.buckets import Bucket, Now
 from gateway.contract.payload import Failure, GroupResult
 from gateway.contract.question import Question
-from gateway.engine.requests import CommandResult, Peeked
+from gateway.engine.jobs.requests import CommandResult, Peeked
 from gateway.errors import Busy, GatewayError
 from gateway.line.send_permit import Duty
 from gateway.line.wire_log import WireLog

@@ -14,7 +14,7 @@ from functools import lru_cache
 
 import orjson
 
-from gateway.engine.requests import CommandResult
+from gateway.engine.jobs.requests import CommandResult
 from gateway.errors import (
     BadValue,
     Busy,

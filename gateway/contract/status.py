@@ -3,13 +3,13 @@
 import math
 from collections.abc import Mapping, Sequence
 
-from gateway.engine.calls import Calls
-from gateway.engine.device import Device
+from gateway.engine.device.device import Device
+from gateway.engine.device.health import State
+from gateway.engine.device.records import CallRecord, CallState
+from gateway.engine.dial_schedule import DialSchedule
 from gateway.engine.engine import Engine
 from gateway.engine.forecast import LineForecast
-from gateway.engine.health import State
-from gateway.engine.jobs import Poll
-from gateway.engine.records import CallRecord, CallState
+from gateway.engine.jobs.jobs import Poll
 from gateway.planning.bad_addresses import BadRange
 from gateway.planning.planner import describe
 from gateway.tags.timestamps import rfc3339
@@ -79,7 +79,7 @@ def refused_sentence(device: Device, bad: BadRange) -> str:
 
 
 def line_document(
-    engine: Engine, expected: LineForecast, calls: Calls | None, now: float
+    engine: Engine, expected: LineForecast, calls: DialSchedule | None, now: float
 ) -> Document:
     """One line: the forecast and the measured figures. `now` by the loop's clock."""
     record = engine.record
@@ -114,7 +114,7 @@ def line_document(
     }
 
 
-def calls_document(record: CallRecord, calls: Calls | None, now: float) -> Document:
+def calls_document(record: CallRecord, calls: DialSchedule | None, now: float) -> Document:
     """The telephone calls of a line. `calls`: of a modem that dials, and is there."""
     waits = calls is not None and record.state is CallState.IDLE
     dials_at = calls.due(now) if calls is not None and waits else math.inf

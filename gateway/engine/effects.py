@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from gateway.engine.device import Device
-from gateway.engine.requests import Outcome, Request
+from gateway.engine.device.device import Device
+from gateway.engine.jobs.requests import Outcome, Request
 from gateway.tags import Reason, Sample, Tag, bad
 
 

@@ -9,11 +9,11 @@ other entries take requests, bytes and events of the port. Effects are returned 
 from collections.abc import Sequence
 from typing import Any, cast
 
-from gateway.engine.changes import Changes
-from gateway.engine.conclusions import Conclusions
-from gateway.engine.device import Device
+from gateway.engine.device.changes import Changes
+from gateway.engine.device.device import Device
+from gateway.engine.device.records import LineRecord
 from gateway.engine.effects import Effect, Effects
-from gateway.engine.jobs import (
+from gateway.engine.jobs.jobs import (
     Idle,
     InFlight,
     Job,
@@ -25,17 +25,17 @@ from gateway.engine.jobs import (
     WriteTogether,
     resync_around,
 )
-from gateway.engine.listening import ONLY_LISTENS, Listening, listens
-from gateway.engine.poll_results import PollResults
-from gateway.engine.records import LineRecord
-from gateway.engine.request_results import RequestResults
-from gateway.engine.requests import Request, Write, why_not_commanded
-from gateway.engine.results import Results, offline
-from gateway.engine.schedule import Schedule
-from gateway.engine.shorter_silences import ShorterSilences
-from gateway.engine.staleness import NEVER, Staleness
-from gateway.engine.stray import Stray
-from gateway.engine.unsolicited import UnsolicitedFrames
+from gateway.engine.jobs.requests import Request, Write, why_not_commanded
+from gateway.engine.results.health_rules import HealthRules, offline
+from gateway.engine.results.listening import ONLY_LISTENS, Listening, listens
+from gateway.engine.results.next_job import NextJob
+from gateway.engine.results.poll_rules import PollRules
+from gateway.engine.results.request_rules import RequestRules
+from gateway.engine.results.shorter_silences import ShorterSilences
+from gateway.engine.results.staleness import NEVER, Staleness
+from gateway.engine.results.stray import Stray
+from gateway.engine.results.unsolicited import UnsolicitedFrames
+from gateway.engine.schedule.schedule import Schedule
 from gateway.errors import BadValue, Busy, LineDown, Superseded
 from gateway.planning.wire_timing import WireTiming
 from gateway.tags import Reason, Tag
@@ -59,8 +59,8 @@ class Engine:
         self.name, self.wire = name, wire
         self._effects = Effects()
         self._staleness = Staleness(self.schedule, self._effects)
-        results = Results(name, self.schedule, self._staleness, self._effects)
-        self._polls = PollResults(self.schedule, results, self._effects)
+        results = HealthRules(name, self.schedule, self._staleness, self._effects)
+        self._polls = PollRules(self.schedule, results, self._effects)
         self._unsolicited: UnsolicitedFrames | Listening
         if listens(devices):
             self._unsolicited = Listening(devices, wire, results, self._effects)
@@ -69,8 +69,8 @@ class Engine:
         self._stray = Stray(name, devices, results, self._effects)
         self._in_flight = InFlight()
         gap = max(GAP, 4 * wire.character)
-        requests = RequestResults(self.schedule, results, self._effects)
-        self._conclusions = Conclusions(
+        requests = RequestRules(self.schedule, results, self._effects)
+        self._next_job = NextJob(
             *(self._in_flight, results, self._polls, requests),
             *(ShorterSilences(name, devices, self._effects), self._effects, gap),
         )
@@ -79,7 +79,7 @@ class Engine:
 
     def next(self, now: float) -> Job:
         """Returns the next job. All except `Idle` and `Reopen` are concluded before the next."""
-        shorter = self._conclusions.shorter
+        shorter = self._next_job.shorter
         if shorter.suspects:
             shorter.judge(now)
         job = self._next(now)
@@ -93,8 +93,8 @@ class Engine:
             return in_flight.resume(now)
         if in_flight.job is not None:
             raise AssertionError(f"{in_flight.job!r} is not concluded")
-        silence = self._conclusions.silence
-        may_reopen = silence.noted and not self.schedule.dials
+        silence = self._next_job.silence
+        may_reopen = silence.noted and not self.schedule.reaches_by_modem
         if may_reopen and silence.due <= now and silence.confirmed(self.schedule, self.devices):
             return silence.reopen(now)
         job: Transacted | Idle | None = None
@@ -121,7 +121,7 @@ class Engine:
 
         They share the transaction of `poll`; each is concluded by itself.
         """
-        most = self._conclusions.together.others(poll, now)
+        most = self._next_job.pipelining.others(poll, now)
         others = self.schedule.alongside(poll, most, now)
         self._in_flight.open_polls += len(others)
         self._in_flight.together += len(others)
@@ -137,17 +137,17 @@ class Engine:
         if isinstance(job, Poll):
             in_flight.open_polls -= 1
             if isinstance(result, Exception):
-                self._conclusions.poll_failed(job, result, now, time)
+                self._next_job.poll_failed(job, result, now, time)
             else:  # units are the only good result of a poll
-                if self._conclusions.silence.noted:
-                    self._conclusions.silence.heard()
+                if self._next_job.silence.noted:
+                    self._next_job.silence.heard()
                 self._polls.read(job, cast("Sequence[int]", result), now, time)
             if in_flight.open_polls:
                 return self._effects.take()
             if in_flight.failed or device.window > 1:
-                self._conclusions.polls_ended(job, traffic, now, time)
+                self._next_job.polls_ended(job, traffic, now, time)
         else:
-            self._conclusions.conclude(job, result, traffic, now, time)
+            self._next_job.conclude(job, result, traffic, now, time)
         if in_flight.continuation is None:
             in_flight.job = None
             in_flight.failed.clear()
@@ -162,7 +162,7 @@ class Engine:
         return effects
 
     def _count_silence(self, job: Transacted, result: Result, traffic: Traffic, now: float) -> None:
-        shorter, device = self._conclusions.shorter, job.device
+        shorter, device = self._next_job.shorter, job.device
         if isinstance(job, Poll) and not isinstance(result, Exception):
             shorter.spoke = device
             if traffic.silence < device.silence.tested_below:
@@ -203,7 +203,7 @@ class Engine:
             if why := why_not_commanded(device.driver, request.name, control=control):
                 self._effects.ended(request, BadValue(why))
                 return self._effects.take()
-        dials = self.schedule.dials  # for a request at once
+        dials = self.schedule.reaches_by_modem  # for a request at once
         if not (self.is_open or dials):
             why = self.record.trouble or f"line {self.name} is not open"
             self._effects.ended(request, LineDown(why))
@@ -234,10 +234,10 @@ class Engine:
             self.record.busy += len(data) * self.wire.character  # of another master
         else:
             self.record.unasked += len(data)
-            self._conclusions.shorter.disturbed(now)
+            self._next_job.shorter.disturbed(now)
             self._stray.received(data, now, time)
         if self._unsolicited.speakers:
-            self._conclusions.silence.heard()
+            self._next_job.silence.heard()
         self._unsolicited.received(data, now, time)
         self._set_deadline()
         return self._effects.take()
@@ -250,8 +250,8 @@ class Engine:
         `echo`: it is equal to the request.
         """
         if not echo:
-            self._conclusions.silence.heard()
-            self._conclusions.shorter.disturbed(now)
+            self._next_job.silence.heard()
+            self._next_job.shorter.disturbed(now)
         self._stray.unmatched(device, frame, now, time, echo=echo)
         self._unsolicited.unmatched(device, frame, now, time)
         self._set_deadline()
@@ -272,7 +272,7 @@ class Engine:
         self._staleness.change(changes, now, is_open=self.is_open)
         self._unsolicited.change(changes, now)
         self._stray.change(changes)
-        self._conclusions.change(changes, now)
+        self._next_job.change(changes, now)
         self._polls.change(changes)
         self._set_deadline()
         return self._effects.take()
@@ -292,7 +292,7 @@ class Engine:
 
     def inherits(self) -> None:
         """Notes that a device server may have kept requests of an earlier process."""
-        self._conclusions.inherits = True
+        self._next_job.inherits = True
 
     def opened(self, now: float) -> list[Effect]:
         """Starts all devices again, because the port was opened."""
@@ -300,8 +300,8 @@ class Engine:
         self.record.opened += 1
         self.record.since, self.record.trouble = now, ""
         self._in_flight.clear()
-        self._conclusions.silence.opened()
-        self._conclusions.shorter.opened(now)
+        self._next_job.silence.opened()
+        self._next_job.shorter.opened(now)
         for device in self.devices:
             device.restart()
         self.schedule.opened(now)
@@ -312,7 +312,7 @@ class Engine:
     def lost(self, error: LineDown, now: float, time: int) -> list[Effect]:
         """Turns every value bad, because the port was lost or could not be opened."""
         why = str(error)
-        self._conclusions.abandon(error, now)
+        self._next_job.abandon(error, now)
         if self.is_open:
             self.record.open_before += now - self.record.since
         self.record.trouble = self.record.last_trouble = why
@@ -324,7 +324,7 @@ class Engine:
 
     def stopped(self, now: float) -> list[Effect]:
         """Ends every request, because the gateway stops."""
-        self._conclusions.abandon(None, now)
+        self._next_job.abandon(None, now)
         return self._close()
 
     def _close(self, why: str = " went down") -> list[Effect]:

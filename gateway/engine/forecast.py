@@ -5,13 +5,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-from gateway.engine.ages import load_of, polled_blocks, worst_ages
-from gateway.engine.device import Device
-from gateway.engine.long_writes import long_write
-from gateway.engine.probes import seen_within
-from gateway.engine.reply_shapes import MARK_LONGEST
+from gateway.engine.device.ages import load_of, polled_blocks, worst_ages
+from gateway.engine.device.device import Device
+from gateway.engine.device.long_writes import long_write
+from gateway.engine.device.reply_shapes import MARK_LONGEST
+from gateway.engine.schedule.probes import seen_within
 from gateway.planning.planner import Block, shortest_round
 from gateway.planning.wire_timing import WireTiming
+from gateway.protocols.driver import AnyDriver
 from gateway.protocols.unsolicited import Unsolicited
 from gateway.tags import Tag
 
@@ -117,6 +118,23 @@ def _unsolicited_tags(device: Device) -> int:
     if not isinstance(driver, Unsolicited):
         return 0
     return sum(driver.unsolicited_only(tag.span) for tag in device.tags)
+
+
+def unsolicited_tags(device: Device) -> list[Tag]:
+    """Returns the tags whose values arrive without a request."""
+    driver = device.driver
+    if device.settings.listen_only:
+        return [*device.tags]
+    if not isinstance(driver, Unsolicited):
+        return []
+    return [tag for tag in device.tags if driver.unsolicited_only(tag.span)]
+
+
+def why_not_learned(driver: AnyDriver, tag: Tag) -> str:
+    """Returns why no traffic can bring the value; empty if it can be learned."""
+    if not driver.areas[tag.span.area].readable:
+        return "it cannot be read, so no reply holds it"
+    return ""
 
 
 def _round(device: Device) -> float:

@@ -5,7 +5,7 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import NoReturn, Protocol, runtime_checkable
 
-from gateway.engine.calls import CallRules, Calls
+from gateway.engine.dial_schedule import CallRules, DialSchedule
 from gateway.engine.effects import Effect
 from gateway.errors import CallEnded, LineDown
 from gateway.line.channel import Channel
@@ -73,10 +73,10 @@ class CallingLine(Protocol):
 
     async def serve(self, channel: Channel) -> None: ...
 
-    def end_call(self, calls: Calls, why: CallEnded | None) -> None: ...
+    def end_call(self, calls: DialSchedule, why: CallEnded | None) -> None: ...
 
 
-async def serve_calls(line: CallingLine, port: CallPort, calls: Calls) -> NoReturn:
+async def serve_calls(line: CallingLine, port: CallPort, calls: DialSchedule) -> NoReturn:
     """Serves one call after another, until the port of the modem is lost. Raises `LineDown`."""
     now = asyncio.get_running_loop().time
     try:
@@ -92,7 +92,9 @@ async def serve_calls(line: CallingLine, port: CallPort, calls: Calls) -> NoRetu
         raise
 
 
-async def _call(line: CallingLine, port: CallPort, calls: Calls, now: Callable[[], float]) -> None:
+async def _call(
+    line: CallingLine, port: CallPort, calls: DialSchedule, now: Callable[[], float]
+) -> None:
     """Makes one call. Raises `LineDown`."""
     ended: CallEnded | None = None
     try:

@@ -4,8 +4,8 @@ import asyncio
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol, runtime_checkable
 
-from gateway.engine.changes import Changes
-from gateway.engine.device_settings import DeviceSettings
+from gateway.engine.device.changes import Changes
+from gateway.engine.device.device_settings import DeviceSettings
 
 
 @runtime_checkable

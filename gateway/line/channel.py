@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import structlog
 
-from gateway.engine.unanswered import Unanswered
+from gateway.engine.jobs.unanswered import Unanswered
 from gateway.errors import Busy, Garbled, LineDown
 from gateway.line.wire_log import WireLog
 from gateway.planning.wire_timing import WireTiming

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import Any, NamedTuple, cast
 
-from gateway.engine.jobs import (
+from gateway.engine.jobs.jobs import (
     Answer,
     Confirm,
     Poll,
@@ -15,7 +15,7 @@ from gateway.engine.jobs import (
     WriteTogether,
     requests_of,
 )
-from gateway.engine.requests import Command, Write
+from gateway.engine.jobs.requests import Command, Write
 from gateway.line.wire_log import Performed
 from gateway.planning.planner import Block, describe
 from gateway.tags import Sample

@@ -13,14 +13,14 @@ from typing import Any, Protocol
 
 import structlog
 
-from gateway.engine.calls import Calls
-from gateway.engine.changes import Changes
-from gateway.engine.device import Device
-from gateway.engine.device_settings import DeviceSettings
+from gateway.engine.device.changes import Changes
+from gateway.engine.device.device import Device
+from gateway.engine.device.device_settings import DeviceSettings
+from gateway.engine.dial_schedule import DialSchedule
 from gateway.engine.effects import Effect, LogEvent, OnlineChange, Pause, RequestEnded, Samples
 from gateway.engine.engine import Engine
-from gateway.engine.jobs import Idle, Poll, Reopen, Result, Settle, Traffic
-from gateway.engine.requests import WRITE_EXPIRY, Command, Group, Outcome, Request, Write
+from gateway.engine.jobs.jobs import Idle, Poll, Reopen, Result, Settle, Traffic
+from gateway.engine.jobs.requests import WRITE_EXPIRY, Command, Group, Outcome, Request, Write
 from gateway.errors import CallEnded, GatewayError, LineDown
 from gateway.line.calling import CallPort, dialling, rules_of, serve_calls
 from gateway.line.changing import Changeable, WaitingChange
@@ -69,7 +69,7 @@ class Line:
         self._new_channel = channels(engine.name, engine.wire, echo, self.wire_log, duty.why_not)
         self._wall = wall
         self._random = random.Random(seed)  # noqa: S311  (jitter, not a secret)
-        self.calls: Calls | None = None  # while a modem is there
+        self.calls: DialSchedule | None = None  # while a modem is there
         self._channel: Channel | None = None
         self._transaction: Transaction | None = None
         self._lost: LineDown | None = None
@@ -224,7 +224,7 @@ class Line:
             self.deliver(self.engine.opened(_now()))
             self.tried.set()
             if isinstance(port, CallPort):
-                self.calls = Calls(self.engine, rules_of(port))
+                self.calls = DialSchedule(self.engine, rules_of(port))
                 await serve_calls(self, port, self.calls)
             await self.serve(channel)
         except LineDown as error:
@@ -242,7 +242,7 @@ class Line:
         channel.unanswered = self.engine.schedule.unanswered
         return channel
 
-    def end_call(self, calls: Calls, why: CallEnded | None) -> None:
+    def end_call(self, calls: DialSchedule, why: CallEnded | None) -> None:
         """Ends a telephone call, or a try of one. `why` None: it is complete."""
         working, self._transaction = self._transaction is not None, None
         if isinstance(self._lost, CallEnded):
@@ -261,7 +261,7 @@ class Line:
     async def _close(self) -> None:
         channel, self._channel = self._channel, None
         self._transaction = self.calls = None
-        self.engine.schedule.dials = False
+        self.engine.schedule.reaches_by_modem = False
         self._expiry.alarm.cancel()  # its timer would keep an ended line alive
         if channel is not None:
             await channel.close()

@@ -5,8 +5,9 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from gateway.engine.device import Device
-from gateway.engine.jobs import (
+from gateway.engine.device.device import Device
+from gateway.engine.device.long_writes import LongWrite
+from gateway.engine.jobs.jobs import (
     Answer,
     Confirm,
     HeldTogether,
@@ -21,9 +22,8 @@ from gateway.engine.jobs import (
     Transacted,
     WriteTogether,
 )
-from gateway.engine.long_writes import LongWrite
-from gateway.engine.requests import Command, Write
-from gateway.engine.runs import needs_read, own_units, together, verified
+from gateway.engine.jobs.requests import Command, Write
+from gateway.engine.jobs.runs import needs_read, own_units, together, verified
 from gateway.errors import (
     BadValue,
     Busy,

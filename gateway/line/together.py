@@ -3,7 +3,7 @@
 import asyncio
 from collections.abc import Callable, Sequence
 
-from gateway.engine.jobs import Poll, Result, Traffic
+from gateway.engine.jobs.jobs import Poll, Result, Traffic
 from gateway.line.channel import Channel
 from gateway.line.perform import perform
 from gateway.line.transaction import Transaction

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any, TypeVar
 
-from gateway.engine.device import Device
-from gateway.engine.jobs import Settled, Traffic
-from gateway.engine.unanswered import TimedOut
+from gateway.engine.device.device import Device
+from gateway.engine.jobs.jobs import Settled, Traffic
+from gateway.engine.jobs.unanswered import TimedOut
 from gateway.errors import DeviceError, Evidence, Garbled, LineDown, NoReply
 from gateway.line.channel import KEPT, NEVER, Channel
 from gateway.protocols.driver import Codec, EndedByGap

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-from gateway.engine.jobs import Result, Transacted
+from gateway.engine.jobs.jobs import Result, Transacted
 from gateway.tags import Sample
 
 

@@ -5,8 +5,8 @@ from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import replace
 
 from gateway.config import LineConfig
-from gateway.engine.device import Device
-from gateway.engine.device_settings import DeviceSettings
+from gateway.engine.device.device import Device
+from gateway.engine.device.device_settings import DeviceSettings
 from gateway.engine.engine import Engine
 from gateway.line.calling import ModemOpener
 from gateway.line.line import Line, SampleSink

@@ -5,8 +5,8 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
-from gateway.engine.device import Device
-from gateway.engine.jobs import Poll
+from gateway.engine.device.device import Device
+from gateway.engine.jobs.jobs import Poll
 from gateway.errors import Busy
 from gateway.line.line import Line
 from gateway.tags import Quality, Sample, Tag

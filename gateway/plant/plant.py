@@ -12,10 +12,10 @@ from gateway.config.changes import DeviceChange
 from gateway.config.commands import check_command, every_command, speaker
 from gateway.contract.faults import below
 from gateway.contract.status import Document, device_document, line_document
-from gateway.engine.device import Device
-from gateway.engine.device_settings import DeviceSettings
+from gateway.engine.device.device import Device
+from gateway.engine.device.device_settings import DeviceSettings
 from gateway.engine.forecast import LineForecast, forecast
-from gateway.engine.requests import WRITE_EXPIRY, CommandResult, Peeked
+from gateway.engine.jobs.requests import WRITE_EXPIRY, CommandResult, Peeked
 from gateway.errors import GatewayError
 from gateway.line.line import Line
 from gateway.line.send_permit import Duty

@@ -4,8 +4,8 @@ import asyncio
 from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol
 
-from gateway.engine.device import Device
-from gateway.engine.requests import WRITE_EXPIRY, CommandResult, Peeked
+from gateway.engine.device.device import Device
+from gateway.engine.jobs.requests import WRITE_EXPIRY, CommandResult, Peeked
 from gateway.errors import BadValue, Busy, ConfigError, GatewayError, Offline
 from gateway.line.groups import ended
 from gateway.line.line import Line

@@ -109,6 +109,7 @@ async def _serve(
         plant,
         parts=parts,
         writers=config.writers_file,
+        writers_state=config.writers_state,
         group=group_settings(config),
     )
     northbound.withhold(withheld)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from gateway.config import load
-from gateway.engine.device import Device
+from gateway.engine.device.device import Device
 from gateway.line.line import Line
 from gateway.plant.build import line_of
 from gateway.tags import Quality, Sample

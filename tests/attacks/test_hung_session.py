@@ -10,7 +10,7 @@ from tests.attacks.tcp_peer import Readings, made_line, modbus_tcp, peer, runnin
 
 async def test_a_hung_session_is_reopened(monkeypatch: pytest.MonkeyPatch) -> None:
     """The first session answers twice, then nothing passes; only a new session helps."""
-    monkeypatch.setattr("gateway.engine.line_silence.FIRST", 1.0)
+    monkeypatch.setattr("gateway.engine.results.line_silence.FIRST", 1.0)
 
     async def hangs(
         number: int, reader: asyncio.StreamReader, writer: asyncio.StreamWriter

@@ -5,7 +5,7 @@ import asyncio
 import pytest
 from structlog.testing import capture_logs
 
-from gateway.engine.together import LOST
+from gateway.engine.results.pipelining import LOST
 from tests.attacks.tcp_peer import Readings, made_line, peer, running, tcp_reply
 
 TAGS = [f"holding:{1000 * n}" for n in range(8)]

@@ -8,7 +8,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from gateway.engine.longer_reads import MOST_CHOICES
+from gateway.engine.device.longer_reads import MOST_CHOICES
 from gateway.protocols.driver import Span
 from gateway.protocols.vigor.devices import cover
 from gateway.stations.vigor import VigorStation

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from gateway.engine import device as engine_device
+from gateway.engine.device import device as engine_device
 from gateway.planning.planner import Block, plan
 from tests.attacks.slave import Slave, polled
 

@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 from gateway.config import load
-from gateway.engine.jobs import Poll
-from gateway.engine.schedule import Schedule
+from gateway.engine.jobs.jobs import Poll
+from gateway.engine.schedule.schedule import Schedule
 from gateway.errors import Busy
 from gateway.plant.plant import Plant as Gateway
 from gateway.protocols.computer_link import ComputerLink

@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from gateway.config import Config, ConfigErrors, load, schema
-from gateway.engine.device import Device
+from gateway.engine.device.device import Device
 from gateway.protocols.driver import Address, Cost, Span
 from gateway.protocols.frames import FrameDriver
 from gateway.tags import Publish, WriteRule

@@ -5,11 +5,11 @@ from dataclasses import replace
 from pathlib import Path
 
 from gateway.config import load
-from gateway.engine.device import Device
+from gateway.engine.device.device import Device
+from gateway.engine.device.health import State
 from gateway.engine.effects import Effect, LogEvent, OnlineChange, Pause, RequestEnded, Samples
 from gateway.engine.engine import Engine
-from gateway.engine.health import State
-from gateway.engine.jobs import (
+from gateway.engine.jobs.jobs import (
     Idle,
     Job,
     Poll,
@@ -22,7 +22,7 @@ from gateway.engine.jobs import (
     Traffic,
     Transacted,
 )
-from gateway.engine.requests import Command, Outcome, Request, Write
+from gateway.engine.jobs.requests import Command, Outcome, Request, Write
 from gateway.errors import DeviceError, LineDown, NoReply
 from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.modbus import ModbusRtu, ModbusTcp

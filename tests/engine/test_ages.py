@@ -4,11 +4,11 @@ import random
 
 import pytest
 
-from gateway.engine.ages import load_of, polled_blocks, worst_ages
-from gateway.engine.device import Device
-from gateway.engine.jobs import Idle, Poll
-from gateway.engine.requests import Write
-from gateway.engine.schedule import Schedule
+from gateway.engine.device.ages import load_of, polled_blocks, worst_ages
+from gateway.engine.device.device import Device
+from gateway.engine.jobs.jobs import Idle, Poll
+from gateway.engine.jobs.requests import Write
+from gateway.engine.schedule.schedule import Schedule
 from gateway.tags import WriteRule
 from tests.sim.plant import device, make_tag
 

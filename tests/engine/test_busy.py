@@ -3,8 +3,8 @@
 import asyncio
 from dataclasses import dataclass, field, replace
 
-from gateway.engine.health import State
-from gateway.engine.poll_results import BUSY_PAUSE
+from gateway.engine.device.health import State
+from gateway.engine.results.poll_rules import BUSY_PAUSE
 from gateway.protocols.checksums import crc16
 from gateway.protocols.modbus import ModbusRtu
 from gateway.stations.modbus import ModbusStation

@@ -4,12 +4,12 @@ from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
-from gateway.engine.changes import Changes
-from gateway.engine.device import Device
-from gateway.engine.device_settings import DeviceSettings
+from gateway.engine.device.changes import Changes
+from gateway.engine.device.device import Device
+from gateway.engine.device.device_settings import DeviceSettings
+from gateway.engine.device.health import State
 from gateway.engine.engine import Engine
-from gateway.engine.health import State
-from gateway.engine.jobs import Idle, Poll, Probe, Resynced, Settle
+from gateway.engine.jobs.jobs import Idle, Poll, Probe, Resynced, Settle
 from gateway.errors import Busy, Refusal, Refused
 from gateway.tags import Quality, Reason, Tag
 from tests.engine.rig import Rig, ended, link_device, tcp_device

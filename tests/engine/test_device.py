@@ -4,8 +4,8 @@ import math
 
 import pytest
 
-from gateway.engine.device import HALF_LIFE, Device
-from gateway.engine.health import State
+from gateway.engine.device.device import HALF_LIFE, Device
+from gateway.engine.device.health import State
 from gateway.errors import Evidence, Garbled, NoReply, Unclear
 from gateway.protocols.driver import Span
 from gateway.protocols.modbus import ModbusRtu

@@ -8,7 +8,7 @@ from gateway.engine.effects import (
     RequestEnded,
     Samples,
 )
-from gateway.engine.requests import Command
+from gateway.engine.jobs.requests import Command
 from gateway.tags import Reason, bad, good
 from tests.sim.plant import device, make_tag
 

@@ -22,10 +22,10 @@ from typing import get_args
 
 import pytest
 
-from gateway.engine.ages import polled_blocks, worst_ages
+from gateway.engine.device.ages import polled_blocks, worst_ages
+from gateway.engine.device.health import State
 from gateway.engine.effects import Effect
-from gateway.engine.health import State
-from gateway.engine.jobs import (
+from gateway.engine.jobs.jobs import (
     Answer,
     HeldTogether,
     Idle,
@@ -39,8 +39,8 @@ from gateway.engine.jobs import (
     Traffic,
     Transacted,
 )
-from gateway.engine.requests import MOST_WAITING
-from gateway.engine.unsolicited import REPLY_WITHIN
+from gateway.engine.jobs.requests import MOST_WAITING
+from gateway.engine.results.unsolicited import REPLY_WITHIN
 from gateway.errors import (
     BadValue,
     Busy,

@@ -10,11 +10,11 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from gateway.engine.device import Device
+from gateway.engine.device.device import Device
+from gateway.engine.device.health import TRANSITIONS, Event, State
 from gateway.engine.effects import Effect, OnlineChange, RequestEnded, Samples
 from gateway.engine.engine import Engine
-from gateway.engine.health import TRANSITIONS, Event, State
-from gateway.engine.jobs import (
+from gateway.engine.jobs.jobs import (
     Answer,
     Confirm,
     HeldTogether,
@@ -35,8 +35,8 @@ from gateway.engine.jobs import (
     WriteTogether,
     requests_of,
 )
-from gateway.engine.requests import Command, Group, Request, Write
-from gateway.engine.runs import together, verified
+from gateway.engine.jobs.requests import Command, Group, Request, Write
+from gateway.engine.jobs.runs import together, verified
 from gateway.errors import (
     BadValue,
     Garbled,

@@ -13,9 +13,9 @@ from typing import Any
 import pytest
 
 from gateway.config import load
-from gateway.engine.device import Device
+from gateway.engine.device.device import Device
+from gateway.engine.device.reply_shapes import MARK_LONGEST
 from gateway.engine.forecast import LineForecast, forecast
-from gateway.engine.reply_shapes import MARK_LONGEST
 from gateway.parts.transfers.forecast import forecasts
 from gateway.planning.planner import shortest_round
 from gateway.planning.wire_timing import WireTiming

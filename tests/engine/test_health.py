@@ -4,13 +4,14 @@ import itertools
 
 import pytest
 
-from gateway.engine.health import (
+from gateway.engine.device.health import (
     MOST_UNANSWERED,
     PAUSE_FIRST,
     PROBE_PAUSE,
     TRANSITIONS,
     Event,
     Health,
+    Heard,
     State,
     diagnosis,
 )
@@ -203,8 +204,8 @@ def test_a_restart_keeps_if_the_device_was_heard() -> None:
         change()
         found.restart()
         heard.append(found.heard)
-    assert heard == [True, False, True]
-    assert Health().heard is None
+    assert heard == [Heard.REPLIED, Heard.GAVE_UP, Heard.REPLIED]
+    assert Health().heard is Heard.NEVER
 
 
 def test_short_probes_are_counted_until_a_patient_one_a_reply_or_a_restart() -> None:

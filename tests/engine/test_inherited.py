@@ -1,6 +1,6 @@
 """Requests that an earlier process left in a device server, when the gateway starts."""
 
-from gateway.engine.jobs import Poll, Probe, Resynced, Settle, Settled, Transacted
+from gateway.engine.jobs.jobs import Poll, Probe, Resynced, Settle, Settled, Transacted
 from gateway.protocols.driver import EVERY_REQUEST
 from tests.engine.rig import SILENCE, Rig, link_device
 

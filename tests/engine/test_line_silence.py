@@ -2,10 +2,10 @@
 
 from dataclasses import replace
 
-from gateway.engine.device import Device
-from gateway.engine.jobs import Idle, Poll, Probe, Reopen, Resynced, Sent, Settle, Settled
-from gateway.engine.line_silence import FIRST, LONGEST
-from gateway.engine.requests import Write
+from gateway.engine.device.device import Device
+from gateway.engine.jobs.jobs import Idle, Poll, Probe, Reopen, Resynced, Sent, Settle, Settled
+from gateway.engine.jobs.requests import Write
+from gateway.engine.results.line_silence import FIRST, LONGEST
 from gateway.errors import Evidence, Garbled, Refused
 from tests.engine.rig import LOST, SILENCE, Rig, broadcast_device, link_device
 from tests.sim.bench import WIRE

@@ -2,13 +2,13 @@
 
 import math
 
-from gateway.engine.device import Device
-from gateway.engine.device_settings import DeviceSettings
+from gateway.engine.device.device import Device
+from gateway.engine.device.device_settings import DeviceSettings
+from gateway.engine.device.health import State
 from gateway.engine.effects import Effect, OnlineChange, RequestEnded, Samples
 from gateway.engine.engine import Engine
-from gateway.engine.health import State
-from gateway.engine.jobs import Idle
-from gateway.engine.requests import Command, Write
+from gateway.engine.jobs.jobs import Idle
+from gateway.engine.jobs.requests import Command, Write
 from gateway.errors import BadValue
 from gateway.planning.wire_timing import WireTiming
 from gateway.protocols.checksums import crc16

@@ -7,12 +7,12 @@ from typing import Any
 
 import pytest
 
-from gateway.engine import device as engine_device
-from gateway.engine.device import MOST_PLANNED, PLANNING, Device
-from gateway.engine.health import State
-from gateway.engine.jobs import Idle, Poll, Probe, Resynced, Traffic
-from gateway.engine.plans import PLANNING_SHARE
-from gateway.engine.turnaround import LEARN_EVERY
+from gateway.engine.device import device as engine_device
+from gateway.engine.device.device import MOST_PLANNED, PLANNING, Device
+from gateway.engine.device.health import State
+from gateway.engine.device.turnaround import LEARN_EVERY
+from gateway.engine.jobs.jobs import Idle, Poll, Probe, Resynced, Traffic
+from gateway.engine.schedule.replan_budget import PLANNING_SHARE
 from gateway.errors import Refusal, Refused
 from gateway.planning.planner import Block, plan
 from gateway.protocols.modbus import ModbusTcp

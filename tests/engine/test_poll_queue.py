@@ -7,9 +7,9 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, rule
 
-from gateway.engine.device import Device
-from gateway.engine.jobs import EXPEDITED, NOT_QUEUED, Poll
-from gateway.engine.poll_queue import ROOM, PollQueue
+from gateway.engine.device.device import Device
+from gateway.engine.jobs.jobs import EXPEDITED, NOT_QUEUED, Poll
+from gateway.engine.schedule.poll_queue import ROOM, PollQueue
 from tests.sim.plant import device, make_tag
 
 

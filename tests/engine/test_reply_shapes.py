@@ -2,11 +2,10 @@
 
 import pytest
 
-from gateway.engine.device import Device
-from gateway.engine.health import State
-from gateway.engine.jobs import Idle, Poll, Probe, Resynced, Sent
-from gateway.engine.longer_reads import KNOWN_FOR, MOST_FAILED, MOST_WARY, LongerReads
-from gateway.engine.reply_shapes import (
+from gateway.engine.device.device import Device
+from gateway.engine.device.health import State
+from gateway.engine.device.longer_reads import KNOWN_FOR, MOST_FAILED, MOST_WARY, LongerReads
+from gateway.engine.device.reply_shapes import (
     MARK_FIRST,
     MARK_LONGEST,
     QUIET,
@@ -15,7 +14,8 @@ from gateway.engine.reply_shapes import (
     ReplyShapes,
     reply_shapes,
 )
-from gateway.engine.requests import Write
+from gateway.engine.jobs.jobs import Idle, Poll, Probe, Resynced, Sent
+from gateway.engine.jobs.requests import Write
 from gateway.errors import Refusal, Refused
 from gateway.planning.bad_addresses import BadAddresses
 from gateway.protocols.computer_link import ComputerLink

@@ -4,9 +4,9 @@ from typing import Any
 
 import pytest
 
+from gateway.engine.device.health import State
 from gateway.engine.effects import Pause
-from gateway.engine.health import State
-from gateway.engine.jobs import (
+from gateway.engine.jobs.jobs import (
     Confirm,
     HeldTogether,
     ReadBack,
@@ -20,8 +20,8 @@ from gateway.engine.jobs import (
     Transacted,
     WriteTogether,
 )
-from gateway.engine.request_results import BROADCAST_PAUSE, STOPPED, Differs
-from gateway.engine.requests import WRITE_EXPIRY, Command, Write
+from gateway.engine.jobs.requests import WRITE_EXPIRY, Command, Write
+from gateway.engine.results.request_rules import BROADCAST_PAUSE, STOPPED, Differs
 from gateway.errors import Busy, Garbled, NoReply, Refusal, Refused, Unclear
 from gateway.planning.bad_addresses import BadRange
 from gateway.protocols.driver import Span

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gateway.engine.device import Device
+from gateway.engine.device.device import Device
 from gateway.errors import BadValue, Busy, LineDown, Offline, Refused, Unclear
 from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.vigor import Vigor

@@ -5,9 +5,11 @@ from dataclasses import replace
 
 import pytest
 
-from gateway.engine.device import SILENT_SHARE
-from gateway.engine.health import PAUSE_LONGEST, State
-from gateway.engine.jobs import (
+from gateway.engine.device.device import SILENT_SHARE
+from gateway.engine.device.health import PAUSE_LONGEST, State
+from gateway.engine.device.reply_shapes import QUIET
+from gateway.engine.device.turnaround import LEARN_EVERY
+from gateway.engine.jobs.jobs import (
     Idle,
     Poll,
     Probe,
@@ -17,9 +19,7 @@ from gateway.engine.jobs import (
     Settled,
     Traffic,
 )
-from gateway.engine.poll_results import BUSY_PAUSE
-from gateway.engine.reply_shapes import QUIET
-from gateway.engine.turnaround import LEARN_EVERY
+from gateway.engine.results.poll_rules import BUSY_PAUSE
 from gateway.errors import DeviceError, Evidence, Garbled, Refusal, Refused, Unsteady
 from gateway.planning.bad_addresses import RETRIES, SILENT, SPLIT_FIRST
 from gateway.planning.planner import plan

@@ -8,10 +8,11 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from gateway.engine.device import Device
-from gateway.engine.health import PAUSE_FIRST, PAUSE_LONGEST, PROBE_PAUSE, State
-from gateway.engine.jobs import Idle, Poll, Probe
-from gateway.engine.probes import (
+from gateway.engine.device.device import Device
+from gateway.engine.device.health import PAUSE_FIRST, PAUSE_LONGEST, PROBE_PAUSE, State
+from gateway.engine.jobs.jobs import Idle, Poll, Probe
+from gateway.engine.jobs.requests import MOST_WAITING, WRITE_EXPIRY, Write
+from gateway.engine.schedule.probes import (
     OFFLINE_SHARE,
     PATIENT_AFTER,
     SHORTEST,
@@ -20,8 +21,7 @@ from gateway.engine.probes import (
     probe_seconds,
     short_timeout,
 )
-from gateway.engine.requests import MOST_WAITING, WRITE_EXPIRY, Write
-from gateway.engine.schedule import Schedule
+from gateway.engine.schedule.schedule import Schedule
 from gateway.errors import NoReply
 from gateway.planning.bad_addresses import RETRIES
 from gateway.protocols.modbus import ModbusRtu, ModbusTcp

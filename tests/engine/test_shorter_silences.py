@@ -5,12 +5,12 @@ from itertools import pairwise
 
 import pytest
 
-from gateway.engine.device import Device
-from gateway.engine.health import State
-from gateway.engine.jobs import Idle, Poll, Probe, Resynced, Sent, Settle, Settled, Traffic
-from gateway.engine.requests import Write
-from gateway.engine.shorter_silences import HELD, PAUSE, PROOF
-from gateway.engine.station_silence import FORGOTTEN_AFTER
+from gateway.engine.device.device import Device
+from gateway.engine.device.health import State
+from gateway.engine.device.station_silence import FORGOTTEN_AFTER
+from gateway.engine.jobs.jobs import Idle, Poll, Probe, Resynced, Sent, Settle, Settled, Traffic
+from gateway.engine.jobs.requests import Write
+from gateway.engine.results.shorter_silences import HELD, PAUSE, PROOF
 from gateway.errors import Refusal, Refused
 from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.driver import AnyDriver

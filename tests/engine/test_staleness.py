@@ -2,8 +2,8 @@
 
 import asyncio
 
-from gateway.engine.ages import polled_blocks, worst_ages
-from gateway.engine.device import Device
+from gateway.engine.device.ages import polled_blocks, worst_ages
+from gateway.engine.device.device import Device
 from gateway.tags import Quality, Reason
 from tests.sim.plant import Plant, device, make_tag, plant, running
 from tests.sim.virtual import on_virtual_time

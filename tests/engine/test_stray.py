@@ -2,12 +2,12 @@
 
 import pytest
 
-from gateway.engine.device import Device
+from gateway.engine.device.device import Device
 from gateway.engine.effects import Effects, LogEvent
-from gateway.engine.results import Results
-from gateway.engine.schedule import Schedule
-from gateway.engine.staleness import Staleness
-from gateway.engine.stray import LOG_EVERY, PAUSE, Stray
+from gateway.engine.results.health_rules import HealthRules
+from gateway.engine.results.staleness import Staleness
+from gateway.engine.results.stray import LOG_EVERY, PAUSE, Stray
+from gateway.engine.schedule.schedule import Schedule
 from gateway.protocols.computer_link.codec import Ack, Text
 from gateway.protocols.driver import Span
 from gateway.stations.computer_link import ComputerLinkStation
@@ -25,7 +25,7 @@ class StrayLine:
         self.effects = Effects()
         schedule = Schedule(devices, 0.0)
         staleness = Staleness(schedule, self.effects)
-        results = Results("line", schedule, staleness, self.effects)
+        results = HealthRules("line", schedule, staleness, self.effects)
         self.stray = Stray("line", devices, results, self.effects)
         for one in devices:
             one.monitor.expect(LIST)

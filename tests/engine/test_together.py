@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import pytest
 
-from gateway.engine.device import Device
-from gateway.engine.jobs import Idle, Poll, Probe, Resynced, Settle, Settled, Traffic
-from gateway.engine.together import PROOFS, TRY_AGAIN
+from gateway.engine.device.device import Device
+from gateway.engine.jobs.jobs import Idle, Poll, Probe, Resynced, Settle, Settled, Traffic
+from gateway.engine.results.pipelining import PROOFS, TRY_AGAIN
 from gateway.protocols.modbus.drivers import ModbusTcp
 from tests.engine.rig import REPLIED, SILENCE, Rig, tcp_device
 from tests.sim.bench import WIRE

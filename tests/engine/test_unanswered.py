@@ -4,9 +4,16 @@ from typing import NamedTuple
 
 import pytest
 
-from gateway.engine.device import Device
-from gateway.engine.health import State
-from gateway.engine.unanswered import FIRST_WAIT, KEPT, LONGEST_WAIT, MARGIN, TimedOut, Unanswered
+from gateway.engine.device.device import Device
+from gateway.engine.device.health import State
+from gateway.engine.jobs.unanswered import (
+    FIRST_WAIT,
+    KEPT,
+    LONGEST_WAIT,
+    MARGIN,
+    TimedOut,
+    Unanswered,
+)
 from gateway.errors import NoReply
 from gateway.protocols.modbus import ModbusTcp
 from tests.line.slaves import NETWORK, registers, slave

@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 from structlog.testing import capture_logs
 
 from gateway.config import Config, LineConfig, load
-from gateway.engine.device import Device
-from gateway.engine.health import State
-from gateway.engine.jobs import Idle, Job
-from gateway.engine.request_results import Differs
-from gateway.engine.unsolicited import REPLY_WITHIN
+from gateway.engine.device.device import Device
+from gateway.engine.device.health import State
+from gateway.engine.jobs.jobs import Idle, Job
+from gateway.engine.results.request_rules import Differs
+from gateway.engine.results.unsolicited import REPLY_WITHIN
 from gateway.errors import GatewayError, LineDown, Refused
 from gateway.line.line import Line
 from gateway.northbound.publishing.republish import Republisher

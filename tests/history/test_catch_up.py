@@ -17,7 +17,7 @@ from gateway.contract.buckets import Bucket, Now
 from gateway.contract.interfaces import History
 from gateway.contract.payload import Failure, Problem, WriteOutcome
 from gateway.contract.question import Question
-from gateway.engine.requests import CommandResult
+from gateway.engine.jobs.requests import CommandResult
 from gateway.northbound.answering.answers import HISTORY_LIMIT
 from gateway.northbound.northbound import Northbound
 from gateway.parts.history import Historian

@@ -7,7 +7,7 @@ from contextlib import closing
 from pathlib import Path
 
 from gateway.contract.payload import Failure, Problem, WriteOutcome
-from gateway.engine.requests import CommandResult
+from gateway.engine.jobs.requests import CommandResult
 from gateway.tags import WriteResult
 from tests.history.recorded import (
     EVERYTHING,

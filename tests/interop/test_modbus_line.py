@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from gateway.engine.device import Device
+from gateway.engine.device.device import Device
 from gateway.planning.wire_timing import NETWORK_BAUD, WireTiming
 from gateway.protocols.modbus import ModbusAscii, ModbusRtu, ModbusTcp
 from gateway.tags import Quality, Reason, WriteRule

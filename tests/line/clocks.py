@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from gateway.engine.device import Device
+from gateway.engine.device.device import Device
 from gateway.tags import Tag
 from tests.sim.plant import Plant, clockwork, device, words
 

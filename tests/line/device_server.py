@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from gateway.engine.device import Device
+from gateway.engine.device.device import Device
 from gateway.planning.wire_timing import WireTiming
 from gateway.protocols.driver import AnyDriver
 from gateway.simulator.plant import station_for

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Literal
 
-from gateway.engine.device import Device
+from gateway.engine.device.device import Device
 from gateway.planning.wire_timing import NETWORK_BAUD, WireTiming
 from gateway.protocols.driver import AnyDriver
 from gateway.protocols.modbus import (

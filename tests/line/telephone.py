@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from gateway.config import built
-from gateway.engine.device import Device
-from gateway.engine.requests import WRITE_EXPIRY
+from gateway.engine.device.device import Device
+from gateway.engine.jobs.requests import WRITE_EXPIRY
 from gateway.line.calling import ModemOpener
 from gateway.plant.build import line_of
 from gateway.stations.vigor import VigorStation

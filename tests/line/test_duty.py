@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-from gateway.engine.requests import Write
+from gateway.engine.jobs.requests import Write
 from gateway.errors import Busy
 from gateway.line.arrival import HELD, PERIOD, ArrivalClock
 from gateway.line.perform import perform

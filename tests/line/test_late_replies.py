@@ -5,7 +5,7 @@ import random
 
 import pytest
 
-from gateway.engine.health import State
+from gateway.engine.device.health import State
 from gateway.errors import Busy, Offline, Unclear
 from gateway.tags import WriteResult, WriteRule
 from tests.line.clocks import clocks, wind_up

@@ -3,7 +3,7 @@
 import asyncio
 from typing import Any
 
-from gateway.engine.changes import Changes
+from gateway.engine.device.changes import Changes
 from tests.reload.plant import file, running, vigor
 from tests.sim.virtual import on_virtual_time
 

@@ -8,8 +8,8 @@ import random
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from gateway.engine.device import Device
-from gateway.engine.device_settings import DeviceSettings
+from gateway.engine.device.device import Device
+from gateway.engine.device.device_settings import DeviceSettings
 from gateway.engine.effects import Samples
 from gateway.engine.engine import Engine
 from gateway.planning.wire_timing import WireTiming

@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 from structlog.testing import capture_logs
 
-from gateway.engine.device import Device
-from gateway.engine.health import State
+from gateway.engine.device.device import Device
+from gateway.engine.device.health import State
 from gateway.planning.wire_timing import WireTiming
 from gateway.protocols.computer_link import NO_REPLY_CAUSES, ComputerLink
 from gateway.protocols.vigor import Vigor

@@ -5,7 +5,7 @@ import asyncio
 import pytest
 from structlog.testing import capture_logs
 
-from gateway.engine.health import State
+from gateway.engine.device.health import State
 from gateway.errors import Evidence, Unclear
 from gateway.protocols.modbus import (
     ModbusAscii,

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from gateway.engine.health import State
+from gateway.engine.device.health import State
 from gateway.errors import Unclear
 from gateway.protocols.modbus import (
     Frame,

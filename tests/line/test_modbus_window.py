@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from gateway.engine.device import Device
+from gateway.engine.device.device import Device
 from gateway.errors import LineDown
 from gateway.planning.wire_timing import WireTiming
 from gateway.protocols.modbus import (

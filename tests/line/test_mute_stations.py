@@ -5,7 +5,7 @@ import itertools
 
 import pytest
 
-from gateway.engine.requests import WRITE_EXPIRY
+from gateway.engine.jobs.requests import WRITE_EXPIRY
 from gateway.errors import Offline
 from gateway.planning.bad_addresses import SPLIT_FIRST
 from gateway.tags import Quality, Reason, WriteRule

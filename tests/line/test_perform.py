@@ -7,8 +7,8 @@ from typing import Any, cast
 
 import pytest
 
-from gateway.engine.device import Device
-from gateway.engine.jobs import (
+from gateway.engine.device.device import Device
+from gateway.engine.jobs.jobs import (
     Answer,
     Confirm,
     HeldTogether,
@@ -24,7 +24,7 @@ from gateway.engine.jobs import (
     Transacted,
     WriteTogether,
 )
-from gateway.engine.requests import Command, Write
+from gateway.engine.jobs.requests import Command, Write
 from gateway.errors import BadValue, LineDown, NoReply, Refused, Unclear, Unsteady
 from gateway.line.perform import perform
 from gateway.planning.planner import Block

@@ -2,7 +2,7 @@
 
 import asyncio
 
-from gateway.engine.health import State
+from gateway.engine.device.health import State
 from gateway.tags import Quality, Reason
 from tests.sim.plant import device, plant, running, words
 from tests.sim.virtual import on_virtual_time

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from gateway.engine.health import State
+from gateway.engine.device.health import State
 from gateway.errors import LineDown, Refused, Unclear
 from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.driver import AnyDriver

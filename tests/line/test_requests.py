@@ -6,7 +6,7 @@ import random
 
 import pytest
 
-from gateway.engine.requests import WRITE_EXPIRY
+from gateway.engine.jobs.requests import WRITE_EXPIRY
 from gateway.errors import Busy, GatewayError, LineDown, Offline, Refused, Unclear
 from gateway.tags import WriteResult, WriteRule
 from tests.line.clocks import wind_up

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from gateway.engine.shorter_silences import PAUSE
+from gateway.engine.results.shorter_silences import PAUSE
 from tests.sim.plant import Plant, device, plant, running, words
 from tests.sim.virtual import now, on_virtual_time
 

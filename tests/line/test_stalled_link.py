@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from gateway.engine.health import State
+from gateway.engine.device.health import State
 from gateway.errors import Busy, LineDown
 from gateway.protocols.checksums import crc16
 from gateway.protocols.computer_link import ComputerLink

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from gateway.engine.jobs import Settled
+from gateway.engine.jobs.jobs import Settled
 from gateway.errors import Evidence, Garbled, LineDown, NoReply, Refused
 from gateway.protocols.driver import Span
 from gateway.protocols.modbus import ModbusRtu, ModbusTcp

@@ -4,8 +4,8 @@ import asyncio
 
 import pytest
 
-from gateway.engine.device import Device
-from gateway.engine.request_results import Differs
+from gateway.engine.device.device import Device
+from gateway.engine.results.request_rules import Differs
 from gateway.errors import Refused, Unclear
 from gateway.tags import Tag, WriteResult, WriteRule
 from tests.sim.plant import Outcome, Plant, device, make_tag, plant, running

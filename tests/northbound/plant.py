@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from gateway.config import AlarmsConfig, ZenohConfig
 from gateway.contract.interfaces import History
-from gateway.engine.requests import CommandResult, Peeked
+from gateway.engine.jobs.requests import CommandResult, Peeked
 from gateway.errors import BadValue, Busy, GatewayError, NotSent
 from gateway.line.send_permit import Duty
 from gateway.line.wire_log import WireLog
@@ -201,9 +201,9 @@ async def nothing() -> None:
 
 
 def northbound_of(plant: PlainPlant, settings: ZenohConfig, **others: Any) -> Northbound:
-    """`others`: those of `Northbound`, and `history`."""
-    plant.parts.kept = others.pop("history", None)
-    made = plant.parts.north = Northbound(settings, "demo", plant, parts=plant.parts, **others)
+    """`others`: those of `Northbound`, `name` and `history`."""
+    plant.parts.kept, name = others.pop("history", None), others.pop("name", "demo")
+    made = plant.parts.north = Northbound(settings, name, plant, parts=plant.parts, **others)
     return made
 
 

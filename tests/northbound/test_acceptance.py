@@ -6,7 +6,7 @@ from datetime import UTC, datetime, timedelta
 
 import pytest
 
-from gateway.engine.requests import WRITE_EXPIRY
+from gateway.engine.jobs.requests import WRITE_EXPIRY
 from gateway.errors import Busy
 from gateway.line.send_permit import Duty
 from gateway.northbound.requests.acceptance import Acceptance, Sender

@@ -41,7 +41,7 @@ async def test_behind_a_router_a_second_gateway_leaves_the_devices_to_the_first(
         settings = ZenohConfig(
             connect=(endpoint,), user="gateway", password_file=tmp_path / "password.txt"
         )
-        second = northbound_of(mixer(), settings)
+        second = northbound_of(mixer(), settings, name="second")
         serves = asyncio.create_task(second.run())
         async with asyncio.timeout(60):
             await second.replaced.wait()

@@ -12,7 +12,7 @@ from structlog.testing import capture_logs
 from gateway.config.commands import NotControlled
 from gateway.contract.keys import Family, Keys, parse_key
 from gateway.contract.payload import Failure, Problem
-from gateway.engine.requests import CommandResult
+from gateway.engine.jobs.requests import CommandResult
 from gateway.errors import LineDown
 from gateway.northbound.requests.acceptance import Acceptance, Sender
 from gateway.northbound.requests.audit import Audit

@@ -109,7 +109,7 @@ async def test_a_port_in_use_is_one_sentence_and_ends_the_run() -> None:
     endpoint = free_endpoint()
     async with serving(mixer(), ZenohConfig(listen=(endpoint,))):
         with pytest.raises(GatewayError, match=r"Zenoh cannot be opened: .*"):
-            await northbound_of(mixer(), ZenohConfig(listen=(endpoint,))).run()
+            await northbound_of(mixer(), ZenohConfig(listen=(endpoint,)), name="second").run()
 
 
 async def serve(endpoint: str, fails: str) -> None:

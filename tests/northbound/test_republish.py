@@ -133,7 +133,7 @@ async def test_a_client_of_the_process_before_gets_all_values_of_the_next() -> N
 def republisher(plant: PlainPlant, published: list[Sample], **how: Any) -> Republisher:
     index = TagIndex(Keys("plant", "demo"), plant.devices())
     settings = {"links": LinkMonitor(), "losses": Losses(0.05), "refresh": 1e6, **how}
-    return Republisher(published.extend, plant, index, **settings)
+    return Republisher(published.extend, plant, index, parts=nothing, **settings)
 
 
 def of_mixer(count: int) -> PlainPlant:

@@ -10,7 +10,7 @@ import pytest
 from gateway.config import load
 from gateway.contract import payload
 from gateway.contract.status import device_document, standing
-from gateway.engine.device import Device
+from gateway.engine.device.device import Device
 from gateway.errors import NoReply
 from gateway.line.line import Line
 from gateway.plant.plant import Plant
@@ -43,7 +43,7 @@ async def served(gateway: Plant, until: str) -> None:
 
 async def test_before_the_first_transaction(tmp_path: Path) -> None:
     documents = made(tmp_path).status()
-    assert set(documents) == {"status", "alarms", "lines/hall", "devices/mixer"}
+    assert set(documents) == {"status", "lines/hall", "devices/mixer"}
     status = documents["status"]
     assert (status["name"], status["tags"]) == ("demo", 2)
     assert (status["lines"], status["devices"]) == ({"hall": False}, {"mixer": "starting"})
@@ -76,7 +76,7 @@ async def test_a_failing_device_has_a_diagnosis(tmp_path: Path) -> None:
 
 async def test_a_disabled_device_has_no_document_of_its_own(tmp_path: Path) -> None:
     documents = made(tmp_path, enabled=False).status()
-    assert set(documents) == {"status", "alarms", "lines/hall"}
+    assert set(documents) == {"status", "lines/hall"}
     assert documents["status"]["devices"] == {}
 
 

@@ -5,7 +5,7 @@ import math
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gateway.engine.device import Device
+from gateway.engine.device.device import Device
 from gateway.planning.bad_addresses import RETRIES, SILENT, SPLIT_FIRST
 from gateway.planning.planner import Block
 from gateway.protocols.driver import Span

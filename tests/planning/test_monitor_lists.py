@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from gateway.engine.device import Device
+from gateway.engine.device.device import Device
 from gateway.planning.monitor_lists import with_monitor_list
 from gateway.planning.planner import Block
 from gateway.protocols.computer_link import ComputerLink, Nak

@@ -8,7 +8,7 @@ from typing import Any
 
 from gateway.config import built
 from gateway.config.changes import Difference, compare
-from gateway.engine.jobs import Job, Poll
+from gateway.engine.jobs.jobs import Job, Poll
 from gateway.parts.transfers.part import with_writes
 from gateway.plant.plant import Plant as Gateway
 from gateway.service.reload import RunningLines

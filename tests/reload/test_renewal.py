@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
-from gateway.engine.device import Device
+from gateway.engine.device.device import Device
 from gateway.engine.engine import Engine
-from gateway.engine.jobs import Poll
+from gateway.engine.jobs.jobs import Poll
 from gateway.errors import Busy, GatewayError
 from gateway.line.line import Line
 from gateway.parts.alarms.part import AlarmPart

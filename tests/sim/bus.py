@@ -5,8 +5,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 from gateway.config import LineConfig
-from gateway.engine.device import Device
-from gateway.engine.health import State
+from gateway.engine.device.device import Device
+from gateway.engine.device.health import State
 from gateway.line.line import Line
 from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.frames import FrameDriver

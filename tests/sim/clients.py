@@ -6,7 +6,7 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from gateway.engine.device import Device
+from gateway.engine.device.device import Device
 from gateway.errors import BadValue, Busy, GatewayError, LineDown, Offline, Refused
 from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.computer_link.replies import model_name

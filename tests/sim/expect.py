@@ -5,11 +5,11 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from gateway.engine.device import Device
+from gateway.engine.device.device import Device
+from gateway.engine.device.health import State
 from gateway.engine.engine import Engine
-from gateway.engine.health import State
-from gateway.engine.unanswered import LONGEST_WAIT
-from gateway.engine.unsolicited import UnsolicitedFrames
+from gateway.engine.jobs.unanswered import LONGEST_WAIT
+from gateway.engine.results.unsolicited import UnsolicitedFrames
 from gateway.line.line import Line
 from gateway.planning.bad_addresses import RETRIES
 from gateway.protocols.frames import FrameDriver

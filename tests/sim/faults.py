@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from gateway.engine.device import Device
+from gateway.engine.device.device import Device
 from gateway.stations.computer_link import ComputerLinkStation
 from gateway.tags import Tag
 from tests.sim.bus import Bus

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-from gateway.engine.device import Device
+from gateway.engine.device.device import Device
 from gateway.planning.wire_timing import WireTiming
 from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.driver import AnyDriver

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Any
 
-from gateway.engine.requests import WRITE_EXPIRY
+from gateway.engine.jobs.requests import WRITE_EXPIRY
 from gateway.northbound.publishing.losses import ROUNDS
 from gateway.tags import Quality, Sample
 from tests.sim.north_peers import Client

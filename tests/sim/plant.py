@@ -10,11 +10,11 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
-from gateway.engine import requests
-from gateway.engine.device import Device
-from gateway.engine.device_settings import DeviceSettings
+from gateway.engine.device.device import Device
+from gateway.engine.device.device_settings import DeviceSettings
+from gateway.engine.device.health import State
 from gateway.engine.engine import Engine
-from gateway.engine.health import State
+from gateway.engine.jobs import requests
 from gateway.errors import GatewayError
 from gateway.line.line import Line
 from gateway.line.send_permit import Duty

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from gateway.contract.keys import Keys
-from gateway.engine.device import Device
+from gateway.engine.device.device import Device
 from gateway.errors import BadValue, GatewayError, Refused
 from gateway.northbound.requests.audit import Audit
 from gateway.northbound.requests.own_writes import OwnWrites

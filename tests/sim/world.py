@@ -19,9 +19,9 @@ from typing import Any
 import structlog
 
 from gateway.config import LineConfig, load
-from gateway.engine.changes import Changes
-from gateway.engine.device_settings import DeviceSettings
-from gateway.engine.shorter_silences import Pace
+from gateway.engine.device.changes import Changes
+from gateway.engine.device.device_settings import DeviceSettings
+from gateway.engine.results.shorter_silences import Pace
 from gateway.plant.plant import Plant
 from gateway.protocols.frames import FrameDriver
 from gateway.protocols.frames.driver import LISTENED
@@ -206,7 +206,7 @@ class World:
         """Lets most lines try shorter silences although they have time, and after few replies."""
         chance = random.Random(f"silence {self.story.seed}")
         for line in self.gateway.lines:
-            shorter = line.engine._conclusions.shorter  # private: no setting of the file
+            shorter = line.engine._next_job.shorter  # private: no setting of the file
             usual = shorter.pace
             shorter.pace = Pace(
                 chance.choice((0.0, 0.0, usual.needed)),

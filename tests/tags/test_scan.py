@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from gateway.engine.effects import Effect, Samples
 from gateway.engine.engine import Engine
-from gateway.engine.jobs import (
+from gateway.engine.jobs.jobs import (
     Poll,
     Probe,
     Result,

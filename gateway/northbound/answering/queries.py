@@ -18,7 +18,7 @@ from gateway.contract.keys import Family, ParsedKey, max_age, parse_key, part_of
 from gateway.contract.parsing import check_encoding
 from gateway.contract.payload import Failure, GroupResult, Problem
 from gateway.contract.question import is_of_past
-from gateway.engine.requests import CommandResult, Peeked
+from gateway.engine.jobs.requests import CommandResult, Peeked
 from gateway.errors import BadValue, Busy, GatewayError
 from gateway.northbound.answering.answers import Answer, AnswerPool, QueryCounters
 from gateway.northbound.answering.replies import Replies

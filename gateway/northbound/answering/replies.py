@@ -15,7 +15,7 @@ from gateway.contract.keys import Family, Keys, ParsedKey
 from gateway.contract.meta import meta
 from gateway.contract.payload import Failure, GroupResult, Problem
 from gateway.contract.question import Question, question
-from gateway.engine.requests import Peeked
+from gateway.engine.jobs.requests import Peeked
 from gateway.errors import BadValue, Busy, Damaged, GatewayError
 from gateway.northbound.answering import pages
 from gateway.northbound.answering.tag_index import TagIndex

@@ -17,7 +17,7 @@ import structlog
 from gateway.contract import payload
 from gateway.contract.payload import Failure, Problem, WriteOutcome
 from gateway.contract.rate_limit import RateLimit
-from gateway.engine.requests import CommandResult
+from gateway.engine.jobs.requests import CommandResult
 from gateway.tags import WriteResult
 from gateway.tags.timestamps import rfc3339
 

@@ -17,7 +17,7 @@ from gateway.contract.interfaces import Plant
 from gateway.contract.keys import Keys
 from gateway.contract.payload import Failure, Problem, WriteOutcome
 from gateway.contract.writers import NotAllowed, Repeated
-from gateway.engine.requests import CommandResult
+from gateway.engine.jobs.requests import CommandResult
 from gateway.errors import BadValue, GatewayError
 from gateway.northbound.publishing import encoding
 from gateway.northbound.requests.acceptance import Acceptance, Sender
@@ -56,6 +56,7 @@ class Commands:
         longest = ANSWER_WITHIN
         try:
             by, within = self._acceptance.accept(key, data, sender)
+            await self._acceptance.kept()
             argument = _argument(data)
             device, command = self._target(key)
             dialling = self._plant.dialling(device)

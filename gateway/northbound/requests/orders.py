@@ -26,6 +26,7 @@ class Orders:
         """Returns the new document. `key`, `data`: as received."""
         try:
             by = self._acceptance.accept(key, data, sender).by
+            await self._acceptance.kept()
             if "*" in key:
                 raise BadValue(f"{payload.short(key)} has a wildcard: an order names one")
             path = key.removeprefix(self._keys.status(f"{part}/"))

@@ -7,7 +7,7 @@ from gateway.contract import payload
 from gateway.contract.interfaces import Plant
 from gateway.contract.keys import Keys
 from gateway.contract.payload import Failure, Problem, WriteOutcome
-from gateway.engine.requests import WRITE_EXPIRY
+from gateway.engine.jobs.requests import WRITE_EXPIRY
 from gateway.errors import Busy, GatewayError, Unclear
 from gateway.northbound.requests.audit import Audit
 from gateway.northbound.requests.writes import ANSWER_WITHIN

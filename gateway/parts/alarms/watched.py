@@ -4,8 +4,8 @@ from collections.abc import Iterable
 from functools import partial
 
 from gateway.config import AlarmsConfig
-from gateway.engine.device import Device
-from gateway.engine.health import State
+from gateway.engine.device.device import Device
+from gateway.engine.device.health import State
 from gateway.line.line import Line
 from gateway.plant.conditions import Condition, Reading
 from gateway.tags import AlarmRule, Level

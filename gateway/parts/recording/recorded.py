@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 from gateway.config import LineConfig
-from gateway.engine.device_settings import DeviceSettings
+from gateway.engine.device.device_settings import DeviceSettings
 from gateway.parts.recording.replay import SILENT_BEFORE, Learned, Replay
 from gateway.parts.recording.wire_file import LoggedPiece, LoggedValue
 from gateway.protocols.driver import Address, Span

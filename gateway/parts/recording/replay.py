@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 from gateway.config import LineConfig
-from gateway.engine.device import Device
+from gateway.engine.device.device import Device
 from gateway.engine.effects import Effect, Samples
 from gateway.engine.engine import Engine
 from gateway.errors import ConfigError

@@ -14,7 +14,7 @@ from typing import Protocol
 import structlog
 
 from gateway.config import LineConfig
-from gateway.engine.records import COMPLETE, CallState, LineRecord
+from gateway.engine.device.records import COMPLETE, CallState, LineRecord
 from gateway.errors import LineDown
 from gateway.line.send_permit import Duty
 from gateway.line.wire_log import WireLog

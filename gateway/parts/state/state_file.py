@@ -11,7 +11,7 @@ from typing import Any
 
 import orjson
 
-from gateway.engine.device import Device
+from gateway.engine.device.device import Device
 from gateway.planning.bad_addresses import KnownBad
 from gateway.plant.saved_file import SavedFile
 from gateway.protocols.driver import Span

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from gateway.config import Config
-from gateway.engine.device import Device
+from gateway.engine.device.device import Device
 from gateway.engine.forecast import LineForecast, TimedWrites, forecast, write_seconds
 from gateway.tags import Tag
 from gateway.tags.transfer import TransferRule, leaves

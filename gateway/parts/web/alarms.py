@@ -9,11 +9,18 @@ from gateway.contract import payload
 from gateway.contract.payload import Failure, Problem
 from gateway.errors import BadValue
 from gateway.parts.web.guard import BY
-from gateway.parts.web.replies import answer, body, json_off_loop, limit, raw
+from gateway.parts.web.replies import answer, body, json_off_loop, raw
+from gateway.parts.web.routes import LIMIT, Choice, Route, Word
+from gateway.parts.web.schemas import ref
 from gateway.plant.part import Core, Listed
 
-MOST_ITEMS = 1000  # of one page
-_ITEMS = 200
+_STATE = Choice(
+    "state",
+    "open, if left out: all that are not normal; all; or one state",
+    ("open", "all", "normal", "active", "acknowledged", "returned"),
+)
+_AFTER = Word("after", "Last alarm of the page before")
+_ALARM = Word("alarm", "device/tag, device, or line:name", required=True)
 _STATUS = {
     Problem.BAD_VALUE: 400,
     Problem.NOT_ALLOWED: 403,
@@ -29,16 +36,44 @@ class AlarmApi:
         self._north = core.north
         self._others = core.others
 
-    def routes(self) -> list[web.RouteDef]:
+    def routes(self) -> list[Route]:
         return [
-            web.get("/api/alarms", self._alarms),
-            web.post("/api/alarms/acknowledge", self._acknowledge),
+            Route(
+                path="/api/alarms",
+                handler=self._alarms,
+                name="alarms",
+                about="Alarms, those without acknowledgement first, in pages",
+                parameters=(_STATE, _AFTER, LIMIT),
+                reply=ref("Alarms"),
+                errors={400: "A wrong state or limit"},
+            ),
+            Route(
+                path="/api/alarms/acknowledge",
+                handler=self._acknowledge,
+                name="acknowledge",
+                about="Acknowledges one alarm for an operator; a repeat gets the same answer",
+                method="post",
+                parameters=(_ALARM,),
+                body=ref("Acknowledgement"),
+                reply=ref("Alarm"),
+                done="It is acknowledged",
+                errors={
+                    403: "No token",
+                    408: "The body did not arrive",
+                    415: "No application/json",
+                },
+                failures={
+                    400: "bad-value: no name of an operator",
+                    404: "unknown-tag: no such alarm",
+                    409: "nothing-to-acknowledge: it is normal, or was raised again",
+                    503: "busy: this gateway is the standby, or stood still",
+                },
+            ),
         ]
 
     async def _alarms(self, request: web.Request) -> web.Response:
         """Without `state` all that are not normal; `state=all` returns those too."""
-        most, after = limit(request, _ITEMS, MOST_ITEMS), request.query.get("after")
-        state = request.query.get("state", "open")
+        most, after, state = LIMIT.of(request), _AFTER.of(request), _STATE.of(request) or "open"
         lists = self._others.each(Listed)
         if not lists:
             return answer(503, "the alarms do not work now: see `faults` of /api/status")
@@ -51,7 +86,7 @@ class AlarmApi:
         arrived = asyncio.get_running_loop().time()
         if request.content_type != "application/json":
             return answer(415, "send the operator's name as Content-Type: application/json")
-        name, data = request.query.get("alarm", ""), await body(request)
+        name, data = _ALARM.of(request) or "", await body(request)
         result = await self._north.order("alarms", name, data, f"web {request[BY]}", arrived)
         if isinstance(result, Failure):
             return raw(payload.outcome(result), _STATUS.get(result.problem, 503))

@@ -1,4 +1,4 @@
-"""The JSON API: tags, devices, lines, history, writes. `openapi.json` describes it.
+"""The JSON API: tags, devices, lines, history, writes.
 
 Lists come in pages: `limit` items, and `next` for the parameter `after` of the next page. Answers
 are made on threads, because those of a large plant take long.
@@ -25,23 +25,20 @@ from gateway.errors import BadValue, Busy, GatewayError
 from gateway.parts.web.connections import client_of
 from gateway.parts.web.guard import BY
 from gateway.parts.web.places import Places
-from gateway.parts.web.replies import answer, as_json, body, count, json_off_loop, raw
-from gateway.parts.web.replies import limit as limit_of
+from gateway.parts.web.replies import answer, as_json, body, json_off_loop, raw
+from gateway.parts.web.routes import LIMIT, Choice, Count, Route, Word
+from gateway.parts.web.schemas import ref
 from gateway.plant.part import Core
 from gateway.plant.threads import off_loop
 from gateway.tags import Tag
 from gateway.tags.sample import has_value
 
 STATE_AGE = 2.0  # seconds that the state of lines and devices may be old
-MOST_ITEMS = 1000  # of one page
 MOST_SAMPLES = 10_000
-_ITEMS = 200
-_SAMPLES = 1000
 HISTORY_WITHIN = 20.0  # seconds for one query
 HISTORY_AT_ONCE = 4  # queries; they read the disk
 HISTORY_WAITING = 16  # queries at once and waiting, and of one client; beyond, 503
 HISTORY_OF_CLIENT = 12
-MOST_NUMBER = 10**8  # of a transfer
 # 200 only for an acknowledged write. 502 and above: it was sent, or the device cannot be reached.
 _STATUS = {
     Problem.BAD_VALUE: 400,
@@ -55,6 +52,24 @@ _STATUS = {
     Problem.UNCLEAR: 504,
     Problem.INCOMPLETE: 502,
 }
+_SAMPLES = Count("limit", "Items of this page, 1000 if left out", 1, MOST_SAMPLES, 1000)
+_AFTER_TRANSFER = Count("after", "Number of the last transfer of the page before", 0, 10**8, 0)
+_AFTER_DEVICE = Word("after", "Name of the last device of the page before")
+_AFTER_TAG = Word("after", "Last tag of the page before")
+_OF_LINE = Word("line", "Only devices of this line")
+_OF_DEVICE = Word("device", "Only tags of this device")
+_FIND = Word("find", "Only tags whose name contains this text")
+_TAG = Word("tag", "device/name", required=True)
+_WRITTEN = Word("tag", "device/name; or a device, to write several of its tags", required=True)
+# `question` parses them, as for Zenoh.
+_QUESTION = (
+    Word("time", "A time range of Zenoh; [now(-1h)..] if left out: see docs/history.md"),
+    _SAMPLES,
+    Word("bucket", "Length of a bucket such as 1min: see docs/charts.md"),
+    Word("agg", "Values of each bucket: min,max,mean,last if left out"),
+    Count("last", "The newest samples of the range", 1, MOST_SAMPLES),
+    Choice("quality", "good leaves out samples and buckets that are not good", ("any", "good")),
+)
 
 
 class Api:
@@ -68,16 +83,91 @@ class Api:
         self._history_turns = asyncio.Semaphore(HISTORY_AT_ONCE)
         self._history_places = Places(HISTORY_WAITING, HISTORY_OF_CLIENT, "queries of history")
 
-    def routes(self) -> list[web.RouteDef]:
+    def routes(self) -> list[Route]:
         return [
-            web.get("/api/status", self._status),
-            web.get("/api/lines", self._lines),
-            web.get("/api/transfers", self._transfers),
-            web.get("/api/devices", self._device_page),
-            web.get("/api/devices/{device}", self._device),
-            web.get("/api/tags", self._tags),
-            web.get("/api/history", self._samples),
-            web.post("/api/write", self._write),
+            Route(
+                path="/api/status",
+                handler=self._status,
+                name="status",
+                about="State of the gateway, and what is wrong",
+                reply=ref("Status"),
+            ),
+            Route(
+                path="/api/lines",
+                handler=self._lines,
+                name="lines",
+                about="All lines",
+                reply=ref("Lines"),
+            ),
+            Route(
+                path="/api/transfers",
+                handler=self._transfers,
+                name="transfers",
+                about="Transfers by number, in pages",
+                parameters=(_AFTER_TRANSFER, LIMIT),
+                reply=ref("Transfers"),
+                errors={400: "A wrong number or limit"},
+            ),
+            Route(
+                path="/api/devices",
+                handler=self._device_page,
+                name="devices",
+                about="Devices by name, in pages",
+                parameters=(_OF_LINE, _AFTER_DEVICE, LIMIT),
+                reply=ref("Devices"),
+                errors={400: "A wrong limit"},
+            ),
+            Route(
+                path="/api/devices/{device}",
+                handler=self._device,
+                name="device",
+                about="One device with its requests",
+                reply=ref("Device"),
+                errors={404: "No such device"},
+            ),
+            Route(
+                path="/api/tags",
+                handler=self._tags,
+                name="tags",
+                about="Tags with their values, in pages, in the order of the file",
+                parameters=(_OF_DEVICE, _FIND, _AFTER_TAG, LIMIT),
+                reply=ref("Tags"),
+                errors={400: "A wrong limit", 404: "No such device"},
+            ),
+            Route(
+                path="/api/history",
+                handler=self._samples,
+                name="history",
+                about="Recorded samples of one tag in the order of time, or buckets of time for "
+                "a chart",
+                parameters=(_TAG, *_QUESTION),
+                reply=ref("History"),
+                errors={
+                    400: "A wrong time range, limit or bucket",
+                    404: "No such tag, or no history of it",
+                },
+            ),
+            Route(
+                path="/api/write",
+                handler=self._write,
+                name="write",
+                about="Writes one tag, or several of a device; answered when the device has "
+                "acknowledged",
+                method="post",
+                parameters=(_WRITTEN,),
+                body={"description": 'The value, as 12.5, true, [1, 2]; or {"value": 12.5}'},
+                reply={"anyOf": [ref("Written"), ref("WrittenGroup")]},
+                done="The device acknowledged",
+                errors={408: "The body did not arrive", 415: "No application/json"},
+                failures={
+                    400: "bad-value: nothing was sent",
+                    403: "not-writable, or no token",
+                    404: "unknown-tag: nothing was sent",
+                    502: "refused by the device; incomplete: some of several tags were written",
+                    503: "busy, line-down, no-reply: nothing was sent",
+                    504: "unclear: it may or may not be done",
+                },
+            ),
         ]
 
     @property
@@ -96,8 +186,7 @@ class Api:
         return await json_off_loop(lambda: {"lines": dict(below("lines/", documents))})
 
     async def _transfers(self, request: web.Request) -> web.Response:
-        limit = limit_of(request, _ITEMS, MOST_ITEMS)
-        after = count(request, "after", 0, 0, MOST_NUMBER)
+        limit, after = LIMIT.of(request), _AFTER_TRANSFER.of(request)
         documents = await self._north.documents(STATE_AGE)
 
         def page() -> object:
@@ -108,8 +197,8 @@ class Api:
         return await json_off_loop(page)
 
     async def _device_page(self, request: web.Request) -> web.Response:
-        limit, after = limit_of(request, _ITEMS, MOST_ITEMS), request.query.get("after", "")
-        line = request.query.get("line")
+        limit, after = LIMIT.of(request), _AFTER_DEVICE.of(request) or ""
+        line = _OF_LINE.of(request)
         documents = await self._north.documents(STATE_AGE)
 
         def page() -> object:
@@ -129,8 +218,8 @@ class Api:
         return as_json(document)
 
     async def _tags(self, request: web.Request) -> web.Response:
-        limit, after = limit_of(request, _ITEMS, MOST_ITEMS), request.query.get("after")
-        device, find = request.query.get("device"), request.query.get("find", "").lower()
+        limit, after = LIMIT.of(request), _AFTER_TAG.of(request)
+        device, find = _OF_DEVICE.of(request), (_FIND.of(request) or "").lower()
         if device is not None and device not in self._devices:
             return answer(404, f"there is no device {payload.short(device)}")
 
@@ -160,7 +249,7 @@ class Api:
         return {**payload.sample_fields(self._plant.sample(tag)), **meta_fields(tag)}
 
     async def _samples(self, request: web.Request) -> web.Response:
-        key = request.query.get("tag", "")
+        key = _TAG.of(request) or ""
         tag = self._plant.tag(key)
         if tag is None:
             return answer(404, f"there is no tag {payload.short(key)}")
@@ -170,7 +259,7 @@ class Api:
             return answer(503, str(error))
         if history is None or not tag.history:
             return answer(404, f"no history is kept of {tag.key}: it needs `history: true`")
-        limit = limit_of(request, _SAMPLES, MOST_SAMPLES)
+        limit = _SAMPLES.of(request)
         find = partial(_found, history, tag, dict(request.query), limit)
         is_valid = has_value(self._plant.sample(tag))
 
@@ -191,7 +280,7 @@ class Api:
         arrived = asyncio.get_running_loop().time()
         if request.content_type != "application/json":
             return answer(415, "send the value as Content-Type: application/json")
-        key, data = request.query.get("tag", ""), await body(request)
+        key, data = _WRITTEN.of(request) or "", await body(request)
         # The server does not cancel this when the client leaves: the write may be on the wire.
         result = await self._north.write(key, data, f"web {request[BY]}", arrived)
         failed = payload.failed(result)

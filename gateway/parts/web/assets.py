@@ -4,23 +4,26 @@ from pathlib import Path
 
 from aiohttp import web
 
+from gateway.parts.web.routes import Route
+
 _FOLDER = Path(__file__).parent / "assets"
 _FILES = {
     "/": ("page.html", "text/html"),
     "/page.js": ("page.js", "text/javascript"),
     "/page.css": ("page.css", "text/css"),
-    "/openapi.json": ("openapi.json", "application/json"),
 }
 
 
-def routes() -> list[web.RouteDef]:
-    return [_route(path, *file) for path, file in _FILES.items()]
+def routes() -> list[Route]:
+    return [
+        file(path, (_FOLDER / name).read_bytes(), kind) for path, (name, kind) in _FILES.items()
+    ]
 
 
-def _route(path: str, name: str, kind: str) -> web.RouteDef:
-    body = (_FOLDER / name).read_bytes()
+def file(path: str, body: bytes, kind: str) -> Route:
+    """Returns the route of a file."""
 
     async def asset(_: web.Request) -> web.Response:
         return web.Response(body=body, content_type=kind, charset="utf-8")
 
-    return web.get(path, asset)
+    return Route(path=path, handler=asset, is_open=True)

@@ -22,6 +22,7 @@ from gateway.parts.web.api import Api, overview
 from gateway.parts.web.connections import client_of
 from gateway.parts.web.places import Places
 from gateway.parts.web.replies import drop
+from gateway.parts.web.routes import Route, Word
 from gateway.parts.web.wire import Recorder, Wires, as_fields
 from gateway.plant.part import Core, Shown
 from gateway.tags import Quality, Sample, Tag
@@ -37,6 +38,9 @@ KEPT_LOADS = 360  # half an hour
 TAGS_SHOWN = 200  # of one device
 _BY_NAME = ("devices", "transfers")  # of the state: a page gets their changes
 MOST_SENTENCES = 50  # about what is wrong, and about what to look at
+_LINE = Word("line", "With the exchanges of this line")
+_DEVICE = Word("device", "With the values of this device")
+_AFTER = Word("after", "From after this tag")
 
 
 class Loads:
@@ -91,6 +95,19 @@ class Events:
         self._pages = Places(MOST_PAGES, MOST_PAGES_OF_CLIENT, "pages")
         self._state: tuple[Documents, dict[str, Any]] = ({}, {})
 
+    def routes(self) -> list[Route]:
+        return [
+            Route(
+                path="/api/events",
+                handler=self.handle,
+                name="events",
+                about="Server-sent events of the status page; their content may change",
+                parameters=(_LINE, _DEVICE, _AFTER),
+                kind="text/event-stream",
+                done="Events",
+            )
+        ]
+
     def state(self, documents: Documents) -> dict[str, Any]:
         """Returns the state as all pages get it; made once for the same documents."""
         if self._state[0] is not documents:
@@ -99,15 +116,12 @@ class Events:
         return self._state[1]
 
     async def handle(self, request: web.Request) -> web.StreamResponse:
-        """`line`: with its exchanges. `device`: with its values, from after the tag `after`."""
-        query = request.query
-        device = query.get("device")
         tags = None
-        if device:
-            tags = self._api.select(device, "", query.get("after"), TAGS_SHOWN)
+        if device := _DEVICE.of(request):
+            tags = self._api.select(device, "", _AFTER.of(request), TAGS_SHOWN)
         with (
             self._pages.taken(client_of(request.transport)),
-            self.wires.watched(query.get("line", "")) as recorder,
+            self.wires.watched(_LINE.of(request) or "") as recorder,
         ):
             response = web.StreamResponse(headers={"Content-Type": "text/event-stream"})
             response.headers["X-Accel-Buffering"] = "no"  # a proxy passes events on at once

@@ -7,6 +7,7 @@ in a header, never in an address: addresses are kept in logs and histories.
 
 import hmac
 import socket
+from collections.abc import Set as AbstractSet
 from ipaddress import ip_address
 from urllib.parse import urlsplit
 
@@ -19,8 +20,6 @@ from gateway.parts.web.connections import Connections, client_of
 from gateway.parts.web.places import Places
 from gateway.parts.web.replies import answer, send
 
-# Without a token at every address: the page itself holds no value.
-OPEN = frozenset({"/", "/page.js", "/page.css", "/openapi.json", "/healthz", "/readyz"})
 BY = web.RequestKey("by", str)  # the name of the token; empty without a valid one
 MOST_OPEN = 64  # requests at once, and of one client; beyond, 503
 MOST_OF_CLIENT = 40
@@ -51,22 +50,24 @@ class Guard:
         self._requests = Places(MOST_OPEN, MOST_OF_CLIENT, "requests")
         self._scrapes = Places(MOST_SCRAPES, MOST_SCRAPES_OF_CLIENT, "scrapes")
 
-    def middleware(self) -> Middleware:
+    def middleware(self, open_paths: AbstractSet[str]) -> Middleware:
+        """`open_paths`: files and probes. They need no token, because they hold no value, and no
+        place, because they wait for nothing."""
+
         @web.middleware
         async def guarded(request: web.Request, handler: Handler) -> web.StreamResponse:
             with self._connections.busy(request.transport):
-                return await self._answered(request, handler)
+                return await self._answered(request, handler, request.path in open_paths)
 
         return guarded
 
-    async def _answered(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        """Answers in a place of its kind: none is free of it until its client has the answer.
-
-        Files and probes need none, because they wait for nothing.
-        """
-        if (refusal := self._refusal(request)) is not None:
+    async def _answered(
+        self, request: web.Request, handler: Handler, is_open: bool
+    ) -> web.StreamResponse:
+        """Answers in a place of its kind, which is taken until the client has the answer."""
+        if (refusal := self._refusal(request, is_open)) is not None:
             return await send(request, refusal)
-        if request.path in OPEN:
+        if is_open:
             return await send(request, await _outcome(request, handler))
         places = self._scrapes if request.path == "/metrics" else self._requests
         try:
@@ -75,7 +76,7 @@ class Guard:
         except web.HTTPServiceUnavailable as error:
             return await send(request, answer(error.status, error.reason))
 
-    def _refusal(self, request: web.Request) -> web.Response | None:
+    def _refusal(self, request: web.Request, is_open: bool) -> web.Response | None:
         if not self._is_known(request.host):
             return answer(421, f"unknown name {request.host[:100]!r}: see web.names")
         if not _is_same_site(request):
@@ -83,7 +84,7 @@ class Guard:
         if not request.headers.get("Authorization", "").isascii():
             return answer(400, "Authorization is no ASCII text")
         request[BY] = self._name(request)
-        if self._needs_token(request) and not request[BY]:
+        if not is_open and self._needs_token(request) and not request[BY]:
             if self._tokens is None:
                 return answer(403, "nothing can be written here: the file has no web.tokens_file")
             refusal = answer(401, "a token is needed: send Authorization: Bearer <token>")
@@ -96,8 +97,7 @@ class Guard:
         return not self._needs_token(request) or bool(self._name(request))
 
     def _needs_token(self, request: web.Request) -> bool:
-        needs_token = request.method != "GET" or self._reads_need_token
-        return needs_token and request.path not in OPEN
+        return request.method != "GET" or self._reads_need_token
 
     def _is_known(self, host: str) -> bool:
         """True for an address, and for a name of this machine: rebinding needs a foreign name."""

@@ -20,7 +20,7 @@ from prometheus_client.registry import Collector, CollectorRegistry
 
 from gateway.contract.faults import Documents, below, faults, transfers, warnings
 from gateway.contract.interfaces import Plant
-from gateway.engine.records import COMPLETE
+from gateway.engine.device.records import COMPLETE
 from gateway.tags import Quality
 
 CONTENT_TYPE = CONTENT_TYPE_LATEST

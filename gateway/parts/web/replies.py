@@ -13,18 +13,6 @@ PIECE_WITHIN = 15.0  # seconds in which a client takes a piece of an answer
 _PIECE = 64 * 1024
 
 
-def limit(request: web.Request, default: int, most: int) -> int:
-    return count(request, "limit", default, 1, most)
-
-
-def count(request: web.Request, name: str, default: int, least: int, most: int) -> int:
-    """Returns the number that a parameter gives. Raises `HTTPBadRequest`."""
-    text = request.query.get(name, str(default))
-    if not (text.isascii() and text.isdigit() and len(text) < 10 and least <= int(text) <= most):
-        raise web.HTTPBadRequest(reason=f"{name} is no number from {least} to {most}")
-    return int(text)
-
-
 async def body(request: web.Request) -> bytes:
     """Returns the body of a request. Raises `HTTPException`."""
     try:

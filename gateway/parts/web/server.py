@@ -5,6 +5,7 @@ dropped, and answers of a large plant are made on threads.
 """
 
 import asyncio
+import json
 import logging
 import socket
 from contextlib import suppress
@@ -14,12 +15,13 @@ from aiohttp import web
 from aiohttp.http_exceptions import HttpProcessingError
 
 from gateway.config import WebConfig
-from gateway.parts.web import assets, metrics
+from gateway.parts.web import assets, metrics, openapi
 from gateway.parts.web.alarms import AlarmApi
 from gateway.parts.web.api import Api
 from gateway.parts.web.connections import Connections
 from gateway.parts.web.events import Events, Loads
 from gateway.parts.web.guard import Guard, add_headers
+from gateway.parts.web.routes import Route
 from gateway.plant.part import Core, Routed
 from gateway.plant.threads import off_loop
 
@@ -55,25 +57,24 @@ class Server:
         self._loads = Loads(core)
         self._connections = Connections()
         guard = Guard(config, self._connections)
-        self._app = web.Application(middlewares=[guard.middleware()], client_max_size=64 * 1024)
-        self._app.on_response_prepare.append(add_headers)
-        self._app.add_routes(
-            [
-                *self._api.routes(),
-                *AlarmApi(core).routes(),
-                *(route for part in core.others.each(Routed) for route in part.routes()),
-                *assets.routes(),
-                web.get("/api/events", Events(core, self._api, self._loads, guard.allows).handle),
-                web.get("/healthz", self._health),
-                web.get("/readyz", self._ready),
-                web.get("/metrics", self._metrics),
-            ]
+        events = Events(core, self._api, self._loads, guard.allows)
+        routes = [
+            *self._api.routes(),
+            *AlarmApi(core).routes(),
+            *(route for part in core.others.each(Routed) for route in part.routes()),
+            *events.routes(),
+            *self._probes(),
+            *assets.routes(),
+        ]
+        self.description = openapi.document(routes)
+        text = json.dumps(self.description, indent=2).encode()
+        routes.append(assets.file("/openapi.json", text, "application/json"))
+        is_open = frozenset(route.path for route in routes if route.is_open)
+        self._app = web.Application(
+            middlewares=[guard.middleware(is_open)], client_max_size=64 * 1024
         )
-
-    def addresses(self) -> list[tuple[str, str]]:
-        """Returns each path that is answered, with its method."""
-        routes = self._app.router.routes()
-        return [(one.resource.canonical, one.method) for one in routes if one.resource is not None]
+        self._app.on_response_prepare.append(add_headers)
+        self._app.add_routes([route.registered() for route in routes])
 
     async def run(self) -> None:
         """Serves until cancelled. Tries again if the address cannot be used: lines are more
@@ -133,6 +134,37 @@ class Server:
             return server
 
     # -- probes and metrics --
+
+    def _probes(self) -> list[Route]:
+        return [
+            Route(
+                path="/metrics",
+                handler=self._metrics,
+                name="metrics",
+                about="Metrics for Prometheus",
+                kind="text/plain",
+                done="Metrics",
+            ),
+            Route(
+                path="/healthz",
+                handler=self._health,
+                name="healthz",
+                about="The event loop turns",
+                kind="text/plain",
+                done="ok",
+                is_open=True,
+            ),
+            Route(
+                path="/readyz",
+                handler=self._ready,
+                name="readyz",
+                about="The gateway serves its plant",
+                kind="text/plain",
+                done="ready",
+                errors={503: "It does not"},
+                is_open=True,
+            ),
+        ]
 
     async def _health(self, _: web.Request) -> web.Response:
         """The event loop turns."""

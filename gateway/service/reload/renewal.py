@@ -9,8 +9,8 @@ from collections.abc import Mapping
 
 from gateway.config import LineConfig
 from gateway.config.changes import DeviceChange, Difference
-from gateway.engine.changes import Changes
-from gateway.engine.device import Device
+from gateway.engine.device.changes import Changes
+from gateway.engine.device.device import Device
 from gateway.engine.forecast import forecast
 from gateway.line.line import Line
 from gateway.planning.bad_addresses import KnownBad

@@ -1,0 +1,28 @@
+"""Changed devices of one line, after the file was read again."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from gateway.engine.device.device import Device
+from gateway.tags import Tag
+
+
+@dataclass(frozen=True, slots=True)
+class Changes:
+    """The devices that an engine takes over together. Those that are new have a plan."""
+
+    removed: Sequence[Device] = ()
+    added: Sequence[Device] = ()
+    replaced: Sequence[tuple[Device, Device]] = ()  # the same station with other settings
+    renewed: Mapping[Tag, Tag] = field(default_factory=dict)  # old to new: the value goes on
+
+    @property
+    def left(self) -> list[Device]:
+        """The devices that the engine forgets."""
+        return [*self.removed, *(old for old, _ in self.replaced)]
+
+    def applied(self, devices: Sequence[Device]) -> list[Device]:
+        """Returns the devices of the line after the changes."""
+        following = dict(self.replaced)
+        stay = [following.get(one, one) for one in devices if one not in self.removed]
+        return [*stay, *self.added]

@@ -1,0 +1,324 @@
+"""The state of one device on a line: its plan, its health and its record."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import InitVar, dataclass, field
+
+from gateway.engine.device.device_settings import DeviceSettings
+from gateway.engine.device.health import Health, State, diagnosis
+from gateway.engine.device.monitor_list import MonitorList
+from gateway.engine.device.records import Record
+from gateway.engine.device.reply_shapes import ReplyShapes, reply_shapes
+from gateway.engine.device.station_silence import StationSilence
+from gateway.engine.device.turnaround import Turnaround
+from gateway.errors import Garbled, LineDown
+from gateway.planning.bad_addresses import RETRIES, BadAddresses, KnownBad
+from gateway.planning.monitor_lists import with_monitor_list
+from gateway.planning.planner import Block, around, plan, runs_of
+from gateway.planning.wire_timing import Transactions, WireTiming
+from gateway.protocols.capabilities import Monitor, NoReplyCauses, Windowed
+from gateway.protocols.driver import AnyDriver, Cost, Span, Timing
+from gateway.protocols.swapped import SWAPPED, KnownReplies, is_swapped
+from gateway.tags import Tag
+
+MOST_PLANNED = 1000  # tags times intervals: planning them takes some tenths of a second
+PLANNING = 2e-4  # seconds for each tag and interval, estimated
+SILENT_SHARE = 0.01  # share of the time for new tries of silent addresses
+MOST_PROBED = 8  # places among which the resyncs change
+WORTH_WHILE = 0.1  # share of the wire time that a new plan must save
+ANSWERS_TWICE = (
+    "Answers twice: a second master is on the line, two stations have the number {station}, or a "
+    "device server repeats replies"
+)
+HALF_LIFE = 10.0  # seconds until past use of the wire counts half
+
+
+@dataclass(slots=True, eq=False)
+class Device:
+    """The state of one device; it belongs to one line."""
+
+    settings: DeviceSettings
+    wire: WireTiming
+    health: Health = field(init=False)
+    record: Record = field(default_factory=Record)
+    bad_addresses: BadAddresses = field(init=False)
+    turnaround: Turnaround = field(init=False)
+    blocks: tuple[Block, ...] = ()
+    last_read: Span | None = None  # the last block that was read
+    monitor: MonitorList = field(default_factory=MonitorList)
+    window: int = field(init=False)  # requests that may be outstanding at once
+    silence: StationSilence = field(init=False)
+    shapes: ReplyShapes | None = field(init=False)  # None: no reply, or each has a number
+    one_at_a_time: bool = False  # it loses requests that are sent together
+    # Its recent use of the wire, to compare with that of other devices: the binary logarithm of
+    # the seconds, plus the half-lives until the time of counting. It grows, and never decays.
+    use: float = -math.inf
+    plan_now: InitVar[bool] = True  # False: the owner calls `plan` before the line runs
+
+    def __post_init__(self, plan_now: bool) -> None:
+        driver = self.driver
+        self.bad_addresses = BadAddresses(driver.cost)
+        self.turnaround = Turnaround(self.settings.turnaround)
+        self.health = Health(answerable=self.settings.answerable)
+        self.window = driver.window if isinstance(driver, Windowed) else 1
+        self.shapes = (
+            None if self.broadcast else reply_shapes(driver, self.polled_tags, self.bad_addresses)
+        )
+        safe = self.wire.silence(self.timing)
+        learns = self.timing.learn_silence and self.shapes is not None
+        self.silence = StationSilence(safe, min(safe, self.wire.character) if learns else safe)
+        if plan_now:
+            self.plan()
+
+    @property
+    def name(self) -> str:
+        return self.settings.name
+
+    @property
+    def driver(self) -> AnyDriver:
+        return self.settings.driver
+
+    @property
+    def timing(self) -> Timing:
+        return self.settings.timing
+
+    @property
+    def tags(self) -> tuple[Tag, ...]:
+        return self.settings.wire_tags
+
+    @property
+    def broadcast(self) -> bool:
+        """True if it receives writes or sends unsolicited frames, and never replies."""
+        return not self.health.answerable
+
+    @property
+    def state(self) -> State:
+        return self.health.state
+
+    @property
+    def polled_tags(self) -> list[Tag]:
+        """The tags that polls read."""
+        return [tag for tag in self.tags if self.driver.areas[tag.span.area].readable]
+
+    @property
+    def longest_reply(self) -> float:
+        """Seconds after a request until its reply can no longer arrive."""
+        return self.timing.reply_timeout + self.settings.late_guard
+
+    @property
+    def usual_turnaround(self) -> float | None:
+        """Seconds of the station for a reply, measured or from the file; None: not known yet."""
+        measured, given = self.record.turnaround, self.turnaround.configured
+        return given if measured is None else max(measured, given or 0.0)
+
+    def diagnosis(self) -> str:
+        """Returns the likely cause of its trouble as a sentence; empty when there is none."""
+        driver = self.driver
+        trouble = self.health.trouble
+        if trouble is None:
+            if self.shapes is not None and self.shapes.answers_twice:
+                return ANSWERS_TWICE.format(station=driver.station)
+            if self.one_at_a_time:
+                return f"It takes one request at a time, not {self.window}: set `window: 1`"
+            return ""
+        heard = trouble.data if isinstance(trouble, Garbled) and not self.health.online else b""
+        if heard and isinstance(driver, KnownReplies) and is_swapped(heard, driver):
+            return SWAPPED
+        causes = driver.no_reply_causes if isinstance(driver, NoReplyCauses) else ""
+        return diagnosis(trouble, causes)
+
+    def takes_one_at_a_time(self, only: bool) -> None:
+        """Notes if the device loses requests that are sent together."""
+        self.one_at_a_time = only
+
+    def successor(self, settings: DeviceSettings, bad: KnownBad) -> "Device":
+        """Returns the same station with other settings of the file, without a plan yet. A thread
+        may do it; `take_over` gives it everything else that was learned. `bad`: addresses."""
+        new = Device(settings, self.wire, plan_now=False)
+        new.bad_addresses.restore(bad, settings.wire_tags)
+        if settings.turnaround == self.settings.turnaround:
+            new.turnaround = self.turnaround
+        return new
+
+    def take_over(self, old: "Device") -> None:
+        """Takes over the state of the same station. No request to it may be in flight."""
+        self.health, self.record, self.use = old.health, old.record, old.use
+        self.health.resyncs_elsewhere()
+        self.last_read, self.one_at_a_time = old.last_read, old.one_at_a_time
+        if (old.silence.safe, old.silence.least) == (self.silence.safe, self.silence.least):
+            self.silence = old.silence
+        if self.shapes is not None and old.shapes is not None:
+            old.shapes.longer, self.shapes = self.shapes.longer, old.shapes
+
+    def restart(self, trouble: LineDown | None = None) -> None:
+        """Starts again after the line was opened or lost."""
+        self.health.restart(trouble)
+        self.monitor.forget()
+
+    # The plan
+
+    def seconds(self, cost: Cost) -> float:
+        """Returns the seconds of one transaction with this station."""
+        return self.wire.transaction(cost, self.timing, self.turnaround.expected)
+
+    @property
+    def transactions(self) -> Transactions:
+        """The durations of transactions with this station, for the planner."""
+        return Transactions(self.wire, self.timing, self.turnaround.expected)
+
+    @property
+    def longest_poll(self) -> float:
+        """Seconds of its longest poll."""
+        longest = max((self.seconds(block.cost) for block in self.blocks), default=0.0)
+        return longest * self.settings.verify_reads
+
+    @property
+    def load(self) -> float:
+        """The share of the wire time that its polls take."""
+        once = sum(self.seconds(block.cost) / block.every for block in self.blocks)
+        return once * self.settings.verify_reads
+
+    def plan(self) -> None:
+        """Plans the blocks that read the tags, without the bad addresses."""
+        bad = self.bad_addresses
+        if self.settings.listen_only:
+            self.poll_nothing()
+            return
+        blocks = plan(self.tags, self.driver, self.transactions, bad.cuts)
+        if self.monitor.allowed:
+            blocks = with_monitor_list(blocks, self.driver, self.seconds, bad.bad.keys())
+        self.blocks = blocks
+        bad.changed.clear()
+        if self.shapes is not None:
+            self.shapes.longer.planned(blocks)
+
+    def poll_seconds(self, block: Block) -> Sequence[float]:
+        """Returns the seconds of one poll of the block: of each span that may be read for it."""
+        if self.shapes is None:
+            return [self.seconds(block.cost)]
+        return [self.seconds(cost) for cost in self.shapes.longer.costs(block)]
+
+    def plan_changes(self) -> float:
+        """Plans again around the addresses that turned bad, returned or are split no longer.
+
+        Plans only the blocks that hold them and their neighbours, a limited number at a time: other
+        lines wait meanwhile. `bad_addresses.changed` keeps the rest. Returns the estimated seconds.
+        """
+        bad = self.bad_addresses
+        if self.monitor.allowed and self._monitored:  # the list may take tags of any block
+            self.plan()
+            return self.planning_seconds(self.tags)
+        rates = len({tag.every for tag in self.tags})
+        blocks = sorted(self.blocks, key=lambda block: block.span)
+        near: set[int] = set()
+        tags: list[Tag] = []
+        for span in sorted(bad.changed):
+            for place in set(around(blocks, span)) - near:
+                near.add(place)
+                tags += blocks[place].tags
+            bad.changed.discard(span)
+            if len(tags) * rates >= MOST_PLANNED:
+                break
+        kept = [block for place, block in enumerate(blocks) if place not in near]
+        found = plan(tags, self.driver, self.transactions, bad.cuts)
+        self.blocks = tuple(sorted((*kept, *found), key=lambda block: block.span))
+        if self.shapes is not None:
+            self.shapes.longer.planned(self.blocks)
+        return self.planning_seconds(tags)
+
+    @property
+    def _monitored(self) -> bool:
+        driver = self.driver
+        return isinstance(driver, Monitor) and any(
+            driver.monitor_cost([tag.span]) is not None for tag in self.tags
+        )
+
+    def planning_seconds(self, tags: Sequence[Tag]) -> float:
+        """Estimates the duration of a plan of these tags, the same on every computer."""
+        return PLANNING * len(tags) * len({tag.every for tag in tags})
+
+    def poll_nothing(self) -> None:
+        """Removes all polls: only requests of clients are sent."""
+        self.blocks = ()
+
+    def learn_turnaround(self) -> bool | None:
+        """Plans again if the measured turnaround can make the load smaller.
+
+        Returns True if the plan is another one now, None if nothing was planned. In every case the
+        measured one is expected from now on.
+        """
+        if self.record.exchanges < self.turnaround.look_at:
+            return None
+        if not self.turnaround.learn(self.record) or self._planning_takes_long:
+            return None
+        load, blocks = self.load, self.blocks
+        if self._most_gain() < WORTH_WHILE * load:
+            return None
+        self.plan()
+        useful = self.load < (1 - WORTH_WHILE) * load
+        self.turnaround.planned(self.record, useful=useful)
+        if not useful:
+            self.blocks = blocks
+        return useful
+
+    def _most_gain(self) -> float:
+        """Returns the load that a new plan can save at most.
+
+        The present plan was the cheapest at its turnaround. A longer one costs it no more than the
+        difference for each of its requests. After a shorter one, a plan with more requests is
+        cheaper by no more than the difference for each additional one.
+        """
+        change = self.turnaround.change(self.timing.turnaround)
+        requests = sum(1 / block.every for block in self.blocks)
+        if change < 0:
+            requests -= sum(1 / tag.every for tag in self.polled_tags)
+        return requests * change * self.settings.verify_reads
+
+    @property
+    def _planning_takes_long(self) -> bool:
+        """True if a new plan would hold up all lines for too long."""
+        return len(self.tags) * len({tag.every for tag in self.tags}) > MOST_PLANNED
+
+    def interval(self, block: Block) -> float:
+        """Returns the interval of the block; bad addresses are polled only rarely.
+
+        The time-outs of silent addresses hold up the others: all of them together take about
+        `SILENT_SHARE` of the time, unless one returned a short time ago.
+        """
+        known = self.bad_addresses.bad
+        bad = known.get(block.span)
+        if bad is None:
+            return block.every
+        pause = bad.retry
+        if bad.silent and pause == RETRIES[-1]:
+            silent = sum(other.silent for other in known.values())
+            pause = max(pause, silent * self.longest_reply / SILENT_SHARE)
+        return max(pause, block.every)
+
+    def was_read(self, span: Span) -> None:
+        """Notes a good read: the device has these addresses."""
+        self.last_read = span
+
+    @property
+    def probe_spans(self) -> Sequence[Span]:
+        """Configured addresses for a resync, those of the last good read first.
+
+        They stay the same from one good read to the next, as `Driver.resync` needs it.
+        """
+        tags = self.polled_tags
+        bad = {tag for one in self.bad_addresses.bad.values() for tag in one.tags}
+        runs = runs_of([tag for tag in tags if tag not in bad] or tags)
+        some = runs[:: 1 + len(runs) // MOST_PROBED]
+        return some if self.last_read is None else (self.last_read, *some)
+
+    # Its share of the wire
+
+    def used(self, now: float, begun: float) -> None:
+        """Adds the time since `begun` of a poll or a probe. Past use counts half after `HALF_LIFE`.
+
+        Writes and reads on demand do not count: the device must not lose polls because of them.
+        """
+        if now > begun:
+            more = math.log2(now - begun) + now / HALF_LIFE
+            least, most = sorted((self.use, more))
+            self.use = most + math.log2(1.0 + math.exp2(least - most))

@@ -1,0 +1,257 @@
+"""Health of one device: a state machine that decides if the device is polled or probed.
+
+The table `TRANSITIONS` holds every change of state. No other module assigns a field of `Health`.
+"""
+
+import math
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import Enum, StrEnum
+
+from gateway.errors import DeviceError, Evidence, Garbled, GatewayError, LineDown, NoReply
+from gateway.protocols.driver import Span
+from gateway.tags import Reason
+
+PAUSE_FIRST, PAUSE_LONGEST = 1.0, 60.0  # seconds between two tries of a block without replies
+PROBE_PAUSE = 4.0  # the longest time between two probes of an offline device; the first is 1 s
+PROBE_SPREAD = 0.1  # share by which it varies
+MOST_UNANSWERED = 64  # unanswered requests whose times are kept
+
+
+class State(StrEnum):
+    """States of a device. Only an online or failing device is polled."""
+
+    STARTING = "starting"  # no reply since the line was opened
+    ONLINE = "online"  # its last transaction ended with a reply
+    FAILING = "failing"  # its last transaction ended unclear; its polls go on
+    OFFLINE = "offline"  # it is only probed, at growing pauses
+
+
+class Event(StrEnum):
+    """Events that change the state."""
+
+    ANSWERED = "answered"  # a transaction ended with a reply, perhaps an error reply
+    UNCLEAR = "unclear"  # a transaction ended without a reply
+    GAVE_UP = "gave up"  # more transactions ended without a reply than `retries` allows
+    RESTARTED = "restarted"  # the line was opened, or lost
+
+
+class Heard(Enum):
+    """The last that was heard of a device, also before the line was opened again."""
+
+    NEVER = 0  # it has not replied yet
+    REPLIED = 1
+    GAVE_UP = 2  # it replied no longer
+
+
+_S, _E = State, Event
+TRANSITIONS: Mapping[tuple[State, Event], State] = {
+    (_S.STARTING, _E.ANSWERED): _S.ONLINE,
+    (_S.ONLINE, _E.ANSWERED): _S.ONLINE,
+    (_S.FAILING, _E.ANSWERED): _S.ONLINE,
+    (_S.OFFLINE, _E.ANSWERED): _S.ONLINE,
+    (_S.STARTING, _E.UNCLEAR): _S.STARTING,
+    (_S.ONLINE, _E.UNCLEAR): _S.FAILING,
+    (_S.FAILING, _E.UNCLEAR): _S.FAILING,
+    (_S.OFFLINE, _E.UNCLEAR): _S.OFFLINE,
+    (_S.STARTING, _E.GAVE_UP): _S.OFFLINE,
+    (_S.ONLINE, _E.GAVE_UP): _S.OFFLINE,
+    (_S.FAILING, _E.GAVE_UP): _S.OFFLINE,
+    (_S.OFFLINE, _E.GAVE_UP): _S.OFFLINE,
+    (_S.STARTING, _E.RESTARTED): _S.STARTING,
+    (_S.ONLINE, _E.RESTARTED): _S.STARTING,
+    (_S.FAILING, _E.RESTARTED): _S.STARTING,
+    (_S.OFFLINE, _E.RESTARTED): _S.STARTING,
+}
+
+
+@dataclass(slots=True, eq=False)
+class Health:
+    """The state of one device, and its outstanding requests.
+
+    `answerable` is False for a device that is only written to, or only sends unsolicited frames:
+    the line does not probe it.
+    """
+
+    answerable: bool = True
+    state: State = State.STARTING
+    online: bool = False  # online or failing: its blocks are polled
+    consecutive_failures: int = 0
+    needs_resync: bool = field(init=False)  # the next frame may answer an older request
+    outstanding: Span | None = None  # the request whose reply may still arrive
+    trouble: GatewayError | None = None
+    heard: Heard = Heard.NEVER
+    pause: float = 0.0  # seconds until the next probe of an offline device
+    next_probe: float = 0.0
+    short_probes: int = 0  # since the last patient one, or the last reply
+    _last_probe: float = -math.inf  # of an offline device
+    _unanswered: deque[float] = field(default_factory=lambda: deque(maxlen=MOST_UNANSWERED))
+    _probe_token: int = 0
+    _extra: bool = False  # an extra reply arrived since the last resync
+
+    def __post_init__(self) -> None:
+        self.needs_resync = self.answerable
+
+    def restart(self, trouble: LineDown | None = None) -> None:
+        """Starts again after the line was opened or lost: an older reply may still arrive."""
+        self._move(Event.RESTARTED)
+        self.trouble = trouble
+        self.consecutive_failures = self.short_probes = 0
+        self.needs_resync = self.answerable
+
+    def reconnected(self) -> None:
+        """Notes a new telephone call to an otherwise unchanged device."""
+        self.needs_resync = self.answerable
+
+    def answered(self, *, resynced: bool = False) -> bool:
+        """Notes a reply. Returns True if the device comes online.
+
+        `resynced`: it is the reply to a resync. After an extra reply only this one counts.
+        """
+        came = not self.online
+        if resynced:
+            self._extra = False
+        self._move(Event.ANSWERED)
+        self.consecutive_failures = self.short_probes = 0
+        self.heard, self.trouble = Heard.REPLIED, None
+        self.pause = 0.0
+        if not self._extra:
+            self.needs_resync = False
+            self.outstanding = None
+            self._unanswered.clear()
+        return came
+
+    def unclear(self, error: DeviceError, outstanding: Span | None, now: float) -> None:
+        """Notes a transaction without a reply, which may still arrive.
+
+        `outstanding`: the requested span. None for a probe: an older span stays outstanding.
+        """
+        self._move(Event.UNCLEAR)
+        self.consecutive_failures += 1
+        self._unanswered.append(now)
+        if not (self._slow and isinstance(error, NoReply)):
+            self.trouble = error  # "too slow" says more than "no reply": the line waits no longer
+        self.needs_resync = self.answerable
+        if outstanding is not None:
+            self.outstanding = outstanding
+
+    def answered_twice(self, outstanding: Span | None, now: float) -> None:
+        """Notes an extra reply: the next reply may be another one. Only a resync ends this."""
+        self._extra = True
+        self.left_outstanding(outstanding, now)
+
+    def left_outstanding(self, outstanding: Span | None, now: float) -> None:
+        """Notes a request whose reply may still arrive, although nothing waits for it."""
+        self.needs_resync = self.answerable
+        self._unanswered.append(now)
+        if outstanding is not None:
+            self.outstanding = outstanding
+
+    def replied_late(self, took: float, reply_timeout: float, *, last: bool) -> None:
+        """Notes the correct reply after its time-out, `took` seconds after the request.
+
+        `last`: no other request is outstanding, so the next frame is no older reply.
+        """
+        if last and not self._extra:
+            self.needs_resync = False
+            self.outstanding = None
+            self._unanswered.clear()
+        self.trouble = Garbled(
+            f"it took {took:.2f} s, reply_timeout is {reply_timeout:g} s", evidence=Evidence.SLOW
+        )
+
+    def gave_up(self, now: float, spread: float) -> None:
+        """Makes the device offline, and doubles the pause before its next probe.
+
+        `spread`: a random factor near 1, so that many devices are not probed at once.
+        """
+        self._move(Event.GAVE_UP)
+        self.heard = Heard.GAVE_UP
+        self.pause = min(max(2 * self.pause, PAUSE_FIRST), PROBE_PAUSE)
+        self.next_probe = now + self.pause * spread
+        self._last_probe = now
+
+    def may_be_probed(self, now: float) -> bool:
+        """Returns True if its last probe is old enough for one on behalf of a client."""
+        return self._last_probe + PAUSE_FIRST <= now
+
+    def probe_soon(self) -> None:
+        """Shortens the pause, because a client waits."""
+        self.next_probe = min(self.next_probe, self._last_probe + PAUSE_FIRST)
+
+    def probed(self, *, short: bool) -> None:
+        """Counts a probe that is sent."""
+        self.short_probes = self.short_probes + 1 if short else 0
+
+    def next_probe_token(self) -> int:
+        """Returns a token for a resync. The token after it is free for a second resync request."""
+        self._probe_token += 2
+        return self._probe_token
+
+    def resyncs_elsewhere(self) -> None:
+        """Notes that resyncs have other spans from now on. Their replies are told apart from those
+        to earlier resyncs no longer, so that the line settles after the first reply."""
+        self._probe_token = 0
+
+    def outstanding_requests(self, since: float) -> int:
+        """Counts the requests sent after `since` that have no reply."""
+        return sum(sent > since for sent in self._unanswered)
+
+    @property
+    def reason(self) -> Reason:
+        """The reason of its bad values."""
+        return Reason.GARBLED if isinstance(self.trouble, Garbled) else Reason.NO_REPLY
+
+    @property
+    def _slow(self) -> bool:
+        trouble = self.trouble
+        return isinstance(trouble, Garbled) and trouble.evidence is Evidence.SLOW
+
+    def _move(self, event: Event) -> None:
+        self.state = TRANSITIONS[self.state, event]
+        self.online = self.state in (State.ONLINE, State.FAILING)
+
+    # Frames of a device that only sends unsolicited frames
+
+    def understood(self) -> None:
+        """Notes a correct frame."""
+        self.trouble = None
+
+    def not_understood(self, damage: Garbled) -> None:
+        """Notes bytes that are no frame."""
+        self.trouble = damage
+
+
+def diagnosis(trouble: GatewayError | None, silent_causes: str) -> str:
+    """Returns the likely cause of the trouble as a sentence; empty when there is none.
+
+    `silent_causes`: causes of no reply that are special to the protocol.
+    """
+    match trouble:
+        case None:
+            return ""
+        case Garbled() as error:
+            return f"{_ADVICE.get(error.evidence, 'not understood')} ({error})"
+        case NoReply():
+            return f"{_SILENCE} {silent_causes}".strip()
+        case error:
+            return str(error)
+
+
+_SILENCE = (
+    "No byte came back: check power, wiring (A and B), station number, baud rate and that no "
+    "other master is on the line."
+)
+_ADVICE = {
+    Evidence.ECHO: "Only our own request came back: the adapter echoes; set `echo: true`. "
+    "The station itself does not reply",
+    Evidence.NOISE: "Bytes arrived that are no frame: check baud rate, parity, data bits, and "
+    "if A and B are swapped",
+    Evidence.CHECKSUM: "Frames arrive with a wrong check sum: noise, missing termination, or sum "
+    "check set differently on both sides",
+    Evidence.STATION: "Another station replied: check the station numbers",
+    Evidence.SHAPE: "The reply belongs to another request, or has another format",
+    Evidence.SLOW: "The device replies too late: raise reply_timeout",
+    Evidence.TRUNCATED: "Replies break off: noise, or a device server that cuts packets",
+}

@@ -1,0 +1,169 @@
+"""Alternates the shapes of a device's replies, so that an extra reply matches no request.
+
+Replies without a number are told apart by shape: kind and length. If a station or a device server
+repeats one reply, every later reply answers the request before its own. So requests in quick
+succession to one device do not expect replies of one shape: where they would, one reads some
+addresses more. An extra reply then arrives as a stray frame.
+"""
+
+from collections.abc import Hashable, Sequence
+
+from gateway.engine.device.long_writes import LongWrite
+from gateway.engine.device.longer_reads import MOST_CHOICES, LongerReads
+from gateway.planning.bad_addresses import BadAddresses
+from gateway.planning.planner import Block
+from gateway.protocols.capabilities import UnnumberedReplies
+from gateway.protocols.driver import AnyDriver, Span
+from gateway.tags import Tag
+
+QUIET = 0.25  # seconds after a reply in which an extra reply would have arrived
+WARY = 1.5  # the same after an extra reply: others may be as late
+WARY_FOR = 600.0  # seconds
+MARK_FIRST, MARK_LONGEST = 60.0, 600.0  # seconds between two resyncs on a wire that is never quiet
+SHOWN = 60.0  # seconds for which an extra reply explains the state of the device
+NEVER = float("inf")
+
+
+class ReplyShapes:
+    """The last replies of one device. Times in seconds of the line's clock."""
+
+    __slots__ = (
+        "_acked",
+        "_driver",
+        "_mark",
+        "_refused",
+        "_used",
+        "at",
+        "extra_at",
+        "last",
+        "longer",
+        "mark_due",
+        "proven",
+        "quiet",
+        "span",
+    )
+
+    def __init__(self, driver: UnnumberedReplies, longer: LongerReads) -> None:
+        self.longer = longer
+        self.last: Hashable = None  # shape of the reply to the last request
+        self._used: dict[Hashable, float] = {}  # when a read with each shape was sent last
+        self.span: Span | None = None  # of the last read
+        self.at = -NEVER  # when the last transaction ended
+        self.quiet = QUIET
+        self.proven = 0.0  # values read before are no extra replies
+        self.mark_due = 0.0  # when a resync must show the order, if the wire is not quiet before
+        self.extra_at = -NEVER  # when an extra reply arrived
+        self._refused = -NEVER  # when the last error reply arrived
+        self._acked: tuple[Hashable, float] = (None, -NEVER)  # the last acknowledgement, and when
+        self._mark = MARK_FIRST
+        self._driver = driver
+
+    def polled(self, block: Block, now: float) -> Span:
+        """Returns the span to read for the block: its own, or a longer one around it."""
+        span = block.span
+        if block.listed:
+            self.sent(block.cost.reply, now)
+            return span
+        choices = self.longer.by_span.get(span) or self.longer.choices(span)
+        used = self._used
+        shape, read = choices[0][1], span  # the caller tells the block's own span by identity
+        if now - self.at >= self.quiet:
+            self._prove(now)
+        elif now - (longest_ago := used.get(shape, -NEVER)) < self.quiet:
+            some = choices if self.quiet == WARY else choices[:MOST_CHOICES]
+            if span in self.longer.alone:
+                self.longer.alone.discard(span)
+            else:  # as min(some, key=...), which is slower
+                for choice in some:
+                    at = used.get(choice[1], -NEVER)
+                    if at < longest_ago:
+                        longest_ago, (read, shape) = at, choice
+        used[shape] = now
+        self.last, self.span = shape, read
+        return read
+
+    def sent(self, shape: Hashable, now: float) -> None:
+        """Notes a read that is no poll, or a command, and the shape of its reply."""
+        self._used[shape] = now
+        self._sent(shape, now)
+
+    def _sent(self, shape: Hashable, now: float) -> None:
+        if now - self.at >= self.quiet:
+            self._prove(now)
+        self.last = shape
+
+    def written(
+        self, span: Span, units: Sequence[int], reads: bool, now: float
+    ) -> tuple[bool, bool]:
+        """Notes a write. Returns True where a resync must precede it, and follow it.
+
+        It precedes where the write begins with a read whose reply may be an extra one. It follows
+        where the acknowledgement may be an extra one. `reads`: the span is read before, because
+        parts of its words are written.
+        """
+        replies = self._driver.write_shapes(span, units)
+        if reads:
+            replies = (self._driver.reply_shape(span), None)
+        before, after = False, self.may_be_extra(replies[-1], now)
+        for shape in replies[:-1]:
+            before = now - self._used.get(shape, -NEVER) < self.quiet
+            self._used[shape] = now
+        self._sent(replies[-1], now)
+        return before, after
+
+    def tells_apart(self, long: LongWrite, units: Sequence[int]) -> bool:
+        """Returns True if no acknowledgement of these requests can be taken for another."""
+        shapes, at = set[Hashable](), 0
+        for span in long.spans:
+            shapes.add(self._driver.write_shapes(span, units[at : at + span.size])[-1])
+            at += span.size
+        return None not in shapes and len(shapes) == len(long.spans)
+
+    def may_be_extra(self, shape: Hashable, now: float) -> bool:
+        """Returns True if an earlier reply to a write, or a refusal, may arrive once more.
+
+        `shape` of the expected reply; None: unknown.
+        """
+        acked, at = self._acked
+        alike = shape == acked or shape is None or acked is None
+        return (alike and now - at < self.quiet) or now - self._refused < self.quiet
+
+    def acknowledged(self, now: float) -> None:
+        """Notes that the last request, a write or command, was acknowledged."""
+        self._acked = (self.last, now)
+
+    def refused(self, now: float) -> None:
+        """Notes an error reply."""
+        self._refused = now
+
+    def marked(self, now: float) -> None:
+        """Notes a resync: its reply shows that no extra reply is waiting."""
+        self._mark = min(2 * self._mark, MARK_LONGEST)
+        self._prove(now)
+
+    def _prove(self, now: float) -> None:
+        self.proven, self.mark_due = now, now + self._mark
+        if now - self.extra_at >= WARY_FOR:
+            self.quiet = QUIET
+
+    def extra_arrived(self, now: float) -> None:
+        """Notes an extra reply."""
+        self.extra_at, self.quiet = now, WARY
+        self._mark = MARK_FIRST
+
+    @property
+    def answers_twice(self) -> bool:
+        """True if an extra reply arrived recently."""
+        return self.at - self.extra_at < SHOWN
+
+
+def reply_shapes(driver: AnyDriver, tags: Sequence[Tag], bad: BadAddresses) -> ReplyShapes | None:
+    """Returns the shapes of a device's replies; None where replies carry a number."""
+    if not isinstance(driver, UnnumberedReplies) or not driver.unnumbered:
+        return None
+    hull: dict[str, tuple[int, int]] = {}
+    for tag in tags:
+        area, start, size = tag.span
+        first, last = hull.get(area, (start, start))
+        hull[area] = (min(first, start), max(last, start + size - 1))
+    return ReplyShapes(driver, LongerReads(driver, hull, bad))

@@ -1,0 +1,45 @@
+"""The turnaround of a station that plans and forecasts expect."""
+
+import math
+from dataclasses import dataclass, field
+
+from gateway.engine.device.records import Record
+
+LEARN_EVERY = 50  # requests between two comparisons with the measured turnaround
+MOST_PATIENCE = 128  # times LEARN_EVERY, between two plans that change nothing
+
+
+@dataclass(slots=True)
+class Turnaround:
+    """The turnaround of a station that plans and forecasts expect. Seconds."""
+
+    configured: float | None
+    expected: float | None = field(init=False)  # None: the default of the protocol
+    look_at: float = LEARN_EVERY  # number of requests at the next comparison with the measured one
+    plan_from: int = 0  # number of requests from which on it may be planned again
+    _planned: float | None = None  # the one in the last plan; None: the default of the protocol
+    _patience: int = 1
+
+    def __post_init__(self) -> None:
+        self.expected = self.configured
+        if self.configured is not None:
+            self.look_at = math.inf
+
+    def learn(self, record: Record) -> bool:
+        """Expects the measured one from now on. Returns True if the device may be planned again."""
+        if record.turnaround is None:
+            return False
+        self.look_at = record.exchanges + LEARN_EVERY
+        self.expected = record.turnaround
+        return record.exchanges >= self.plan_from
+
+    def change(self, default: float) -> float:
+        """Returns the difference to the one in the last plan. `default`: of the protocol."""
+        planned = default if self._planned is None else self._planned
+        return (default if self.expected is None else self.expected) - planned
+
+    def planned(self, record: Record, *, useful: bool) -> None:
+        """Notes a plan with the expected one. The next waits longer if this one was not useful."""
+        self._planned = self.expected
+        self._patience = 1 if useful else min(2 * self._patience, MOST_PATIENCE)
+        self.plan_from = record.exchanges + LEARN_EVERY * self._patience

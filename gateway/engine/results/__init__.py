@@ -1,0 +1,1 @@
+"""What follows from a result: the rules of the engine."""

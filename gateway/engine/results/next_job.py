@@ -1,0 +1,215 @@
+"""Applies the result of a job that is no good read, and decides what follows it."""
+
+from gateway.engine.device.changes import Changes
+from gateway.engine.device.health import State
+from gateway.engine.effects import Effects
+from gateway.engine.jobs.jobs import (
+    Answer,
+    Confirm,
+    InFlight,
+    Poll,
+    Probe,
+    ReadBack,
+    Repeat,
+    RequestJob,
+    Result,
+    Resynced,
+    Settle,
+    Settled,
+    Traffic,
+    Transacted,
+    Unfinished,
+    WriteTogether,
+    span_of,
+)
+from gateway.engine.jobs.requests import Command, Write
+from gateway.engine.results.health_rules import HealthRules
+from gateway.engine.results.line_silence import LineSilence
+from gateway.engine.results.pipelining import Pipelining
+from gateway.engine.results.poll_rules import PollRules
+from gateway.engine.results.request_rules import RequestRules
+from gateway.engine.results.shorter_silences import ShorterSilences
+from gateway.errors import BadValue, DeviceError, Garbled, LineDown, Refused, Unclear, Unsteady
+from gateway.protocols.driver import EVERY_REQUEST
+
+NEVER_QUIET = "the line is never quiet, the order of replies is unknown: noise, or another master"
+
+
+class NextJob:
+    """The rules that lead from one job to the next of the same transaction.
+
+    An unclear end is followed by `Settle`, a write whose tag says so by `Confirm` and `Repeat`, a
+    probe after many open requests by a second one.
+    """
+
+    def __init__(
+        self,
+        in_flight: InFlight,
+        results: HealthRules,
+        polls: PollRules,
+        requests: RequestRules,
+        shorter: ShorterSilences,
+        effects: Effects,
+        gap: float,
+    ) -> None:
+        """`gap`: seconds without a byte that end a run of noise."""
+        self.silence = LineSilence()
+        self.shorter = shorter
+        self.pipelining = Pipelining(effects)
+        # An earlier process may have left requests in a device server, until the wire was quiet.
+        self.inherits = False
+        self._in_flight = in_flight
+        self._results = results
+        self._polls = polls
+        self._requests = requests
+        self._effects = effects
+        self._gap = gap
+
+    def change(self, changes: Changes, now: float) -> None:
+        """Takes over changed devices."""
+        self.shorter.change(now)
+        for device in changes.left:
+            self.pipelining.forget(device)
+
+    def poll_failed(self, poll: Poll, result: Exception, now: float, time: int) -> None:
+        """Applies the result of a poll without units."""
+        if self.silence.noted:
+            self.silence.concluded(result)
+        device, results = poll.device, self._results
+        match result:
+            case Refused():
+                results.answered(device, now, time)
+                self._polls.refused(poll, result, now, time)
+            case Unsteady():
+                results.answered(device, now, time)
+                self._polls.unsteady(poll, result, now, time)
+            case DeviceError():
+                self._in_flight.failed.append((poll, result))
+            case LineDown():
+                device.health.left_outstanding(poll.span, now)
+            case _:
+                raise result
+
+    def polls_ended(self, last: Poll, traffic: Traffic, now: float, time: int) -> None:
+        """Applies the end of a transaction of polls, some of which failed or were together."""
+        failed = self._in_flight.failed
+        if last.device.window > 1:
+            polls = [poll for poll, _ in failed]
+            self.pipelining.concluded(last, self._in_flight.together, polls, now)
+        if failed:
+            self.unclear(*failed[0], traffic, now, time)
+
+    def conclude(
+        self, job: Transacted, result: Result, traffic: Traffic, now: float, time: int
+    ) -> None:
+        """Applies the result of a job that is no poll."""
+        if self.silence.noted:
+            self.silence.concluded(result)
+        match job:
+            case Settle():
+                self._settled(job, result, now, time)
+            case Probe():
+                self._probed(job, result, traffic, now, time)
+            case Answer():
+                if isinstance(result, Garbled):
+                    why = str(result)
+                    self._effects.warning("reply dropped", device=job.device.name, why=why)
+            case Write() | WriteTogether() | ReadBack() | Command() | Confirm() | Repeat():
+                self._requested(job, result, traffic, now, time)
+
+    def _probed(
+        self, probe: Probe, result: Result, traffic: Traffic, now: float, time: int
+    ) -> None:
+        device = probe.device
+        match result:
+            case (
+                Resynced() | Refused()
+            ):  # an error reply counts too, but may belong to an older request
+                told_from = result.told_from if isinstance(result, Resynced) else 0
+                outstanding = self._results.outstanding_requests(device)
+                inherited = self.inherits and told_from < EVERY_REQUEST
+                if not probe.again and (outstanding > told_from or inherited):
+                    # A device server may pass on all of them, one after another.
+                    quiet = device.longest_reply
+                    guard = (outstanding + 1 + inherited) * quiet
+                    self._in_flight.continuation = Settle(device, guard, quiet, probe)
+                else:
+                    if probe.again:
+                        self.inherits = False
+                    self._results.answered(device, now, time, resynced=True)
+            case Unclear():
+                self.unclear(probe, result, traffic, now, time)
+            case LineDown():  # its reply may still arrive, on the next connection
+                device.health.left_outstanding(None, now)
+            case BadValue():
+                raise result
+
+    def _requested(
+        self, job: RequestJob, result: Result, traffic: Traffic, now: float, time: int
+    ) -> None:
+        match self._requests.conclude(job, result, now, time):
+            case Unclear() as error:
+                self.unclear(job, error, traffic, now, time)
+            case ReadBack() | Repeat() as following:
+                self._in_flight.continuation = following
+
+    def unclear(
+        self, job: Unfinished, error: DeviceError, traffic: Traffic, now: float, time: int
+    ) -> None:
+        """Lets the line settle next: the late reply must not disturb another transaction."""
+        device = job.device
+        if traffic.sent and not device.broadcast:  # only polled devices must reply
+            self.silence.unanswered(error, self._in_flight.begun)
+        before = self._results.unclear(device, error, span_of(job), now, time)
+        no_guard = before is State.OFFLINE or _is_short(job)
+        self._in_flight.continuation = Settle(
+            device,
+            0.0 if no_guard else device.settings.late_guard,
+            self._gap,
+            after=job,
+            error=error,
+            before=before,
+            sent=traffic.sent > 0,
+            failed=tuple(self._in_flight.failed),
+        )
+
+    def _settled(self, settle: Settle, result: Result, now: float, time: int) -> None:
+        device, after = settle.device, settle.after
+        if settle.error is None:
+            if isinstance(result, Settled) and not result.quiet:
+                self.inherits = False  # it is another master that speaks
+                self.unclear(after, Garbled(NEVER_QUIET), Traffic(), now, time)
+            elif isinstance(after, Probe):
+                again = Probe(device, after.outstanding, after.token + 1, again=True)
+                self._in_flight.continuation = again
+            return
+        short = _is_short(after)
+        late = result.late if isinstance(result, Settled) and not short else None
+        took = now - self._in_flight.begun
+        alone = len(settle.failed) == 1
+        suspect = alone and isinstance(after, Poll) and _is_suspect(after)
+        self._results.settled(
+            *(device, settle.before, took, late, now, time), short=short, suspect=suspect
+        )
+        for poll, error in settle.failed:
+            self._polls.unread(poll, error, now, time, alone=alone)
+        if not isinstance(after, Poll | Probe):
+            self._in_flight.continuation = self._requests.settled(settle, now)
+
+    def abandon(self, error: LineDown | None, now: float) -> None:
+        """Ends the job, because the port was lost or the gateway stops."""
+        job = self._in_flight.continuation or self._in_flight.job
+        self._in_flight.clear()
+        if job is not None:
+            self._requests.abandon(job, error, now)
+
+
+def _is_suspect(poll: Poll) -> bool:
+    """Returns True if the device may be silent about an address of the poll."""
+    longer = poll.span is not poll.block.span
+    return longer or poll.device.bad_addresses.is_suspect(poll.block)
+
+
+def _is_short(job: Unfinished) -> bool:
+    """Returns True for a probe that waits less than the `reply_timeout` of the device."""
+    return isinstance(job, Probe) and job.timeout is not None

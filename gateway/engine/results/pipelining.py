@@ -1,0 +1,78 @@
+"""Requests together: finds devices that take one request at a time, although `window` is larger."""
+
+from dataclasses import dataclass, field
+
+from gateway.engine.device.device import Device
+from gateway.engine.effects import Effects
+from gateway.engine.jobs.jobs import Poll
+from gateway.protocols.driver import Span
+
+PROOFS = 3  # requests that were answered alone and not beside others
+LOST = "requests that are sent together stay unanswered: now one at a time; set window: 1"
+ALONE = 10.0  # seconds at most in which all polls go alone, until the suspects had theirs
+TRY_AGAIN = 3600.0  # seconds; a device may have been busy
+
+
+@dataclass(slots=True)
+class _Window:
+    """The evidence of one device."""
+
+    suspects: set[Span] = field(default_factory=set)  # unanswered beside others, not yet alone
+    alone_until: float = 0.0
+    proofs: int = 0
+    apart_until: float = 0.0
+
+
+class Pipelining:
+    """Decides how many polls of a device share a transaction.
+
+    A poll without a reply beside others is polled alone. A reply then proves that the device lost
+    the request because of the others. A transaction in which all are answered proves the opposite.
+    Until then no other polls share a transaction: one more loss may take the device offline.
+    """
+
+    def __init__(self, effects: Effects) -> None:
+        self._effects = effects
+        self._windows: dict[Device, _Window] = {}
+
+    def forget(self, device: Device) -> None:
+        """Forgets a device that the line no longer has."""
+        self._windows.pop(device, None)
+
+    def others(self, poll: Poll, now: float) -> int:
+        """Returns how many polls may be sent beside this one."""
+        window = self._windows.get(poll.device)
+        if window is not None:
+            suspects = window.suspects
+            if now < window.apart_until or poll.block.span in suspects:
+                return 0
+            if now < window.alone_until and suspects - poll.device.bad_addresses.bad.keys():
+                return 0
+        return poll.device.window - 1
+
+    def concluded(self, poll: Poll, count: int, failed: list[Poll], now: float) -> None:
+        """Takes the end of a transaction with `count` polls, of which `poll` was the last."""
+        device = poll.device
+        window = self._windows.get(device)
+        if window is None:
+            window = self._windows[device] = _Window()
+        if count > 1:
+            window.suspects = {each.block.span for each in failed}  # another plan has other polls
+            window.alone_until = now + ALONE
+            if not failed:
+                window.proofs = 0
+                device.takes_one_at_a_time(False)
+        elif poll.block.span in window.suspects:
+            window.suspects.remove(poll.block.span)
+            if not failed:
+                window.suspects = set()
+                window.proofs += 1
+                self._judge(device, window, now)
+
+    def _judge(self, device: Device, window: _Window, now: float) -> None:
+        if window.proofs < PROOFS and not device.one_at_a_time:
+            return
+        window.apart_until = now + TRY_AGAIN
+        if not device.one_at_a_time:
+            device.takes_one_at_a_time(True)
+            self._effects.warning("window reduced", device=device.name, why=LOST)

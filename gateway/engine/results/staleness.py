@@ -1,0 +1,95 @@
+"""Staleness: a value that was not read for too long turns bad, whatever the cause."""
+
+from collections.abc import Iterator, Sequence
+
+from gateway.engine.device.ages import polled_block, worst_ages
+from gateway.engine.device.changes import Changes
+from gateway.engine.device.device import Device
+from gateway.engine.device.health import State
+from gateway.engine.effects import Effects
+from gateway.engine.jobs.jobs import Poll
+from gateway.engine.schedule.schedule import Schedule
+from gateway.planning.planner import describe
+from gateway.tags import Reason
+
+LOG_EVERY = 60.0  # seconds for each device
+CAUSE = "others on the line, or writes, take its time"
+NEVER = float("inf")
+
+
+class Staleness:
+    """Limits the age of the values of one line.
+
+    A value of a failing device turns bad after two intervals. All others turn bad at twice the
+    worst age that `check` prints; at once that age while some device fails, as the whole line may
+    be dead. In either case the longest wait for one reply is added.
+    """
+
+    def __init__(self, schedule: Schedule, effects: Effects) -> None:
+        self.due = NEVER  # when `look` must be called again
+        self._schedule = schedule
+        self._effects = effects
+        self._plan: list[tuple[Device, Sequence[Poll], float | None]] = []
+        self._ages: list[float] = []
+        self._logged: dict[Device, float] = {}
+
+    def change(self, changes: Changes, now: float, *, is_open: bool) -> None:
+        """Takes over changed devices: values that go on may have shorter limits."""
+        for device in changes.left:
+            self._logged.pop(device, None)
+        if is_open:
+            soonest = min((limit for _, limit in self._limits()), default=NEVER)
+            self.due = min(self.due, now + soonest)
+
+    def stop(self) -> None:
+        """Stops, because the line is closed and all its values are bad."""
+        self.due = NEVER
+
+    def look(self, now: float, time: int) -> None:
+        """Turns values bad that are too old. `time`: ns since 1970."""
+        self.due = NEVER
+        for poll, limit in self._limits():
+            if poll.last.at is None:
+                self.due = min(self.due, now + limit)
+            elif poll.last.at + limit > now:
+                self.due = min(self.due, poll.last.at + limit)
+            else:
+                self._turn_bad(poll, now, time)
+
+    def _limits(self) -> Iterator[tuple[Poll, float]]:
+        """Yields the age limit of each poll of an online device; other values are bad already."""
+        devices = self._schedule.devices
+        failing = any(device.health.state is State.FAILING for device in devices)
+        stretch = 1.0 if failing else 2.0
+        longest_reply = max((device.longest_reply for device in devices), default=0.0)
+        longest_reply += self._schedule.unanswered.longest
+        for poll, age in zip(*self._worst_ages(), strict=True):
+            if poll.device.health.state is State.FAILING:
+                yield poll, 2 * poll.block.every
+            else:
+                yield poll, stretch * age + longest_reply
+
+    def _worst_ages(self) -> tuple[list[Poll], list[float]]:
+        """Returns the polls with their worst ages, calculated again only after a new plan."""
+        online = [device for device in self._schedule.devices if device.health.online]
+        plan = [(d, self._schedule.polls(d), d.turnaround.expected) for d in online]
+        polls = [poll for _, polls, _ in plan for poll in polls]
+        if plan != self._plan:
+            blocks = [polled_block(poll.device, poll.block) for poll in polls]
+            self._plan, self._ages = plan, worst_ages(blocks)
+        return polls, self._ages
+
+    def _turn_bad(self, poll: Poll, now: float, time: int) -> None:
+        device, age = poll.device, poll.forget(now)
+        if device.health.state is State.FAILING:
+            self._effects.bad(poll.block.tags, device.health.reason, time, device.diagnosis())
+            return
+        device.record.count_overdue()
+        detail = f"not read for {age:.1f} s: {CAUSE}"
+        self._effects.bad(poll.block.tags, Reason.OVERDUE, time, detail)
+        if now - self._logged.get(device, -NEVER) >= LOG_EVERY:
+            self._logged[device] = now
+            block = describe(poll.block)
+            self._effects.warning(
+                "block overdue", device=device.name, block=block, age=round(age, 1), why=CAUSE
+            )

@@ -1,0 +1,113 @@
+"""Stray frames: counted, explained in the log by the driver, and taken as extra replies."""
+
+from collections.abc import Iterable, Sequence
+from typing import Any, cast
+
+from gateway.engine.device.changes import Changes
+from gateway.engine.device.device import Device
+from gateway.engine.effects import Effects
+from gateway.engine.results.health_rules import HealthRules
+from gateway.errors import Garbled
+from gateway.protocols.capabilities import StrayFrames, UnnumberedReplies
+from gateway.protocols.driver import Codec
+
+LOG_EVERY = 10.0  # seconds for each device; other frames are logged at level debug
+PAUSE = 0.1  # seconds without a byte after which a frame begins
+
+
+class Stray:
+    """Counts and logs frames of one line that are no reply to any request.
+
+    Another master may have sent them and changed the monitor list of a PLC. So the line registers
+    the list again.
+    """
+
+    def __init__(
+        self, line: str, devices: Sequence[Device], results: HealthRules, effects: Effects
+    ) -> None:
+        self._line = line
+        self._devices = devices
+        self._results = results
+        self._effects = effects
+        self._readers = _readers(devices)
+        self._codecs: dict[object, Codec[Any]] = {}
+        self._last = float("-inf")
+        self._logged: dict[Device, float] = {}
+
+    def change(self, changes: Changes) -> None:
+        """Takes over changed devices of the line, which are in `devices` already."""
+        self._readers = _readers(self._devices)
+        for device in changes.left:
+            self._logged.pop(device, None)
+
+    def received(self, data: bytes, now: float, time: int) -> None:
+        """Takes bytes that arrived outside of a transaction."""
+        if now - self._last > PAUSE:
+            self._codecs.clear()
+        self._last = now
+        for device in self._devices:
+            device.monitor.forget()
+        for kind, devices in self._readers.items():
+            found = self._feed(kind, devices[0], data)
+            for device in devices if found else ():
+                station = device.driver.station
+                own = [frame for frame in found if frame.station == station]
+                device.record.count_stray(len(own))
+                self._log_frames(device, own, now)
+                if any(_is_extra_reply(device, frame) for frame in own):
+                    self._results.answered_twice(device, now, time)
+
+    def unmatched(self, device: Device, frame: Any, now: float, time: int, *, echo: bool) -> None:
+        """Takes a frame that arrived in a transaction with this device and is not its reply."""
+        device.record.count_stray()
+        self._log_frames(device, [frame], now)
+        for each in self._devices:
+            if not echo and _is_extra_reply(each, frame):
+                self._results.answered_twice(each, now, time)
+
+    def _log_frames(self, device: Device, frames: Iterable[Any], now: float) -> None:
+        """Logs complete frames that are already counted."""
+        for frame in frames:
+            device.monitor.forget()
+            if not isinstance(device.driver, StrayFrames):
+                continue
+            if text := device.driver.describe_stray(frame):
+                self._log(device, text, now)
+
+    def _feed(self, kind: object, device: Device, data: bytes) -> list[Any]:
+        codec = self._codecs.get(kind)
+        if codec is None:
+            codec = self._codecs[kind] = device.driver.codec()
+        try:
+            return codec.feed(data)
+        except Garbled:
+            del self._codecs[kind]
+            return []
+
+    def _log(self, device: Device, text: str, now: float) -> None:
+        due = now - self._logged.get(device, float("-inf")) >= LOG_EVERY
+        if due:
+            self._logged[device] = now
+        log = self._effects.info if due else self._effects.debug
+        count = device.record.unasked
+        log("stray frame", line=self._line, device=device.name, what=text, count=count)
+
+
+def _readers(devices: Sequence[Device]) -> dict[object, list[Device]]:
+    """Returns the devices whose frames are read, by their codecs: equal ones read bytes once."""
+    readers: dict[object, list[Device]] = {}
+    for device in devices:
+        if device.shapes is not None or isinstance(device.driver, StrayFrames):
+            readers.setdefault(_kind(device.driver.codec()), []).append(device)
+    return readers
+
+
+def _is_extra_reply(device: Device, frame: Any) -> bool:
+    """Returns True for a reply of the device, where replies have no number."""
+    driver = device.driver
+    return device.shapes is not None and cast("UnnumberedReplies", driver).is_reply(frame)
+
+
+def _kind(codec: Codec[Any]) -> object:
+    """Returns the same for fresh codecs that read the same frames."""
+    return type(codec), str(vars(codec))

@@ -1,0 +1,1 @@
+"""The order of everything that a line has to do."""

@@ -1,0 +1,120 @@
+"""Decides which device of a line is probed next, and how long the probe waits."""
+
+import random
+from collections.abc import Sequence
+
+from gateway.engine.device.device import Device
+from gateway.engine.device.health import PROBE_SPREAD, State
+from gateway.engine.jobs.jobs import Probe
+from gateway.engine.schedule.probes import (
+    OFFLINE_SHARE,
+    PATIENT_AFTER,
+    order_of_start,
+    probe_seconds,
+    short_timeout,
+)
+
+NEVER = float("inf")
+
+
+class ProbeSchedule:
+    """The probes of one line, and their shares of the wire's time."""
+
+    def __init__(self, devices: Sequence[Device], now: float, seed: int) -> None:
+        self.failing_lane = now  # the time of the next request that may fail, while polls are due
+        self._devices = devices
+        self._random = random.Random(seed)  # noqa: S311  (jitter, not a secret)
+        self._offline_lane = now  # the time of the next probe of an offline device beside idle time
+        self._in_idle_time = False  # the current probe uses idle time of the wire
+
+    def opened(self, now: float) -> None:
+        """Starts again after the line was opened."""
+        self.failing_lane = self._offline_lane = now
+
+    def reachable(self, device: Device, now: float, *, late: bool) -> bool:
+        """Returns True if the offline device is probed at once for a request.
+
+        `late`: polls of others are late.
+        """
+        if not self._any_online:
+            return True
+        idle = not (device.driver.traits.over_network or late)
+        return device.health.may_be_probed(now) and (idle or self._offline_lane <= now)
+
+    def for_request(self, device: Device, now: float, *, due: bool) -> Probe | None:
+        """Returns the probe before a request to the device, which needs a resync.
+
+        `due`: a poll is due.
+        """
+        offline = device.health.state is State.OFFLINE
+        lane = self._offline_lane if offline else self.failing_lane
+        if lane > now and (due or not offline):
+            return None
+        self._in_idle_time = not due
+        return self.probe(device)
+
+    def next(self, others: Sequence[Device], now: float, idle_until: float) -> Probe | float:
+        """Returns the probe of a starting or an offline device, or the time of the next one.
+
+        `idle_until`: when the next poll is due; `now` while one is due.
+        """
+        until, idle = NEVER, idle_until > now
+        starting = [
+            device
+            for device in others
+            if device.health.state is State.STARTING and not device.broadcast
+        ]
+        if starting:
+            if idle or self.failing_lane <= now:
+                return self.probe(min(starting, key=order_of_start))
+            until = self.failing_lane
+        offline = [device for device in others if device.health.state is State.OFFLINE]
+        if not offline:
+            return until
+        device = min(offline, key=lambda device: device.health.next_probe)
+        if device.health.next_probe > now:
+            return min(until, device.health.next_probe)
+        return self._offline(device, now, idle_until) or min(until, self._offline_lane)
+
+    def _offline(self, device: Device, now: float, idle_until: float) -> Probe | None:
+        """Returns the probe that the wire has time for, if any."""
+        if idle_until <= now < self._offline_lane:
+            return None
+        short = short_timeout(device, self._devices)
+        if short is None or device.health.short_probes >= PATIENT_AFTER:
+            fits = idle_until - now >= probe_seconds(device)
+            self._in_idle_time = fits and not device.driver.traits.over_network
+            if self._in_idle_time or self._offline_lane <= now:
+                return self.probe(device, patient=True)
+        if short is None:
+            return None
+        room = idle_until - now
+        if room > 0.0:  # no poll is due
+            room = max(room, *(device.longest_poll for device in self._devices))
+        self._in_idle_time = room >= probe_seconds(device, short)
+        return self.probe(device) if self._in_idle_time or self._offline_lane <= now else None
+
+    def probe(self, device: Device, *, patient: bool = False) -> Probe:
+        """Returns a probe. It is short if the device is offline, or starts."""
+        health, timeout = device.health, None
+        starting = health.state is State.STARTING and not health.short_probes
+        if not patient and (starting or health.state is State.OFFLINE):
+            timeout = short_timeout(device, self._devices)
+        health.probed(short=timeout is not None)
+        return Probe(device, health.outstanding, health.next_probe_token(), timeout=timeout)
+
+    def failed(self, now: float, took: float) -> None:
+        """Notes an unclear transaction of `took` seconds with a device that is not offline."""
+        self.failing_lane = now + took
+        self._in_idle_time = False
+
+    def went_offline(self, device: Device, now: float, took: float) -> None:
+        """Makes the device offline, after a failed probe or last retry of `took` seconds."""
+        device.health.gave_up(now, self._random.uniform(1 - PROBE_SPREAD, 1 + PROBE_SPREAD))
+        if self._in_idle_time:
+            return
+        self._offline_lane = now + took * (1 / OFFLINE_SHARE - 1) if self._any_online else now
+
+    @property
+    def _any_online(self) -> bool:
+        return any(device.health.online for device in self._devices)

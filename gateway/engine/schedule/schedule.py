@@ -1,0 +1,348 @@
+"""Decides the next job of one line."""
+
+import itertools
+from collections.abc import Iterable, Mapping, Sequence
+
+from gateway.engine.device.changes import Changes
+from gateway.engine.device.device import Device
+from gateway.engine.device.health import PAUSE_LONGEST, State
+from gateway.engine.jobs.jobs import EXPEDITED, NOT_QUEUED, ON_DEMAND, Idle, LastRead, Poll, Probe
+from gateway.engine.jobs.requests import Request, RequestQueue
+from gateway.engine.jobs.unanswered import Unanswered
+from gateway.engine.schedule.poll_queue import PollQueue
+from gateway.engine.schedule.probe_schedule import ProbeSchedule
+from gateway.planning.planner import Block
+from gateway.tags import Tag
+
+NEVER = float("inf")
+UNCHANGED: Mapping[Tag, Tag] = {}
+LONG = 10.0  # seconds: a longer interval is too long to wait for a first value
+ON_DEMAND_SHARE = 0.25  # share of the wire time for polls on demand that delay others
+FIRST_SHARE = 0.1  # share of the wire time for blocks of long intervals without good values
+GOLDEN = 0.6180339887498949  # any number of its multiples is spread evenly
+
+
+class Schedule:
+    """Requests, polls and probes of one line, and their order.
+
+    * Requests go first, but not twice in a row while a poll is due. Requests to other devices do
+      not wait behind one whose device needs a resync while a device has just failed.
+    * Polls go by earliest deadline, over all devices. On an overloaded line the device that has
+      used the wire least in recent seconds goes first.
+    * An expedited poll goes before other polls, but not twice in a row while one is due. Polls on
+      demand get a quarter of the wire's time, and more if they end before the next poll is due.
+    * A late poll is done once, not once per missed period.
+    * A block of a long interval without good values gets an early deadline, in turn with others:
+      all these together get a tenth of the wire's time.
+    * After their first round the polls are spread over their periods.
+    * A device that needs a resync is probed before anything else is sent to it.
+    * A starting device is probed at once, first by a short probe. Devices that have replied last
+      time go first. While polls of others are due, these probes and those of devices that have
+      just failed get half of the wire's time.
+    * An offline device is probed at growing pauses, mostly by short probes. A probe uses idle time
+      of the wire if it ends before the next poll is due, or takes no longer than the longest poll.
+      Otherwise all offline devices together get a twentieth of the wire's time.
+    * A request to an offline device has it probed at once, when no poll is due.
+    """
+
+    def __init__(self, devices: Sequence[Device], now: float, seed: int = 0) -> None:
+        self.devices = devices
+        self.reaches_by_modem = False  # a modem reaches the devices: docs/modem.md
+        self.requests = RequestQueue()
+        self.unanswered = Unanswered()
+        # The share of its period by which each poll begins early.
+        self._phases = (n * GOLDEN % 1 / 2 for n in itertools.count())
+        self._probes = ProbeSchedule(devices, now, seed)
+        self._queue = PollQueue(shared=len(devices) > 1)
+        self._polls: dict[Device, list[Poll]] = {}
+        self._readers: dict[Device, dict[Tag, Poll]] = {}  # made at the first call of `reader`
+        self._wrote = False
+        self._expedited = False
+        self._on_demand_lane = now  # until then no poll on demand delays another
+        self._on_demand_at = NEVER  # when the poll on demand in flight was sent
+        self._first_lane = now  # the deadline of the last block without good values
+        for device in devices:
+            self.plan(device, now)
+
+    # Changes
+
+    def plan(self, device: Device, now: float, renewed: Mapping[Tag, Tag] = UNCHANGED) -> None:
+        """Makes polls of the blocks of the device. A poll of the same span keeps its due time.
+
+        `renewed`: tags of the polls before whose values go on as those of other tags.
+        """
+        before = self._polls.get(device, ())
+        old = {poll.block.span: poll for poll in before}
+        by_tag = [(renewed.get(tag, tag), poll) for poll in before for tag in poll.block.tags]
+        read = {tag: poll.last.at for tag, poll in by_tag}
+        seen = {tag for tag, poll in by_tag if poll.last.ever}
+        polls = []
+        for block in device.blocks:
+            known = old.get(block.span)
+            if known is None or known.ticket <= EXPEDITED:
+                poll = Poll(device, block, now)
+            else:
+                poll = Poll(device, block, known.due, missed=known.missed)
+                # The block may have been a bad address, which is polled rarely.
+                poll.due = min(known.due, now + poll.every)
+            ages = (at for tag in block.tags if (at := read.get(tag)) is not None)
+            poll.last.at = min(ages, default=None)
+            poll.last.ever = not seen.isdisjoint(block.tags)
+            polls.append(poll)
+        for poll in before:
+            poll.live = False
+        self._set_polls(device, polls, polls, now)
+
+    def change(self, changes: Changes, now: float) -> None:
+        """Takes over changed devices of the line, which are in `devices` already."""
+        for old, new in changes.replaced:
+            self._polls[new] = self._polls.pop(old)
+            self._readers.pop(old, None)
+            self.plan(new, now, changes.renewed)
+        for device in changes.removed:
+            self._readers.pop(device, None)
+            for poll in self._polls.pop(device):
+                poll.live = False
+        expedited = [poll for poll in self._queue.expedited if poll.live]
+        self._queue = PollQueue(shared=len(self.devices) > 1)
+        self._queue.expedited.extend(expedited)
+        for polls in self._polls.values():
+            self._queue.push_all(polls)
+        for device in changes.added:
+            self.plan(device, now)
+
+    def replace(self, poll: Poll, blocks: Iterable[Block], now: float) -> None:
+        """Replaces one poll by polls of these blocks, due at once."""
+        if not poll.live:
+            return
+        poll.live = False
+        last = poll.last
+        new = [Poll(poll.device, block, now, last=LastRead(last.at, last.ever)) for block in blocks]
+        kept = [other for other in self._polls[poll.device] if other is not poll]
+        self._set_polls(poll.device, kept + new, new, now)
+
+    def try_soon(self, device: Device, when: float) -> None:
+        """Polls all bad addresses of the device before `when`, because one has returned."""
+        bad = device.bad_addresses.bad
+        later = [p for p in self._polls[device] if p.due > when and p.block.span in bad]
+        for poll in later:
+            poll.due = when
+        self._queue.push_all(later)
+
+    def take_along(self, now: float) -> None:
+        """Makes all polls due that are due within half their interval, for one telephone call."""
+        polls = (poll for polls in self._polls.values() for poll in polls)
+        early = [poll for poll in polls if now < poll.due <= now + poll.block.every / 2]
+        for poll in early:
+            poll.due = now
+        self._queue.push_all(early)
+
+    def _set_polls(self, device: Device, polls: list[Poll], new: list[Poll], now: float) -> None:
+        for poll in new:
+            self._hasten(poll, now)
+        self._polls[device] = polls
+        self._readers.pop(device, None)
+        self._queue.push_all(new)
+
+    def _hasten(self, poll: Poll, now: float) -> None:
+        """Gives the poll an early deadline if the values of its block are bad."""
+        device, block = poll.device, poll.block
+        poll.soon = NEVER
+        if block.every <= LONG or poll.last.at is not None or not device.health.online:
+            return
+        if block.span in device.bad_addresses.bad:
+            return
+        turn = device.seconds(block.cost) / FIRST_SHARE
+        soon = max(self._first_lane, now) + turn
+        if max(soon, poll.due + turn) < poll.deadline:
+            self._first_lane = soon
+            poll.soon = max(soon, poll.due + turn)
+
+    def expedite(self, poll: Poll, *, on_demand: bool = False) -> None:
+        """Polls this next, after requests, because a client waits for it."""
+        if poll.device.health.state is State.OFFLINE:
+            poll.device.health.probe_soon()
+        elif poll.live and poll.device.health.online:
+            self._queue.expedite(poll, on_demand=on_demand)
+
+    # Questions
+
+    def reachable(self, device: Device, now: float) -> bool:
+        """False for an offline device that is not probed at once for a request."""
+        if device.health.state is not State.OFFLINE:
+            return True
+        return self._probes.reachable(device, now, late=self._queue.is_late)
+
+    def polls(self, device: Device) -> Sequence[Poll]:
+        return self._polls[device]
+
+    def reader(self, device: Device, tag: Tag) -> Poll | None:
+        """Returns the poll that reads this tag of the device, if any."""
+        readers = self._readers.get(device)
+        if readers is None:
+            readers = {tag: poll for poll in self._polls[device] for tag in poll.block.tags}
+            self._readers[device] = readers
+        return readers.get(tag)
+
+    @property
+    def is_expedited(self) -> bool:
+        """True if a client waits for a poll of an online device."""
+        return any(poll.live and poll.device.health.online for poll in self._queue.expedited)
+
+    # The next job
+
+    def next(self, now: float) -> Request | Probe | Poll | Idle:
+        if now >= self._on_demand_at or self._queue.expedited:
+            self._share_on_demand(now)
+        due = self._queue.ripen(now)
+        waiting = self._queue.waiting
+        until = waiting[0][0] if waiting else NEVER
+        if due and self._queue.due is None and not self._may_expedite(now, until):
+            due, until = False, min(until, self._on_demand_lane)
+        if self.requests.waiting and not (self._wrote and due):
+            job = self._next_request(now, due)
+            if job is not None:
+                return job
+        self._wrote = False
+        # `online` alone is slower: almost always all devices are in the first state.
+        online = State.ONLINE
+        others = [d for d in self.devices if d.health.state is not online and not d.health.online]
+        if others:
+            probe = self._probes.next(others, now, now if due else until)
+            if isinstance(probe, Probe):
+                return probe
+            until = min(until, probe)
+        return self._next_poll(now) if due else Idle(until)
+
+    def _share_on_demand(self, now: float) -> None:
+        """Charges the poll on demand that has ended: others wait three times as long."""
+        if now >= self._on_demand_at:
+            took, self._on_demand_at = now - self._on_demand_at, NEVER
+            lane = max(self._on_demand_lane, now - took)
+            self._on_demand_lane = lane + took / ON_DEMAND_SHARE
+        if now < self._on_demand_lane and self._queue.expedited:
+            self._queue.return_due(now)
+
+    def _next_request(self, now: float, due: bool) -> Request | Probe | None:
+        first = self.requests.first.device
+        if first.health.needs_resync:
+            probe = self._probes.for_request(first, now, due=due)
+            if probe is not None:
+                return probe
+        request = self.requests.take()
+        if request is not None:
+            self._wrote = True
+            return request
+        return None if due else self._probes.probe(first)
+
+    def _next_poll(self, now: float) -> Poll | Probe:
+        queue = self._queue
+        poll = queue.due
+        first = queue.expedited and not self._expedited and self._may_expedite(now, now)
+        if expedited := poll is None or bool(first):
+            poll = queue.expedited[0]
+        shapes = poll.device.shapes
+        if shapes is not None and shapes.mark_due <= now < shapes.at + shapes.quiet:
+            poll.device.health.left_outstanding(shapes.span, now)
+        if poll.device.health.needs_resync:
+            other = self._first_without_resync() if now < self._probes.failing_lane else None
+            if other is None:
+                return self._probes.probe(poll.device)
+            poll = other
+            expedited = False
+        self._expedited = poll.expedited = expedited
+        if poll.ticket == ON_DEMAND:
+            self._on_demand_at = now
+        return self._hand_out(poll, now)
+
+    def _may_expedite(self, now: float, until: float) -> bool:
+        """True if the first expedited poll may be sent; another poll is due at `until`."""
+        poll = self._queue.expedited[0]
+        if now >= self._on_demand_lane or poll.ticket != ON_DEMAND:
+            return True
+        return now + poll.device.seconds(poll.block.cost) <= until
+
+    def alongside(self, poll: Poll, most: int, now: float) -> list[Poll]:
+        """Returns more due polls of the device, if it accepts several requests at once."""
+        return [self._hand_out(other, now) for other in self._queue.more(poll.device, most)]
+
+    def _hand_out(self, poll: Poll, now: float) -> Poll:
+        if poll.ticket <= EXPEDITED:
+            self._queue.expedited.remove(poll)
+        poll.ticket = NOT_QUEUED  # its entry in the heap is stale now
+        if poll.due > now:
+            poll.due = now
+        poll.asked = now
+        listed, shapes = poll.block.listed, poll.device.shapes
+        if shapes is not None:
+            poll.span = shapes.polled(poll.block, now)
+        if listed:
+            poll.register = poll.device.monitor.registered != listed
+            poll.device.monitor.expect(listed)
+        return poll
+
+    def _first_without_resync(self) -> Poll | None:
+        """Returns the due poll with the earliest deadline whose device needs no resync."""
+        ready = (poll for poll in self._queue.valid() if not poll.device.health.needs_resync)
+        return min(ready, key=lambda poll: poll.deadline, default=None)
+
+    # Results
+
+    def polled(self, poll: Poll, now: float, *, answered: bool = True) -> None:
+        """Ends the poll for this period, after a good or a bad read."""
+        poll.missed = 0 if answered else poll.missed + 1
+        device, block = poll.device, poll.block
+        plain = answered and not device.bad_addresses.bad
+        every = block.every if plain else poll.every
+        behind = int((poll.asked - poll.due) / every)
+        if behind:
+            device.record.count_overruns(behind)
+            poll.counts.overruns += behind
+        poll.due = (poll.asked if behind or poll.missed else poll.due) + every
+        if not (poll.phased or self.reaches_by_modem):  # one call reads all that is due at a time
+            poll.phased = True
+            poll.due -= every * next(self._phases)
+        if poll.last.at is None and block.span not in device.bad_addresses.bad:
+            poll.due = min(poll.due, now + PAUSE_LONGEST)  # the cause may have gone
+        poll.tries = 0
+        if block.every > LONG:
+            self._hasten(poll, now)
+        self._queue.push(poll)
+
+    def again(self, poll: Poll, when: float | None = None, *, counted: bool = True) -> None:
+        """Polls again when the deadline is the earliest, or from `when` on."""
+        poll.tries += counted
+        poll.device.record.count_retry()
+        if when is not None:
+            poll.due = when
+        self._queue.push(poll)
+
+    def failed(self, now: float, took: float) -> None:
+        """Notes an unclear transaction of `took` seconds with a device that is not offline."""
+        self._probes.failed(now, took)
+
+    def went_offline(self, device: Device, now: float, took: float) -> None:
+        """Makes the device offline, after a failed probe or last retry of `took` seconds."""
+        self._probes.went_offline(device, now, took)
+
+    def resynced(self, device: Device) -> None:
+        """Compares the next read of each block with nothing: it decodes all units."""
+        for poll in self._polls[device]:
+            poll.last.scan = None
+
+    def came_online(self, device: Device, now: float) -> None:
+        """Makes all blocks of a device due, because it came online."""
+        for poll in self._polls[device]:
+            poll.due = now
+            poll.missed = 0
+            device.record.was_good(poll.last.at)
+            poll.last.at = None
+        self.plan(device, now)
+        for poll in self._polls[device]:
+            poll.phased = False
+
+    def opened(self, now: float) -> None:
+        """Starts again after the line was opened."""
+        self._probes.opened(now)
+        self.unanswered.requests.clear()
+        self._wrote = self._expedited = False
