@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import structlog
 
+from gateway.contract import audited
 from gateway.errors import NothingToAcknowledge
 from gateway.parts.alarms.machine import Alarm, Event, State, Status
 from gateway.plant.conditions import Condition, Reading
@@ -242,7 +243,7 @@ def _log(entry: Entry, event: Event) -> None:
     fields: dict[str, object] = {"alarm": entry.key, "state": status.state.value}
     if event is Event.ACKNOWLEDGED and status.acknowledged is not None:
         by = status.acknowledged
-        log.info("alarm acknowledged", **fields, by=by.by, via=by.via)
+        log.info(audited.ACKNOWLEDGED, **fields, by=by.by, via=by.via)
         return
     fields["text"] = rule.text
     if entry.tag is not None:
