@@ -190,6 +190,7 @@ def _northbound(config: Config, gateway: Gateway, history: Historian | None) -> 
         history=history,
         writers=config.writers_file,
         writers_state=config.writers_state,
+        folder=config.folder,
         group=group_settings(config),
     )
 
