@@ -72,6 +72,8 @@ HOURS ?= 1
 PACE ?= busy
 EXAMPLES ?= 20000
 MINUTES ?= 30
+SAMPLE ?= 50
+SEED ?= 0
 
 sim: .venv/ready
 	$(BIN)/python -m tests.sim.campaign --seeds $(SEEDS) --hours $(HOURS) --pace $(PACE) \
@@ -85,7 +87,8 @@ soak: .venv/ready
 	$(BIN)/python -m tests.faults.soak --minutes $(MINUTES)
 
 mutants: .venv/ready
-	$(BIN)/python -m tests.sim.mutants $(if $(QUICK),--quick)
+	$(BIN)/python -m tests.sim.mutants --sample $(SAMPLE) --seed $(SEED) $(ONLY) \
+	    $(if $(WORKERS),--workers $(WORKERS))
 
 # Faults as an operator meets them, and what each place says of them (docs/operator.md).
 operator: .venv/ready

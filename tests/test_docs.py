@@ -43,7 +43,6 @@ from gateway.parts.history import Historian
 from gateway.protocols.registry import PROTOCOLS
 from gateway.tags import Reason, WriteResult, bad, good
 from tests.e2e.processes import ROOT, Program, plc_gateway, started, until
-from tests.sim.broken import MUTANTS
 from tests.zenoh_peer import free_endpoint
 
 README = ROOT / "README.md"
@@ -743,9 +742,3 @@ def test_the_example_of_a_replay_is_the_one_that_the_suite_runs() -> None:
     [log] = [block for block in _blocks("wire-log-to-test.md") if block.language == "text"]
     kept = (ROOT / "tests/cases/late_reply_and_bad_address/wire.log").read_text("utf-8")
     assert set(log.text.splitlines()) <= set(kept.splitlines())
-
-
-def test_the_page_of_mutants_has_every_mutant() -> None:
-    both = TEXT["mutants.md"] + TEXT["mutants-later.md"]
-    names = re.findall(r"^\| (?!mutant )([^|-][^|]*?) \|", both, re.MULTILINE)
-    assert names == [mutant.name for mutant in MUTANTS]

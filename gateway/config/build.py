@@ -53,6 +53,7 @@ from gateway.transport.port import ModemAddress, SerialPath
 
 STATE_FILE = FilePath("state.json")  # where there is a folder for it
 ALARM_FILE = FilePath("alarms.json")
+WRITERS_STATE = FilePath("writers.json")
 
 
 @dataclass(slots=True)
@@ -107,6 +108,7 @@ class Builder:
             standby_alone=top.gateway.standby_alone,
             secret_file=self._file(top.gateway.secret_file, ("gateway", "secret_file")),
             writers_file=self._file(top.writers.file, ("writers", "file")) if top.writers else None,
+            writers_state=self._written(WRITERS_STATE) if top.writers else None,
             zenoh=with_files(top.zenoh.record(), self.folder, self.mistakes),
             history=self._history(top),
             web=self._web(top),

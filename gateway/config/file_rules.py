@@ -38,6 +38,7 @@ _MEANT: dict[Path, str] = {
     ("history", "path"): "history.db",
     ("gateway", "state"): "state.json",
     ("alarms", "path"): "alarms.json",
+    ("writers", "file"): "writers.txt",
 }
 
 
@@ -48,6 +49,8 @@ def _written(config: Config) -> Iterator[tuple[Path, FilePath, tuple[str, ...]]]
         yield ("gateway", "state"), config.state_file, _STATE
     if config.alarms.path is not None:
         yield ("alarms", "path"), config.alarms.path, _STATE
+    if config.writers_state is not None:
+        yield ("writers", "file"), config.writers_state, _STATE
 
 
 def _read(config: Config, own: FilePath) -> Iterator[tuple[str, FilePath]]:

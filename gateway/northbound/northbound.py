@@ -25,6 +25,7 @@ from gateway.northbound.publishing.republish import Republisher
 from gateway.northbound.publishing.status_publisher import StatusPublisher
 from gateway.northbound.publishing.traces import Traces
 from gateway.northbound.requests.acceptance import Acceptance
+from gateway.northbound.requests.accepted import AcceptedUntil
 from gateway.northbound.requests.audit import Audit
 from gateway.northbound.requests.inbox import Inbox
 from gateway.northbound.requests.incoming import Declarations, Incoming
@@ -67,11 +68,13 @@ class Northbound:
         *,
         history: History | None = None,
         writers: Path | None = None,
+        writers_state: Path | None = None,
         group: GroupSettings | None = None,
         status_every: float = STATUS_EVERY,
     ) -> None:
         """`history` answers queries of the past and records every audited outcome. `writers` is
         the file of the clients that may write; without it every client may that Zenoh admits.
+        `writers_state` keeps until when their signatures were accepted.
         """
         self.keys = Keys(settings.prefix, name)
         self.exclusive = asyncio.Event()
@@ -79,7 +82,9 @@ class Northbound:
         self._config = configure(settings)
         self._is_client = settings.mode is ZenohMode.CLIENT
         group = group or GroupSettings()
-        known_writers = None if writers is None else Writers(writers)
+        accepted = None if writers_state is None else AcceptedUntil(writers_state)
+        floor = 0.0 if accepted is None else accepted.floor
+        known_writers = None if writers is None else Writers(writers, floor)
         for exposure in _exposures(self._config, writers, group):
             log.warning("Zenoh session exposed", why=exposure)
         self._plant = plant
@@ -114,7 +119,7 @@ class Northbound:
             audit,
             self._status.documents,
             history,
-            Acceptance(plant.duty, known_writers),
+            Acceptance(plant.duty, known_writers, accepted=accepted),
         )
         self._declared: list[object] = []  # Zenoh undeclares an object without a reference
 

@@ -189,6 +189,7 @@ def _northbound(config: Config, gateway: Gateway, history: Historian | None) -> 
         gateway,
         history=history,
         writers=config.writers_file,
+        writers_state=config.writers_state,
         group=group_settings(config),
     )
 

@@ -27,6 +27,11 @@ SIGNED = "test_only_writers_write_and_a_signature_counts_once_and_for_seconds"
 COVERED = "test_a_signature_covers_key_value_time_nonce_and_name"
 STOLEN = "test_a_program_that_receives_a_signed_write_can_do_nothing_with_it"
 TAKEOVER = "test_a_gateway_that_becomes_active_accepts_no_signature_from_before"
+POWER_CUT = "test_a_signed_write_counts_once_after_a_power_cut_and_a_clock_that_is_set_back"
+SET_BACK = "test_a_clock_that_is_set_back_makes_no_signature_count_again"
+AHEAD = "test_a_clock_of_the_gateway_that_was_a_day_ahead_locks_no_writer_out"
+READERS = "test_a_flood_of_reads_denies_no_write"
+PLACES = "test_each_kind_has_its_own_places"
 FLOOD = "test_the_audit_trail_keeps_the_writes"
 SHARED = "test_the_second_gateway_leaves_the_device_to_the_first"
 CLAIMED = "test_forged_claims_are_refused_and_those_of_the_plant_count"
@@ -155,6 +160,12 @@ RULES: dict[str, dict[str, tuple[str, ...]]] = {
             SIGNED,
             TAKEOVER,
         ),
+        "The file `writers.json`, in `$STATE_DIRECTORY` or beside the configuration, has the time "
+        "until when signatures were accepted, and 6 s more: none of them counts again, also with a "
+        "clock that was set back while the gateway did not run.": (POWER_CUT, SET_BACK),
+        "A clock that was ahead for less than an hour locks no writer out. If the log says `is a "
+        "clock wrong?`, correct the clock; if the file has a time in the future, stop the gateway "
+        "and delete the file.": (AHEAD, POWER_CUT),
         "`plc-gateway write` and `control` sign with the variable `PLC_GATEWAY_WRITER`, which "
         "holds the line. [write-values.md](write-values.md#sign-a-write) shows how a program "
         "signs.": (STOLEN, SIGNED),
@@ -188,15 +199,22 @@ RULES: dict[str, dict[str, tuple[str, ...]]] = {
         # Limits
         "| message | 256 kB | dropped by Zenoh before it is put together |": (BEYOND,),
         "| payload of a write | a JSON value of 64 kB | refused |": (BEYOND,),
-        "| open queries | 1,024 | `busy`, or no answer if even that cannot be sent |": (BEYOND,),
+        "| open reads | 1,024 | `busy`, or no answer if even that cannot be sent |": (BEYOND,),
         "| of these with a wildcard | 64 | `busy` |": (BEYOND,),
+        "| `@peek` that wait for one line | 16 | `busy` |": (PLACES,),
+        "| open writes, commands and acknowledgements | 1,024, beside the reads | `busy` |": (
+            BEYOND,
+            READERS,
+        ),
         "| of these writes | 256 | `busy` |": (BEYOND,),
         "A router drops messages above Zenoh's own limit instead, because it also forwards other "
         "messages.": (TAKEOVER,),
-        "No load from clients delays the lines: Zenoh's threads only append to a queue of 1,024.": (
+        "No load from clients delays the lines: Zenoh's threads only append to queues of 1,024.": (
             BEYOND,
             HOSTILE,
         ),
+        "Reads, however many, take no place of a write. A peek waits until no write or command "
+        "waits.": (READERS, PLACES),
     },
     "docs/access-control.md": {
         "Zenoh's access control works by key and by user name, or by the common name of a "

@@ -15,9 +15,18 @@ from gateway.config import ZenohConfig
 from gateway.contract.buckets import Bucket, Now
 from gateway.contract.question import Question
 from gateway.contract.signatures import sign
-from gateway.contract.writers import EARLIEST, LATEST, NotAllowed, Repeated, Writers
+from gateway.contract.writers import (
+    EARLIEST,
+    KEPT,
+    LATEST,
+    MOST_KEPT,
+    NotAllowed,
+    Repeated,
+    Writers,
+)
 from gateway.errors import ConfigError
 from gateway.northbound.northbound import Northbound
+from gateway.northbound.requests.accepted import AcceptedUntil
 from gateway.tags import Sample, Tag
 from gateway.tags.recorded import Recorded, RecordedQuery
 from gateway.tags.timestamps import rfc3339
@@ -109,20 +118,33 @@ async def test_only_a_signed_request_writes_and_its_writer_is_named(tmp_path: Pa
 
 
 class Clock:
-    """The wall clock of a `Writers`, in seconds."""
+    """The wall clock of a `Writers`, in seconds, and the one that is never set."""
 
     def __init__(self) -> None:
         self.now = 1_790_000_000.0
+        self.passed = 0.0
 
-    def __call__(self) -> int:
+    def wall(self) -> int:
         return int(self.now * 1e9)
+
+    def monotonic(self) -> float:
+        return self.passed
+
+    def wait(self, seconds: float) -> None:
+        self.now += seconds
+        self.passed += seconds
+
+
+def began(tmp_path: Path, clock: Clock, floor: float = 0.0) -> Writers:
+    file = secret(tmp_path / "writers.txt", ALICE)
+    return Writers(file, floor, clock.wall, clock.monotonic)
 
 
 def known(tmp_path: Path) -> tuple[Writers, Clock]:
     """The writers of a gateway that began a minute ago."""
     clock = Clock()
-    writers = Writers(secret(tmp_path / "writers.txt", ALICE), clock)
-    clock.now += 60
+    writers = began(tmp_path, clock)
+    clock.wait(60)
     return writers, clock
 
 
@@ -172,16 +194,81 @@ def test_no_signature_counts_twice_whatever_the_clock_does(tmp_path: Path) -> No
 
 def test_a_signature_from_before_the_start_or_the_takeover_does_not_count(tmp_path: Path) -> None:
     clock = Clock()
-    writers = Writers(secret(tmp_path / "writers.txt", ALICE), clock)
+    writers = began(tmp_path, clock)
     for at in (clock.now - 1, clock.now, clock.now + 0.9 * EARLIEST):
         with pytest.raises(NotAllowed, match="before the gateway began"):
             writers.writer(RECIPE, b"7", made(at))
-    clock.now += 60
+    clock.wait(60)
     taken_by_the_other = made(clock.now - 2)
     writers.begin()
     with pytest.raises(NotAllowed):
         writers.writer(RECIPE, b"7", taken_by_the_other)
     assert writers.writer(RECIPE, b"7", made(clock.now + 0.1)) == "alice"
+
+
+@pytest.mark.parametrize("waited", [0.0, 10.0, KEPT + 1])
+def test_a_clock_that_is_set_back_makes_no_signature_count_again(
+    tmp_path: Path, waited: float
+) -> None:
+    writers, clock = known(tmp_path)
+    attachment = made(clock.now)
+    writers.writer(RECIPE, b"7", attachment)
+    clock.wait(waited)
+    writers.writer(RECIPE, b"7", made(clock.now))
+    clock.now -= waited
+    with pytest.raises((Repeated, NotAllowed)):
+        writers.writer(RECIPE, b"7", attachment)
+
+
+def test_a_clock_that_was_a_day_ahead_locks_no_writer_out(tmp_path: Path) -> None:
+    writers, clock = known(tmp_path)
+    writers.writer(RECIPE, b"7", made(clock.now))
+    clock.now += 86400
+    ahead = made(clock.now)
+    writers.writer(RECIPE, b"7", ahead)
+    clock.wait(3)
+    with pytest.raises(NotAllowed):
+        writers.writer(RECIPE, b"7", made(clock.now - 86400))
+    clock.now -= 86400
+    assert writers.writer(RECIPE, b"7", made(clock.now)) == "alice"
+    clock.wait(KEPT / 2)
+    assert writers.writer(RECIPE, b"7", made(clock.now)) == "alice"
+    clock.now += 86400 - KEPT / 2 - 3
+    with pytest.raises(Repeated):
+        writers.writer(RECIPE, b"7", ahead)
+
+
+def test_nonces_take_no_memory_without_an_end(tmp_path: Path) -> None:
+    writers, clock = known(tmp_path)
+    first = made(clock.now)
+    writers.writer(RECIPE, b"7", first)
+    clock.wait(0.001)
+    for _ in range(MOST_KEPT):
+        writers.writer(RECIPE, b"7", made(clock.now))
+    with pytest.raises(NotAllowed, match="has taken signatures until"):
+        writers.writer(RECIPE, b"7", first)
+
+
+async def test_a_restart_with_a_clock_that_was_set_back_accepts_nothing_again(
+    tmp_path: Path,
+) -> None:
+    writers, clock = known(tmp_path)
+    attachment = made(clock.now)
+    writers.writer(RECIPE, b"7", attachment)
+    await AcceptedUntil(tmp_path / "writers.json").keep(writers.newest)
+    floor = AcceptedUntil(tmp_path / "writers.json").floor
+    later = began(tmp_path, clock, floor)
+    clock.passed += 60  # the gateway runs, the wall clock was set back
+    with pytest.raises(NotAllowed, match="is a clock wrong"):
+        later.writer(RECIPE, b"7", attachment)
+    clock.now = floor + 1
+    assert later.writer(RECIPE, b"7", made(clock.now)) == "alice"
+
+
+async def test_a_full_disk_keeps_no_operator_from_writing(tmp_path: Path) -> None:
+    accepted = AcceptedUntil(tmp_path / "missing" / "writers.json")
+    await accepted.keep(1_790_000_000.0)
+    assert accepted.floor == 0.0
 
 
 def test_a_withdrawn_secret_or_a_file_readable_by_all_permits_no_write(
@@ -194,7 +281,7 @@ def test_a_withdrawn_secret_or_a_file_readable_by_all_permits_no_write(
 
     def may(by: str) -> bool:
         try:
-            attachment = sign(by, SECRET, rfc3339(clock()), RECIPE, b"7")
+            attachment = sign(by, SECRET, rfc3339(clock.wall()), RECIPE, b"7")
             return writers.writer(RECIPE, b"7", attachment) == by
         except NotAllowed:
             return False
@@ -237,8 +324,9 @@ def test_the_command_of_the_page_makes_a_line_of_the_file(tmp_path: Path) -> Non
         [sys.executable, "-c", program], capture_output=True, text=True, check=True
     )
     clock = Clock()
-    writers = Writers(secret(tmp_path / "writers.txt", out.stdout), clock)
-    clock.now += 60
+    file = secret(tmp_path / "writers.txt", out.stdout)
+    writers = Writers(file, 0.0, clock.wall, clock.monotonic)
+    clock.wait(60)
     name, _, made_secret = out.stdout.strip().partition(":")
-    attachment = sign(name, made_secret, rfc3339(clock()), RECIPE, b"7")
+    attachment = sign(name, made_secret, rfc3339(clock.wall()), RECIPE, b"7")
     assert writers.writer(RECIPE, b"7", attachment) == "alice"

@@ -1,128 +1,163 @@
-"""Breaks one rule of the gateway at a time and runs the tests: `make mutants`.
+"""Breaks one rule of the gateway at a time and runs the tests: `make mutants SAMPLE=100 SEED=7`.
 
-Each mutant is one replacement in a copy of the tree. Two checks run on it: the tests of the module
-and a few stormy seeds of the simulation. The program prints which check caught it, and its time.
-It ends with exit code 1 when a mutant lives, or when a text to be replaced is missing.
+`mutate.py` makes the mutants. Each runs in a copy of the tree: first with the tests of its room,
+then with the rest, at the end with a few stormy seeds of the simulation. What notices it ends its
+run. The program prints the survivors, and ends with exit code 1 when there are any.
 """
 
 import argparse
+import os
+import re
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
+from queue import SimpleQueue
 
-from tests.sim.broken import MUTANTS, Mutant
+from tests.sim.mutate import GATEWAY, Mutant, modules_in, mutants_of, sample
 
-ROOT = Path(__file__).parents[2]
-TREE = (
-    *("gateway", "tests", "benchmarks", "docs", "examples", "README.md", "pyproject.toml"),
-    *("config.example.yaml", "config.schema.json"),
+ROOT = GATEWAY.parent
+LEFT = shutil.ignore_patterns(".*", "__pycache__", "node_modules", "build", "*.egg-info")
+PATIENCE = 300.0  # seconds for each check
+
+Command = tuple[str, ...]
+
+# The folders and modules of gateway/ that hold rules, and the tests of each.
+ROOMS = {
+    "engine": "engine line",
+    "planning": "planning engine",
+    "line": "line engine",
+    "tags": "tags engine northbound",
+    "protocols": "protocols line",
+    "parts/alarms": "alarms",
+    "parts/transfers": "transfers",
+    "contract/writers.py": "northbound",
+    "northbound/group": "northbound",
+    "northbound/requests": "northbound",
+}
+REST = ("tests/engine", "tests/line", "tests/northbound", "tests/cases", "tests/sim")
+PYTEST = ("-m", "pytest", "-q", "-x", "-p", "no:cacheprovider")
+STORM = (
+    *("-m", "tests.sim.campaign", "--pace", "storm", "--hours", "0.6", "--seeds", "14,20"),
+    *("--first", "--workers", "1"),
 )
-PATIENCE = 180.0  # seconds for each check; a test that fails may wait 60 s
 
 
-def check(tree: Path, command: list[str]) -> tuple[bool, float, str]:
-    """Runs a check. Returns whether it failed, after how many seconds, and its message."""
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What noticed a mutant; `by` is empty when nothing did."""
+
+    mutant: Mutant
+    by: str
+    seconds: float
+
+
+def all_mutants(words: Iterable[str] = ()) -> list[Mutant]:
+    """Returns the mutants of all rooms whose names hold one of the words."""
+    wanted = tuple(words)
+    modules = sorted({module for room in ROOMS for module in modules_in(room)})
+    made = (mutant for module in modules for mutant in mutants_of(module))
+    return [m for m in made if not wanted or any(word in m.name for word in wanted)]
+
+
+def checks_near(module: str) -> list[str]:
+    """Returns the tests of the module's room; those that speak of it most come first."""
+    room = max((room for room in ROOMS if module.startswith(room)), key=len)
+    folders = [f"tests/{folder}" for folder in ROOMS[room].split()]
+    *above, name = module.removesuffix(".py").split("/")
+    package, word = ".".join(["gateway", *above]), re.compile(rf"\b{name}\b")
+    said = {
+        path.relative_to(ROOT).as_posix(): len(word.findall(text)) + 99 * (name in path.stem)
+        for folder in folders
+        for path in sorted((ROOT / folder).glob("test_*.py"))
+        if package in (text := path.read_text())
+    }
+    return [*sorted((path for path in said if said[path]), key=lambda path: -said[path]), *folders]
+
+
+def all_checks(module: str) -> dict[str, Command]:
+    room = checks_near(module)
+    rest = [folder for folder in REST if folder not in room]
+    return {"tests": (*PYTEST, *room), "others": (*PYTEST, *rest), "simulation": STORM}
+
+
+def judged(tree: Path, mutant: Mutant, checks: dict[str, Command]) -> Verdict:
+    """Puts a mutant into a tree, and runs check after check until one notices it."""
     began = time.monotonic()
+    module = tree / "gateway" / mutant.module
+    right = module.read_text()
+    module.write_text(mutant.text())
     try:
-        done = subprocess.run(
-            [sys.executable, *command],
-            cwd=tree,
-            capture_output=True,
-            text=True,
-            timeout=PATIENCE,
-            check=False,
-        )
-    except subprocess.TimeoutExpired:
-        return False, PATIENCE, "took too long"
-    said = [line.strip() for line in done.stdout.splitlines() if _tells(line)]
-    minded = done.returncode == 1 and bool(said)  # not an error before any test was run
-    return minded, time.monotonic() - began, said[0][:110] if said else done.stderr[-110:].strip()
-
-
-def _tells(line: str) -> bool:
-    return line.startswith("FAILED") or " s: " in line
-
-
-def simulation(mutant: Mutant) -> list[str]:
-    numbers = ",".join(map(str, mutant.seeds))
-    return [
-        *("-m", "tests.sim.campaign", "--pace", mutant.pace, "--hours", str(mutant.hours)),
-        *("--seeds", numbers, "--first", "--workers", "1"),
-    ]
-
-
-def tests(files: str) -> list[str]:
-    return ["-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", *files.split()]
-
-
-@contextmanager
-def put_in(tree: Path, mutant: Mutant) -> Iterator[bool]:
-    """Applies the mutant. Yields False when its text is missing, or not unique."""
-    path = tree / "gateway" / mutant.file
-    text = path.read_text()
-    path.write_text(text.replace(mutant.old, mutant.new))
-    try:
-        yield text.count(mutant.old) == 1
+        by = next((who for who, command in checks.items() if fails(tree, command)), "")
     finally:
-        path.write_text(text)
+        module.write_text(right)
+    return Verdict(mutant, by, time.monotonic() - began)
 
 
-def stale() -> list[str]:
-    """The mutants whose text is missing in the gateway, or not unique."""
-    return [
-        mutant.name
-        for mutant in MUTANTS
-        if (ROOT / "gateway" / mutant.file).read_text().count(mutant.old) != 1
-    ]
+def fails(tree: Path, command: Command) -> bool:
+    """Runs a check. A check that does not end has noticed the mutant, too."""
+    with subprocess.Popen(
+        [sys.executable, *command],
+        cwd=tree,
+        env=os.environ | {"PYTHONPATH": str(tree), "PYTHONDONTWRITEBYTECODE": "1"},
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    ) as running:
+        try:
+            return running.wait(PATIENCE) != 0
+        except subprocess.TimeoutExpired:
+            os.killpg(running.pid, signal.SIGKILL)
+            return True
+
+
+def verdicts(
+    mutants: Iterable[Mutant],
+    workers: int,
+    checks: Callable[[str], dict[str, Command]] = all_checks,
+) -> Iterator[Verdict]:
+    """Judges mutants, several at a time; each worker has a copy of the tree."""
+    with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(workers) as pool:
+        trees: SimpleQueue[Path] = SimpleQueue()
+        for number in range(workers):
+            trees.put(shutil.copytree(ROOT, Path(folder) / str(number), ignore=LEFT))
+
+        def one(mutant: Mutant) -> Verdict:
+            tree = trees.get()
+            try:
+                return judged(tree, mutant, checks(mutant.module))
+            finally:
+                trees.put(tree)
+
+        yield from pool.map(one, mutants)
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("words", nargs="*", help="only mutants whose names hold one of these")
-    parser.add_argument("--quick", action="store_true", help="no simulation of what tests caught")
+    parser.add_argument("--sample", type=int, default=50, help="how many")
+    parser.add_argument("--seed", type=int, default=0, help="which")
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     options = parser.parse_args()
-    words = options.words
-    alive = 0
-    for name in stale():
-        print(f"STALE: the text to replace is not there, or not once: {name}", flush=True)
-    with tempfile.TemporaryDirectory() as folder:
-        tree = Path(folder)
-        for name in TREE:
-            source = ROOT / name
-            if source.is_dir():
-                leave = shutil.ignore_patterns("__pycache__", "node_modules")
-                shutil.copytree(source, tree / name, ignore=leave)
-            else:
-                shutil.copy(source, tree / name)
-        for mutant in MUTANTS:
-            if words and not any(word in mutant.name for word in words):
-                continue
-            with put_in(tree, mutant) as there:
-                alive += not (there and _judged(tree, mutant, quick=options.quick))
-                if not there:
-                    print(f"{mutant.name}: NOT TRIED, its text is not in {mutant.file}", flush=True)
-    print("all mutants were caught" if not alive else f"{alive} mutants live")
-    return int(bool(alive))
-
-
-def _judged(tree: Path, mutant: Mutant, *, quick: bool) -> bool:
-    print(mutant.name, flush=True)
-    caught = False
-    for who, command in (
-        ("tests", tests(mutant.tests)),
-        ("simulation", simulation(mutant)),
-    ):
-        if caught and quick:
-            break
-        minded, seconds, said = check(tree, command)
-        caught |= minded
-        print(f"    {who:10} {'caught' if minded else '-':6} {seconds:5.1f} s  {said}", flush=True)
-    return caught
+    made = all_mutants(options.words)
+    drawn = sample(made, options.sample, options.seed)
+    survivors, tried = [], 0
+    for verdict in verdicts(drawn, options.workers):
+        tried += 1
+        print(
+            f"{verdict.by or 'SURVIVED':10} {verdict.seconds:5.0f} s  {verdict.mutant}", flush=True
+        )
+        survivors += [] if verdict.by else [verdict.mutant]
+    print(f"{tried} of {len(made)} mutants, seed {options.seed}: {len(survivors)} survived")
+    for mutant in survivors:
+        print(f"  {mutant}")
+    return int(bool(survivors))
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ from gateway.contract.writers import Writers
 from gateway.engine.jobs.requests import WRITE_EXPIRY
 from gateway.errors import BadValue, Busy
 from gateway.line.send_permit import Duty
+from gateway.northbound.requests.accepted import AcceptedUntil
 
 
 class Sender(NamedTuple):
@@ -40,11 +41,17 @@ class Acceptance:
     """Refuses what is too old, and what comes from no writer."""
 
     def __init__(
-        self, duty: Duty, writers: Writers | None, wall: Callable[[], int] = time.time_ns
+        self,
+        duty: Duty,
+        writers: Writers | None,
+        wall: Callable[[], int] = time.time_ns,
+        accepted: AcceptedUntil | None = None,
     ) -> None:
-        """Without `writers` Zenoh alone decides who may write. `wall`: ns since 1970."""
+        """Without `writers` Zenoh alone decides who may write. `wall`: ns since 1970. Without
+        `accepted` a signature may count again after a restart with a clock that was set back."""
         self._duty = duty
         self._writers = writers
+        self._accepted = accepted
         self._wall = wall
 
     def begin(self) -> None:
@@ -68,6 +75,11 @@ class Acceptance:
         if waited >= WRITE_EXPIRY:
             raise Busy(f"it is {waited:.1f} s old; not sent")
         return Accepted(by, WRITE_EXPIRY - waited)
+
+    async def kept(self) -> None:
+        """Returns when no restart can accept again what was accepted. Nothing is sent before."""
+        if self._writers is not None and self._accepted is not None:
+            await self._accepted.keep(self._writers.newest)
 
 
 def sender(message: zenoh.Query | zenoh.Sample, arrived: float) -> Sender:

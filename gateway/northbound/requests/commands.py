@@ -56,6 +56,7 @@ class Commands:
         longest = ANSWER_WITHIN
         try:
             by, within = self._acceptance.accept(key, data, sender)
+            await self._acceptance.kept()
             argument = _argument(data)
             device, command = self._target(key)
             dialling = self._plant.dialling(device)

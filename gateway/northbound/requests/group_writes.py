@@ -61,6 +61,7 @@ class GroupWrites:
         self._waiting += 1
         try:
             by, within = self._acceptance.accept(key, data, sender)
+            await self._acceptance.kept()
             self._check_room()
             pairs = parse_group(data or b"")
             for name, value in pairs:

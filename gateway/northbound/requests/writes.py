@@ -68,6 +68,7 @@ class Writes:
         self._waiting += 1
         try:
             by, within = self._acceptance.accept(key, data, sender)
+            await self._acceptance.kept()
             target = self._target(key)
             if isinstance(target, Failure):
                 result = target
