@@ -13,6 +13,7 @@ from typing import Any
 
 import structlog
 
+from gateway.contract import audited
 from gateway.contract.rate_limit import RateLimit
 
 Entry = MutableMapping[str, Any]
@@ -20,8 +21,6 @@ Key = tuple[str, ...]
 
 EVERY = 60.0  # seconds
 BURST = 20  # changes of one state at once; different entries of one topic that are told apart
-# Each write is an entry of its own; the audit limits them.
-_ALL = frozenset({"tag written", "write failed", "command executed", "command failed"})
 # Changes of these are logged at once, up to `BURST` of them: a cable is plugged again soon.
 _STATES = frozenset(
     {
@@ -60,7 +59,7 @@ class Repeats:
 
     def __call__(self, _logger: object, method: str, entry: Entry) -> Entry:
         """Raises `DropEvent` for an entry that waits for the next `flush`."""
-        if entry.pop(_AGAIN, False) or entry["event"] in _ALL:
+        if entry.pop(_AGAIN, False) or entry["event"] in audited.EVENTS:
             return entry
         event = str(entry["event"])
         noun = "" if "logger" in entry else event.rpartition(" ")[0]

@@ -10,6 +10,7 @@ import structlog
 from gateway.cli import logs, repeats
 from gateway.cli.logs import QueuedHandler
 from gateway.cli.repeats import Repeats
+from gateway.contract import audited
 
 
 @pytest.fixture
@@ -85,6 +86,15 @@ class Log:
             self.repeats.flush()
         assert all(entry.pop("repeated") and entry["last"] for entry in logged)
         return [(entry["event"], entry.get("unlogged", 0)) for entry in logged]
+
+
+def test_an_audited_entry_never_waits_whatever_waits_beside_it() -> None:
+    log = Log()
+    for number in range(100):
+        log.passes("alarm raised", alarm=f"mixer/{number}")
+    for event in audited.EVENTS:
+        assert all(log.passes(event, key="mixer/recipe", by="Ana") for _ in range(100)), event
+    assert all(log.passes("alarm acknowledged", alarm="a", by=f"by {n}") for n in range(60))
 
 
 def test_what_repeats_is_logged_at_once_and_then_once_a_minute_with_its_number() -> None:

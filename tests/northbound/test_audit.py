@@ -1,16 +1,19 @@
 """The audit under a flood of refused writes."""
 
 import json
+from dataclasses import replace
 
 import structlog
 
+from gateway.contract import audited
 from gateway.contract.payload import Failure, Problem, WriteOutcome
 from gateway.contract.rate_limit import RateLimit
+from gateway.engine.jobs.requests import CommandResult
 from gateway.northbound.requests.audit import BURST, Audit
 from gateway.tags import WriteResult
 
 
-def outcome(result: WriteResult | Failure, number: int = 0) -> WriteOutcome:
+def outcome(result: WriteResult | CommandResult | Failure, number: int = 0) -> WriteOutcome:
     return WriteOutcome("plant/mixer/recipe", number, result, number, 0.0, None)
 
 
@@ -46,6 +49,17 @@ def test_a_flood_of_refusals_is_counted_while_sent_writes_are_all_reported() -> 
     assert audit.suppressed == 10_000 - BURST
     assert len(lines) == BURST + 3 + 1
     assert lines[-1]["count"] == 10_000 - BURST
+
+
+def test_every_entry_of_an_outcome_is_known_as_audited() -> None:
+    """The log writes all of these, however often they come."""
+    audit = Audit(lambda _: None)
+    ends = [WriteResult(1, 0, took=0.1), CommandResult("ok", 0, 0.1)]
+    with structlog.testing.capture_logs() as lines:
+        for result in (*ends, *(Failure(problem, "why") for problem in Problem)):
+            for command in (False, True):
+                audit(replace(outcome(result), command=command))
+    assert {line["event"] for line in lines} == audited.EVENTS - {audited.ACKNOWLEDGED}
 
 
 def test_a_rate_limit_allows_a_burst_and_then_one_per_interval() -> None:

@@ -14,7 +14,7 @@ from typing import Protocol
 
 import structlog
 
-from gateway.contract import payload
+from gateway.contract import audited, payload
 from gateway.contract.payload import Failure, Problem, WriteOutcome
 from gateway.contract.rate_limit import RateLimit
 from gateway.engine.jobs.requests import CommandResult
@@ -26,10 +26,10 @@ log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 BURST = 300  # refusals reported one by one
 EVERY = 1.0  # seconds between further ones: 20 MB of log a day at most
 _FAILURE_EVENTS = {
-    (False, False): "write failed",
-    (False, True): "write unclear",
-    (True, False): "command failed",
-    (True, True): "command unclear",
+    (False, False): audited.WRITE_FAILED,
+    (False, True): audited.WRITE_UNCLEAR,
+    (True, False): audited.COMMAND_FAILED,
+    (True, True): audited.COMMAND_UNCLEAR,
 }
 _SENT = frozenset({Problem.UNCLEAR, Problem.REFUSED})
 # Seconds: the upper ends of the ranges in which the times of writes and commands are counted.
@@ -144,9 +144,9 @@ def _log(outcome: WriteOutcome) -> None:
     }
     match outcome.result:
         case WriteResult(verified=verified):
-            log.info("tag written", verified=verified, **fields)
+            log.info(audited.WRITTEN, verified=verified, **fields)
         case CommandResult(answer):
-            log.info("command executed", answer=answer, **fields)
+            log.info(audited.EXECUTED, answer=answer, **fields)
         case Failure(problem, reason, code):
             log.warning(
                 _FAILURE_EVENTS[outcome.command, problem is Problem.UNCLEAR],

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import structlog
 
+from gateway.contract import audited
 from gateway.parts.alarms.machine import Alarm, Event, NothingToAcknowledge, State, Status
 from gateway.tags import AlarmRule, Quality, Sample, Tag
 from gateway.tags.scan import Scan
@@ -257,7 +258,7 @@ def _log(entry: Entry, event: Event) -> None:
     fields: dict[str, object] = {"alarm": entry.key, "state": status.state.value}
     if event is Event.ACKNOWLEDGED and status.acknowledged is not None:
         by = status.acknowledged
-        log.info("alarm acknowledged", **fields, by=by.by, via=by.via)
+        log.info(audited.ACKNOWLEDGED, **fields, by=by.by, via=by.via)
         return
     fields["text"] = rule.text
     if entry.tag is not None:
