@@ -71,17 +71,19 @@ class Northbound:
         parts: Parts,
         writers: Path | None = None,
         writers_state: Path | None = None,
+        folder: Path | None = None,
         group: GroupSettings | None = None,
         status_every: float = STATUS_EVERY,
     ) -> None:
         """`writers` is the file of the clients that may write; without it every client may that
-        Zenoh admits.
-        `writers_state` keeps until when their signatures were accepted.
+        Zenoh admits. `writers_state` keeps until when their signatures were accepted. `folder`: of
+        the files that the gateway writes; only one process runs with it.
         """
         self.keys = Keys(settings.prefix, name)
         self.exclusive = asyncio.Event()
         self.opened = asyncio.Event()
         self._config = configure(settings)
+        self._folder = folder
         self._is_client = settings.mode is ZenohMode.CLIENT
         group = group or GroupSettings()
         accepted = None if writers_state is None else AcceptedUntil(writers_state)
@@ -225,7 +227,7 @@ class Northbound:
         second process with the same endpoint fails here.
         """
         places = (self._config.get_json(f"{side}/endpoints") for side in ("listen", "connect"))
-        with only_process(self.keys.own, *places):
+        with only_process(self._folder, self.keys.own, *places):
             await self._run()
 
     async def _run(self) -> None:

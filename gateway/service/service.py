@@ -110,6 +110,7 @@ async def _serve(
         parts=parts,
         writers=config.writers_file,
         writers_state=config.writers_state,
+        folder=config.folder,
         group=group_settings(config),
     )
     northbound.withhold(withheld)

@@ -46,6 +46,15 @@ def test_refused_addresses_are_avoided_after_a_restart(tmp_path: Path) -> None:
     assert (bad.since, bad.code, [tag.text for tag in bad.tags]) == (1_000, "28", ["D7"])
 
 
+def test_the_file_is_closed_to_other_users(tmp_path: Path) -> None:
+    path = tmp_path / "state.json"
+    path.write_text("{}")
+    path.with_name("state.json.new").write_text("of a gateway that was killed")
+    state_file = StateFile(path)
+    state_file.save(state_file.snapshot([]))
+    assert path.stat().st_mode & 0o777 == 0o600
+
+
 def test_a_device_without_a_plan_is_planned_later(tmp_path: Path) -> None:
     """At the start of a large plant a thread plans, beside the event loop."""
     before = searched(range(20), 7)
