@@ -17,6 +17,7 @@ from gateway.config.transfer_ranges import is_range
 from gateway.contract.meta import meta_fields
 from gateway.errors import ConfigError
 from gateway.protocols.driver import Unit
+from gateway.sheets import neutral
 from gateway.tags import Tag
 from gateway.tags.tag import CounterRule
 from gateway.values import BYTES, Kind
@@ -161,5 +162,6 @@ def _or_empty(value: object) -> object:
 def _cell(value: object, decimal_comma: bool) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
-    text = f"{value:.15g}" if isinstance(value, float) else str(value)
-    return text.replace(".", ",") if decimal_comma and isinstance(value, float) else text
+    if isinstance(value, float):
+        return f"{value:.15g}".replace(".", ",") if decimal_comma else f"{value:.15g}"
+    return neutral(value) if isinstance(value, str) else str(value)

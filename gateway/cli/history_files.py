@@ -6,9 +6,12 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
+from secrets import token_hex
+from types import SimpleNamespace
 from typing import Any, NamedTuple, TextIO
 
 from gateway.errors import ConfigError
+from gateway.sheets import neutral
 from gateway.tags.timestamps import rfc3339
 from gateway.values import Value
 
@@ -28,7 +31,9 @@ Rows = Iterable[Sequence[Any]]
 
 def write_csv(stream: TextIO, columns: Sequence[Column], rows: Rows, *, comma: bool) -> int:
     """Writes rows; returns their number. `comma`: decimal commas, and `;` between cells."""
-    writer = csv.writer(stream, delimiter=";" if comma else ",", lineterminator="\n")
+    # Its own ends of lines are \r\n, so that it quotes a cell with one of both.
+    lines = SimpleNamespace(write=lambda line: stream.write(line[:-2] + "\n"))
+    writer = csv.writer(lines, delimiter=";" if comma else ",")
     writer.writerow([column.name for column in columns])
     is_time = [column.kind == "time" for column in columns]
     count = 0
@@ -50,6 +55,8 @@ def _cell(value: Value | None, is_time: bool, comma: bool) -> object:
             return repr(value).replace(".", ",") if comma else repr(value)
         case tuple():
             return json.dumps(value)
+        case str():
+            return neutral(value)
     return value
 
 
@@ -58,8 +65,10 @@ def new_file(path: Path) -> Iterator[Path]:
     """Yields a path beside it, which gets its name at the end. Raises `ConfigError`."""
     if path.exists():
         raise ConfigError(f"{path} exists: name a new file")
-    unfinished = path.with_name(f"{path.name}.unfinished")
+    # Under a name that can be known, a link could wait that leads to another file.
+    unfinished = path.with_name(f"{path.name}.{token_hex(8)}.unfinished")
     try:
+        unfinished.open("xb").close()
         yield unfinished
         unfinished.rename(path)
     except OSError as error:

@@ -108,6 +108,7 @@ class Builder:
             standby_alone=top.gateway.standby_alone,
             secret_file=self._file(top.gateway.secret_file, ("gateway", "secret_file")),
             writers_file=self._file(top.writers.file, ("writers", "file")) if top.writers else None,
+            folder=self.state_folder or self.folder,
             writers_state=self._written(WRITERS_STATE) if top.writers else None,
             zenoh=with_files(top.zenoh.record(), self.folder, self.mistakes),
             history=self._history(top),

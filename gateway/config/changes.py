@@ -10,6 +10,7 @@ from gateway.tags import Tag
 
 # Parts of a configuration that a reload takes over. All others need a restart.
 _TAKEN_OVER = {"lines", "sheets", "transfers", "watch"}
+_DERIVED = {"folder", "writers_state"}  # from the place of the file, and from `writers_file`
 # Settings of a tag that do not change the meaning of its value. After a change of any other one
 # the value begins again.
 _HARMLESS = {"every", "description", "deadband", "publish", "heartbeat", "history"}
@@ -92,7 +93,7 @@ class Difference:
 
 def needs_restart(old: Config, new: Config) -> list[str]:
     """Returns the settings that changed and that only a restart takes over."""
-    found = [*_changed(old, new, "", _TAKEN_OVER), *_served(old, new), *_kept(old, new)]
+    found = [*_changed(old, new, "", _TAKEN_OVER | _DERIVED), *_served(old, new), *_kept(old, new)]
     return list(dict.fromkeys(found))
 
 

@@ -85,6 +85,7 @@ class Config:
     standby_alone: float | None = None  # seconds without a link until it becomes active
     secret_file: Path | None = None  # None: claims and tokens are not signed
     writers_file: Path | None = None  # None: every client of Zenoh may write
+    folder: Path | None = None  # of the files that the gateway writes
     writers_state: Path | None = None  # with `writers_file`: what a restart must not accept again
     zenoh: ZenohConfig
     history: HistoryConfig | None

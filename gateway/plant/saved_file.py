@@ -63,6 +63,8 @@ class SavedFile:
             return
         temporary = self._path.with_name(self._path.name + ".new")
         try:
+            temporary.unlink(missing_ok=True)
+            temporary.touch(0o600, exist_ok=False)  # names of operators are in it
             with temporary.open("wb") as file:
                 file.write(snapshot)
                 file.flush()

@@ -5,7 +5,16 @@ by their titles. Nothing here knows addresses or limits: the configuration check
 """
 
 from gateway.sheets import link_table
-from gateway.sheets.grid import Grid, read_grid
+from gateway.sheets.grid import Grid, neutral, read_grid
 from gateway.sheets.sheet import Sheet, SheetMistake, devices_in, read_sheet
 
-__all__ = ["Grid", "Sheet", "SheetMistake", "devices_in", "link_table", "read_grid", "read_sheet"]
+__all__ = [
+    "Grid",
+    "Sheet",
+    "SheetMistake",
+    "devices_in",
+    "link_table",
+    "neutral",
+    "read_grid",
+    "read_sheet",
+]

@@ -23,7 +23,9 @@ _BOMS = {b"\xef\xbb\xbf": "utf-8-sig", b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-
 _HIGH = re.compile(rb"[\x80-\xff]+")
 # Encodings of Chinese Excel; the narrowest first, so that a wrong one rarely fits.
 _CHINESE = ("gb2312", "big5", "gb18030")
-
+# A spreadsheet takes a text that begins with one of these for a formula, and performs it.
+_FORMULA = tuple("=+-@\t\r\n＝＋－＠")
+_QUOTE = "'"  # before it: a text
 
 # What the reader of .xlsx files raises where bytes of the archive or of its XML are wrong.
 _DAMAGED = (
@@ -60,6 +62,15 @@ def read_grid(data: bytes) -> Grid:
     if data.startswith(_ZIP):
         return Grid(_xlsx(data), ".")
     return _delimited(_decoded(data))
+
+
+def neutral(text: str) -> str:
+    """Returns a text as a cell of CSV that no spreadsheet performs. `read_grid` takes it back."""
+    return _QUOTE + text if text.startswith((*_FORMULA, _QUOTE)) else text
+
+
+def _plain(cell: str) -> str:
+    return cell[1:] if cell[:1] == _QUOTE and cell[1:].startswith((*_FORMULA, _QUOTE)) else cell
 
 
 def _decoded(data: bytes) -> str:
@@ -132,7 +143,7 @@ def _records(text: str, delimiter: str) -> Iterator[Row]:
                 f'row {number}: a quote (") that is not closed, or text after a closed one: '
                 "inside a quoted cell write it twice"
             ) from None
-        yield Row(number, _trimmed(cells))
+        yield Row(number, _trimmed(map(_plain, cells)))
 
 
 def _trimmed(cells: Iterable[str]) -> list[str]:

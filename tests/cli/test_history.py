@@ -1,5 +1,7 @@
 """`history export`: samples and buckets of the file, also without a gateway."""
 
+import csv
+import io
 import sqlite3
 import sys
 from contextlib import closing
@@ -7,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from gateway.cli.history_files import Column, write_csv
 from gateway.parts.history.file import HistoryFile
 from gateway.tags import Reason, bad, good
 from tests.cli.conftest import Command
@@ -79,6 +82,31 @@ def test_many_buckets_go_into_a_new_file(config: Path, command: Command, tmp_pat
     again = command("history", "export", config, "--output", file)
     assert (again.code, "exists: name a new file" in again.err) == (2, True)
     assert not list(tmp_path.glob("*.unfinished"))
+
+
+def test_no_link_that_waits_is_followed(
+    config: Path, command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other, file = tmp_path / "other", tmp_path / "out.csv"
+    other.write_text("kept")
+    (tmp_path / "out.csv.unfinished").symlink_to(other)
+    file.symlink_to(tmp_path / "missing")
+    assert command("history", "export", config, "--time", HOUR, "--output", file).code == 0
+    assert (other.read_text(), file.read_text()) == ("kept", EXPORTED)
+    assert not file.is_symlink()
+    monkeypatch.setattr("gateway.cli.history_files.token_hex", lambda _: "known")
+    (tmp_path / "more.csv.known.unfinished").symlink_to(other)
+    done = command("history", "export", config, "--output", tmp_path / "more.csv")
+    assert (done.code, other.read_text()) == (2, "kept")
+
+
+def test_a_recorded_text_is_no_formula_in_a_spreadsheet() -> None:
+    texts = ["=cmd|' /C calc'!A0", "+1", "-1", "@A1", "\t=1", "\r=1", "'", "A, B"]
+    stream = io.StringIO(newline="")
+    rows = [(text,) for text in [*texts, -1, -1.5]]
+    write_csv(stream, [Column("value", "value")], rows, comma=False)
+    found = [row[0] for row in csv.reader(io.StringIO(stream.getvalue(), newline=""))][1:]
+    assert found == [*("'" + text for text in texts[:-1]), "A, B", "-1", "-1.5"]
 
 
 def test_buckets_with_decimal_commas(config: Path, command: Command) -> None:

@@ -1,6 +1,7 @@
 """The commands `import` and `export`."""
 
 import csv
+import re
 from pathlib import Path
 from typing import Any
 
@@ -255,7 +256,8 @@ lines:
           level: {address: D10, type: float32, word_order: high_first, history: true}
           text: {address: D600, type: "string[16]", byte_order: high_first, every: 15s}
           door: {address: M12, description: "Door; \\"open\\"", heartbeat: 1min, publish: always}
-          batches: {address: C200}
+          batches: {address: C200, description: "=cmd|' /C calc'!A0", unit: "-"}
+          evil: {address: M13, description: "'+1", unit: "@SUM(1)"}
           recipe: {address: D500, write: {min: 2, max: 40, verify: true}, payload: raw}
 """
 
@@ -271,7 +273,10 @@ def test_an_export_imports_as_the_same_tags(
     exported = plant_file.with_name("tags.csv")
     options = ["--decimal-comma"] if comma else []
     done = command("export", rich, "--output", exported, *options)
-    assert done.out == f"{exported}: 6 tags of {rich}\n"
+    assert done.out == f"{exported}: 7 tags of {rich}\n"
+    cells = exported.read_text("utf-8-sig")
+    formulas = [cell for cell in re.split('[;,"\n]', cells) if cell[:1] in tuple("=+-@")]
+    assert [cell for cell in formulas if not re.fullmatch(r"-\d+", cell)] == []
     assert command("import", exported, "--into", empty).code == 0
     assert _meaning(load(empty)) == _meaning(load(rich))
 

@@ -152,7 +152,7 @@ async def test_a_killed_station_is_online_again_after_its_restart(tmp_path: Path
 def test_restarts_leave_nothing_behind(tmp_path: Path) -> None:
     """Ended and killed by turns, a gateway leaves no process, file, lock or port name, and no file
     descriptor in the process of the PLC. The next start removes the files of SQLite after a kill.
-    The lock file stays and is not locked."""
+    The lock files stay and are not locked."""
     tty = str(tmp_path / "tty")
     tags = {**TAGS, "speed": {**TAGS["speed"], "history": True}}
     with station("pty", tty) as plc:
@@ -177,6 +177,8 @@ def test_restarts_leave_nothing_behind(tmp_path: Path) -> None:
             assert not Path(f"/proc/{pid}").exists()
             assert not _children(pid)
             beside = set() if kindly else {tmp_path / f"history.db-{what}" for what in _OF_SQLITE}
+            [lock] = tmp_path.glob("gateway-*.lock")
+            beside.add(lock)
             assert set(tmp_path.rglob("*")) - beside == files
         until(lambda: not _holders(tty), "no process holds the port")
         assert len(list(Path(f"/proc/{plc.pid}/fd").iterdir())) == kept_open

@@ -9,7 +9,7 @@ from structlog.testing import capture_logs
 
 from gateway.contract.status import refused_sentence
 from gateway.engine.device.device import Device
-from gateway.plant.state_file import StateFile
+from gateway.parts.state.state_file import StateFile
 from tests.e2e.processes import PATIENCE
 from tests.sim.plant import device, make_tag
 
@@ -44,6 +44,15 @@ def test_refused_addresses_are_avoided_after_a_restart(tmp_path: Path) -> None:
     assert [block.span for block in after.blocks] == [block.span for block in before.blocks]
     (bad,) = after.bad_addresses.bad.values()
     assert (bad.since, bad.code, [tag.text for tag in bad.tags]) == (1_000, "28", ["D7"])
+
+
+def test_the_file_is_closed_to_other_users(tmp_path: Path) -> None:
+    path = tmp_path / "state.json"
+    path.write_text("{}")
+    path.with_name("state.json.new").write_text("of a gateway that was killed")
+    state_file = StateFile(path)
+    state_file.save(state_file.snapshot([]))
+    assert path.stat().st_mode & 0o777 == 0o600
 
 
 def test_a_device_without_a_plan_is_planned_later(tmp_path: Path) -> None:

@@ -54,9 +54,10 @@ def test_a_flood_of_refusals_is_counted_while_sent_writes_are_all_reported() -> 
 def test_every_entry_of_an_outcome_is_known_as_audited() -> None:
     """The log writes all of these, however often they come."""
     audit = Audit(lambda _: None)
+    ends: list[WriteResult | CommandResult | Failure]
     ends = [WriteResult(1, 0, took=0.1), CommandResult("ok", 0, 0.1)]
     with structlog.testing.capture_logs() as lines:
-        for result in (*ends, *(Failure(problem, "why") for problem in Problem)):
+        for result in [*ends, *(Failure(problem, "why") for problem in Problem)]:
             for command in (False, True):
                 audit(replace(outcome(result), command=command))
     assert {line["event"] for line in lines} == audited.EVENTS - {audited.ACKNOWLEDGED}
