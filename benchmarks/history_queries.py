@@ -24,6 +24,7 @@ import zenoh
 from benchmarks.history import tags
 from benchmarks.northbound import Device, Plant
 from gateway.config import ZenohConfig, ZenohMode
+from gateway.contract.interfaces import NoParts
 from gateway.northbound.northbound import Northbound
 from gateway.northbound.session.session_settings import configure
 from gateway.parts.history import Historian
@@ -34,6 +35,16 @@ from tests.zenoh_peer import free_endpoint
 
 ROOT = Path(__file__).parents[1]
 GIGABYTE = 10**9
+
+
+class Kept(NoParts):
+    """A history, and no other part."""
+
+    def __init__(self, historian: Historian) -> None:
+        self._kept = historian
+
+    def history(self) -> Historian:
+        return self._kept
 
 
 def write(path: Path, count: int, samples: int) -> None:
@@ -65,7 +76,8 @@ async def serve(endpoint: str, path: Path, count: int) -> None:
     historian.start()
     while historian.document()["state"] != "ok":
         await asyncio.sleep(0.01)
-    northbound = Northbound(ZenohConfig(listen=(endpoint,)), "demo", plant, history=historian)
+    settings = ZenohConfig(listen=(endpoint,))
+    northbound = Northbound(settings, "demo", plant, parts=Kept(historian))
     serving = asyncio.create_task(northbound.run())
     await northbound.opened.wait()
     print("ready", flush=True)

@@ -35,6 +35,7 @@ import structlog
 import zenoh
 
 from gateway.config import ZenohConfig, ZenohMode
+from gateway.contract.interfaces import NoParts
 from gateway.engine.jobs.requests import CommandResult, Peeked
 from gateway.errors import GatewayError
 from gateway.line.send_permit import Duty
@@ -382,7 +383,7 @@ async def gateway(tags: int, devices: int, seconds: float, for_flood: float) -> 
     made = plant(tags, devices)
     with_tags = memory()
     began = time.perf_counter()
-    northbound = Northbound(ZenohConfig(listen=(endpoint,)), "demo", made)
+    northbound = Northbound(ZenohConfig(listen=(endpoint,)), "demo", made, parts=NoParts())
     serves = asyncio.create_task(northbound.run())
     await northbound.opened.wait()
     print(f"on Zenoh with {tags:,} tags on {devices} devices after "
@@ -408,7 +409,7 @@ async def gateway(tags: int, devices: int, seconds: float, for_flood: float) -> 
 async def gateway_of_blocks(tags: int, devices: int, seconds: float) -> Rate:
     """Each device has one scan in a round; the next round begins when all were put."""
     endpoint, made = free_endpoint(), plant(tags, devices, "only")
-    northbound = Northbound(ZenohConfig(listen=(endpoint,)), "demo", made)
+    northbound = Northbound(ZenohConfig(listen=(endpoint,)), "demo", made, parts=NoParts())
     serves = asyncio.create_task(northbound.run())
     await northbound.opened.wait()
     try:

@@ -18,17 +18,20 @@ import tempfile
 import time
 import urllib.request
 from pathlib import Path
+from typing import Any
 
 import structlog
 
 from benchmarks.start import HERE, Sizes, rows, started
 from gateway.config import Config, load
 from gateway.contract import payload
+from gateway.contract.faults import Documents
+from gateway.contract.interfaces import NoParts
 from gateway.northbound.requests.audit import Counts
 from gateway.parts.web.api import Api
 from gateway.parts.web.events import WIRE_EVERY, Events, Loads, Page
-from gateway.parts.web.sources import Documents, Sources
-from gateway.plant.plant import Gateway
+from gateway.plant.part import Core
+from gateway.plant.plant import Plant
 from tests.e2e.processes import free_port
 from tests.sim.virtual import run_virtual
 from tests.web.browser import browser
@@ -42,7 +45,7 @@ PUBLISHED_EVERY = 5.0  # seconds
 class North(PlainNorth):
     """Collects the documents as the gateway does: also with their JSON."""
 
-    def __init__(self, gateway: Gateway) -> None:
+    def __init__(self, gateway: Plant) -> None:
         super().__init__()
         self._gateway = gateway
         self._at = float("-inf")
@@ -65,26 +68,38 @@ class North(PlainNorth):
             await asyncio.sleep(PUBLISHED_EVERY)
 
 
-async def play(gateway: Gateway, seconds: float, made: list[float] | None) -> None:
+async def play(gateway: Plant, seconds: float, made: list[float] | None) -> None:
     north = North(gateway)
     tasks = [asyncio.create_task(line.run()) for line in gateway.lines]
     tasks.append(asyncio.create_task(north.publish()))
     if made is not None:
-        tasks.append(asyncio.create_task(show(Sources(gateway, north, None, lambda: True), made)))
+        tasks.append(asyncio.create_task(show(core_of(gateway, north), made)))
     await asyncio.sleep(seconds)
     for task in tasks:
         task.cancel()
     await asyncio.gather(*tasks, return_exceptions=True)
 
 
-async def show(sources: Sources, made: list[float]) -> None:
+class Nothing(NoParts):
+    """No other part works."""
+
+    def each(self, capability: type[object]) -> list[object]:
+        return []
+
+
+def core_of(gateway: Plant, north: Any) -> Core:
+    parts = Nothing()
+    return Core(gateway, north, parts.history, parts)
+
+
+async def show(core: Core, made: list[float]) -> None:
     """Makes the events of one page. Adds the processor time of each to `made`."""
-    api, loads = Api(sources), Loads(sources)
-    events = Events(sources, api, loads, lambda _: True)
+    api, loads = Api(core), Loads(core)
+    events = Events(core, api, loads, lambda _: True)
     measuring = asyncio.create_task(loads.run())
     try:
         with events.wires.watched("line0") as recorder:
-            page = Page(sources, events, api.select("d0-0", "", None, 200), recorder)
+            page = Page(core, events, api.select("d0-0", "", None, 200), recorder)
             while True:
                 begun = time.process_time()  # nothing else runs meanwhile
                 await page.next()
@@ -96,7 +111,7 @@ async def show(sources: Sources, made: list[float]) -> None:
 
 def spent(config: Config, seconds: float, made: list[float] | None) -> tuple[float, int]:
     """Seconds of the processor for so many seconds of the plant, and its exchanges."""
-    gateway = Gateway(config)
+    gateway = Plant(config)
     gc.collect()
     begun = time.process_time()
     run_virtual(play(gateway, seconds, made))

@@ -6,6 +6,8 @@ GatewayError
 ├── Busy                 try again later; nothing has been sent
 │   ├── NotSent          a write of a group, after another one that was not done
 │   └── Superseded       a newer write of the same tag took its place: do not try again
+├── Unknown              there is no such thing; nothing was done
+├── NothingToAcknowledge look at the alarm again
 ├── Damaged              a part of the history file is lost; the rest can be read
 ├── Offline              the device is offline; nothing has been sent
 ├── LineDown             reopen the port; pending writes fail at once
@@ -38,6 +40,14 @@ class Busy(GatewayError):
 
 class NotSent(Busy):
     """A write of a group that was not sent, because another one of it was not done."""
+
+
+class Unknown(GatewayError):
+    """A request to something that is not there; nothing was done."""
+
+
+class NothingToAcknowledge(GatewayError):
+    """An acknowledgement of an alarm that is normal, or was raised again."""
 
 
 class Superseded(Busy):

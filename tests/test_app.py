@@ -14,7 +14,7 @@ from gateway.config import ZenohMode, load
 from gateway.errors import BadValue, LineDown, Offline
 from gateway.parts.transfers.forecast import forecasts
 from gateway.plant.on_demand import FRESH_WITHIN
-from gateway.plant.plant import Gateway
+from gateway.plant.plant import Plant
 from gateway.stations.vigor import VigorStation
 from gateway.tags import Quality, Reason, Sample, Tag, good
 from gateway.transport import Receiver
@@ -32,7 +32,7 @@ TAGS = {
 class Watched:
     """A gateway, and all that it published."""
 
-    def __init__(self, gateway: Gateway) -> None:
+    def __init__(self, gateway: Plant) -> None:
         self.gateway = gateway
         self.published: list[Sample] = []
         self.online_changes: list[tuple[str, bool]] = []
@@ -65,7 +65,7 @@ def made(folder: Path, **device: Any) -> Watched:
     every = device.pop("every", "200ms")
     lines = {"hall": vigor_line("simulator", TAGS, **device)}
     path = write_config(folder / "c.yaml", "tcp/127.0.0.1:7447", lines, defaults={"every": every})
-    return Watched(Gateway(load(path)))
+    return Watched(Plant(load(path)))
 
 
 @asynccontextmanager
@@ -96,7 +96,7 @@ async def test_a_line_that_is_not_planned_refuses_writes(
 ) -> None:
     lines = {"hall": vigor_line("simulator", TAGS)}
     path = write_config(tmp_path / "c.yaml", "tcp/127.0.0.1:7447", lines)
-    watched = Watched(Gateway(load(path), plan_now=False))
+    watched = Watched(Plant(load(path), plan_now=False))
     gateway, recipe = watched.gateway, tag(watched, "recipe")
     with pytest.raises(LineDown, match="line hall is not open"):
         await gateway.write(recipe, 7)
@@ -194,7 +194,7 @@ async def slow_line(
     path = write_config(folder / "c.yaml", "tcp/127.0.0.1:7447", lines, defaults={"every": every})
     station, bench = Unruly(VigorStation(1), late=lambda _: 0.4), Bench()
     opened = partial(bench.open, [station], WIRE)
-    async with running(Watched(Gateway(load(path), open_line=lambda _: opened))) as watched:
+    async with running(Watched(Plant(load(path), open_line=lambda _: opened))) as watched:
         await watched.until_good("mixer/speed")
         yield watched, station, bench
 
@@ -285,7 +285,7 @@ async def test_fresh_returns_the_last_sample_of_an_unsolicited_tag_at_once(tmp_p
         receivers.append(receiver)
         return Mute()
 
-    async with running(Watched(Gateway(load(path), open_line=lambda _: opened))) as watched:
+    async with running(Watched(Plant(load(path), open_line=lambda _: opened))) as watched:
         await asyncio.sleep(1)
         gateway, since = watched.gateway, asyncio.get_running_loop().time()
         code = gateway.tag("reader/code")
@@ -303,7 +303,7 @@ def test_a_republished_change_within_the_deadband_reaches_every_subscriber(
     """History needs it too: its next sample is compared with this one."""
     lines = {"hall": vigor_line("simulator", {"level": {"address": "D10", "deadband": 5}})}
     path = write_config(tmp_path / "c.yaml", "tcp/127.0.0.1:7447", lines)
-    watched = Watched(Gateway(load(path)))
+    watched = Watched(Plant(load(path)))
     gateway, level = watched.gateway, tag(watched, "level")
     published = watched.published
     for value in (100, 104):

@@ -534,7 +534,7 @@ def _example_keys() -> set[str]:
         *(
             keys.own,
             keys.status("alarms"),
-            keys.alarm("**"),
+            keys.status("alarms/**"),
             keys.status("status"),
             keys.status("transfers/1"),
             keys.writes,

@@ -3,9 +3,11 @@
 import asyncio
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from gateway.parts.history.part import HistoryPart
 from gateway.service import service
 from gateway.tags import good
 from tests.history.recorded import history
@@ -18,8 +20,8 @@ def test_published_samples_are_recorded(tmp_path: Path) -> None:
     tag = make_tag("D0", history=True)
     now = time.time_ns()
     with history(tmp_path / "history.db") as historian:
-        # The class is the service's own; nothing but the service subscribes history.
-        recording = service._Recording(historian)
+        plant: Any = None  # only its start is recorded
+        recording = HistoryPart(plant, historian)
         recording.set_online("plc", False)
         recording.publish([good(tag, 7, now)])
         found = list(historian.samples(tag, "[..]", None, now + SECOND))

@@ -11,7 +11,7 @@ Documents = Mapping[str, Mapping[str, Any]]  # by path: `status`, `lines/hall-1`
 
 def faults(documents: Documents) -> Iterator[str]:
     """Yields what needs a person: lines that are down, silent devices, transfers that do not
-    work, a lost router, history not written."""
+    work, a lost router, a stopped part, history not written."""
     for line, document in below("lines/", documents):
         if not document["open"]:
             yield f"line {line} is down: {document['trouble'] or 'not opened yet'}"
@@ -27,9 +27,16 @@ def faults(documents: Documents) -> Iterator[str]:
     zenoh = documents.get("zenoh", {})
     if (wanted := zenoh.get("connect")) and not {"router", "peer"} & set(zenoh["to"]):
         yield f"Zenoh: not connected to {' or '.join(wanted)}: its clients get no values"
+    yield from _stopped(documents.get("parts", {}))
     history = documents.get("history", {"state": "ok"})
     if history["state"] != "ok":
         yield f"history: {history['state']}"
+
+
+def _stopped(parts: Mapping[str, Any]) -> Iterator[str]:
+    for part, document in parts.items():
+        if document["why"]:
+            yield f"{part} stopped: {document['why']}; it is tried again in {document['again']} s"
 
 
 def warnings(documents: Documents) -> Iterator[str]:

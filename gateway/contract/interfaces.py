@@ -1,15 +1,15 @@
-"""The parts of the gateway that the Zenoh side uses: its plant and its history."""
+"""The plant, the history and the Zenoh side, as far as others of them may use them."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import Literal, Protocol
+from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Any, Literal, Protocol, runtime_checkable
 
 from gateway.contract.buckets import Bucket, Now
+from gateway.contract.payload import Failure, GroupResult
 from gateway.contract.question import Question
 from gateway.engine.jobs.requests import CommandResult, Peeked
-from gateway.errors import GatewayError
+from gateway.errors import Busy, GatewayError
 from gateway.line.send_permit import Duty
 from gateway.line.wire_log import WireLog
-from gateway.parts.alarms import Alarms
 from gateway.tags import Sample, Tag, WriteResult
 from gateway.tags.recorded import Recorded, RecordedQuery
 from gateway.values import Value
@@ -41,9 +41,6 @@ class Plant(Lines, Protocol):
 
     @property
     def duty(self) -> Duty: ...
-
-    @property
-    def alarms(self) -> Alarms: ...
 
     def devices(self) -> Iterable[Device]: ...
 
@@ -142,3 +139,82 @@ class History(Protocol):
     def record_write(self, time: int, outcome: str, *, refused: bool) -> None:
         """Records one outcome, as on the `writes` key; `time`: ns since 1970. `refused`: nothing
         was sent. Never blocks."""
+
+
+@runtime_checkable
+class Keyed(Protocol):
+    """A part with documents of its own, below `@gateway/<name>/<name of the part>/`."""
+
+    def entries(self) -> Sequence[tuple[str, Callable[[], bytes]]]:
+        """Returns the path of each document, and what makes it. Any thread may call both."""
+
+    def recorded(self, history: History, time_range: str, now: int) -> Iterator[tuple[str, str]]:
+        """Yields recorded documents with their paths, as JSON. Raises as `History.samples`."""
+
+    async def order(self, path: str, data: bytes, by: str | None) -> bytes:
+        """Carries out the order of a client that may write, and returns the new document.
+
+        Raises `GatewayError`; what it returns is kept across a restart.
+        """
+
+
+class Parts(Protocol):
+    """The parts of the service, as far as Zenoh needs them."""
+
+    def has_keys(self, part: str) -> bool:
+        """True for a part with documents of its own, also while it does not work."""
+
+    def keyed(self, part: str) -> Keyed:
+        """Returns the part. Raises `Busy` while it does not work."""
+
+    def history(self) -> History | None:
+        """Returns the history; None: none is kept. Raises `Busy` while it does not work."""
+
+    async def publish_all(self) -> None:
+        """Publishes what subscribers of the parts may have missed."""
+
+
+class NoParts:
+    """A gateway without parts."""
+
+    def has_keys(self, part: str) -> bool:
+        return False
+
+    def keyed(self, part: str) -> Keyed:
+        raise Busy(f"there is no {part} here")
+
+    def history(self) -> History | None:
+        return None
+
+    async def publish_all(self) -> None:
+        """Publishes nothing."""
+
+
+class North(Protocol):
+    """The Zenoh side, as far as parts use it. Belongs to the event loop."""
+
+    @property
+    def is_ready(self) -> bool:
+        """True when the gateway serves its plant on Zenoh."""
+
+    async def documents(self, max_age: float) -> Mapping[str, Mapping[str, Any]]:
+        """Returns the status documents by path, at most `max_age` seconds old."""
+
+    def publish_latest(self, path: str, make: Callable[[], bytes]) -> None:
+        """Publishes the document at `@gateway/<name>/<path>`. Never blocks: the publishing thread
+        calls `make`, and only for the last of several."""
+
+    def write_own(self, tag: Tag, value: Value, by: str, within: float) -> Awaitable[WriteResult]:
+        """Writes for a part, named `by`. After `within` seconds nothing is sent any more. Raises
+        `GatewayError`."""
+
+    async def write(
+        self, tag: str, data: bytes, by: str, arrived: float
+    ) -> WriteResult | Failure | GroupResult:
+        """Writes for the client `by`, whom a part has admitted. `tag`: `device/name`; `data`: the
+        payload as on Zenoh; `arrived`: by the loop's clock."""
+
+    async def order(
+        self, part: str, path: str, data: bytes, by: str, arrived: float
+    ) -> bytes | Failure:
+        """Has a part carry out an order of the client `by`, as `write` does."""

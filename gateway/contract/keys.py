@@ -41,7 +41,6 @@ class Family(StrEnum):
     META = "meta"
     BLOCK = "block"
     STATUS = "status"
-    ALARM = "alarm"
     COMMAND = "command"
     PEEK = "peek"
 
@@ -71,12 +70,15 @@ def parse_key(key: str) -> ParsedKey:
     if late:
         return ParsedKey(Family.LAST, stem)
     if "@gateway" in (chunks := key.split("/")):
-        below = chunks[chunks.index("@gateway") + 2 :]
-        if below[:1] == ["alarms"] and len(below) > 1:
-            return ParsedKey(Family.ALARM, key)
         is_command = chunks[-3:-2] == ["lines"] and chunks[-1] == "global"
         return ParsedKey(Family.COMMAND if is_command else Family.STATUS, key)
     return ParsedKey(Family.VALUE, key)
+
+
+def part_of(status_key: str) -> str:
+    """Returns the name of the part in `…/@gateway/<name>/<part>/…`; empty: another status key."""
+    chunks = status_key.partition("@gateway/")[2].split("/")
+    return chunks[1] if len(chunks) > 2 else ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,10 +136,6 @@ class Keys:
     def writes(self) -> str:
         """The outcome of every write."""
         return f"{self.own}/writes"
-
-    def alarm(self, name: str) -> str:
-        """An alarm: `device/tag`, `device`, or `line:name`."""
-        return f"{self.own}/alarms/{name}"
 
     @property
     def page(self) -> str:

@@ -21,9 +21,11 @@ from gateway.errors import (
     Damaged,
     GatewayError,
     LineDown,
+    NothingToAcknowledge,
     NotSent,
     Offline,
     Refused,
+    Unknown,
 )
 from gateway.tags import Quality, Reason, Sample, WriteResult
 from gateway.tags.timestamps import rfc3339
@@ -129,6 +131,10 @@ def failure(error: GatewayError) -> Failure:
             return Failure(Problem.NO_REPLY, reason)
         case Damaged():
             return Failure(Problem.DAMAGED, reason)
+        case Unknown():
+            return Failure(Problem.UNKNOWN_TAG, reason)
+        case NothingToAcknowledge():
+            return Failure(Problem.NOTHING_TO_ACKNOWLEDGE, reason)
         case _:
             return Failure(Problem.UNCLEAR, reason)
 

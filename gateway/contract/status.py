@@ -9,7 +9,7 @@ from gateway.engine.device.records import CallRecord, CallState
 from gateway.engine.dial_schedule import DialSchedule
 from gateway.engine.engine import Engine
 from gateway.engine.forecast import LineForecast
-from gateway.engine.jobs.jobs import Poll
+from gateway.engine.jobs.jobs import PolledBlock
 from gateway.planning.bad_addresses import BadRange
 from gateway.planning.planner import describe
 from gateway.tags.timestamps import rfc3339
@@ -26,10 +26,10 @@ def standing(device: Device) -> str:
     return _STANDING.get(state, state.value)
 
 
-def device_document(device: Device, polls: Sequence[Poll], now: float) -> Document:
+def device_document(device: Device, polls: Sequence[PolledBlock], now: float) -> Document:
     """One device. Times in seconds, counts since the start. `now` by the loop's clock."""
     record = device.record
-    read = [at for poll in polls if (at := poll.last.at) is not None]
+    read = [at for poll in polls if (at := poll.reads.at) is not None]
     last_good = max(read, default=record.last_good)
     return {
         "protocol": device.driver.protocol,
@@ -58,15 +58,15 @@ def device_document(device: Device, polls: Sequence[Poll], now: float) -> Docume
     }
 
 
-def _request(poll: Poll) -> Document:
+def _request(poll: PolledBlock) -> Document:
     """One block: its configured interval and the measured one."""
-    record = poll.counts
+    record = poll.reads
     return {
         "tags": describe(poll.block),
         "every": poll.block.every,
         "measured_every": round(record.mean_gap, 4) if record.mean_gap else None,
         "worst_age": round(record.worst_gap, 4) if record.worst_gap else None,
-        "reads": record.reads,
+        "reads": record.count,
         "overruns": record.overruns,
     }
 

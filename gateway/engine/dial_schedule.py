@@ -10,7 +10,7 @@ from gateway.engine.device.health import State
 from gateway.engine.device.records import COMPLETE, CallState
 from gateway.engine.effects import Effect, LogEvent
 from gateway.engine.engine import Engine
-from gateway.engine.jobs.jobs import Poll
+from gateway.engine.schedule.poll_entry import PollEntry
 from gateway.errors import CallEnded, LineDown
 
 NEVER = float("inf")
@@ -42,7 +42,7 @@ class DialSchedule:
     def __init__(self, engine: Engine, rules: CallRules) -> None:
         self.failed = 0  # calls in a row
         self.record = engine.record.telephone()
-        engine.schedule.reaches_by_modem = True
+        engine.reach_by_modem()
         self._engine = engine
         self._rules = rules
         self._ended = -NEVER  # the last call, or the last try of a call
@@ -147,9 +147,9 @@ class DialSchedule:
         return [*self._engine.lost(why, now, time), event]
 
 
-def _due(poll: Poll) -> float:
+def _due(poll: PollEntry) -> float:
     """Returns the time of the next call for the poll. A block that cannot be read waits its turn:
     the schedule would try it again every minute."""
-    if poll.last.at is None and poll.asked:
+    if poll.reads.at is None and poll.asked:
         return max(poll.due, poll.asked + poll.block.every)
     return poll.due

@@ -15,9 +15,9 @@ from gateway.engine.device.records import LineRecord
 from gateway.engine.effects import Effect, Effects
 from gateway.engine.jobs.jobs import (
     Idle,
-    InFlight,
     Job,
     Poll,
+    PolledBlock,
     Probe,
     Result,
     Traffic,
@@ -26,6 +26,7 @@ from gateway.engine.jobs.jobs import (
     resync_around,
 )
 from gateway.engine.jobs.requests import Request, Write, why_not_commanded
+from gateway.engine.jobs.unanswered import Unanswered
 from gateway.engine.results.health_rules import HealthRules, offline
 from gateway.engine.results.listening import ONLY_LISTENS, Listening, listens
 from gateway.engine.results.next_job import NextJob
@@ -35,6 +36,8 @@ from gateway.engine.results.shorter_silences import ShorterSilences
 from gateway.engine.results.staleness import NEVER, Staleness
 from gateway.engine.results.stray import Stray
 from gateway.engine.results.unsolicited import UnsolicitedFrames
+from gateway.engine.schedule.in_flight import InFlight
+from gateway.engine.schedule.poll_entry import PollEntry
 from gateway.engine.schedule.schedule import Schedule
 from gateway.errors import BadValue, Busy, LineDown, Superseded
 from gateway.planning.wire_timing import WireTiming
@@ -82,9 +85,9 @@ class Engine:
         shorter = self._next_job.shorter
         if shorter.suspects:
             shorter.judge(now)
-        job = self._next(now)
+        job, in_flight = self._next(now), self._in_flight
         if shorter.step:
-            shorter.before(job)
+            shorter.before(job, in_flight.open.get(job) if isinstance(job, Poll) else None)
         return job
 
     def _next(self, now: float) -> Job:
@@ -97,23 +100,20 @@ class Engine:
         may_reopen = silence.noted and not self.schedule.reaches_by_modem
         if may_reopen and silence.due <= now and silence.confirmed(self.schedule, self.devices):
             return silence.reopen(now)
-        job: Transacted | Idle | None = None
+        job: Transacted | PollEntry | Idle | None = None
         if self._unsolicited.speakers:
             job = self._unsolicited.next(now)
         if job is None:
             job = self.schedule.next(now)
+        if isinstance(job, PollEntry):
+            return in_flight.begin_poll(job, now)
         if isinstance(job, Idle):
             return Idle(silence.due) if may_reopen and now < silence.due < job.until else job
-        if isinstance(job, Poll):
-            in_flight.open_polls = in_flight.together = 1
-            in_flight.charged = None if job.expedited else job.device
-        else:
-            if type(job) is Write and (shared := self.schedule.requests.companions(job)):
-                job = WriteTogether(job.device, shared.writes, shared.run)
-            if job.device.shapes is not None:
-                resync_around(job, job.device.shapes, now)
-            in_flight.charged = job.device if isinstance(job, Probe) else None
-        in_flight.job, in_flight.begun = job, now
+        if type(job) is Write and (shared := self.schedule.requests.companions(job)):
+            job = WriteTogether(job.device, shared.writes, shared.run)
+        if job.device.shapes is not None:
+            resync_around(job, job.device.shapes, now)
+        in_flight.begin(job, now, job.device if isinstance(job, Probe) else None)
         return job
 
     def alongside(self, poll: Poll, now: float) -> Sequence[Poll]:
@@ -122,27 +122,25 @@ class Engine:
         They share the transaction of `poll`; each is concluded by itself.
         """
         most = self._next_job.pipelining.others(poll, now)
-        others = self.schedule.alongside(poll, most, now)
-        self._in_flight.open_polls += len(others)
-        self._in_flight.together += len(others)
-        return others
+        others = self.schedule.alongside(poll.device, most, now)
+        return [self._in_flight.begin_beside(other) for other in others]
 
     def conclude(
         self, job: Transacted, result: Result, traffic: Traffic, now: float, time: int
     ) -> list[Effect]:
         """Applies the result of a job. Polls of one transaction report its traffic once."""
         device, in_flight = job.device, self._in_flight
-        self._count_silence(job, result, traffic, now)
+        self._next_job.shorter.concluded(job, result, traffic, now)
         self._count(device, traffic, now)
         if isinstance(job, Poll):
-            in_flight.open_polls -= 1
+            entry = in_flight.open.pop(job)
             if isinstance(result, Exception):
-                self._next_job.poll_failed(job, result, now, time)
+                self._next_job.poll_failed(entry, result, now, time)
             else:  # units are the only good result of a poll
                 if self._next_job.silence.noted:
                     self._next_job.silence.heard()
-                self._polls.read(job, cast("Sequence[int]", result), now, time)
-            if in_flight.open_polls:
+                self._polls.read(entry, cast("Sequence[int]", result), now, time)
+            if in_flight.open:
                 return self._effects.take()
             if in_flight.failed or device.window > 1:
                 self._next_job.polls_ended(job, traffic, now, time)
@@ -161,23 +159,9 @@ class Engine:
         effects, self._effects.collected = self._effects.collected, []
         return effects
 
-    def _count_silence(self, job: Transacted, result: Result, traffic: Traffic, now: float) -> None:
-        shorter, device = self._next_job.shorter, job.device
-        if isinstance(job, Poll) and not isinstance(result, Exception):
-            shorter.spoke = device
-            if traffic.silence < device.silence.tested_below:
-                shorter.answered += 1
-                if shorter.answered >= shorter.look_at:
-                    shorter.look(now)
-        else:
-            if isinstance(job, Poll):
-                shorter.failed(device, result, traffic.silence, now)
-            shorter.spoke = None
-
     def _count(self, device: Device, traffic: Traffic, now: float) -> None:
         characters = (traffic.sent + traffic.heard) * self.wire.character
-        self.record.busy += characters
-        self.record.turnarounds += traffic.turnaround
+        self.record.count(characters, traffic.turnaround)
         device.record.count_exchanges(traffic.exchanges, characters, traffic.turnaround)
         if device.shapes is not None:
             device.shapes.at = now
@@ -228,12 +212,34 @@ class Engine:
         if poll is not None:
             self.schedule.expedite(poll, on_demand=True)
 
+    def polls(self, device: Device) -> Sequence[PolledBlock]:
+        """Returns the blocks of the device that are polled, and their last reads."""
+        return self.schedule.polls(device)
+
+    def reader(self, device: Device, tag: Tag) -> PolledBlock | None:
+        """Returns the block that reads this tag of the device; None: its value is unsolicited."""
+        return self.schedule.reader(device, tag)
+
+    @property
+    def unanswered(self) -> Unanswered:
+        """The timed-out requests of the line, whose replies may arrive in other transactions."""
+        return self.schedule.unanswered
+
+    def planned(self, now: float) -> None:
+        """Takes over the plans that a thread made of all devices."""
+        for device in self.devices:
+            self.schedule.plan(device, now)
+
+    def reach_by_modem(self, by_modem: bool = True) -> None:
+        """Notes if a telephone call is needed for every exchange."""
+        self.schedule.reach_by_modem(by_modem)
+
     def received(self, data: bytes, now: float, time: int) -> list[Effect]:
         """Takes bytes that arrived outside of a transaction."""
         if isinstance(self._unsolicited, Listening):
-            self.record.busy += len(data) * self.wire.character  # of another master
+            self.record.count(len(data) * self.wire.character, 0.0)  # of another master
         else:
-            self.record.unasked += len(data)
+            self.record.count_unasked(len(data))
             self._next_job.shorter.disturbed(now)
             self._stray.received(data, now, time)
         if self._unsolicited.speakers:
@@ -292,13 +298,12 @@ class Engine:
 
     def inherits(self) -> None:
         """Notes that a device server may have kept requests of an earlier process."""
-        self._next_job.inherits = True
+        self._next_job.inherit()
 
     def opened(self, now: float) -> list[Effect]:
         """Starts all devices again, because the port was opened."""
         self.is_open = True
-        self.record.opened += 1
-        self.record.since, self.record.trouble = now, ""
+        self.record.open(now)
         self._in_flight.clear()
         self._next_job.silence.opened()
         self._next_job.shorter.opened(now)
@@ -313,9 +318,7 @@ class Engine:
         """Turns every value bad, because the port was lost or could not be opened."""
         why = str(error)
         self._next_job.abandon(error, now)
-        if self.is_open:
-            self.record.open_before += now - self.record.since
-        self.record.trouble = self.record.last_trouble = why
+        self.record.lose(why, now, was_open=self.is_open)
         for device in self.devices:
             device.restart(error)
             self._effects.online(device, False)

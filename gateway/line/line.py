@@ -239,7 +239,7 @@ class Line:
     def begin(self, port: Port) -> Channel:
         """Begins to use an open port, or the next telephone call."""
         channel = self._channel = self._new_channel(port)
-        channel.unanswered = self.engine.schedule.unanswered
+        channel.unanswered = self.engine.unanswered
         return channel
 
     def end_call(self, calls: DialSchedule, why: CallEnded | None) -> None:
@@ -261,7 +261,7 @@ class Line:
     async def _close(self) -> None:
         channel, self._channel = self._channel, None
         self._transaction = self.calls = None
-        self.engine.schedule.reaches_by_modem = False
+        self.engine.reach_by_modem(False)
         self._expiry.alarm.cancel()  # its timer would keep an ended line alive
         if channel is not None:
             await channel.close()

@@ -180,15 +180,15 @@ async def _one_by_one(write: Write, long: LongWrite, talk: Transaction) -> bool:
     """Sends the requests of a long write, and notes how far it comes."""
     driver, at = write.device.driver, 0
     for number, span in enumerate(long.spans):
-        long.asked = max(long.asked, number + 1)
+        long.sends(number)
         try:
             await driver.write(talk, span, write.units[at : at + span.size])
         except Busy:
-            long.asked = max(long.done, number)
+            long.not_sent(number)
             raise
         if long.tokens:
             await _prove_only_reply(write, span, long.tokens[number], talk)
-        long.done = max(long.done, number + 1)
+        long.acknowledged(number)
         at += span.size
     return True
 

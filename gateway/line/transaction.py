@@ -8,7 +8,6 @@ from typing import Any, TypeVar
 
 from gateway.engine.device.device import Device
 from gateway.engine.jobs.jobs import Settled, Traffic
-from gateway.engine.jobs.unanswered import TimedOut
 from gateway.errors import DeviceError, Evidence, Garbled, LineDown, NoReply
 from gateway.line.channel import KEPT, NEVER, Channel
 from gateway.protocols.driver import Codec, EndedByGap
@@ -306,10 +305,9 @@ class Transaction:
                 again = min(again, request.until)
             else:
                 self._late = _LateReply(request.answers)
-                if number := _number(request.frame):
-                    device, answers = self._device, request.answers
-                    known = TimedOut(device, number, answers, request.sent)
-                    self._channel.unanswered.requests.append(known)
+                self._channel.unanswered.timed_out(
+                    self._device, request.frame, request.answers, request.sent
+                )
                 request.future.set_exception(self._verdict(request.data))
         return again
 

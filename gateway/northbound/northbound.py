@@ -1,7 +1,8 @@
 """The Zenoh side of the gateway: one session, its declarations, and their life."""
 
 import asyncio
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
@@ -10,12 +11,11 @@ import zenoh
 
 from gateway.config import Config, ZenohConfig, ZenohMode
 from gateway.contract import secrets
-from gateway.contract.interfaces import Device, History, Plant
+from gateway.contract.interfaces import Device, Parts, Plant
 from gateway.contract.keys import Keys
 from gateway.contract.payload import Failure, GroupResult
 from gateway.contract.writers import Writers
-from gateway.errors import GatewayError
-from gateway.northbound.alarms import AlarmPublisher
+from gateway.errors import Busy, GatewayError
 from gateway.northbound.answering.tag_index import TagIndex
 from gateway.northbound.group.admission import Admission
 from gateway.northbound.group.standby import GroupSettings
@@ -33,10 +33,12 @@ from gateway.northbound.requests.own_writes import OwnWrites
 from gateway.northbound.session import exposures
 from gateway.northbound.session.link_monitor import LinkMonitor
 from gateway.northbound.session.one_process import only_process
-from gateway.northbound.session.session import CLOSE_WITHIN, off_loop, open_session
+from gateway.northbound.session.session import CLOSE_WITHIN, open_session
 from gateway.northbound.session.session_settings import configure, connect_endpoints, drop_limit
 from gateway.northbound.session.watchdog import Watchdog
+from gateway.plant.threads import off_loop
 from gateway.tags import Sample, Tag, WriteResult
+from gateway.values import Value
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 
@@ -66,17 +68,16 @@ class Northbound:
         name: str,
         plant: Plant,
         *,
-        history: History | None = None,
+        parts: Parts,
         writers: Path | None = None,
         writers_state: Path | None = None,
         folder: Path | None = None,
         group: GroupSettings | None = None,
         status_every: float = STATUS_EVERY,
     ) -> None:
-        """`history` answers queries of the past and records every audited outcome. `writers` is
-        the file of the clients that may write; without it every client may that Zenoh admits.
-        `writers_state` keeps until when their signatures were accepted. `folder`: of the files that
-        the gateway writes; only one process runs with it.
+        """`writers` is the file of the clients that may write; without it every client may that
+        Zenoh admits. `writers_state` keeps until when their signatures were accepted. `folder`: of
+        the files that the gateway writes; only one process runs with it.
         """
         self.keys = Keys(settings.prefix, name)
         self.exclusive = asyncio.Event()
@@ -97,7 +98,6 @@ class Northbound:
         losses = Losses(drop_limit(self._config))
         self._publisher = Publisher(self.keys, losses)
         self._batches = ScanBatches(self._publisher, index)
-        alarms = AlarmPublisher(self.keys, plant, self._publisher, history)
         self._republisher = Republisher(
             self._batches.publish,
             plant,
@@ -105,12 +105,10 @@ class Northbound:
             self._links,
             losses,
             settings.refresh,
-            alarms.publish_all,
+            parts.publish_all,
         )
-        audit = Audit(
-            partial(self._publisher.document, self.keys.writes),
-            None if history is None else history.record_write,
-        )
+        self._parts = parts
+        audit = Audit(partial(self._publisher.document, self.keys.writes), self._record)
         self.own_writes = OwnWrites(self.keys, plant, audit)
         self._status = StatusPublisher(
             self.keys, self._collect_status, self._publisher, audit, status_every
@@ -121,7 +119,7 @@ class Northbound:
             index,
             audit,
             self._status.documents,
-            history,
+            parts,
             Acceptance(plant.duty, known_writers, accepted=accepted),
         )
         self._declared: list[object] = []  # Zenoh undeclares an object without a reference
@@ -156,9 +154,24 @@ class Northbound:
         `device/name`; `data`: the payload as on Zenoh; `arrived`: by the loop's clock."""
         return await self._incoming.write(tag, data, by, arrived)
 
-    def acknowledge(self, alarm: str, data: bytes, by: str, arrived: float) -> bytes | Failure:
-        """Acknowledges an alarm for the client `by`, as `write` does; `data`: as on Zenoh."""
-        return self._incoming.acknowledge(alarm, data, by, arrived)
+    async def order(
+        self, part: str, path: str, data: bytes, by: str, arrived: float
+    ) -> bytes | Failure:
+        """Has a part carry out an order of the client `by`, as `write` does."""
+        return await self._incoming.order(part, path, data, by, arrived)
+
+    def publish_latest(self, path: str, make: Callable[[], bytes]) -> None:
+        """Publishes a document of a part. Never blocks: the publishing thread makes it."""
+        self._publisher.latest(self.keys.status(path), make)
+
+    async def write_own(self, tag: Tag, value: Value, by: str, within: float) -> WriteResult:
+        """Writes for a part named `by`, as `OwnWrites.write`."""
+        return await self.own_writes.write(tag, value, by, within)
+
+    @property
+    def is_ready(self) -> bool:
+        """True when the gateway serves its plant."""
+        return self.opened.is_set()
 
     @property
     def active(self) -> asyncio.Event:
@@ -300,6 +313,11 @@ class Northbound:
     def _close_session(self, session: zenoh.Session) -> None:
         self._publisher.stop(_FLUSH_TIMEOUT)
         session.close()  # type: ignore[no-untyped-call]  # Zenoh's stub lacks it
+
+    def _record(self, time: int, outcome: str, *, refused: bool) -> None:
+        with suppress(Busy):  # a stopped history is a fault already
+            if (history := self._parts.history()) is not None:
+                history.record_write(time, outcome, refused=refused)
 
     async def _watch_publisher(self) -> None:
         await self._publisher.ended.wait()

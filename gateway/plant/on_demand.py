@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
 from gateway.engine.device.device import Device
-from gateway.engine.jobs.jobs import Poll
+from gateway.engine.jobs.jobs import PolledBlock
 from gateway.errors import Busy
 from gateway.line.line import Line
 from gateway.tags import Quality, Sample, Tag
@@ -48,9 +48,9 @@ class OnDemand:
         poll = self._poll(tag)
         if place is None or poll is None or not place[0].engine.is_open:
             return True
-        if poll.last.at is None or self._latest(tag).quality is Quality.BAD:
+        if poll.reads.at is None or self._latest(tag).quality is Quality.BAD:
             return False
-        return asyncio.get_running_loop().time() - poll.last.at < max_age
+        return asyncio.get_running_loop().time() - poll.reads.at < max_age
 
     def age(self, tag: Tag) -> float:
         """Returns the seconds since the last good read, in monotonic time; infinite without one.
@@ -63,7 +63,7 @@ class OnDemand:
         if poll is None:
             at: float | None = self.arrived.setdefault(tag, -math.inf)
         else:
-            at = poll.last.at
+            at = poll.reads.at
         return math.inf if at is None else asyncio.get_running_loop().time() - at
 
     def note(self, samples: Sequence[Sample]) -> None:
@@ -134,10 +134,10 @@ class OnDemand:
             if tag not in left:
                 self._expedite(tag)
 
-    def _poll(self, tag: Tag) -> Poll | None:
+    def _poll(self, tag: Tag) -> PolledBlock | None:
         """Returns the poll that reads the tag; None if the value is unsolicited."""
         place = self._place(tag.device)
-        return None if place is None else place[0].engine.schedule.reader(place[1], tag)
+        return None if place is None else place[0].engine.reader(place[1], tag)
 
     def _expedite(self, tag: Tag) -> None:
         if (place := self._place(tag.device)) is not None:

@@ -1,4 +1,4 @@
-"""Connects the lines of a configuration with the last sample of every tag, without Zenoh."""
+"""The lines of a configuration, the last sample of every tag, and the doors for the parts."""
 
 import asyncio
 import itertools
@@ -10,7 +10,8 @@ from gateway import __version__
 from gateway.config import Config, LineConfig
 from gateway.config.changes import DeviceChange
 from gateway.config.commands import check_command, every_command, speaker
-from gateway.contract.status import Document, device_document, line_document, standing
+from gateway.contract.faults import below
+from gateway.contract.status import Document, device_document, line_document
 from gateway.engine.device.device import Device
 from gateway.engine.device.device_settings import DeviceSettings
 from gateway.engine.forecast import LineForecast, forecast
@@ -19,22 +20,24 @@ from gateway.errors import GatewayError
 from gateway.line.line import Line
 from gateway.line.send_permit import Duty
 from gateway.line.wire_log import WireLog
-from gateway.parts.alarms import Alarms
-from gateway.parts.alarms.watched import watch
-from gateway.parts.serving.served_lines import Serving
-from gateway.parts.serving.status import served_documents
-from gateway.parts.transfers.expected import Expected
 from gateway.plant.build import OpenPort, line_of, opener
+from gateway.plant.conditions import Conditions
+from gateway.plant.expected import Adjust, Expected
 from gateway.plant.on_demand import OnDemand
-from gateway.plant.write_path import Requests
-from gateway.stations.served.station import Station
+from gateway.plant.write_path import Store, WritePath
 from gateway.tags import Reason, Sample, Tag, WriteResult, bad
 from gateway.tags.mirror import Mirror
-from gateway.tags.scan import Scan
 from gateway.tags.timestamps import rfc3339
 from gateway.values import Value
 
 REMOVED = "removed from the file"
+
+
+class Named(Protocol):
+    """A device, or a station of the gateway."""
+
+    @property
+    def name(self) -> str: ...
 
 
 class Subscriber(Protocol):
@@ -45,8 +48,15 @@ class Subscriber(Protocol):
     def set_online(self, device: str, online: bool) -> None: ...
 
 
-class Gateway:
-    """The lines of one configuration, and the last sample of every tag."""
+Documents = Mapping[str, Document]
+
+
+class Plant:
+    """The lines of one configuration, and the last sample of every tag.
+
+    Parts use the doors: `subscribe`, `add_documents`, `seers`, `retagged`, `conditions`, `stores`,
+    `logs`, `adjust_forecasts`.
+    """
 
     def __init__(
         self,
@@ -68,20 +78,23 @@ class Gateway:
         self._wall = wall
         self._started = time.monotonic()  # the wall clock may be set back
         self._subscribers: list[Subscriber] = []
-        self._documents: dict[str, Callable[[], Document]] = {}  # of other parts, in the status
+        self._documents: list[Callable[[], Documents]] = []  # of the parts, in the status
+        # Called with all samples that the mirror has stored, and with tags that came and went.
+        self.seers: Sequence[Callable[[Sequence[Sample]], None]] = ()
+        self.retagged: Callable[[Sequence[Tag], Sequence[Tag]], None] = _ignore
+        self.conditions = Conditions()
+        self.is_restored = False  # what was learned before the start is known
+        self.stores: list[Store] = []
+        self.logs: list[Callable[[], Mapping[str, WireLog]]] = []
         self._tags = {tag.key: tag for device in config.devices for tag in device.tags}
         self._places: dict[str, tuple[Line, Device]] = {}
         self._open_line, self._seeds = open_line, itertools.count()
         self._expected = Expected(lambda: self.config)
         self._on_demand = OnDemand(self._places.get, self.sample)
-        self.alarms = Alarms(self._tags.values(), wall)
-        self.add_document("alarms", self.alarms.counts)
-        self.serving = Serving(config, self, self._find_sample, wall=wall, duty=self.duty)
-        self._requests = Requests(self._places, self._tags, self.serving, wall)
+        self._requests = WritePath(self._places, self._tags, self.stores, wall)
         for line in config.lines:
             if not line.serve:
                 self.add_line(line)
-        watch(self.alarms, self.lines, config.alarms)
         if plan_now:
             for made in self.lines:
                 self.planned(made, self.plan(made))
@@ -127,8 +140,7 @@ class Gateway:
     def planned(self, line: Line, expected: LineForecast) -> None:
         """Takes over the plans of a line: it may run now."""
         self.expect(expected)
-        for device in line.engine.devices:
-            line.engine.schedule.plan(device, 0.0)
+        line.engine.planned(0.0)
 
     def expect(self, line: LineForecast) -> None:
         """Takes over the forecast of a line."""
@@ -149,8 +161,8 @@ class Gateway:
             for tag in ended:
                 del self._tags[tag.key]
             self.mirror.forget(left)  # last: other threads find the new tag instead
-            self.alarms.take_over([*change.started, *change.renewed.values()], left)
-            self.alarms.judge(started)
+            self.retagged([*change.started, *change.renewed.values()], left)
+            self._see(started)
             last = [bad(tag, Reason.DISABLED, now, REMOVED) for tag in ended]
             self._publish([*started, *last])
             gone += left
@@ -167,9 +179,9 @@ class Gateway:
             bad(tag, Reason.STARTING if tag.device in enabled else Reason.DISABLED, now)
             for tag in new
         ]
-        self.alarms.take_over(new, gone)
+        self.retagged(new, gone)
         found = self.mirror.compute(first, gone)
-        self.alarms.judge(found)
+        self._see(found)
         ended = [tag for tag in gone if self._tags.get(tag.key) is tag]
         for tag in ended:
             del self._tags[tag.key]
@@ -178,7 +190,6 @@ class Gateway:
     def configure(self, config: Config) -> None:
         """Has this configuration, after its changes are taken over."""
         self.config, self._devices = config, config.devices
-        watch(self.alarms, self.lines, config.alarms)
 
     def move(self, gone: Iterable[str], line: Line, devices: Iterable[Device] = ()) -> None:
         """Notes the devices that the line has no longer, and those that it has now."""
@@ -190,17 +201,20 @@ class Gateway:
         """Adds a subscriber. It receives each sample after the earlier subscribers."""
         self._subscribers.append(subscriber)
 
-    def add_document(self, path: str, document: Callable[[], Document]) -> None:
-        """Adds a document of another part to the status."""
-        self._documents[path] = document
+    def unsubscribe(self, subscriber: Subscriber) -> None:
+        self._subscribers.remove(subscriber)
 
-    def drop_document(self, path: str) -> None:
-        """Removes a document of another part."""
-        self._documents.pop(path, None)
+    def add_documents(self, documents: Callable[[], Documents]) -> None:
+        """Adds documents of a part to the status, by path."""
+        self._documents.append(documents)
+
+    def adjust_forecasts(self, adjust: Adjust) -> None:
+        """Has the forecasts adjusted for the requests of a part."""
+        self._expected.adjust(adjust)
 
     def wire_logs(self) -> Mapping[str, WireLog]:
         polled = {line.engine.name: line.wire_log for line in self.lines}
-        return polled | {line.name: line.wire_log for line in self.serving.lines}
+        return {name: log for logs in self.logs for name, log in logs().items()} | polled
 
     @property
     def enabled_devices(self) -> Sequence[Device]:
@@ -210,24 +224,23 @@ class Gateway:
 
     def samples(self, samples: Sequence[Sample]) -> None:
         changed = self.mirror.update(samples)
-        if self.alarms.of_tags and not (type(samples) is Scan and samples.latest.alarmed == ()):
-            self.alarms.judge(samples)
-        if self.serving.remembering:
-            self.serving.remember(samples)
+        for seen in self.seers:
+            seen(samples)
         if self._on_demand.arrived:
             self._on_demand.note(samples)
         if self._on_demand.waiting:
             self._on_demand.answer_all(samples)
         if self.mirror.derives and (changed or self.mirror.pending):
             changed = self.mirror.follow(changed)
-            if self.alarms.of_tags:
-                self.alarms.judge([sample for sample in changed if sample.tag.inputs])
-            if self.serving.remembering:
-                self.serving.remember(changed)
+            self._see([sample for sample in changed if sample.tag.inputs])
         if changed:
             self._publish(changed)
 
-    def online(self, device: Device | Station, online: bool) -> None:
+    def _see(self, samples: Sequence[Sample]) -> None:
+        for seen in self.seers if samples else ():
+            seen(samples)
+
+    def online(self, device: Named, online: bool) -> None:
         for subscriber in self._subscribers:
             subscriber.set_online(device.name, online)
 
@@ -257,10 +270,12 @@ class Gateway:
                 return bad(tag, Reason.DISABLED, self._wall(), REMOVED)
             return self.mirror[current]
 
-    def _find_sample(self, key: str) -> Sample | None:
-        """Returns the sample of `device/tag`; None: no such tag in this process."""
-        tag = self._tags.get(key)
-        return None if tag is None else self.sample(tag)
+    def tags(self) -> Iterable[Tag]:
+        return self._tags.values()
+
+    def wall(self) -> int:
+        """Returns ns since 1970."""
+        return self._wall()
 
     def mark_published(self, samples: Sequence[Sample]) -> None:
         if changed := self.mirror.mark_published(samples):
@@ -318,10 +333,6 @@ class Gateway:
                 "time": rfc3339(self._wall()),
                 "up": round(time.monotonic() - self._started, 1),
                 "tags": len(self._tags),
-                "lines": {line.engine.name: line.engine.is_open for line in self.lines}
-                | {line.name: line.is_open for line in self.serving.lines},
-                "devices": {name: standing(d) for name, (_, d) in self._places.items()}
-                | {station.name: station.presence.value for station in self.serving.stations},
             }
         }
         forecasts = self._expected.lines()
@@ -331,7 +342,16 @@ class Gateway:
                 continue  # not planned yet
             documents[f"lines/{engine.name}"] = line_document(engine, expected, line.calls, now)
         for name, (line, device) in self._places.items():
-            polls = line.engine.schedule.polls(device)
+            polls = line.engine.polls(device)
             documents[f"devices/{name}"] = device_document(device, polls, now)
-        documents |= served_documents(self.serving.lines, now)
-        return documents | {path: document() for path, document in self._documents.items()}
+        for found in self._documents:
+            documents |= found()
+        lines = {name: one["open"] for name, one in below("lines/", documents)}
+        lines = {one.engine.name: one.engine.is_open for one in self.lines} | lines
+        standings = {name: one["standing"] for name, one in below("devices/", documents)}
+        documents["status"] = {**documents["status"], "lines": lines, "devices": standings}
+        return documents
+
+
+def _ignore(tags: Sequence[Tag], gone: Sequence[Tag]) -> None:
+    """No part follows the tags."""

@@ -2,13 +2,13 @@
 
 import asyncio
 from collections.abc import Callable, Mapping, Sequence
+from typing import Protocol
 
 from gateway.engine.device.device import Device
 from gateway.engine.jobs.requests import WRITE_EXPIRY, CommandResult, Peeked
 from gateway.errors import BadValue, Busy, ConfigError, GatewayError, Offline
 from gateway.line.groups import ended
 from gateway.line.line import Line
-from gateway.parts.serving.served_lines import Serving
 from gateway.protocols.driver import Address
 from gateway.protocols.ranges import addresses, spans
 from gateway.tags import Tag, WriteResult
@@ -17,7 +17,16 @@ from gateway.values import Value
 MOST_PEEKED = 256  # addresses of one peek
 
 
-class Requests:
+class Store(Protocol):
+    """Tags whose values no device has: a part keeps what clients write."""
+
+    def holds(self, tag: Tag) -> bool: ...
+
+    async def write_group(self, values: Sequence[tuple[Tag, Value]]) -> Sequence[WriteResult]:
+        """Raises `BadValue` and `Busy` before anything changed."""
+
+
+class WritePath:
     """Writes, commands and peeks. Each raises `BadValue` before anything is sent, and otherwise a
     `GatewayError`."""
 
@@ -25,13 +34,14 @@ class Requests:
         self,
         places: Mapping[str, tuple[Line, Device]],
         tags: Mapping[str, Tag],
-        serving: Serving,
+        stores: Sequence[Store],
         wall: Callable[[], int],
     ) -> None:
-        """`places`: of each device; `tags`: by key. Both change with a reload."""
+        """`places`: of each device; `tags`: by key. Both change with a reload, `stores` with the
+        parts."""
         self._places = places
         self._tags = tags
-        self._serving = serving
+        self._stores = stores
         self._wall = wall
 
     async def write(self, tag: Tag, value: Value, within: float = WRITE_EXPIRY) -> WriteResult:
@@ -40,8 +50,9 @@ class Requests:
             place = self._places.get(tag.device)
             if place is None or tag not in place[1].settings.targets:
                 raise Busy(f"the file was reloaded, and {tag.key} with it; not sent")
-        if self._serving.holds(tag):
-            return await self._serving.write(tag, value)
+        if (store := self._store(tag)) is not None:
+            [result] = await store.write_group([(tag, value)])
+            return result
         line, device = self._place(tag.device)
         return await line.write(device, tag, tag.encode(value), within)
 
@@ -58,8 +69,8 @@ class Requests:
         name = values[0][0].device
         if any(self._tags.get(tag.key) is not tag for tag, _ in values):
             raise Busy(f"the file was reloaded, and {name} with it; not sent")
-        if self._serving.holds(values[0][0]):
-            return await self._serving.write_group(values)
+        if (store := self._store(values[0][0])) is not None:
+            return await store.write_group(values)
         line, device = self._place(name)
         units = [(tag, tag.encode(value)) for tag, value in values]
         return await ended(line.write_group(device, units, within), patience)
@@ -98,6 +109,9 @@ class Requests:
         """Returns the seconds that a request may wait for a telephone call; 0: for none."""
         place = self._places.get(device)
         return 0.0 if place is None else place[0].dialling
+
+    def _store(self, tag: Tag) -> Store | None:
+        return next((store for store in self._stores if store.holds(tag)), None)
 
     def _place(self, device: str) -> tuple[Line, Device]:
         if device not in self._places:

@@ -1,12 +1,12 @@
-"""The service: runs lines, Zenoh and history in one process, from start to SIGTERM."""
+"""The service: runs the plant, Zenoh and the parts in one process, from start to SIGTERM."""
 
 import asyncio
 import gc
 import signal
 import sys
 import time
-from collections.abc import AsyncIterator, Callable, Coroutine, Mapping, Sequence
-from contextlib import AsyncExitStack, asynccontextmanager
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AsyncExitStack
 from pathlib import Path
 from typing import Any
 
@@ -18,15 +18,13 @@ from gateway.line.arrival import ArrivalClock
 from gateway.line.line import Line
 from gateway.line.send_permit import Duty
 from gateway.northbound.northbound import Northbound, group_settings
-from gateway.northbound.session.session import off_loop
-from gateway.parts.alarms.file import AlarmFile
-from gateway.parts.history import Historian
-from gateway.parts.transfers import Transfers
-from gateway.plant.plant import Gateway
-from gateway.plant.state_file import StateFile
+from gateway.parts.registry import kinds
+from gateway.plant.part import Phase
+from gateway.plant.plant import Plant
+from gateway.plant.threads import off_loop
+from gateway.service.bulkheads import Bulkheads
 from gateway.service.reload import LiveReload, Reloader, RunningLines
 from gateway.service.supervisor import Supervisor
-from gateway.tags import Sample
 
 log = structlog.get_logger("gateway")
 # Seconds. Python's usual 5 ms of the publishing thread would delay the lines.
@@ -35,10 +33,8 @@ THREAD_SWITCH = 0.0005
 # every 100th of those all: with 50,000 tags a full collection stops the process for 10 ms.
 GC_THRESHOLDS = (5000, 5, 100)
 
-SAVE_EVERY = 10.0  # seconds
 # Seconds after the signal; 2 are allowed. Zenoh takes at most 1.5, the disk gets the rest.
 END_WITHIN = 1.7
-STATE_FILE_WITHIN = 0.5  # seconds; a lost state file costs only a new search
 
 
 async def run(config: Config, path: Path, started: Callable[[], None] = lambda: None) -> None:
@@ -103,33 +99,34 @@ async def _serve(
     config = reloader.current.without(withheld)
     clock = ArrivalClock()
     duty = Duty(clock.released, shared=config.standby is not None)
-    gateway = Gateway(config, clock, duty=duty, plan_now=False)
+    plant = Plant(config, clock, duty=duty, plan_now=False)
     gc.collect()
     gc.freeze()  # tags live as long as the gateway: each collection skips them
-    history = _history(config)
-    northbound = _northbound(config, gateway, history)
+    parts = Bulkheads(plant)
+    northbound = Northbound(
+        config.zenoh,
+        config.name,
+        plant,
+        parts=parts,
+        writers=config.writers_file,
+        writers_state=config.writers_state,
+        folder=config.folder,
+        group=group_settings(config),
+    )
     northbound.withhold(withheld)
-    web = _web(config, gateway, northbound, history)
-    state_file = None if config.state_file is None else StateFile(config.state_file)
-    if state_file is not None:
-        state_file.restore(gateway.enabled_devices)
-        gateway.mirror.restore(state_file.counters)
-    alarm_file = AlarmFile(config.alarms.path, gateway.alarms)
-    gateway.add_document("clock", clock.document)
-    gateway.subscribe(northbound)
-    transfers = _transfers(config, gateway, northbound)
-    gateway.subscribe(transfers)
-    if history is not None:  # clients may have missed what was published
-        gateway.subscribe(_Recording(history))
-        gateway.add_document("history", history.document)
-    gateway.add_document("reload", reloader.document)
-    running = RunningLines()
+    plant.subscribe(northbound)
+    plant.subscribe(parts)  # clients may have missed what was published
+    plant.add_documents(lambda: {"clock": clock.document(), "reload": reloader.document()})
+    parts.make(kinds(), northbound)
     async with AsyncExitStack() as cleanup:  # in reverse order of the start
         clock.start()
         cleanup.callback(clock.stop)
-        plans = _plan_lines(gateway, cleanup)
+        await parts.restore()
+        plans = _plan_lines(plant, cleanup)
         zenoh = asyncio.create_task(northbound.run(), name="zenoh")
-        cleanup.push_async_callback(_close, zenoh, history, state_file, alarm_file)
+        cleanup.push_async_callback(_close, zenoh, parts)
+        running = RunningLines()
+        live = LiveReload(reloader, plant, northbound, running, plans, supervisor, parts)
         exclusive, active, opened, replaced, stopping, failed = events = [
             asyncio.create_task(event.wait())
             for event in (
@@ -144,27 +141,25 @@ async def _serve(
         ends = [zenoh, stopping, replaced, failed]
         for event in events:
             cleanup.callback(event.cancel)
-        live = LiveReload(
-            reloader, gateway, northbound, running, plans, supervisor, transfers.renew
-        )
         await _first(exclusive, zenoh, stopping)
         if exclusive.done():  # otherwise another process may have this file and these lines
-            if history is not None:
-                history.start()
             supervisor.ready()  # also a standby, and a client that waits for its router
             supervisor.says("waiting for the network, or as standby")
-            if web is not None:
-                _start_web(web, cleanup)
+            await parts.start(Phase.KEEPING, Phase.SHOWING)
+            cleanup.push_async_callback(parts.stop, Phase.SHOWING)
             reload = asyncio.create_task(live.run(), name="reload")
             ends.append(reload)
             cleanup.push_async_callback(_end, [reload])
             await _first(active, *ends)
             if active.done():
                 supervisor.says(reloader.says)
-                transfers.start()  # before the alarms are restored: it has some
-                await cleanup.enter_async_context(alarm_file.kept())
-                await _start_lines(gateway, plans, running, history, state_file, cleanup)
-                cleanup.push_async_callback(transfers.stop)  # before the lines
+                plant.begin()
+                parts.activate()
+                await parts.start(Phase.ACTIVE, Phase.DRIVING)
+                for line, plan in zip(plant.lines, plans, strict=True):
+                    running.start(line, line.engine.name, _run_planned(line, plan))
+                cleanup.push_async_callback(running.end_all)  # before Zenoh: the last outcomes
+                cleanup.push_async_callback(parts.stop, Phase.DRIVING)
                 cleanup.push_async_callback(_end, [reload])  # before the lines: it starts some
         await _first(opened, *ends)
         if opened.done():
@@ -182,51 +177,15 @@ async def _first(*tasks: asyncio.Task[Any]) -> None:
     await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
 
 
-def _northbound(config: Config, gateway: Gateway, history: Historian | None) -> Northbound:
-    return Northbound(
-        config.zenoh,
-        config.name,
-        gateway,
-        history=history,
-        writers=config.writers_file,
-        writers_state=config.writers_state,
-        folder=config.folder,
-        group=group_settings(config),
-    )
-
-
-def _transfers(config: Config, gateway: Gateway, northbound: Northbound) -> Transfers:
-    write, alarms = northbound.own_writes.write, config.alarms.transfers
-    return Transfers(gateway, write, config.transfers, alarms=alarms)
-
-
-def _web(
-    config: Config, gateway: Gateway, northbound: Northbound, history: Historian | None
-) -> Callable[[], Coroutine[Any, Any, None]] | None:
-    """Returns the program of the HTTP side; None without `web` in the file."""
-    if config.web is None:
-        return None
-    from gateway.parts.web.server import Server  # imported only here: it costs time and memory
-    from gateway.parts.web.sources import Sources
-
-    sources = Sources(gateway, northbound, history, northbound.opened.is_set)
-    return Server(config.web, sources).run
-
-
-def _start_web(web: Callable[[], Coroutine[Any, Any, None]], cleanup: AsyncExitStack) -> None:
-    serving = asyncio.create_task(web(), name="web")
-    cleanup.push_async_callback(_end, [serving])
-
-
-def _plan_lines(gateway: Gateway, cleanup: AsyncExitStack) -> list[asyncio.Task[None]]:
+def _plan_lines(plant: Plant, cleanup: AsyncExitStack) -> list[asyncio.Task[None]]:
     """Plans the lines one after another, beside the event loop: each may run once it is planned."""
     turn = asyncio.Lock()
 
     async def plan(line: Line) -> None:
         async with turn:
-            gateway.planned(line, await off_loop(gateway.plan, line))
+            plant.planned(line, await off_loop(plant.plan, line))
 
-    plans = [asyncio.create_task(plan(line), name="plan") for line in gateway.lines]
+    plans = [asyncio.create_task(plan(line), name="plan") for line in plant.lines]
     cleanup.push_async_callback(_end, plans)
     return plans
 
@@ -236,54 +195,8 @@ async def _run_planned(line: Line, plan: asyncio.Task[None]) -> None:
     await line.run()
 
 
-async def _start_lines(
-    gateway: Gateway,
-    plans: Sequence[asyncio.Task[None]],
-    running: RunningLines,
-    history: Historian | None,
-    state_file: StateFile | None,
-    cleanup: AsyncExitStack,
-) -> None:
-    gateway.begin()
-    if history is not None:
-        history.record(gateway.mirror.samples())  # "starting" marks the restart
-    if state_file is not None:
-        await cleanup.enter_async_context(_saved(state_file, gateway))
-    for line, plan in zip(gateway.lines, plans, strict=True):
-        running.start(line, line.engine.name, _run_planned(line, plan))
-    gateway.serving.restore()
-    for one in gateway.serving.lines:
-        running.start(one, one.name, one.run())
-    cleanup.push_async_callback(running.end_all)  # first, so that the last outcomes are published
-
-
-@asynccontextmanager
-async def _saved(state_file: StateFile, gateway: Gateway) -> AsyncIterator[None]:
-    """Saves the state file regularly, and at the end."""
-    state_file.start()
-    saving = asyncio.create_task(_save_regularly(state_file, gateway), name="state")
-    try:
-        yield
-    finally:
-        counters = gateway.mirror.counters()
-        state_file.save_last(state_file.snapshot(gateway.enabled_devices, counters))
-        await _end([saving])
-
-
-async def _save_regularly(state_file: StateFile, gateway: Gateway) -> None:
-    while True:
-        await asyncio.sleep(SAVE_EVERY)
-        counters = gateway.mirror.counters()
-        state_file.save_soon(state_file.snapshot(gateway.enabled_devices, counters))
-
-
-async def _close(
-    zenoh: asyncio.Task[None],
-    history: Historian | None,
-    state_file: StateFile | None,
-    alarm_file: AlarmFile,
-) -> None:
-    """Ends Zenoh, then the files: they keep the last outcomes too.
+async def _close(zenoh: asyncio.Task[None], parts: Bulkheads) -> None:
+    """Ends Zenoh, then the parts with files: they keep the last outcomes too.
 
     A disk may hang, and clients on the network must not wait for it.
     """
@@ -291,36 +204,7 @@ async def _close(
     try:
         await _end([zenoh])
     finally:
-        if history is not None:
-            left = by - time.monotonic()
-            if not await asyncio.to_thread(history.close, left):
-                log.error("history close timed out", so="samples that are not on disk are lost")
-        closes = [alarm_file.close] if state_file is None else [alarm_file.close, state_file.close]
-        for close in closes:
-            left = min(STATE_FILE_WITHIN, by - time.monotonic())
-            if not await asyncio.to_thread(close, left):
-                log.warning("state file close timed out", so="the last changes are not saved")
-
-
-def _history(config: Config) -> Historian | None:
-    kept = config.history
-    return None if kept is None else Historian(kept.path, kept.keep, kept.max_size)
-
-
-class _Recording:
-    """Records published samples in the history.
-
-    It does so before the event loop takes the query of a client that received them.
-    """
-
-    def __init__(self, history: Historian) -> None:
-        self._history = history
-
-    def publish(self, samples: Sequence[Sample]) -> None:
-        self._history.record(samples)
-
-    def set_online(self, device: str, online: bool) -> None:
-        """History keeps no device states."""
+        await parts.stop(Phase.KEEPING, Phase.ACTIVE, within=by - time.monotonic())
 
 
 async def _end(tasks: Sequence[asyncio.Task[None]]) -> None:

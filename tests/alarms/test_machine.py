@@ -4,15 +4,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gateway.parts.alarms.machine import (
-    IN_ALARM,
-    TRANSITIONS,
-    Alarm,
-    Event,
-    NothingToAcknowledge,
-    State,
-    Status,
-)
+from gateway.errors import NothingToAcknowledge
+from gateway.parts.alarms.machine import IN_ALARM, TRANSITIONS, Alarm, Event, State, Status
 from gateway.tags import AlarmRule, Level
 
 HIGH, LOW, HYSTERESIS = 80.0, 10.0, 5.0

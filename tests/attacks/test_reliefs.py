@@ -11,14 +11,14 @@ RUN = """
 import asyncio, sys, weakref
 from pathlib import Path
 from gateway.service import (service)
-from gateway.plant.plant import Gateway
+from gateway.plant.plant import Plant
 from gateway.config import load
 
 made = []
 
 def make(*arguments, **named):
     print("alive", sum(one() is not None for one in made), "of", len(made), flush=True)
-    gateway = Gateway(*arguments, **named)
+    gateway = Plant(*arguments, **named)
     made.append(weakref.ref(gateway))
     return gateway
 

@@ -13,7 +13,7 @@ RUN = """
 import asyncio, sys
 from pathlib import Path
 from gateway.service import (service)
-from gateway.plant.plant import Gateway
+from gateway.plant.plant import Plant
 from gateway.config import load
 from gateway.line.line import Line
 
@@ -28,7 +28,7 @@ async def run(line):
     print("running", line.engine.name, flush=True)
     await usual_run(line)
 
-usual, Gateway.plan = Gateway.plan, staticmethod(plan)
+usual, Plant.plan = Plant.plan, staticmethod(plan)
 usual_run, Line.run = Line.run, run
 asyncio.run(service.run(load(file := Path(sys.argv[1])), file))
 """

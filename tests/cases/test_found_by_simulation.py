@@ -13,7 +13,7 @@ from gateway.config import load
 from gateway.engine.jobs.jobs import Poll
 from gateway.engine.schedule.schedule import Schedule
 from gateway.errors import Busy
-from gateway.plant.plant import Gateway
+from gateway.plant.plant import Plant as Gateway
 from gateway.protocols.computer_link import ComputerLink
 from gateway.tags import Quality, Reason, Sample
 from tests.sim.bench import Bench, Unruly

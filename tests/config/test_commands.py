@@ -12,7 +12,7 @@ from gateway.config import load
 from gateway.config.commands import NotControlled, check_command, speaker
 from gateway.contract.keys import Keys
 from gateway.errors import BadValue, ConfigError, LineDown
-from gateway.plant.plant import Gateway
+from gateway.plant.plant import Plant
 from tests.e2e.processes import plc_gateway, started, write_config
 from tests.zenoh_peer import ZenohPeer, free_endpoint
 
@@ -86,7 +86,7 @@ def test_area_c_on_an_echoing_line_is_an_error(tmp_path: Path) -> None:
 
 
 async def test_the_gateway_hands_commands_to_the_line(tmp_path: Path) -> None:
-    gateway = Gateway(load(written(tmp_path)))
+    gateway = Plant(load(written(tmp_path)))
     with pytest.raises(LineDown):
         await gateway.control("oven", "model")
     tasks = [asyncio.create_task(line.run()) for line in gateway.lines]

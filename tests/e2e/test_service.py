@@ -2,7 +2,6 @@
 
 import asyncio
 import json
-import math
 import os
 import socket
 import sys
@@ -16,10 +15,10 @@ import pytest
 
 from gateway.config import load
 from gateway.northbound.requests.inbox import Inbox
-from gateway.parts.alarms import Alarms
-from gateway.parts.alarms.file import AlarmFile
 from gateway.parts.history import Historian
-from gateway.plant.plant import Gateway
+from gateway.parts.history.part import HistoryPart
+from gateway.plant.part import Phase
+from gateway.plant.plant import Plant
 from gateway.service import service
 from gateway.tags import Sample, good
 from tests.e2e.processes import (
@@ -39,7 +38,7 @@ from tests.zenoh_peer import ZenohPeer, free_endpoint
 TAGS = {f"d{n}": {"address": f"D{n}"} for n in range(700, 708)}
 # The command itself, with a state file that is written more often.
 SOON = (
-    "import gateway.service.service as s; s.SAVE_EVERY = 0.05; "
+    "import gateway.parts.state.part as s; s.SAVE_EVERY = 0.05; "
     "from gateway.cli.main import main; main()"
 )
 # The command itself, with a history that fails at the first sample.
@@ -195,7 +194,7 @@ async def test_a_published_value_is_found_by_the_next_query(tmp_path: Path) -> N
     """In one pass of the loop a line has a sample, and then the inbox takes the queries."""
     lines = {"hall": vigor_line("simulator", {"speed": {"address": "D10", "history": True}})}
     path = write_config(tmp_path / "config.yaml", free_endpoint(), lines, history={"path": "h.db"})
-    whole = Gateway(load(path))
+    whole = Plant(load(path))
     speed = whole.tag("mixer/speed")
     assert speed is not None
     found: dict[str, list[object]] = {}
@@ -214,8 +213,7 @@ async def test_a_published_value_is_found_by_the_next_query(tmp_path: Path) -> N
     await asyncio.to_thread(history_says, historian, state="ok")
     inbox = Inbox(answer, lambda _: None)
     whole.subscribe(Network())
-    # Private: the service subscribes it after Zenoh, and that order is the subject.
-    whole.subscribe(service._Recording(historian))
+    whole.subscribe(HistoryPart(whole, historian))  # after Zenoh, as the service does
     asyncio.get_running_loop().call_soon(whole.samples, [good(speed, 1, time.time_ns())])
     inbox("before the sample")  # the inbox takes both in the same turn of the loop
     for _ in range(3):
@@ -234,16 +232,13 @@ def test_a_stalled_disk_does_not_delay_the_end(tmp_path: Path) -> None:
         assert not program.has_said("Traceback")
 
 
-async def test_history_gets_the_time_that_zenoh_leaves() -> None:
+async def test_the_files_get_the_time_that_zenoh_leaves() -> None:
     """The gateway ends within 2 s in all."""
-    zenoh_takes = 0.3
+    zenoh_takes, given = 0.3, list[float]()
 
-    class Disk:
-        given = math.inf
-
-        def close(self, within: float) -> bool:
-            self.given = within
-            return True
+    class Files:
+        async def stop(self, *phases: Phase, within: float) -> None:
+            given.append(within)
 
     async def zenoh() -> None:
         try:
@@ -251,12 +246,9 @@ async def test_history_gets_the_time_that_zenoh_leaves() -> None:
         finally:
             await asyncio.sleep(zenoh_takes)
 
-    history, state_file = Disk(), Disk()
-    as_history: Any = history
-    as_state_file: Any = state_file
+    files: Any = Files()
     zenoh_task = asyncio.create_task(zenoh())
     await asyncio.sleep(0)
     # Private: the order and the times of the end are the subject; `run` needs signals and ports.
-    await service._close(zenoh_task, as_history, as_state_file, AlarmFile(None, Alarms(())))
-    assert history.given <= service.END_WITHIN - zenoh_takes < 2
-    assert state_file.given <= service.STATE_FILE_WITHIN
+    await service._close(zenoh_task, files)
+    assert given[0] <= service.END_WITHIN - zenoh_takes < 2

@@ -23,6 +23,7 @@ from gateway.engine.jobs.jobs import (
     Transacted,
 )
 from gateway.engine.jobs.requests import Command, Outcome, Request, Write
+from gateway.engine.schedule.poll_entry import PollEntry
 from gateway.errors import DeviceError, LineDown, NoReply
 from gateway.protocols.computer_link import ComputerLink
 from gateway.protocols.modbus import ModbusRtu, ModbusTcp
@@ -119,6 +120,10 @@ class Rig:
             job = self.next()
         assert not isinstance(job, Idle | Reopen)
         return job
+
+    def entry(self, poll: Poll) -> PollEntry:
+        """The entry of a poll in the schedule."""
+        return next(e for e in self.engine.schedule.polls(poll.device) if e.job is poll)
 
     def conclude(
         self, job: Transacted, result: Result, traffic: Traffic | None = None, took: float = 0.02

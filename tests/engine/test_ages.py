@@ -6,8 +6,9 @@ import pytest
 
 from gateway.engine.device.ages import load_of, polled_blocks, worst_ages
 from gateway.engine.device.device import Device
-from gateway.engine.jobs.jobs import Idle, Poll
+from gateway.engine.jobs.jobs import Idle
 from gateway.engine.jobs.requests import Write
+from gateway.engine.schedule.poll_entry import PollEntry
 from gateway.engine.schedule.schedule import Schedule
 from gateway.tags import WriteRule
 from tests.sim.plant import device, make_tag
@@ -38,19 +39,21 @@ def random_devices(chance: random.Random) -> list[Device]:
     return [answering(n + 1, *intervals()) for n in range(chance.choice((1, 2, 3, 5, 8)))]
 
 
-def ages(devices: list[Device], seconds: float, written: Device | None = None) -> dict[Poll, float]:
+def ages(
+    devices: list[Device], seconds: float, written: Device | None = None
+) -> dict[PollEntry, float]:
     """The worst age of each poll, in planned wire times. `written`: all the time."""
-    schedule, now, worst = Schedule(devices, 0.0), 0.0, dict[Poll, float]()
+    schedule, now, worst = Schedule(devices, 0.0), 0.0, dict[PollEntry, float]()
     while now < seconds:
         if written is not None and not schedule.requests.waiting:
             schedule.requests.submit(Write(written, written.tags[0], [1], now))
         match schedule.next(now):
-            case Poll(device=of) as poll:
-                begun, before = now, poll.last.at
+            case PollEntry(device=of) as poll:
+                begun, before = now, poll.reads.at
                 now += of.seconds(poll.block.cost)
                 if before is not None and before > seconds / 10:  # all have found their places
                     worst[poll] = max(worst.get(poll, 0.0), now - before)
-                poll.last.at = now
+                poll.reads.at = now
                 schedule.polled(poll, now)
                 of.used(now, begun)
             case Write():
@@ -58,10 +61,10 @@ def ages(devices: list[Device], seconds: float, written: Device | None = None) -
             case Idle(until):
                 now = until if written is None else now + 0.001
     polls = [poll for device in devices for poll in schedule.polls(device)]
-    return {poll: worst.get(poll, now - (poll.last.at or 0.0)) for poll in polls}
+    return {poll: worst.get(poll, now - (poll.reads.at or 0.0)) for poll in polls}
 
 
-def over(found: dict[Poll, float]) -> float:
+def over(found: dict[PollEntry, float]) -> float:
     """The worst age as a share of the promised one."""
     blocks = polled_blocks([*dict.fromkeys(poll.device for poll in found)])
     promised = dict(zip([(b.device, b.block) for b in blocks], worst_ages(blocks), strict=True))

@@ -46,7 +46,7 @@ def test_a_value_that_goes_on_keeps_its_age_and_turns_stale_in_time() -> None:
     known = renewed(rig.device.settings, 1.0)
     rig.now += 0.5
     new = change(rig, rig.device, known, tags=tuple(known.values()))
-    assert [poll.last.at for poll in rig.engine.schedule.polls(new)] == [read]
+    assert [poll.reads.at for poll in rig.engine.schedule.polls(new)] == [read]
     rig.now = rig.engine.deadline
     rig.note(rig.engine.expire(rig.now, rig.time))
     while not any(sample.quality is Quality.BAD for sample in rig.samples):

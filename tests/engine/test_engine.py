@@ -661,7 +661,7 @@ def test_polls_alongside_are_concluded_one_by_one_and_fail_together() -> None:
     assert rig.device.state == "failing"
     settle = rig.next()
     assert isinstance(settle, Settle)
-    assert [failed for failed, _ in settle.failed] == [poll, others[0]]
+    assert settle.after is poll
     assert rig.device.health.outstanding == poll.block.span
 
 
@@ -783,7 +783,7 @@ def test_old_values_turn_bad_at_the_deadline() -> None:
     [poll] = rig.engine.schedule.polls(rig.device)
     [age] = worst_ages(polled_blocks([rig.device]))
     assert rig.now - read == pytest.approx(2 * age + rig.device.longest_reply)
-    assert poll.last.at is None
+    assert poll.reads.at is None
 
 
 def test_an_expedited_poll_is_next_before_its_time() -> None:
@@ -794,7 +794,7 @@ def test_an_expedited_poll_is_next_before_its_time() -> None:
     rig.engine.expedite(rig.device, rig.device.tags[0])
     poll = rig.next()
     assert isinstance(poll, Poll)
-    assert poll.expedited
+    assert rig.entry(poll).expedited
 
 
 @pytest.mark.parametrize("stopped", [False, True], ids=["lost", "stopped"])
@@ -832,7 +832,7 @@ def test_a_reopened_line_probes_every_device_again() -> None:
 def test_bytes_outside_of_a_transaction_are_counted_and_forget_the_monitor_list() -> None:
     rig = Rig()
     rig.bring(State.ONLINE)
-    rig.device.monitor.expect((rig.device.blocks[0].span,))
+    rig.device.monitor.must_register((rig.device.blocks[0].span,))
     rig.note(rig.engine.received(b"noise", rig.now, rig.time))
     assert rig.engine.record.unasked == 5
     assert rig.device.monitor.registered == ()

@@ -222,9 +222,9 @@ class Machine(RuleBasedStateMachine):
         if waited[job.device]:
             assert isinstance(job, RESYNC)
         if isinstance(job, Poll):
-            assert job.live
+            [entry] = [e for e in self.engine.schedule.polls(job.device) if e.job is job]
             assert job.device.health.online
-            assert job.due <= self.now
+            assert entry.due <= self.now
         if isinstance(job, Probe):
             assert not job.device.broadcast
         return job

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, rule
 
 from gateway.engine.device.device import Device
-from gateway.engine.jobs.jobs import EXPEDITED, NOT_QUEUED, Poll
+from gateway.engine.schedule.poll_entry import EXPEDITED, NOT_QUEUED, PollEntry
 from gateway.engine.schedule.poll_queue import ROOM, PollQueue
 from tests.sim.plant import device, make_tag
 
@@ -20,17 +20,17 @@ def online(station: int = 1) -> Device:
     return found
 
 
-def polls(of: Device, *dues: float, block: int = 0) -> list[Poll]:
-    return [Poll(of, of.blocks[block], due) for due in dues]
+def polls(of: Device, *dues: float, block: int = 0) -> list[PollEntry]:
+    return [PollEntry(of, of.blocks[block], due) for due in dues]
 
 
-def queue(*pushed: Poll) -> PollQueue:
+def queue(*pushed: PollEntry) -> PollQueue:
     made = PollQueue()
     made.push_all(pushed)
     return made
 
 
-def first(made: PollQueue, now: float) -> Poll | None:
+def first(made: PollQueue, now: float) -> PollEntry | None:
     return made.due if made.ripen(now) else None
 
 
@@ -162,7 +162,7 @@ class AnyOrder(RuleBasedStateMachine):
         self.now = 0.0
         self.devices = [online(1), online(2)]
         self.polls = [poll for of in self.devices for poll in polls(of, *[0.0] * (ROOM + 4))]
-        self.taken: list[Poll] = []
+        self.taken: list[PollEntry] = []
         self.queue = queue(*self.polls)
 
     @rule(which=st.integers(0, 99), pause=st.sampled_from([0.0, 0.5, 4.0]), times=st.integers(1, 9))
@@ -226,14 +226,14 @@ class AnyOrder(RuleBasedStateMachine):
         self.queue = queue(*self.polls)
         self.queue.expedited.extend(expedited)
 
-    def replace(self, of: Device, new: list[Poll]) -> None:
+    def replace(self, of: Device, new: list[PollEntry]) -> None:
         for poll in self.polls:
             poll.live = poll.live and poll.device is not of
         self.polls = [poll for poll in self.polls if poll.live] + new
         self.taken = [poll for poll in self.taken if poll.live]
         self.queue.push_all(new)
 
-    def due(self) -> list[Poll]:
+    def due(self) -> list[PollEntry]:
         ready = (poll for poll in self.polls if poll.device.health.online)
         return [p for p in ready if p.due <= self.now and p.ticket > NOT_QUEUED]
 

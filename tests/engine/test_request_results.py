@@ -301,7 +301,7 @@ def test_the_written_tag_is_polled_next() -> None:
     rig.write("D0")
     rig.conclude(rig.transacted(), OK)
     [poll] = rig.engine.schedule.polls(rig.device)
-    assert rig.next() is poll
+    assert rig.next() is poll.job
     assert poll.expedited
 
 

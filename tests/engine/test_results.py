@@ -72,15 +72,16 @@ def test_good_reads_are_counted_with_their_mean_and_worst_gap() -> None:
     for took in (0.02, 0.02, 0.52):
         poll = polled(rig)
         rig.conclude(poll, UNITS, took=took)
-    assert poll.counts.reads == 3
-    assert poll.counts.worst_gap > poll.counts.mean_gap > 0.9
+    reads = rig.entry(poll).reads
+    assert reads.count == 3
+    assert reads.worst_gap > reads.mean_gap > 0.9
 
 
 def test_a_device_that_comes_online_is_logged_and_its_polls_are_due_at_once() -> None:
     rig = Rig()
     rig.conclude(rig.transacted(), Resynced(1))
     assert events(rig) == ["device online"]
-    assert polled(rig).due == rig.now
+    assert rig.entry(polled(rig)).due == rig.now
 
 
 def test_a_good_poll_after_a_late_reply_ends_the_failures() -> None:
@@ -126,7 +127,8 @@ def test_a_request_that_arrived_damaged_is_sent_again_at_once() -> None:
     poll = polled(rig)
     for _ in range(2):
         rig.conclude(poll, DAMAGED, REPLIED)
-        assert rig.next() is poll
+        block, poll = poll.block, polled(rig)
+        assert poll.block is block
     rig.conclude(poll, DAMAGED, REPLIED)
     assert {sample.reason for sample in rig.samples} == {Reason.REFUSED}
 
@@ -293,8 +295,9 @@ def test_unsteady_reads_are_repeated_before_the_tags_turn_bad() -> None:
     poll = polled(rig)
     rig.conclude(poll, Unsteady("differ"), REPLIED)
     assert rig.samples == []
-    assert rig.next() is poll
-    rig.conclude(poll, Unsteady("differ"), REPLIED)
+    again = polled(rig)
+    assert again.block is poll.block
+    rig.conclude(again, Unsteady("differ"), REPLIED)
     assert {(s.reason, s.detail) for s in rig.samples} == {(Reason.GARBLED, "differ")}
     assert rig.device.state is State.ONLINE
 
@@ -330,7 +333,7 @@ def test_a_failed_probe_of_an_offline_device_is_no_second_warning() -> None:
 
 def test_an_unclear_end_forgets_the_monitor_list() -> None:
     rig = online()
-    rig.device.monitor.expect((rig.device.blocks[0].span,))
+    rig.device.monitor.must_register((rig.device.blocks[0].span,))
     rig.conclude(polled(rig), SILENCE)
     assert rig.device.monitor.registered == ()
 

@@ -10,8 +10,9 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 
 from gateway.engine.device.device import Device
 from gateway.engine.device.health import PAUSE_FIRST, PAUSE_LONGEST, PROBE_PAUSE, State
-from gateway.engine.jobs.jobs import Idle, Poll, Probe
+from gateway.engine.jobs.jobs import Idle, Probe
 from gateway.engine.jobs.requests import MOST_WAITING, WRITE_EXPIRY, Write
+from gateway.engine.schedule.poll_entry import PollEntry
 from gateway.engine.schedule.probes import (
     OFFLINE_SHARE,
     PATIENT_AFTER,
@@ -48,9 +49,9 @@ def fail(device: Device) -> None:
     device.health.unclear(NoReply("silence"), None, 0.0)
 
 
-def polled(schedule: Schedule, now: float) -> Poll:
+def polled(schedule: Schedule, now: float) -> PollEntry:
     job = schedule.next(now)
-    assert isinstance(job, Poll)
+    assert isinstance(job, PollEntry)
     schedule.polled(job, now)
     return job
 
@@ -61,7 +62,7 @@ def test_requests_go_first() -> None:
     mine = write(dev)
     schedule.requests.submit(mine)
     assert schedule.next(0.0) is mine
-    assert isinstance(schedule.next(0.0), Poll)
+    assert isinstance(schedule.next(0.0), PollEntry)
 
 
 def test_but_not_twice_in_a_row_while_a_poll_is_due() -> None:
@@ -73,10 +74,10 @@ def test_but_not_twice_in_a_row_while_a_poll_is_due() -> None:
     jobs: list[Any] = []
     for _ in range(6):
         jobs.append(schedule.next(0.0))
-        if isinstance(jobs[-1], Poll):
+        if isinstance(jobs[-1], PollEntry):
             schedule.polled(jobs[-1], 0.0)
     assert [job for job in jobs if isinstance(job, Write)] == writes
-    assert [isinstance(job, Poll) for job in jobs] == [False, True, False, True, False, False]
+    assert [isinstance(job, PollEntry) for job in jobs] == [False, True, False, True, False, False]
 
 
 def test_a_write_does_not_wait_for_replaced_polls() -> None:
@@ -121,14 +122,14 @@ def test_but_not_twice_in_a_row_while_one_is_due() -> None:
     assert asked == [expedited, other, expedited, expedited]
 
 
-def questions(schedule: Schedule, asked: Sequence[Poll], until: float) -> dict[Poll, int]:
+def questions(schedule: Schedule, asked: Sequence[PollEntry], until: float) -> dict[PollEntry, int]:
     """Clients ask for these polls all the time; a poll takes its expected time."""
-    now, sent = 0.0, dict[Poll, int]()
+    now, sent = 0.0, dict[PollEntry, int]()
     while now < until:
         for poll in asked:
             schedule.expedite(poll, on_demand=True)
         match schedule.next(now):
-            case Poll() as poll:
+            case PollEntry() as poll:
                 now += poll.device.seconds(poll.block.cost)
                 schedule.polled(poll, now)
                 sent[poll] = sent.get(poll, 0) + 1
@@ -188,7 +189,7 @@ def test_a_poll_expedited_while_it_is_in_flight_is_sent_once_more() -> None:
     dev = online(0)
     schedule = Schedule([dev], 0.0)
     poll = schedule.next(0.0)
-    assert isinstance(poll, Poll)
+    assert isinstance(poll, PollEntry)
     schedule.expedite(poll)
     schedule.polled(poll, 0.1)
     assert polled(schedule, 0.1) is poll
@@ -224,7 +225,7 @@ def test_a_device_that_needs_a_resync_is_probed_before_anything_else() -> None:
         assert job.device is dev
     dev.health.answered()
     assert isinstance(schedule.next(0.0), Write)
-    assert isinstance(schedule.next(0.0), Poll)
+    assert isinstance(schedule.next(0.0), PollEntry)
 
 
 def test_a_write_does_not_wait_behind_one_for_a_device_that_has_just_failed() -> None:
@@ -245,9 +246,9 @@ def test_a_bad_poll_is_tried_again_within_a_minute_even_at_a_long_interval() -> 
     dev = online(0, every=86_400.0)
     schedule = Schedule([dev], 0.0)
     job = schedule.next(0.0)
-    assert isinstance(job, Poll)
+    assert isinstance(job, PollEntry)
     schedule.polled(job, 0.0)  # the device was busy, say: no value was read
-    assert isinstance(schedule.next(PAUSE_LONGEST), Poll)
+    assert isinstance(schedule.next(PAUSE_LONGEST), PollEntry)
 
 
 def test_a_bad_address_is_polled_rarely_but_keeps_its_short_deadline() -> None:
@@ -275,7 +276,7 @@ def test_a_starting_device_is_probed_at_once() -> None:
     assert isinstance(schedule.next(0.0), Probe)
     dev.health.answered()
     schedule.came_online(dev, 0.1)
-    assert isinstance(schedule.next(0.1), Poll)
+    assert isinstance(schedule.next(0.1), PollEntry)
 
 
 def test_while_polls_of_others_are_due_starting_devices_get_half_of_the_time() -> None:
@@ -291,7 +292,7 @@ def test_while_polls_of_others_are_due_starting_devices_get_half_of_the_time() -
                 fail(found)
                 schedule.failed(now, 0.5)
                 schedule.went_offline(found, now, 0.5)
-            case Poll() as poll:
+            case PollEntry() as poll:
                 now += 0.02
                 schedule.polled(poll, now)
     assert 0.4 <= probing / now <= 0.55
@@ -301,7 +302,7 @@ def test_a_device_that_fails_does_not_hold_up_the_others_twice_in_a_row() -> Non
     bad, healthy = online(0, every=0.1), online(0, every=5.0, station=2)
     schedule = Schedule([bad, healthy], 0.0)
     poll = schedule.next(0.0)
-    assert isinstance(poll, Poll)
+    assert isinstance(poll, PollEntry)
     assert poll.device is bad
     fail(bad)
     schedule.failed(1.0, 1.0)
@@ -328,7 +329,7 @@ def test_an_offline_device_is_only_probed_at_growing_pauses() -> None:
     assert len(set(pauses[8:])) == 4  # jitter
     dev.health.answered()
     schedule.came_online(dev, now)
-    assert isinstance(schedule.next(now), Poll)
+    assert isinstance(schedule.next(now), PollEntry)
 
 
 def test_all_offline_devices_together_get_a_twentieth_while_others_are_online() -> None:
@@ -346,7 +347,7 @@ def test_all_offline_devices_together_get_a_twentieth_while_others_are_online() 
                 probing += 0.5
                 probed.add(found)
                 schedule.went_offline(found, now, 0.5)
-            case Poll() as poll:
+            case PollEntry() as poll:
                 now += 0.02
                 schedule.polled(poll, now)
     assert 0.8 * OFFLINE_SHARE <= probing / now <= OFFLINE_SHARE
@@ -436,7 +437,7 @@ def test_a_short_probe_waits_a_multiple_of_the_usual_turnaround_of_its_neighbour
     def timeout(now: float) -> float | None:
         schedule.went_offline(offline, now, 0.5)
         while not isinstance(job := schedule.next(now + 10.0), Probe):
-            assert isinstance(job, Poll)
+            assert isinstance(job, PollEntry)
             schedule.polled(job, now + 10.0)
         return job.timeout
 
@@ -519,7 +520,7 @@ def test_a_poll_without_replies_is_sent_less_and_less() -> None:
     now, gaps = 0.0, []
     for _ in range(9):
         poll = schedule.next(now)
-        assert isinstance(poll, Poll)
+        assert isinstance(poll, PollEntry)
         schedule.polled(poll, now, answered=False)
         job = schedule.next(now)
         assert isinstance(job, Idle)
@@ -535,7 +536,7 @@ def test_new_polls_are_due_at_once_and_the_replaced_one_is_sent_no_more() -> Non
     dev = online(0, 1)
     schedule = Schedule([dev], 0.0)
     whole = schedule.next(0.0)
-    assert isinstance(whole, Poll)
+    assert isinstance(whole, PollEntry)
     halves = dev.bad_addresses.refused(whole.block, 0, "28")
     schedule.replace(whole, halves, 0.0)
     assert {polled(schedule, 0.0).block.span for _ in halves} == {b.span for b in halves}
@@ -545,10 +546,10 @@ def test_new_polls_are_due_at_once_and_the_replaced_one_is_sent_no_more() -> Non
 def test_a_plan_keeps_the_age_and_due_time_of_a_block() -> None:
     dev = online(0, 1000)
     schedule = Schedule([dev], 0.0)
-    polled(schedule, 0.0).last.at = 0.25
+    polled(schedule, 0.0).reads.at = 0.25
     schedule.plan(dev, 0.5)
     first, second = schedule.polls(dev)
-    assert first.last.at == 0.25
+    assert first.reads.at == 0.25
     assert polled(schedule, 0.5) is second
     assert schedule.next(0.5) == Idle(1.0)
 
@@ -586,10 +587,10 @@ def run_full(schedule: Schedule, begin: float, seconds: float) -> dict[str, list
     now, found = begin, dict[str, list[float]]()
     while now < begin + seconds:
         job = schedule.next(now)
-        assert isinstance(job, Poll)
+        assert isinstance(job, PollEntry)
         now += 0.05
         found.setdefault(job.block.tags[0].text, []).append(now)
-        job.last.at = now
+        job.reads.at = now
         schedule.polled(job, now)
     return found
 
@@ -637,7 +638,7 @@ class AnyOrder(RuleBasedStateMachine):
             for s in (1, 2, 3)
         ]
         self.schedule = Schedule(self.devices, self.now)
-        self.running: Poll | None = None
+        self.running: PollEntry | None = None
         self.written = 0
         self.submitted = 0
 
@@ -664,7 +665,7 @@ class AnyOrder(RuleBasedStateMachine):
         match self.schedule.next(self.now):
             case Probe(found):
                 (self._answered if answers else self._unclear)(found)
-            case Poll() as poll:
+            case PollEntry() as poll:
                 assert poll.live
                 assert poll.device.health.online
                 assert not poll.device.health.needs_resync
@@ -681,7 +682,7 @@ class AnyOrder(RuleBasedStateMachine):
                 assert until > self.now
                 assert not self._due()
 
-    def _end(self, poll: Poll, *, answers: bool, refused: bool) -> None:
+    def _end(self, poll: PollEntry, *, answers: bool, refused: bool) -> None:
         found, schedule = poll.device, self.schedule
         if answers and not refused:
             self._answered(found)
@@ -731,13 +732,13 @@ class AnyOrder(RuleBasedStateMachine):
             found.restart()
         self.schedule.opened(self.now)
 
-    def _queues(self, poll: Poll) -> int:
+    def _queues(self, poll: PollEntry) -> int:
         queue = self.schedule._queue  # private: a lost poll shows only after its whole period
         entries = [*queue.waiting, *(e for own in queue.by_device.values() for e in own.heap)]
         valid = [one for _, ticket, one in entries if one is poll and ticket == poll.ticket]
         return len(valid) + sum(one is poll for one in queue.expedited)
 
-    def _due(self) -> list[Poll]:
+    def _due(self) -> list[PollEntry]:
         return [
             poll
             for found in self.devices

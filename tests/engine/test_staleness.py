@@ -89,6 +89,6 @@ async def test_a_device_that_is_written_all_the_time_is_polled_like_the_others()
             await asyncio.sleep(0.02)
     # A written tag is polled at once each time; no other device is left behind.
     reads = [
-        min(poll.counts.reads for poll in line.line.engine.schedule.polls(dev)) for dev in devices
+        min(poll.reads.count for poll in line.line.engine.schedule.polls(dev)) for dev in devices
     ]
     assert min(reads) > 0.6 * max(reads)

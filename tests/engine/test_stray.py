@@ -28,7 +28,7 @@ class StrayLine:
         results = HealthRules("line", schedule, staleness, self.effects)
         self.stray = Stray("line", devices, results, self.effects)
         for one in devices:
-            one.monitor.expect(LIST)
+            one.monitor.must_register(LIST)
 
     def log(self) -> list[LogEvent]:
         return [effect for effect in self.effects.take() if isinstance(effect, LogEvent)]

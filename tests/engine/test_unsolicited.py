@@ -22,11 +22,12 @@ from gateway.errors import GatewayError, LineDown, Refused
 from gateway.line.line import Line
 from gateway.northbound.publishing.republish import Republisher
 from gateway.plant.build import line_of
-from gateway.plant.plant import Gateway
+from gateway.plant.plant import Plant
 from gateway.stations.vigor import VigorStation
 from gateway.tags import Quality, Reason, Sample, Tag, WriteResult, good
 from gateway.transport import Port, Receiver
 from gateway.values import Value
+from tests.northbound.plant import nothing
 from tests.sim.virtual import VirtualLoop, on_virtual_time
 from tests.vectors import vectors
 
@@ -221,7 +222,7 @@ async def test_each_of_two_equal_events_is_published() -> None:
     config = load(EXAMPLES / "barcode-reader.yaml")
     news: list[Value | Reason | None] = []
     bench = Bench()
-    gateway = Gateway(config, lambda: int(now() * SECOND), lambda _: bench.open)
+    gateway = Plant(config, lambda: int(now() * SECOND), lambda _: bench.open)
 
     class Publisher:
         def publish(self, samples: Sequence[Sample]) -> None:
@@ -262,7 +263,7 @@ async def test_an_event_is_not_published_again_when_the_link_returns() -> None:
 
     everything: Any = Everything()
     republisher = Republisher(
-        repeated.extend, everything, everything, everything, everything, 600.0
+        repeated.extend, everything, everything, everything, everything, 600.0, nothing
     )
     await republisher.publish_all()
     assert [sample.tag.key for sample in repeated] == ["scale/weight", "scale/state"]

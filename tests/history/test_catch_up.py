@@ -26,7 +26,7 @@ from gateway.tags.recorded import Recorded, RecordedQuery
 from tests.e2e.processes import Program
 from tests.history.recorded import record_outcome
 from tests.history_writer import WEEK, until
-from tests.northbound.plant import PlainDevice, PlainPlant, tag
+from tests.northbound.plant import PlainDevice, PlainPlant, northbound_of, tag
 from tests.test_docs import bare, table
 from tests.zenoh_peer import ZenohPeer, free_endpoint
 
@@ -64,7 +64,7 @@ async def serving(
         listen=(endpoint,) if listen else (),
         connect=() if listen else (endpoint,),
     )
-    northbound = Northbound(settings, "demo", below, history=historian)
+    northbound = northbound_of(below, settings, history=historian)
     serves = asyncio.create_task(northbound.run())
     try:
         async with asyncio.timeout(60):

@@ -88,7 +88,7 @@ async def test_a_call_reads_what_is_due_within_half_its_interval() -> None:
         await asyncio.sleep(3600 - 30)
         assert far.model.calls == 6  # at 0, 10, 20, 30, 40, 50 minutes
         polls = far.line.engine.schedule.polls(far.device)
-        assert sum(poll.counts.reads for poll in polls) == 6 + 6
+        assert sum(poll.reads.count for poll in polls) == 6 + 6
 
 
 @on_virtual_time

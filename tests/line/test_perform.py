@@ -78,7 +78,7 @@ class Plc:
         span = tags[0].span._replace(size=len(tags) if not listed else 1)
         spans = tuple(tag.span for tag in tags) if listed else ()
         block = Block(span, 1.0, tags, Cost(0, 0), listed=spans)
-        return Poll(self.device, block, 0.0, register=register)
+        return Poll(self.device, block, block.span, register=register)
 
     def write(
         self, text: str, units: Sequence[int], rule: WriteRule | None = None, **settings: Any
@@ -101,7 +101,7 @@ def test_a_poll_follows_the_example_of_the_manual() -> None:
     dev = device([make_tag("D1"), make_tag("D2")], station=0)
     request, reply = (vector.frame.hex(" ") for vector in vectors("vigor")[2:4])
     script = Script(dev.driver, f"> {request}", f"< {reply}")
-    result = result_of(perform(Poll(dev, dev.blocks[0], 0.0), cast(Any, script)))
+    result = result_of(perform(Poll(dev, dev.blocks[0], dev.blocks[0].span), cast(Any, script)))
     assert result == (0x1234, 0xABCD)
     script.done()
 
@@ -271,7 +271,7 @@ async def test_settling_returns_the_delay_of_the_late_reply(delay: float | None)
     port.after = lambda _: delay
     transaction = opened(port)
     dev = device([make_tag("D0"), make_tag("D1")])
-    poll = Poll(dev, dev.blocks[0], 0.0)
+    poll = Poll(dev, dev.blocks[0], dev.blocks[0].span)
     assert isinstance(await perform(poll, transaction), NoReply)
     result = await perform(Settle(dev, 0.5, 0.02, poll), transaction)
     assert isinstance(result, Settled)

@@ -11,7 +11,7 @@ from gateway.line.wire_log import Event, Performed, Piece
 from gateway.parts.recording.replay import Checked, Difference, Learned, Replay
 from gateway.parts.recording.wire_file import LoggedPiece, LoggedValue
 from gateway.plant.build import line_of
-from gateway.plant.plant import Gateway
+from gateway.plant.plant import Plant
 from gateway.transport import Port, Receiver
 from tests.sim.virtual import on_virtual_time
 
@@ -21,7 +21,7 @@ Log = list[LoggedPiece | LoggedValue]
 
 async def recorded(config: Config, seconds: float) -> dict[str, Log]:
     """Runs the gateway on simulated PLCs. Returns the wire log of each line."""
-    gateway, loop = Gateway(config), asyncio.get_running_loop()
+    gateway, loop = Plant(config), asyncio.get_running_loop()
     logs: dict[str, Log] = {name: [] for name in gateway.wire_logs()}
 
     def listener(log: Log, event: Event) -> None:

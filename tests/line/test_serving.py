@@ -10,11 +10,13 @@ import pytest
 from gateway.cli import direct
 from gateway.config import built
 from gateway.errors import BadValue, Busy
-from gateway.plant.plant import Gateway
+from gateway.parts.serving.part import ServingPart
+from gateway.plant.plant import Plant
 from gateway.tags import Quality, Reason, Tag, WriteResult
 from gateway.transport import TcpAddress, listen
 from gateway.values import Value
 from tests.interop.peers import free_port
+from tests.parts.made import parts_of
 
 TAGS = {
     "limit": {"address": "holding:1", "write": {"max": 50}, "retain": True},
@@ -24,14 +26,22 @@ TAGS = {
 }
 
 
-def gateway(folder: Path) -> Gateway:
+def gateway(folder: Path) -> Plant:
     hmi = {"protocol": "modbus-tcp", "accept": ["holding:100"], "tags": TAGS}
     panel = {"port": "tcp://127.0.0.1:502", "serve": True, "devices": {"hmi": hmi}}
     data: dict[str, Any] = {"gateway": {"state": "state.json"}, "lines": {"panel": panel}}
-    return Gateway(built(data, folder))
+    made = Plant(built(data, folder))
+    parts_of(made, "serving")
+    return made
 
 
-def tag(of: Gateway, name: str) -> Tag:
+def served(of: Plant) -> ServingPart:
+    [store] = of.stores
+    assert isinstance(store, ServingPart)
+    return store
+
+
+def tag(of: Plant, name: str) -> Tag:
     found = of.tag(f"hmi/{name}")
     assert found is not None
     return found
@@ -43,7 +53,7 @@ async def test_a_held_value_is_on_the_disk_before_it_is_acknowledged(tmp_path: P
     assert (await first.write(tag(first, "name"), "AB")).value == "AB"
     assert (await first.write(tag(first, "steps"), (1, -2, 3))).value == (1, -2, 3)
     again = gateway(tmp_path)
-    again.serving.restore()
+    await served(again).begin()
     assert again.sample(tag(again, "limit")).value == 42
     assert again.sample(tag(again, "steps")).value == (1, -2, 3)
     assert again.sample(tag(again, "name")).quality is Quality.BAD  # without `retain`
@@ -77,7 +87,7 @@ async def test_several_held_values_change_all_at_once_or_none(tmp_path: Path) ->
 async def test_a_damaged_file_of_held_values_is_moved_aside(tmp_path: Path) -> None:
     (tmp_path / "state.held.json").write_text('{"form": 1, "held": [')
     one = gateway(tmp_path)
-    one.serving.restore()
+    await served(one).begin()
     assert one.sample(tag(one, "limit")).quality is Quality.BAD
     assert (tmp_path / "state.held.json.bad").exists()
 
@@ -85,7 +95,7 @@ async def test_a_damaged_file_of_held_values_is_moved_aside(tmp_path: Path) -> N
 async def test_a_held_value_outside_new_limits_is_dropped(tmp_path: Path) -> None:
     (tmp_path / "state.held.json").write_text('{"form": 1, "held": {"hmi/limit": 51}}')
     one = gateway(tmp_path)
-    one.serving.restore()
+    await served(one).begin()
     assert one.sample(tag(one, "limit")).quality is Quality.BAD
 
 
@@ -104,7 +114,7 @@ async def test_a_connection_ends_with_bytes_that_are_no_modbus_and_the_next_is_s
 ) -> None:
     monkeypatch.setattr(listen, "MOST_CONNECTIONS", 2)
     one = gateway(tmp_path)
-    [line] = one.serving.lines
+    [line] = served(one).lines
     number = free_port()
     line.config = replace(line.config, port=TcpAddress("127.0.0.1", number))
     task = asyncio.create_task(line.run())

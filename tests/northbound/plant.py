@@ -5,15 +5,19 @@ import time
 from collections.abc import AsyncIterator, Callable, Iterable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any, Literal
 
-from gateway.config import ZenohConfig
+from gateway.config import AlarmsConfig, ZenohConfig
+from gateway.contract.interfaces import History
 from gateway.engine.jobs.requests import CommandResult, Peeked
 from gateway.errors import BadValue, Busy, GatewayError, NotSent
 from gateway.line.send_permit import Duty
 from gateway.line.wire_log import WireLog
 from gateway.northbound.northbound import Northbound
-from gateway.parts.alarms import Alarms
+from gateway.parts.alarms.part import AlarmPart
+from gateway.plant.conditions import Conditions
+from gateway.plant.part import Core
 from gateway.protocols.driver import Address, Span, Unit
 from gateway.tags import Reason, Sample, Tag, WriteResult, WriteRule, bad, good
 from gateway.values import Layout, Value, parse_type
@@ -48,7 +52,9 @@ class PlainPlant:
         self.duty = Duty()
         self._devices = devices
         self._tags = {tag.key: tag for device in devices for tag in device.tags}
-        self.alarms = Alarms(self._tags.values())
+        self.conditions, self.lines = Conditions(), ()
+        self.parts = PlainParts(self)
+        self.alarms = self.parts.alarms.alarms
         self.samples = {
             key: bad(tag, Reason.STARTING, time.time_ns()) for key, tag in self._tags.items()
         }
@@ -65,6 +71,16 @@ class PlainPlant:
         self.command_result: CommandResult | Exception = CommandResult("acknowledged", 1, 0.1)
         self.commanded: list[tuple[str, str, str]] = []
         self.hall = WireLog()
+
+    def tags(self) -> Iterable[Tag]:
+        return self._tags.values()
+
+    def wall(self) -> int:
+        return time.time_ns()
+
+    @property
+    def config(self) -> Any:
+        return SimpleNamespace(alarms=AlarmsConfig())
 
     def wire_logs(self) -> Mapping[str, WireLog]:
         return {"hall": self.hall}
@@ -149,6 +165,48 @@ class PlainPlant:
         return self.samples[key]
 
 
+class PlainParts:
+    """The alarms of a plant, and perhaps a history. They never fail."""
+
+    def __init__(self, plant: PlainPlant, history: History | None = None) -> None:
+        self.kept = history
+        self.north: Northbound | None = None
+        doubles: Any = plant, self  # of the plant and of Zenoh
+        self.alarms = AlarmPart(Core(doubles[0], doubles[1], self.history, self))
+
+    def has_keys(self, part: str) -> bool:
+        return part == "alarms"
+
+    def keyed(self, part: str) -> AlarmPart:
+        return self.alarms
+
+    def history(self) -> History | None:
+        return self.kept
+
+    def each(self, capability: type[Any]) -> Sequence[Any]:
+        return [self.alarms] if isinstance(self.alarms, capability) else []
+
+    async def publish_all(self) -> None:
+        await self.alarms.publish_all()
+
+    def publish_latest(self, path: str, make: Callable[[], bytes]) -> None:
+        if self.north is not None:
+            self.north.publish_latest(path, make)
+        else:
+            make()
+
+
+async def nothing() -> None:
+    """The parts have nothing to publish again."""
+
+
+def northbound_of(plant: PlainPlant, settings: ZenohConfig, **others: Any) -> Northbound:
+    """`others`: those of `Northbound`, `name` and `history`."""
+    plant.parts.kept, name = others.pop("history", None), others.pop("name", "demo")
+    made = plant.parts.north = Northbound(settings, name, plant, parts=plant.parts, **others)
+    return made
+
+
 def mixer(*, blocks: bool | Literal["only"] = False) -> PlainPlant:
     return PlainPlant(
         PlainDevice(
@@ -166,7 +224,7 @@ def mixer(*, blocks: bool | Literal["only"] = False) -> PlainPlant:
 
 @asynccontextmanager
 async def serving(plant: PlainPlant, settings: ZenohConfig) -> AsyncIterator[Northbound]:
-    async with running(Northbound(settings, "demo", plant, status_every=0.5)) as northbound:
+    async with running(northbound_of(plant, settings, status_every=0.5)) as northbound:
         yield northbound
 
 

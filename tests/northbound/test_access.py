@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from gateway.config import ZenohConfig
-from gateway.northbound.northbound import Northbound
 from tests.northbound.access import (
     PASSWORDS,
     ROUTER_RULES,
@@ -15,7 +14,7 @@ from tests.northbound.access import (
     secret,
     users,
 )
-from tests.northbound.plant import PlainPlant, mixer, running, until
+from tests.northbound.plant import PlainPlant, mixer, northbound_of, running, until
 from tests.zenoh_peer import ZenohPeer, free_endpoint
 
 
@@ -29,7 +28,7 @@ async def behind_a_router(plant: PlainPlant, folder: Path) -> AsyncIterator[tupl
     password = secret(folder / "password.txt", PASSWORDS["gateway"] + "\n")
     settings = ZenohConfig(connect=(endpoint,), user="gateway", password_file=password)
     async with ZenohPeer("router", listen=[endpoint], config=config):
-        northbound = Northbound(settings, "demo", plant)
+        northbound = northbound_of(plant, settings)
         async with running(northbound):
             await until(lambda: northbound.counters()["links"] == 1)
             yield northbound, endpoint
@@ -42,7 +41,7 @@ async def test_behind_a_router_a_second_gateway_leaves_the_devices_to_the_first(
         settings = ZenohConfig(
             connect=(endpoint,), user="gateway", password_file=tmp_path / "password.txt"
         )
-        second = Northbound(settings, "second", mixer())
+        second = northbound_of(mixer(), settings, name="second")
         serves = asyncio.create_task(second.run())
         async with asyncio.timeout(60):
             await second.replaced.wait()

@@ -8,21 +8,22 @@ from typing import Any
 
 import pytest
 
-from gateway.contract.keys import Family, Keys, parse_key
+from gateway.contract.keys import Family, Keys, parse_key, part_of
 from gateway.contract.payload import Failure
 from gateway.contract.signatures import sign
 from gateway.contract.writers import Writers
 from gateway.line.send_permit import Duty
-from gateway.northbound.alarms import Acknowledgements, AlarmPublisher, open_alarms
 from gateway.northbound.requests.acceptance import Acceptance, Sender
 from gateway.northbound.requests.audit import Audit
+from gateway.northbound.requests.orders import Orders
 from gateway.parts.alarms import State
+from gateway.parts.alarms.documents import open_alarms
 from gateway.tags import AlarmRule, Level, Reason, bad, good
 from gateway.tags.timestamps import rfc3339
 from tests.northbound.plant import PlainDevice, PlainPlant, gateway_and_client, tag
 
 KEYS = Keys("plant", "demo")
-KEY = KEYS.alarm("mixer/speed")
+KEY = KEYS.status("alarms/mixer/speed")
 SPEED = tag("mixer", "speed", alarm=AlarmRule({Level.HIGH: 80}, text="too fast"))
 SECRET = "Zm9vYmFyYmF6cXV4Zm9vYmFyYmF6cXV4"  # noqa: S105  (of a test)
 
@@ -35,27 +36,27 @@ class Desk:
         self.audited: list[dict[str, Any]] = []
         audit = Audit(lambda data: self.audited.append(json.loads(data)))
         acceptance = Acceptance(Duty(), writers)
-        self._desk = Acknowledgements(KEYS, self.plant, audit, acceptance)
+        self._desk = Orders(KEYS, self.plant.parts, audit, acceptance)
 
     def take(self, value: float) -> None:
         self.plant.samples["mixer/speed"] = sample = good(SPEED, value, time.time_ns())
         self.plant.alarms.judge([sample])
 
-    def acknowledge(
+    async def acknowledge(
         self, data: bytes = b'{"by": "Ana"}', key: str = KEY, attachment: bytes | None = None
     ) -> Any:
         sender = Sender("5e55", attachment, asyncio.get_running_loop().time())
-        result = self._desk.acknowledge(key, data, sender)
+        result = await self._desk.execute("alarms", key, data, sender)
         return result if isinstance(result, Failure) else json.loads(result)
 
 
 async def test_an_acknowledgement_is_answered_with_the_alarm_and_a_repeat_with_the_same() -> None:
     desk = Desk()
     desk.take(85)
-    first = desk.acknowledge()
+    first = await desk.acknowledge()
     assert (first["state"], first["value"], first["text"]) == ("acknowledged", 85, "too fast")
     assert (first["acknowledged"]["by"], first["acknowledged"]["via"]) == ("Ana", "5e55")
-    assert desk.acknowledge() == first
+    assert (await desk.acknowledge()) == first
     assert desk.audited == []
 
 
@@ -63,8 +64,8 @@ async def test_an_acknowledgement_is_answered_with_the_alarm_and_a_repeat_with_t
     ("data", "key", "error"),
     [
         (b'{"by": "Ana"}', KEY, "nothing-to-acknowledge"),
-        (b'{"by": "Ana"}', KEYS.alarm("mixer/none"), "unknown-tag"),
-        (b'{"by": "Ana"}', KEYS.alarm("mixer/*"), "bad-value"),
+        (b'{"by": "Ana"}', KEYS.status("alarms/mixer/none"), "unknown-tag"),
+        (b'{"by": "Ana"}', KEYS.status("alarms/mixer/*"), "bad-value"),
         (b"", KEY, "bad-value"),
         (b"[]", KEY, "bad-value"),
         (b'{"by": " "}', KEY, "bad-value"),
@@ -77,7 +78,7 @@ async def test_an_acknowledgement_is_answered_with_the_alarm_and_a_repeat_with_t
 )
 async def test_each_refusal_has_its_word_and_is_audited(data: bytes, key: str, error: str) -> None:
     desk = Desk()
-    refused = desk.acknowledge(data, key)
+    refused = await desk.acknowledge(data, key)
     assert refused.problem == error
     assert [one["outcome"] for one in desk.audited] == [error]
     assert desk.plant.alarms.entries["mixer/speed"].status.state is State.NORMAL
@@ -86,12 +87,12 @@ async def test_each_refusal_has_its_word_and_is_audited(data: bytes, key: str, e
 async def test_an_alarm_that_was_raised_again_is_not_acknowledged() -> None:
     desk = Desk()
     desk.take(85)
-    [seen] = open_alarms(desk.plant)
+    [seen] = open_alarms(desk.plant.alarms)
     raised = rfc3339(seen.status.raised)
     desk.take(70)
     desk.take(90)
     data = json.dumps({"by": "Ana", "raised": raised}).encode()
-    assert desk.acknowledge(data).problem == "nothing-to-acknowledge"
+    assert (await desk.acknowledge(data)).problem == "nothing-to-acknowledge"
     assert seen.status.state is State.ACTIVE
 
 
@@ -106,10 +107,10 @@ async def test_with_writers_only_a_signed_acknowledgement_counts(tmp_path: Path)
     data = b'{"by": "Ana"}'
     forged = sign("hmi", "x" * 30, rfc3339(time.time_ns()), KEY, data)
     for attachment in (None, forged):
-        assert desk.acknowledge(data, attachment=attachment).problem == "not-allowed"
+        assert (await desk.acknowledge(data, attachment=attachment)).problem == "not-allowed"
     assert desk.plant.alarms.entries["mixer/speed"].status.state is State.ACTIVE
     signed = sign("hmi", SECRET, rfc3339(time.time_ns()), KEY, data)
-    assert desk.acknowledge(data, attachment=signed)["acknowledged"]["via"] == "hmi"
+    assert (await desk.acknowledge(data, attachment=signed))["acknowledged"]["via"] == "hmi"
 
 
 def test_the_first_of_a_list_are_those_without_acknowledgement() -> None:
@@ -121,12 +122,13 @@ def test_the_first_of_a_list_are_those_without_acknowledgement() -> None:
         strict=True,
     ):
         plant.alarms.restore({alarm.key: alarm.status._replace(state=state, level=Level.ON)})
-    assert [entry.key for entry in open_alarms(plant)] == ["mixer/c", "mixer/b", "mixer/a"]
+    assert [entry.key for entry in open_alarms(plant.alarms)] == ["mixer/c", "mixer/b", "mixer/a"]
 
 
 def test_keys_of_alarms() -> None:
-    assert parse_key("plant/@gateway/demo/alarms/mixer/speed").family is Family.ALARM
-    assert parse_key("a/b/@gateway/*/alarms/**").family is Family.ALARM
+    assert part_of("plant/@gateway/demo/alarms/mixer/speed") == "alarms"
+    assert part_of("a/b/@gateway/*/alarms/**") == "alarms"
+    assert part_of("plant/@gateway/demo/alarms") == ""
     assert parse_key("plant/@gateway/demo/alarms").family is Family.STATUS
     assert parse_key("plant/@gateway/demo/**").family is Family.STATUS
 
@@ -156,14 +158,9 @@ def test_each_change_is_in_history() -> None:
         def record_alarm(self, time: int, change: str) -> None:
             self.rows.append((time, json.loads(change)))
 
-    class Nowhere:
-        def latest(self, key: str, make: Any) -> None:
-            make()
-
     plant, history = PlainPlant(PlainDevice("mixer", (SPEED,))), Recorded()
-    nowhere: Any = Nowhere()
     as_history: Any = history
-    AlarmPublisher(KEYS, plant, nowhere, as_history)
+    plant.parts.kept = as_history
     entry = plant.alarms.entries["mixer/speed"]
     entry.alarm.restore(entry.status._replace(state=State.ACTIVE, level=Level.HIGH, raised=1))
     plant.alarms.acknowledge("mixer/speed", "Ana")

@@ -14,10 +14,10 @@ from gateway.errors import (
     ConfigError,
     GatewayError,
 )
-from gateway.northbound.northbound import Northbound
 from tests.northbound.plant import (
     gateway_and_client,
     mixer,
+    northbound_of,
     serving,
 )
 from tests.zenoh_peer import ZenohPeer, free_endpoint
@@ -98,7 +98,7 @@ async def test_a_failing_process_closes_the_session_and_ends(fails: str) -> None
 )
 def test_a_mistake_in_the_settings_is_one_sentence(settings: Any, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
-        Northbound(ZenohConfig(**settings), "demo", no_plant())
+        northbound_of(mixer(), ZenohConfig(**settings))
 
 
 def no_plant() -> Any:
@@ -109,7 +109,7 @@ async def test_a_port_in_use_is_one_sentence_and_ends_the_run() -> None:
     endpoint = free_endpoint()
     async with serving(mixer(), ZenohConfig(listen=(endpoint,))):
         with pytest.raises(GatewayError, match=r"Zenoh cannot be opened: .*"):
-            await Northbound(ZenohConfig(listen=(endpoint,)), "second", mixer()).run()
+            await northbound_of(mixer(), ZenohConfig(listen=(endpoint,)), name="second").run()
 
 
 async def serve(endpoint: str, fails: str) -> None:

@@ -11,7 +11,6 @@ import pytest
 from gateway.config import ZenohConfig, ZenohMode
 from gateway.contract.keys import Keys
 from gateway.northbound.answering.tag_index import TagIndex
-from gateway.northbound.northbound import Northbound
 from gateway.northbound.publishing.losses import Losses
 from gateway.northbound.publishing.republish import Republisher
 from gateway.northbound.session.link_monitor import LinkMonitor
@@ -21,6 +20,8 @@ from tests.northbound.plant import (
     PlainPlant,
     has_value,
     mixer,
+    northbound_of,
+    nothing,
     serving,
     tag,
 )
@@ -53,7 +54,8 @@ async def test_an_event_is_published_once_but_its_bad_quality_again() -> None:
     plant = PlainPlant(PlainDevice("reader", (code, weight)))
     index = TagIndex(Keys("plant", "demo"), plant.devices())
     published: list[Sample] = []
-    republisher = Republisher(published.extend, plant, index, LinkMonitor(), Losses(1.0), 600.0)
+    losses = Losses(1.0)
+    republisher = Republisher(published.extend, plant, index, LinkMonitor(), losses, 600.0, nothing)
     await republisher.publish_all()  # as at a start
     assert published == [bad(of, Reason.STARTING, plant.sample(of).time) for of in (code, weight)]
     published.clear()
@@ -75,7 +77,9 @@ async def test_the_plant_marks_republished_samples_before_they_go_out() -> None:
         assert plant.republished == published
 
     index = TagIndex(Keys("plant", "demo"), plant.devices())
-    await Republisher(publish, plant, index, LinkMonitor(), Losses(1.0), 600.0).publish_all()
+    await Republisher(
+        publish, plant, index, LinkMonitor(), Losses(1.0), 600.0, nothing
+    ).publish_all()
     assert len(published) == 4
 
 
@@ -86,7 +90,7 @@ async def test_after_a_router_was_killed_and_returned_everything_is_published_ag
     plant = mixer()
     endpoint = free_endpoint()
     # The gateway starts without its router.
-    northbound = Northbound(ZenohConfig(mode=mode, connect=(endpoint,)), "demo", plant)
+    northbound = northbound_of(plant, ZenohConfig(mode=mode, connect=(endpoint,)))
     serves = asyncio.create_task(northbound.run())
     northbound.publish([plant.now("mixer/speed", 1)])
     try:
@@ -129,7 +133,7 @@ async def test_a_client_of_the_process_before_gets_all_values_of_the_next() -> N
 def republisher(plant: PlainPlant, published: list[Sample], **how: Any) -> Republisher:
     index = TagIndex(Keys("plant", "demo"), plant.devices())
     settings = {"links": LinkMonitor(), "losses": Losses(0.05), "refresh": 1e6, **how}
-    return Republisher(published.extend, plant, index, **settings)
+    return Republisher(published.extend, plant, index, parts=nothing, **settings)
 
 
 def of_mixer(count: int) -> PlainPlant:
@@ -161,7 +165,7 @@ async def test_a_round_ends_when_the_link_is_full_again() -> None:
 
     index = TagIndex(Keys("plant", "demo"), plant.devices())
     losses.sent(plant.samples.values(), 0.05, now())
-    again = Republisher(publish, plant, index, LinkMonitor(), losses, 1e6)
+    again = Republisher(publish, plant, index, LinkMonitor(), losses, 1e6, nothing)
     task = asyncio.create_task(again.run())
     await asyncio.sleep(1.4)
     assert len(published) == 100

@@ -13,24 +13,24 @@ from gateway.contract.status import device_document, standing
 from gateway.engine.device.device import Device
 from gateway.errors import NoReply
 from gateway.line.line import Line
-from gateway.plant.plant import Gateway
+from gateway.plant.plant import Plant
 from tests.e2e.processes import vigor_line, write_config
 
 TAGS = {"speed": {"address": "D10"}, "door": {"address": "M12"}}
 
 
-def made(folder: Path, **device: Any) -> Gateway:
+def made(folder: Path, **device: Any) -> Plant:
     line = vigor_line("simulator", TAGS, **device)
-    return Gateway(load(write_config(folder / "c.yaml", "tcp/127.0.0.1:7447", {"hall": line})))
+    return Plant(load(write_config(folder / "c.yaml", "tcp/127.0.0.1:7447", {"hall": line})))
 
 
-def only(gateway: Gateway) -> tuple[Line, Device]:
+def only(gateway: Plant) -> tuple[Line, Device]:
     [line] = gateway.lines
     [device] = line.engine.devices
     return line, device
 
 
-async def served(gateway: Gateway, until: str) -> None:
+async def served(gateway: Plant, until: str) -> None:
     """Runs the one line until the document of the device shows this standing."""
     line, device = only(gateway)
     task = asyncio.create_task(line.run())
@@ -43,7 +43,7 @@ async def served(gateway: Gateway, until: str) -> None:
 
 async def test_before_the_first_transaction(tmp_path: Path) -> None:
     documents = made(tmp_path).status()
-    assert set(documents) == {"status", "alarms", "lines/hall", "devices/mixer"}
+    assert set(documents) == {"status", "lines/hall", "devices/mixer"}
     status = documents["status"]
     assert (status["name"], status["tags"]) == ("demo", 2)
     assert (status["lines"], status["devices"]) == ({"hall": False}, {"mixer": "starting"})
@@ -76,7 +76,7 @@ async def test_a_failing_device_has_a_diagnosis(tmp_path: Path) -> None:
 
 async def test_a_disabled_device_has_no_document_of_its_own(tmp_path: Path) -> None:
     documents = made(tmp_path, enabled=False).status()
-    assert set(documents) == {"status", "alarms", "lines/hall"}
+    assert set(documents) == {"status", "lines/hall"}
     assert documents["status"]["devices"] == {}
 
 
@@ -102,7 +102,7 @@ async def test_the_uptime_does_not_follow_the_wall_clock(tmp_path: Path) -> None
     wall = [1_800_000_000 * 10**9]
     line = vigor_line("simulator", TAGS)
     config = load(write_config(tmp_path / "c.yaml", "tcp/127.0.0.1:7447", {"hall": line}))
-    gateway = Gateway(config, wall=lambda: wall[0])
+    gateway = Plant(config, wall=lambda: wall[0])
     wall[0] -= 600 * 10**9
     up = gateway.status()["status"]["up"]
     assert isinstance(up, float)

@@ -25,13 +25,12 @@ from gateway.contract.writers import (
     Writers,
 )
 from gateway.errors import ConfigError
-from gateway.northbound.northbound import Northbound
 from gateway.northbound.requests.accepted import AcceptedUntil
 from gateway.tags import Sample, Tag
 from gateway.tags.recorded import Recorded, RecordedQuery
 from gateway.tags.timestamps import rfc3339
 from tests.northbound.access import PAGE, secret
-from tests.northbound.plant import mixer, running, until
+from tests.northbound.plant import mixer, northbound_of, running, until
 from tests.zenoh_peer import ZenohPeer, free_endpoint
 
 RECIPE = "plant/mixer/recipe/@set"
@@ -88,7 +87,7 @@ async def test_only_a_signed_request_writes_and_its_writer_is_named(tmp_path: Pa
     file = secret(tmp_path / "writers.txt", "# plant\n\n" + ALICE)
     plant, endpoint, history = mixer(), free_endpoint(), RecordedWrites()
     settings = ZenohConfig(listen=(endpoint,))
-    northbound = Northbound(settings, "demo", plant, writers=file, history=history)
+    northbound = northbound_of(plant, settings, writers=file, history=history)
     begun = past_start()
     async with running(northbound), ZenohPeer("client", connect=[endpoint]) as client:
         audit = await client.subscribe("plant/@gateway/demo/writes")

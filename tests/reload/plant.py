@@ -9,10 +9,12 @@ from typing import Any
 from gateway.config import built
 from gateway.config.changes import Difference, compare
 from gateway.engine.jobs.jobs import Job, Poll
-from gateway.plant.plant import Gateway
+from gateway.parts.transfers.part import with_writes
+from gateway.plant.plant import Plant as Gateway
 from gateway.service.reload import RunningLines
 from gateway.service.reload.renewal import Renewal
 from gateway.tags import Quality, Sample
+from tests.parts.made import parts_of
 
 Data = dict[str, Any]
 
@@ -41,6 +43,8 @@ class Plant:
         self.data = data
         self.gateway = Gateway(built(data), wall=self._wall)
         self.gateway.subscribe(self)
+        self.parts = parts_of(self.gateway, "alarms")
+        self.gateway.adjust_forecasts(with_writes)
         self.lines = RunningLines()
         self.published: list[Sample] = []
         self.online: list[tuple[str, bool]] = []
@@ -74,6 +78,7 @@ class Plant:
         difference = compare(self.gateway.config, built(self.data))
         self.published.clear()
         await Renewal(self.gateway, self.lines, difference).run()
+        await self.parts.take_over(difference.config, difference.renewed)
         return difference
 
     def polls(self, name: str) -> list[tuple[str, float]]:

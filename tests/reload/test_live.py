@@ -6,9 +6,10 @@ from pathlib import Path
 from typing import Any
 
 from gateway.config import load
-from gateway.plant.plant import Gateway
+from gateway.plant.plant import Plant
 from gateway.service.reload import LiveReload, Reloader, RunningLines
 from gateway.service.supervisor import Supervisor
+from tests.parts.made import parts_of
 from tests.reload.plant import Data, file, vigor
 from tests.sim.virtual import on_virtual_time
 
@@ -36,11 +37,11 @@ def write(path: Path, **devices: Data) -> Path:
 @on_virtual_time
 async def test_a_device_of_another_gateway_is_refused_and_nothing_changes(tmp_path: Path) -> None:
     path = write(tmp_path / "c.yaml", mixer=vigor(1))
-    gateway = Gateway(load(path))
+    gateway = Plant(load(path))
     before = gateway.config
     reloader, lines, north = Reloader(path, before), RunningLines(), North()
     any_north: Any = north
-    live = LiveReload(reloader, gateway, any_north, lines, (), Supervisor({}), lambda *_: None)
+    live = LiveReload(reloader, gateway, any_north, lines, (), Supervisor({}), parts_of(gateway))
     config = load(write(path, press=vigor(3), mixer=vigor(1)))
     await live._reload(config)  # its only caller waits for a signal
     assert gateway.config is before

@@ -15,7 +15,9 @@ from gateway.engine.engine import Engine
 from gateway.engine.jobs.jobs import Poll
 from gateway.errors import Busy, GatewayError
 from gateway.line.line import Line
+from gateway.parts.alarms.part import AlarmPart
 from gateway.tags import Quality, Reason, Tag
+from tests.parts.made import find
 from tests.reload.plant import Data, Plant, file, running, vigor
 from tests.sim.virtual import on_virtual_time
 
@@ -228,7 +230,7 @@ async def test_alarms_follow_their_tags_devices_and_lines() -> None:
     data = file(hall={"mixer": vigor(1), "oven": vigor(2)}, yard={"pump": vigor(3)})
     alarmed(data, -1.0)
     async with running(data) as plant:
-        alarms = plant.gateway.alarms
+        alarms = find(plant.parts, AlarmPart).alarms
         await plant.until_good("mixer/level")
         assert list(alarms.open) == ["mixer/level"]
         await plant.reload(lambda data: device(data, "mixer").update(defaults={"every": "200ms"}))

@@ -4,7 +4,7 @@ import asyncio
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from gateway.plant.plant import Gateway
+from gateway.plant.plant import Plant
 from gateway.protocols.capabilities import UnnumberedReplies
 from gateway.protocols.driver import Span
 from gateway.protocols.frames import FrameDriver
@@ -26,7 +26,7 @@ MOST_TROUBLES = 20  # recorded in one run
 class Judge:
     """Judges every sample before the gateway gets it. Times by the loop's clock."""
 
-    gateway: Gateway
+    gateway: Plant
     buses: dict[str, Bus]  # by device
     stations: dict[str, Troubled]  # by device
     story: Story

@@ -5,14 +5,25 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from gateway.config import Config, LineConfig
+from gateway.contract.interfaces import History, NoParts
 from gateway.northbound.northbound import Northbound
-from gateway.northbound.session.session import off_loop
 from gateway.parts.history import Historian
-from gateway.plant.plant import Gateway
+from gateway.plant.plant import Plant
+from gateway.plant.threads import off_loop
 from gateway.tags import Sample
 from tests.sim.north_judge import Judge
 
 CLOSE_WITHIN = 1.0  # seconds for the history
+
+
+class Kept(NoParts):
+    """A history, and no other part."""
+
+    def __init__(self, kept: History) -> None:
+        self._kept = kept
+
+    def history(self) -> History:
+        return self._kept
 
 
 class Process:
@@ -26,15 +37,15 @@ class Process:
         opener: Callable[[LineConfig], Any],
     ) -> None:
         self.judge = judge
-        self.gateway = Gateway(config, wall, opener)
+        self.gateway = Plant(config, wall, opener)
         history = config.history
         assert history is not None
         self.history = Historian(history.path, history.keep, history.max_size, wall)
-        self.northbound = Northbound(config.zenoh, "sim", self.gateway, history=self.history)
+        self.northbound = Northbound(config.zenoh, "sim", self.gateway, parts=Kept(self.history))
         self.gateway.subscribe(judge)
         self.gateway.subscribe(self.northbound)
         self.gateway.subscribe(self)
-        self.gateway.add_document("history", self.history.document)
+        self.gateway.add_documents(lambda: {"history": self.history.document()})
         self._serving: list[asyncio.Task[None]] = []
         self._lines: list[asyncio.Task[None]] = []
 

@@ -15,12 +15,14 @@ from gateway.config import LineConfig, built
 from gateway.contract.keys import Keys
 from gateway.northbound.requests.audit import Audit
 from gateway.northbound.requests.own_writes import OwnWrites
-from gateway.parts.alarms import State
+from gateway.parts.alarms import Alarms, State
+from gateway.parts.alarms.part import AlarmPart
 from gateway.parts.transfers import Transfers
 from gateway.plant.build import OpenPort
-from gateway.plant.plant import Gateway
+from gateway.plant.plant import Plant
 from gateway.stations.registry import station_of
 from gateway.stations.station import Memory, Station
+from tests.parts.made import find, parts_of
 from tests.sim.bench import Bench
 from tests.sim.virtual import now, on_virtual_time
 
@@ -111,11 +113,13 @@ class Chain:
         self.benches: dict[str, Bench] = {}
         self.ends: Sequence[dict[str, Any]] = ()  # the rows at the end
         config = built(FILE)
-        self.gateway = Gateway(config, lambda: int(now() * 1e9), self._open_line)
+        self.gateway = Plant(config, lambda: int(now() * 1e9), self._open_line)
         keys = Keys("plant", "demo")
         own = OwnWrites(keys, self.gateway, Audit(self.outcomes.append))
         self.transfers = Transfers(self.gateway, own.write, config.transfers)
         self.gateway.subscribe(self.transfers)
+        self.gateway.add_documents(self.transfers.documents)
+        self.alarms = find(parts_of(self.gateway, "alarms"), AlarmPart)
         source = self.stations["vigor"].memory
         for number in (10, 11):
             source.animate("D", number, lambda at: int(at / STEP))
@@ -153,8 +157,8 @@ class Chain:
             await asyncio.sleep(self.draw.choice((0.2, 5.0)))
 
 
-def active(gateway: Gateway) -> list[str]:
-    found = gateway.alarms.open.items()
+def active(alarms: Alarms) -> list[str]:
+    found = alarms.open.items()
     return [key for key, entry in found if entry.status.state is State.ACTIVE]
 
 
@@ -195,14 +199,14 @@ def test_a_chain_carries_nothing_bad_nothing_old_and_nothing_twice(seed: int) ->
         gateway = chain.gateway
         tasks = [asyncio.create_task(line.run()) for line in gateway.lines]
         chain.transfers.start()
-        watch = asyncio.create_task(gateway.alarms.run())
+        watch = asyncio.create_task(chain.alarms.run())
         await chain.suffer()
         await asyncio.sleep(CALM)
         # All is well again: both rows carry, and say so.
         assert [row["state"] for row in chain.rows] == ["carried", "carried"]
         assert [row["code"] for row in chain.rows] == ["0", "0"]
         assert now() / STEP - chain.stations["modbus-rtu"].value < 2 / STEP
-        assert not {"transfer:1", "transfer:2"} & set(active(gateway))
+        assert not {"transfer:1", "transfer:2"} & set(active(chain.alarms.alarms))
         # The first PLC is silent: both say why, and the last PLC gets the substitute once.
         chain.stations["vigor"].mute = True
         await asyncio.sleep(CALM)
@@ -214,7 +218,7 @@ def test_a_chain_carries_nothing_bad_nothing_old_and_nothing_twice(seed: int) ->
         await asyncio.sleep(CALM)
         assert [row["state"] for row in chain.rows] == ["stale", "stale"]
         assert chain.stations["modbus-rtu"].value == SUBSTITUTE
-        assert {"transfer:1", "transfer:2"} <= set(active(gateway))
+        assert {"transfer:1", "transfer:2"} <= set(active(chain.alarms.alarms))
         # The target is silent: nothing is sent until it replies.
         chain.stations["vigor"].mute = False
         await asyncio.sleep(CALM)

@@ -22,7 +22,7 @@ from gateway.config import LineConfig, load
 from gateway.engine.device.changes import Changes
 from gateway.engine.device.device_settings import DeviceSettings
 from gateway.engine.results.shorter_silences import Pace
-from gateway.plant.plant import Gateway
+from gateway.plant.plant import Plant
 from gateway.protocols.frames import FrameDriver
 from gateway.protocols.frames.driver import LISTENED
 from gateway.tags import Sample
@@ -70,7 +70,7 @@ class World:
             self.freezer.install()
         with tempfile.TemporaryDirectory() as folder:
             config = load(drawn.write(Path(folder)))
-        self.gateway = gateway = Gateway(config, self._wall, self._opener)
+        self.gateway = gateway = Plant(config, self._wall, self._opener)
         gateway.subscribe(self)
         for line, settings in zip(gateway.lines, config.lines, strict=True):
             self._lines[line.engine.name].line = line

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from gateway.parts.transfers.forecast import forecasts
-from gateway.plant.plant import Gateway
+from gateway.plant.plant import Plant
 from tests.reload.plant import Data, file, running, vigor
 from tests.sim.virtual import on_virtual_time
 
@@ -16,7 +16,7 @@ SOURCE: dict[str, Any] = {
 TARGET = {"n": {"address": "D20", "write": {"verify": True}}}
 
 
-def shown(gateway: Gateway) -> dict[str, tuple[float, float]]:
+def shown(gateway: Plant) -> dict[str, tuple[float, float]]:
     """Returns load and requests a second of each line in its status document."""
     documents: dict[str, Any] = {**gateway.status()}
     lines = {path: one for path, one in documents.items() if path.startswith("lines/")}
@@ -29,7 +29,7 @@ def shown(gateway: Gateway) -> dict[str, tuple[float, float]]:
     }
 
 
-def checked(gateway: Gateway) -> dict[str, tuple[float, float]]:
+def checked(gateway: Plant) -> dict[str, tuple[float, float]]:
     lines = forecasts(gateway.config)
     return {one.name: (round(one.load, 4), round(one.requests, 3)) for one in lines}
 

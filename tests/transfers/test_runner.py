@@ -38,6 +38,7 @@ class Rig:
         gateway = plant.gateway
         self.transfers = Transfers(gateway, self._write, gateway.config.transfers)
         gateway.subscribe(self.transfers)
+        gateway.add_documents(self.transfers.documents)
 
     async def _write(self, tag: Tag, value: Value, by: str, within: float) -> WriteResult:
         assert within > 0
@@ -151,7 +152,7 @@ async def test_the_age_of_a_value_counts_from_its_last_read() -> None:
         await asyncio.sleep(2)
         poll = line.engine.schedule.reader(line.engine.devices[0], tag)
         assert poll is not None
-        poll.last.at = now() - 2.5
+        poll.reads.at = now() - 2.5
         count = len(made.written)
         await asyncio.sleep(5)
         assert len(made.written) <= count + 1

@@ -2,17 +2,20 @@
 
 import asyncio
 import json
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
 from typing import Any, NamedTuple
 
 from gateway.config import WebConfig
+from gateway.contract.faults import Documents
+from gateway.contract.interfaces import History
 from gateway.contract.payload import Failure, GroupResult, Problem
 from gateway.northbound.requests.audit import Counts
 from gateway.parts.web import metrics
 from gateway.parts.web.server import Server
-from gateway.parts.web.sources import Documents, Sources
-from gateway.tags import WriteResult
+from gateway.plant.part import Core
+from gateway.tags import Tag, WriteResult
+from gateway.values import Value
 from tests.e2e.processes import free_port
 from tests.northbound.plant import PlainPlant, mixer
 
@@ -81,6 +84,7 @@ class PlainNorth:
     """Documents from a dict, and writes that end as `endings` says for their payload."""
 
     def __init__(self) -> None:
+        self.is_ready = True
         self.changed: dict[str, Mapping[str, Any]] = {}
         self.endings: dict[bytes, WriteResult | Failure | GroupResult] = {}
         self.written: list[tuple[str, bytes, str]] = []
@@ -107,8 +111,16 @@ class PlainNorth:
         self.written.append((tag, data, by))
         return self.endings.get(data, Failure(Problem.UNKNOWN_TAG, "no such tag"))
 
-    def acknowledge(self, alarm: str, data: bytes, by: str, arrived: float) -> bytes | Failure:
-        self.written.append((alarm, data, by))
+    def publish_latest(self, path: str, make: Callable[[], bytes]) -> None:
+        raise AssertionError("the web publishes nothing")
+
+    async def write_own(self, tag: Tag, value: Value, by: str, within: float) -> WriteResult:
+        raise AssertionError("the web writes for its clients only")
+
+    async def order(
+        self, part: str, path: str, data: bytes, by: str, arrived: float
+    ) -> bytes | Failure:
+        self.written.append((path, data, by))
         ending = self.endings.get(data, Failure(Problem.NOTHING_TO_ACKNOWLEDGE, "it is normal"))
         return ending if isinstance(ending, Failure) else b"{}"
 
@@ -157,12 +169,18 @@ def local(**settings: Any) -> WebConfig:
     return WebConfig(**{"host": "127.0.0.1", "port": free_port(), **settings})
 
 
+def core_of(plant: PlainPlant, north: PlainNorth, history: History | None = None) -> Core:
+    plant.parts.kept = history
+    double: Any = plant
+    return Core(double, north, plant.parts.history, plant.parts)
+
+
 @asynccontextmanager
 async def serving(**settings: Any) -> AsyncIterator[Client]:
     """Serves at a free port; `settings`: those of `WebConfig`, `history`, `plant`."""
     history, plant = settings.pop("history", None), settings.pop("plant", None) or mixer()
     config, north = local(**settings), PlainNorth()
-    server = Server(config, Sources(plant, north, history, lambda: True))
+    server = Server(config, core_of(plant, north, history))
     serves = asyncio.create_task(server.run())
     binds = asyncio.create_task(_until_bound(config.port))
     try:

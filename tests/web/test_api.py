@@ -10,7 +10,6 @@ import pytest
 
 from gateway.contract.payload import Failure, GroupResult, Problem
 from gateway.parts.web.server import Server
-from gateway.parts.web.sources import Sources
 from gateway.tags import AlarmRule, Level, WriteResult, good
 from tests.history.recorded import SPEED, history
 from tests.northbound.plant import PlainDevice, PlainPlant, mixer, tag
@@ -20,12 +19,13 @@ from tests.web.serving import (
     Client,
     PlainNorth,
     calling,
+    core_of,
     local,
     serving,
     transfer,
 )
 
-DESCRIBED = Server(local(), Sources(mixer(), PlainNorth(), None, lambda: True)).description
+DESCRIBED = Server(local(), core_of(mixer(), PlainNorth())).description
 AS_JSON = {"Content_Type": "application/json", "Authorization": f"Bearer {TOKEN}"}
 
 

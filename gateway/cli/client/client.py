@@ -115,14 +115,14 @@ class Client:
 
     def alarms(self) -> list[dict[str, Any]]:
         """Returns the document of each alarm. Raises `GatewayError`."""
-        replies = self._answers(self._keys.alarm("**"))
+        replies = self._answers(self._keys.status("alarms/**"))
         if not replies:
             self.status()  # a gateway may have no alarms
         return [document(reply.ok.payload.to_bytes()) for reply in replies if reply.ok is not None]
 
     def acknowledge(self, alarm: str, by: str) -> dict[str, object]:
         """Returns the document of the alarm, or `error ...`. Raises as `write`."""
-        key = self._keys.alarm(alarm)
+        key = self._keys.status(f"alarms/{alarm}")
         status = self._keys.status("status")
         return self._request(key, json.dumps({"by": by}).encode(), status)
 

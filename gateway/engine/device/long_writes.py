@@ -24,6 +24,22 @@ class LongWrite:
     # arrived twice. Empty: no acknowledgement can be mistaken for another.
     tokens: Sequence[int] = ()
 
+    def resync_each(self, tokens: Sequence[int]) -> None:
+        """Has a resync sent after each request."""
+        self.tokens = tokens
+
+    def sends(self, number: int) -> None:
+        """Notes that this request is sent."""
+        self.asked = max(self.asked, number + 1)
+
+    def not_sent(self, number: int) -> None:
+        """Notes that this request was not sent, although it should be."""
+        self.asked = max(self.done, number)
+
+    def acknowledged(self, number: int) -> None:
+        """Notes the acknowledgement of this request."""
+        self.done = max(self.done, number + 1)
+
     def doubt(self) -> None:
         """Notes that the order of the replies is unknown: nothing is certain to be done."""
         self.done = 0

@@ -12,9 +12,10 @@ class MonitorList:
     registered: tuple[Span, ...] = ()
     allowed: bool = True
 
-    def expect(self, spans: tuple[Span, ...]) -> None:
-        """Notes the list that is registered in the PLC next."""
-        self.registered = spans
+    def must_register(self, spans: tuple[Span, ...]) -> bool:
+        """Notes the list that is read next. Returns True if it must be registered first."""
+        known, self.registered = self.registered, spans
+        return known != spans
 
     def forget(self) -> None:
         """Forgets the list: the PLC may have restarted, or another master may have changed it."""

@@ -71,6 +71,25 @@ class LineRecord:
     last_trouble: str = ""  # why the port was not open last
     calls: CallRecord | None = None  # with a modem, once it was there
 
+    def open(self, now: float) -> None:
+        """Notes that the port was opened."""
+        self.opened += 1
+        self.since, self.trouble = now, ""
+
+    def lose(self, why: str, now: float, *, was_open: bool) -> None:
+        """Notes that the port was lost, or could not be opened."""
+        if was_open:
+            self.open_before += now - self.since
+        self.trouble = self.last_trouble = why
+
+    def count(self, seconds: float, turnaround: float) -> None:
+        """Counts a transaction: the seconds of its characters, and those of the stations."""
+        self.busy += seconds
+        self.turnarounds += turnaround
+
+    def count_unasked(self, size: int) -> None:
+        self.unasked += size
+
     def telephone(self) -> CallRecord:
         """Returns the record of its calls, which outlives the modem."""
         if self.calls is None:
@@ -142,13 +161,3 @@ class Record:
 
     def count_overdue(self) -> None:
         self.overdue += 1
-
-
-@dataclass(slots=True)
-class PollRecord:
-    """Counts of one block since it was planned. Times in seconds."""
-
-    reads: int = 0  # good ones
-    overruns: int = 0  # rounds that were skipped because the one before was late
-    mean_gap: float = 0.0  # between two good reads, smoothed over about ten
-    worst_gap: float = 0.0

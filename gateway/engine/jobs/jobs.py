@@ -2,79 +2,44 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import cast
+from dataclasses import dataclass
+from typing import Protocol, cast
 
+from gateway.engine.device.block_reads import BlockReads
 from gateway.engine.device.device import Device
-from gateway.engine.device.health import PAUSE_FIRST, PAUSE_LONGEST, State
-from gateway.engine.device.records import PollRecord
+from gateway.engine.device.health import State
 from gateway.engine.device.reply_shapes import ReplyShapes
-from gateway.engine.jobs.requests import Command, Request, Resyncs, Write
+from gateway.engine.jobs.requests import Command, Request, Write
 from gateway.engine.jobs.runs import needs_read, together
 from gateway.errors import BadValue, Busy, DeviceError, LineDown, Refused, Unclear
 from gateway.planning.planner import Block
 from gateway.protocols.capabilities import UnnumberedReplies
 from gateway.protocols.driver import Span
-from gateway.tags.scan import Scan
-
-NOT_QUEUED, EXPEDITED, ON_DEMAND = -1, -2, -3  # tickets of polls that are in no heap
 
 
-@dataclass(slots=True)
-class LastRead:
-    """The last good read of a block."""
-
-    at: float | None = None  # by the line's clock; None: the block's values are bad
-    ever: bool = False  # the block was read at least once
-    scan: Scan | None = None  # the next read is compared with it; None: with nothing
-
-
-@dataclass(slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False)
 class Poll:
-    """A job: read one block. Also holds its due time and its last read, by the line's clock."""
+    """A job: read one block."""
 
     device: Device
     block: Block
-    due: float
-    span: Span = field(init=False)  # to be read: that of the block, or a longer one around it
-    tries: int = 0
-    missed: int = 0  # rounds in a row without a reply, while the device replies to others
-    soon: float = math.inf  # an earlier deadline, because its values are bad
-    asked: float = 0.0  # when it was handed out last
-    expedited: bool = False  # before its time, because a client waits
-    phased: bool = True  # it has found its place in the period
-    live: bool = True  # False after the device was planned again
-    ticket: int = NOT_QUEUED  # its one valid place in the queues
+    span: Span  # to be read: that of the block, or a longer one around it
     register: bool = False  # its monitor list must be registered first
-    last: LastRead = field(default_factory=LastRead)
-    counts: PollRecord = field(default_factory=PollRecord)
 
-    def __post_init__(self) -> None:
-        self.span = self.block.span
 
-    def forget(self, now: float) -> float:
-        """Forgets the last read, because its values turn bad. Returns their age."""
-        age = 0.0 if self.last.at is None else now - self.last.at
-        self.counts.worst_gap = max(self.counts.worst_gap, age)
-        self.device.record.was_good(self.last.at)
-        self.last.at = self.last.scan = None
-        return age
+class PolledBlock(Protocol):
+    """A block in the schedule, as the other rooms see it."""
 
     @property
-    def every(self) -> float:
-        """Seconds until it is due again. They grow while no reply arrives."""
-        every = self.device.interval(self.block)
-        if self.missed:
-            every = max(every, min(PAUSE_FIRST * 2.0 ** min(self.missed, 10), PAUSE_LONGEST))
-        return every
+    def block(self) -> Block: ...
 
     @property
-    def deadline(self) -> float:
-        """The latest time to start the poll: its interval after due, also for a bad address.
+    def asked(self) -> float:
+        """When it was sent last, by the line's clock."""
+        ...
 
-        It is earlier for a block of a long interval without good values.
-        """
-        return min(self.due + self.block.every, self.soon)
+    @property
+    def reads(self) -> BlockReads: ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -165,7 +130,6 @@ class Settle:
     error: DeviceError | None = None  # None: the reply may belong to an older request
     before: State = State.ONLINE  # of the device before it failed
     sent: bool = True  # something was sent at all
-    failed: Sequence[tuple[Poll, DeviceError]] = ()  # polls of the same transaction
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,35 +148,6 @@ class Reopen:
 
 Transacted = Unfinished | Answer | Settle
 Job = Transacted | Idle | Reopen
-
-
-@dataclass(slots=True)
-class InFlight:
-    """The current job of the line, and the job that must follow it."""
-
-    job: Transacted | None = None
-    begun: float = 0.0  # by the line's clock
-    charged: Device | None = None  # its use of the wire grows: by polls that were due, and probes
-    open_polls: int = 0
-    together: int = 0  # polls of the transaction
-    failed: list[tuple[Poll, DeviceError]] = field(default_factory=list)
-    continuation: Transacted | None = None
-
-    def clear(self) -> None:
-        """No job is handed out any more."""
-        self.job = self.charged = self.continuation = None
-        self.open_polls = 0
-        self.failed.clear()
-
-    def resume(self, now: float) -> Transacted:
-        """Returns the continuation. All but `Settle` and `Probe` begin their own time."""
-        job, self.continuation = self.continuation, None
-        if job is None:
-            raise AssertionError("no continuation")
-        self.job = job
-        if isinstance(job, ReadBack | Confirm | Repeat):
-            self.begun = now
-        return job
 
 
 def requests_of(job: Job) -> Sequence[Request]:
@@ -258,13 +193,13 @@ def resync_around(job: Transacted, shapes: ReplyShapes, now: float) -> None:
                 span, reads = job.run, needs_read(job.writes)
                 units = together(span, job.writes, [0] * span.size)
             before, after = shapes.written(span, units, reads, now)
-            write.resyncs = Resyncs(token() if before else None, token() if after else None)
+            write.resync(token() if before else None, token() if after else None)
             if (long := write.long) is not None and not shapes.tells_apart(long, units):
-                long.tokens = [token() for _ in long.spans]
+                long.resync_each([token() for _ in long.spans])
             return
         case Command():
-            before = not job.broadcast and shapes.may_be_extra(None, now)
-            job.resyncs = Resyncs(before=token() if before else None)
+            if not job.broadcast and shapes.may_be_extra(None, now):
+                job.resync(token())
         case Probe(outstanding=outstanding, token=marked):
             last = driver.resync_shape(outstanding, marked, device.probe_spans)
         case Confirm(run=run):

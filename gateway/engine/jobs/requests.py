@@ -57,6 +57,10 @@ class Group:
 
     failed: str = ""  # the tag of the first that was not done
 
+    def fail(self, tag: Tag) -> None:
+        """Notes a write that was not done."""
+        self.failed = self.failed or tag.name
+
 
 @dataclass(slots=True, eq=False)
 class Write:
@@ -84,6 +88,14 @@ class Write:
     def expires(self) -> float:
         """The time after which it is not sent, because the client no longer waits."""
         return self.submitted + self.within
+
+    def resync(self, before: int | None, after: int | None) -> None:
+        """Has resyncs with these tokens sent around it."""
+        self.resyncs = Resyncs(before, after)
+
+    def send_alone(self) -> None:
+        """Notes that none of the writes that it shared a request with was done."""
+        self.alone = True
 
     @property
     def plain(self) -> bool:
@@ -123,6 +135,10 @@ class Command:
     within: float = WRITE_EXPIRY
     span: Span | None = None  # of a peek: it is read, and nothing changes
     resyncs: Resyncs = NO_RESYNCS
+
+    def resync(self, before: int) -> None:
+        """Has a resync with this token sent before it."""
+        self.resyncs = Resyncs(before)
 
     @property
     def broadcast(self) -> bool:
@@ -259,7 +275,7 @@ class RequestQueue:
     def each_alone(self, writes: Sequence[Write]) -> None:
         """Puts back writes of which none was done: now one by one."""
         for write in reversed(writes):
-            write.alone = True
+            write.send_alone()
             self.waiting.appendleft(write)
 
     def withdraw(self, device: Device | None = None) -> list[Request]:

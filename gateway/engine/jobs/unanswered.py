@@ -28,6 +28,10 @@ class TimedOut:
     sent: float
     holds_up: bool = True  # False after the answer to a later request
 
+    def release(self) -> None:
+        """Notes that a later request was answered."""
+        self.holds_up = False
+
 
 class Unanswered:
     """The timed-out requests of one line, and the time for which they hold up others."""
@@ -35,6 +39,13 @@ class Unanswered:
     def __init__(self) -> None:
         self.requests: deque[TimedOut] = deque(maxlen=MOST_KEPT)
         self.longest = 0.0  # seconds for which a request was seen to hold up others
+
+    def timed_out(
+        self, device: Device, request: Any, answers: Callable[[Any], Any], sent: float
+    ) -> None:
+        """Notes a request whose time is over. Without a number its reply settles the line."""
+        if number := getattr(request, "transaction", 0):
+            self.requests.append(TimedOut(device, number, answers, sent))
 
     def held_up_until(self, device: Device) -> float:
         """Returns the time until which requests to other devices can hold up one to `device`.
@@ -54,7 +65,7 @@ class Unanswered:
         older = [each for each in self._holding if each.sent < sent]
         self._measure(older, now)
         for each in older:
-            each.holds_up = False
+            each.release()
 
     def take(self, frame: Any, now: float) -> bool:
         """Returns True if the frame is the late answer to one of the requests."""

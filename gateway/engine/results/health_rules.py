@@ -121,7 +121,7 @@ class HealthRules:
         log = self._effects.debug if known else self._effects.warning
         log("device answers twice", line=self._line, device=device.name, why=why)
         for poll in self._schedule.polls(device):
-            at = poll.last.at
+            at = poll.reads.at
             if suspect and at is not None and at >= shapes.proven:
                 poll.forget(now)
                 self._effects.bad(poll.block.tags, Reason.GARBLED, time, why)
@@ -134,7 +134,7 @@ class HealthRules:
         devices do not: each may have a link of its own behind one port.
         """
         polls = self._schedule.polls(device)
-        flowed = max((at for poll in polls if (at := poll.last.at) is not None), default=-math.inf)
+        flowed = max((at for poll in polls if (at := poll.reads.at) is not None), default=-math.inf)
         return device.health.outstanding_requests(flowed - device.longest_reply)
 
 

@@ -61,11 +61,11 @@ class _Station:
         """
         before, self.before = self.before, read
         equal = before is not None and before is not read and before.data == data
-        suspect = equal and data not in (read.learned, read.data)
-        read.data = data
-        if not suspect:
-            read.learned = data
-        return suspect
+        return not read.replied(data, suspect=equal)
+
+    def learned(self, read: "_Read") -> None:
+        """Notes the read from which values were learned last."""
+        self.last = read.tags
 
 
 class _Read:
@@ -88,6 +88,14 @@ class _Read:
                 units += tag.span.size
         self.stale_after = min(map(stale_after, self.tags), default=math.inf)
         self._decoder = Decoder(self.tags, begins) if self.tags else None
+
+    def replied(self, data: Any, *, suspect: bool) -> bool:
+        """Notes the data of a reply. Returns False if it is suspect, and news."""
+        counts = not suspect or data in (self.learned, self.data)
+        self.data = data
+        if counts:
+            self.learned = data
+        return counts
 
     def samples(self, data: Any, time: int) -> Sequence[Any]:
         """Returns the samples of a reply; none if its data cannot be those of the request."""
@@ -170,7 +178,7 @@ class Listening:
             self._pairing.not_answered(asked, now)
             return
         if samples := read.samples(told.data, time):
-            station.last = read.tags
+            station.learned(read)
             self._heard |= dict.fromkeys(read.tags, now)
             self._effects.samples(samples)
             self.due = min(self.due, now + read.stale_after)

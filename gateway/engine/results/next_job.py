@@ -6,7 +6,6 @@ from gateway.engine.effects import Effects
 from gateway.engine.jobs.jobs import (
     Answer,
     Confirm,
-    InFlight,
     Poll,
     Probe,
     ReadBack,
@@ -29,6 +28,8 @@ from gateway.engine.results.pipelining import Pipelining
 from gateway.engine.results.poll_rules import PollRules
 from gateway.engine.results.request_rules import RequestRules
 from gateway.engine.results.shorter_silences import ShorterSilences
+from gateway.engine.schedule.in_flight import InFlight
+from gateway.engine.schedule.poll_entry import PollEntry
 from gateway.errors import BadValue, DeviceError, Garbled, LineDown, Refused, Unclear, Unsteady
 from gateway.protocols.driver import EVERY_REQUEST
 
@@ -65,13 +66,17 @@ class NextJob:
         self._effects = effects
         self._gap = gap
 
+    def inherit(self) -> None:
+        """Notes that a device server may have kept requests of an earlier process."""
+        self.inherits = True
+
     def change(self, changes: Changes, now: float) -> None:
         """Takes over changed devices."""
         self.shorter.change(now)
         for device in changes.left:
             self.pipelining.forget(device)
 
-    def poll_failed(self, poll: Poll, result: Exception, now: float, time: int) -> None:
+    def poll_failed(self, poll: PollEntry, result: Exception, now: float, time: int) -> None:
         """Applies the result of a poll without units."""
         if self.silence.noted:
             self.silence.concluded(result)
@@ -86,7 +91,7 @@ class NextJob:
             case DeviceError():
                 self._in_flight.failed.append((poll, result))
             case LineDown():
-                device.health.left_outstanding(poll.span, now)
+                device.health.left_outstanding(poll.job.span, now)
             case _:
                 raise result
 
@@ -94,10 +99,11 @@ class NextJob:
         """Applies the end of a transaction of polls, some of which failed or were together."""
         failed = self._in_flight.failed
         if last.device.window > 1:
-            polls = [poll for poll, _ in failed]
+            polls = [poll.job for poll, _ in failed]
             self.pipelining.concluded(last, self._in_flight.together, polls, now)
         if failed:
-            self.unclear(*failed[0], traffic, now, time)
+            first, error = failed[0]
+            self.unclear(first.job, error, traffic, now, time)
 
     def conclude(
         self, job: Transacted, result: Result, traffic: Traffic, now: float, time: int
@@ -132,7 +138,7 @@ class NextJob:
                     # A device server may pass on all of them, one after another.
                     quiet = device.longest_reply
                     guard = (outstanding + 1 + inherited) * quiet
-                    self._in_flight.continuation = Settle(device, guard, quiet, probe)
+                    self._in_flight.follow(Settle(device, guard, quiet, probe))
                 else:
                     if probe.again:
                         self.inherits = False
@@ -151,7 +157,7 @@ class NextJob:
             case Unclear() as error:
                 self.unclear(job, error, traffic, now, time)
             case ReadBack() | Repeat() as following:
-                self._in_flight.continuation = following
+                self._in_flight.follow(following)
 
     def unclear(
         self, job: Unfinished, error: DeviceError, traffic: Traffic, now: float, time: int
@@ -162,7 +168,7 @@ class NextJob:
             self.silence.unanswered(error, self._in_flight.begun)
         before = self._results.unclear(device, error, span_of(job), now, time)
         no_guard = before is State.OFFLINE or _is_short(job)
-        self._in_flight.continuation = Settle(
+        settle = Settle(
             device,
             0.0 if no_guard else device.settings.late_guard,
             self._gap,
@@ -170,8 +176,8 @@ class NextJob:
             error=error,
             before=before,
             sent=traffic.sent > 0,
-            failed=tuple(self._in_flight.failed),
         )
+        self._in_flight.follow(settle)
 
     def _settled(self, settle: Settle, result: Result, now: float, time: int) -> None:
         device, after = settle.device, settle.after
@@ -181,20 +187,23 @@ class NextJob:
                 self.unclear(after, Garbled(NEVER_QUIET), Traffic(), now, time)
             elif isinstance(after, Probe):
                 again = Probe(device, after.outstanding, after.token + 1, again=True)
-                self._in_flight.continuation = again
+                self._in_flight.follow(again)
             return
         short = _is_short(after)
         late = result.late if isinstance(result, Settled) and not short else None
         took = now - self._in_flight.begun
-        alone = len(settle.failed) == 1
+        failed = self._in_flight.failed  # in the same transaction
+        alone = len(failed) == 1
         suspect = alone and isinstance(after, Poll) and _is_suspect(after)
         self._results.settled(
             *(device, settle.before, took, late, now, time), short=short, suspect=suspect
         )
-        for poll, error in settle.failed:
+        for poll, error in failed:
             self._polls.unread(poll, error, now, time, alone=alone)
         if not isinstance(after, Poll | Probe):
-            self._in_flight.continuation = self._requests.settled(settle, now)
+            confirm = self._requests.settled(settle, now)
+            if confirm is not None:
+                self._in_flight.follow(confirm)
 
     def abandon(self, error: LineDown | None, now: float) -> None:
         """Ends the job, because the port was lost or the gateway stops."""

@@ -1,5 +1,6 @@
 """Requests together: finds devices that take one request at a time, although `window` is larger."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from gateway.engine.device.device import Device
@@ -21,6 +22,20 @@ class _Window:
     alone_until: float = 0.0
     proofs: int = 0
     apart_until: float = 0.0
+
+    def ended(self, failed: set[Span], now: float) -> None:
+        """Takes the end of a transaction of several polls. Another plan has other polls."""
+        self.suspects, self.alone_until = failed, now + ALONE
+        if not failed:
+            self.proofs = 0
+
+    def proved(self) -> None:
+        """Counts a suspect that was answered alone."""
+        self.suspects = set()
+        self.proofs += 1
+
+    def stay_apart(self, until: float) -> None:
+        self.apart_until = until
 
 
 class Pipelining:
@@ -50,29 +65,26 @@ class Pipelining:
                 return 0
         return poll.device.window - 1
 
-    def concluded(self, poll: Poll, count: int, failed: list[Poll], now: float) -> None:
+    def concluded(self, poll: Poll, count: int, failed: Sequence[Poll], now: float) -> None:
         """Takes the end of a transaction with `count` polls, of which `poll` was the last."""
         device = poll.device
         window = self._windows.get(device)
         if window is None:
             window = self._windows[device] = _Window()
         if count > 1:
-            window.suspects = {each.block.span for each in failed}  # another plan has other polls
-            window.alone_until = now + ALONE
+            window.ended({each.block.span for each in failed}, now)
             if not failed:
-                window.proofs = 0
                 device.takes_one_at_a_time(False)
         elif poll.block.span in window.suspects:
             window.suspects.remove(poll.block.span)
             if not failed:
-                window.suspects = set()
-                window.proofs += 1
+                window.proved()
                 self._judge(device, window, now)
 
     def _judge(self, device: Device, window: _Window, now: float) -> None:
         if window.proofs < PROOFS and not device.one_at_a_time:
             return
-        window.apart_until = now + TRY_AGAIN
+        window.stay_apart(now + TRY_AGAIN)
         if not device.one_at_a_time:
             device.takes_one_at_a_time(True)
             self._effects.warning("window reduced", device=device.name, why=LOST)

@@ -7,8 +7,8 @@ from gateway.engine.device.changes import Changes
 from gateway.engine.device.device import Device
 from gateway.engine.device.health import State
 from gateway.engine.effects import Effects, Samples
-from gateway.engine.jobs.jobs import Poll
 from gateway.engine.results.health_rules import HealthRules
+from gateway.engine.schedule.poll_entry import PollEntry
 from gateway.engine.schedule.replan_budget import ReplanBudget
 from gateway.engine.schedule.schedule import Schedule
 from gateway.errors import (
@@ -22,7 +22,7 @@ from gateway.errors import (
 )
 from gateway.planning.bad_addresses import DAMAGED, RETRIES, SILENT
 from gateway.planning.planner import Block, describe
-from gateway.tags import Reason, Sample
+from gateway.tags import Reason
 
 TOGETHER = RETRIES[0] + 1.0  # seconds in which all addresses that return are tried
 OF_OTHERS = (Evidence.STATION, Evidence.SHAPE, Evidence.ECHO)  # they say nothing of addresses
@@ -43,26 +43,18 @@ class PollRules:
         for device in changes.left:
             self._replans.forget(device)
 
-    def read(self, poll: Poll, units: Sequence[int], now: float, time: int) -> None:
+    def read(self, poll: PollEntry, units: Sequence[int], now: float, time: int) -> None:
         """Applies a good read of a block."""
         device, block = poll.device, poll.block
-        health, last = device.health, poll.last
+        health = device.health
         if health.needs_resync or health.state is not State.ONLINE:
             self._results.answered(device, now, time)
         shapes = device.shapes
-        if poll.span is not block.span and shapes is not None and shapes.longer.failed:
+        if poll.job.span is not block.span and shapes is not None and shapes.longer.failed:
             shapes.longer.answered(block.span)
-        counts = poll.counts
-        if last.at is not None:
-            gap = now - last.at
-            if gap > counts.worst_gap:
-                counts.worst_gap = gap
-            counts.mean_gap += (gap - counts.mean_gap) / (min(10, counts.reads) or 1)
-        counts.reads += 1
-        last.at, last.ever = now, True
         if not block.listed:
             device.was_read(block.span)
-        self._effects.collected.append(Samples(self._samples(poll, units, time)))
+        self._effects.collected.append(Samples(poll.reads.take(block, units, now, time)))
         if block.of_fields:
             self._count_garbled(device, units)
         self._schedule.polled(poll, now)
@@ -97,20 +89,6 @@ class PollRules:
             self._replans.want(device, now)
         self._end_search(device, now)
 
-    def _samples(self, poll: Poll, units: Sequence[int], time: int) -> Sequence[Sample]:
-        """Returns the samples of the units. Only units that changed are decoded."""
-        block, last = poll.block, poll.last
-        scan = last.scan
-        if block.of_fields:
-            return block.decoder.fields(units, time)
-        if scan is None or scan.latest.superseded:
-            scan = last.scan = block.decoder.first(units, time)
-        elif units == scan.units:
-            scan.time = time
-        else:
-            scan = last.scan = block.decoder.after(scan, units, time)
-        return scan
-
     def _count_garbled(self, device: Device, fields: Sequence[Any]) -> None:
         """Counts the garbled fields of a good frame."""
         for value in fields:
@@ -119,14 +97,14 @@ class PollRules:
                 heard = value.data.hex(" ")
                 self._effects.info("field garbled", device=device.name, why=str(value), bytes=heard)
 
-    def unsteady(self, poll: Poll, error: Unsteady, now: float, time: int) -> None:
+    def unsteady(self, poll: PollEntry, error: Unsteady, now: float, time: int) -> None:
         """Applies two different reads of a block: polls it again, or turns its tags bad."""
         if poll.tries < poll.device.timing.retries:
             self._schedule.again(poll)
             return
         self._end_badly(poll, Reason.GARBLED, error, now, time)
 
-    def refused(self, poll: Poll, error: Refused, now: float, time: int) -> None:
+    def refused(self, poll: PollEntry, error: Refused, now: float, time: int) -> None:
         """Applies the refusal of a poll: polls again, halves the block, or turns its tags bad."""
         device, block = poll.device, poll.block
         device.record.count_refusal(error)
@@ -146,7 +124,7 @@ class PollRules:
         lasting = error.refusal in (Refusal.ADDRESS, Refusal.OTHER)
         if lasting and block.span not in device.bad_addresses.bad:
             # The address may exist: noise can change a request, or the device may have restarted.
-            if error.refusal is Refusal.ADDRESS and poll.last.ever and not poll.tries:
+            if error.refusal is Refusal.ADDRESS and poll.reads.ever and not poll.tries:
                 self._schedule.again(poll)
                 return
             if error.refusal is Refusal.OTHER and poll.tries < device.timing.retries:
@@ -157,22 +135,24 @@ class PollRules:
         self._end_badly(poll, Reason.REFUSED, error, now, time)
         self._end_search(device, now)
 
-    def _refused_longer(self, poll: Poll, error: Refused, now: float) -> bool:
+    def _refused_longer(self, poll: PollEntry, error: Refused, now: float) -> bool:
         """Polls the block alone if the refused read was longer than the block."""
         shapes = poll.device.shapes
         if shapes is None:
             return False
         shapes.refused(now)
-        if poll.span is poll.block.span:
-            shapes.longer.refused_alone(poll.block.span, poll.last.at)
+        if poll.job.span is poll.block.span:
+            shapes.longer.refused_alone(poll.block.span, poll.reads.at)
             return False
         if error.refusal in (Refusal.DAMAGED, Refusal.BUSY):
             return False
-        shapes.longer.refused(poll.block.span, poll.span, now)
+        shapes.longer.refused(poll.block.span, poll.job.span, now)
         self._schedule.again(poll, counted=False)
         return True
 
-    def _halved(self, poll: Poll, error: DeviceError, code: str, now: float, time: int) -> bool:
+    def _halved(
+        self, poll: PollEntry, error: DeviceError, code: str, now: float, time: int
+    ) -> bool:
         """Polls the halves of a block that failed for good. False: it is a bad address."""
         device, block = poll.device, poll.block
         if block.of_fields or block.listed:  # any part of it is read by the same request
@@ -186,7 +166,7 @@ class PollRules:
         log("address refused", device=device.name, block=describe(block), why=str(error))
         return False
 
-    def _list_refused(self, poll: Poll, error: Refused, now: float) -> None:
+    def _list_refused(self, poll: PollEntry, error: Refused, now: float) -> None:
         """Registers the monitor list again, or plans without one: it may have a bad address."""
         if poll.tries < 1:
             self._schedule.again(poll)
@@ -200,7 +180,7 @@ class PollRules:
 
     def _end_badly(
         self,
-        poll: Poll,
+        poll: PollEntry,
         reason: Reason,
         error: GatewayError,
         now: float,
@@ -219,7 +199,7 @@ class PollRules:
             self._replans.want(device, now)
 
     def unread(
-        self, poll: Poll, error: DeviceError, now: float, time: int, *, alone: bool = True
+        self, poll: PollEntry, error: DeviceError, now: float, time: int, *, alone: bool = True
     ) -> None:
         """Applies an unclear poll: polls again, halves the block, or turns its tags bad.
 
@@ -233,7 +213,7 @@ class PollRules:
             if alone and health.consecutive_failures <= 1:  # it replied to the request before
                 bad.went_silent(poll.block)
             return
-        if poll.span is not poll.block.span and device.shapes is not None:
+        if poll.job.span is not poll.block.span and device.shapes is not None:
             device.shapes.longer.unanswered(poll.block.span, now)
             self._schedule.again(poll, counted=False)
             return

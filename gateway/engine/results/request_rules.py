@@ -9,7 +9,6 @@ from gateway.engine.jobs.jobs import (
     Answer,
     Confirm,
     HeldTogether,
-    Poll,
     ReadBack,
     Repeat,
     RequestJob,
@@ -24,10 +23,10 @@ from gateway.engine.jobs.jobs import (
 from gateway.engine.jobs.requests import Command, Group, Outcome, Request, Write, after_failed
 from gateway.engine.jobs.runs import own_units, verified
 from gateway.engine.results.health_rules import HealthRules
+from gateway.engine.schedule.poll_entry import PollEntry
 from gateway.engine.schedule.schedule import Schedule
 from gateway.errors import Busy, DeviceError, GatewayError, LineDown, Refusal, Refused, Unclear
 from gateway.protocols.driver import Span
-from gateway.tags import Tag
 
 BROADCAST_PAUSE = 0.1  # seconds
 _SHOWN = 3  # elements of an array that differ
@@ -246,21 +245,21 @@ class RequestRules:
         self._effects.collected.append(RequestEnded(request, outcome))
         if isinstance(request, Write):
             if request.group is not None and isinstance(outcome, GatewayError):
-                self._end_group(request.group, request.tag)
+                request.group.fail(request.tag)
+                self._end_group(request.group)
             poll = self._schedule.reader(request.device, request.tag)
             if poll is not None and (request.group is None or not self._more(request.group, poll)):
                 self._schedule.expedite(poll)  # the client sees the new value soon
 
-    def _end_group(self, group: Group, failed: Tag) -> None:
+    def _end_group(self, group: Group) -> None:
         """Ends the waiting writes of a group: they must not follow one that was not done."""
-        group.failed = group.failed or failed.name
         for waiting in self._schedule.requests.of_group(group):
             self._effects.ended(waiting, after_failed(group))
             poll = self._schedule.reader(waiting.device, waiting.tag)
             if poll is not None:
                 self._schedule.expedite(poll)  # it has tags that were written before
 
-    def _more(self, group: Group, poll: Poll) -> bool:
+    def _more(self, group: Group, poll: PollEntry) -> bool:
         """Returns True if tags of the poll are still to be written: one poll shows them all."""
         schedule = self._schedule
         return any(

@@ -8,7 +8,8 @@ from gateway.engine.device.device import Device
 from gateway.engine.device.health import State
 from gateway.engine.device.station_silence import MOST_DOUBLED
 from gateway.engine.effects import Effects
-from gateway.engine.jobs.jobs import Idle, Job, Poll, Reopen
+from gateway.engine.jobs.jobs import Idle, Job, Poll, Reopen, Result, Traffic, Transacted
+from gateway.engine.schedule.poll_entry import PollEntry
 from gateway.errors import Garbled, NoReply, Refusal, Refused
 from gateway.protocols.unsolicited import Unsolicited
 
@@ -76,20 +77,34 @@ class ShorterSilences:
         self._next = -math.inf  # when the next step may be taken
         self._shape: Hashable = None  # of the last reply to a poll; None: unknown
 
-    def before(self, job: Job) -> None:
+    def before(self, job: Job, entry: PollEntry | None) -> None:
         """Sets the silence before the requests of the job. Called at every step but the first."""
         if isinstance(job, Idle | Reopen):
             return
         device, spoke = job.device, self.spoke
         silence = device.silence
         silence.keep_safe(at_rest=False)
-        if not isinstance(job, Poll):
+        if entry is None:
             return
         shape = None if device.shapes is None else device.shapes.last
         copied = spoke is device and self._shape in (None, shape)
         self._shape = shape
-        if spoke is not None and not copied and _may_be_lost(job):
+        if spoke is not None and not copied and _may_be_lost(entry):
             silence.keep(max(silence.shorter, spoke.silence.shorter))
+
+    def concluded(self, job: Transacted, result: Result, traffic: Traffic, now: float) -> None:
+        """Counts the polls at this step, and notes the station that spoke last."""
+        if isinstance(job, Poll):
+            device = job.device
+            if not isinstance(result, Exception):
+                self.spoke = device
+                if traffic.silence < device.silence.tested_below:
+                    self.answered += 1
+                    if self.answered >= self.look_at:
+                        self.look(now)
+                return
+            self.failed(device, result, traffic.silence, now)
+        self.spoke = None
 
     def look(self, now: float) -> None:
         """Takes the next step, if the replies are enough and the polls need it."""
@@ -199,13 +214,13 @@ def _learning(devices: Sequence[Device]) -> list[Device]:
     return [device for device in devices if device.silence.learns]
 
 
-def _may_be_lost(poll: Poll) -> bool:
+def _may_be_lost(poll: PollEntry) -> bool:
     """Returns True for the poll of a device in order, whose loss costs one repeated poll."""
     device = poll.device
     return (
         device.state is State.ONLINE
         and not device.health.needs_resync
-        and not (poll.tries or poll.missed or poll.register)
+        and not (poll.tries or poll.missed or poll.job.register)
         and device.settings.verify_reads == 1
         and device.timing.retries > 0
     )

@@ -7,7 +7,7 @@ from gateway.engine.device.changes import Changes
 from gateway.engine.device.device import Device
 from gateway.engine.device.health import State
 from gateway.engine.effects import Effects
-from gateway.engine.jobs.jobs import Poll
+from gateway.engine.schedule.poll_entry import PollEntry
 from gateway.engine.schedule.schedule import Schedule
 from gateway.planning.planner import describe
 from gateway.tags import Reason
@@ -29,7 +29,7 @@ class Staleness:
         self.due = NEVER  # when `look` must be called again
         self._schedule = schedule
         self._effects = effects
-        self._plan: list[tuple[Device, Sequence[Poll], float | None]] = []
+        self._plan: list[tuple[Device, Sequence[PollEntry], float | None]] = []
         self._ages: list[float] = []
         self._logged: dict[Device, float] = {}
 
@@ -49,14 +49,14 @@ class Staleness:
         """Turns values bad that are too old. `time`: ns since 1970."""
         self.due = NEVER
         for poll, limit in self._limits():
-            if poll.last.at is None:
+            if poll.reads.at is None:
                 self.due = min(self.due, now + limit)
-            elif poll.last.at + limit > now:
-                self.due = min(self.due, poll.last.at + limit)
+            elif poll.reads.at + limit > now:
+                self.due = min(self.due, poll.reads.at + limit)
             else:
                 self._turn_bad(poll, now, time)
 
-    def _limits(self) -> Iterator[tuple[Poll, float]]:
+    def _limits(self) -> Iterator[tuple[PollEntry, float]]:
         """Yields the age limit of each poll of an online device; other values are bad already."""
         devices = self._schedule.devices
         failing = any(device.health.state is State.FAILING for device in devices)
@@ -69,7 +69,7 @@ class Staleness:
             else:
                 yield poll, stretch * age + longest_reply
 
-    def _worst_ages(self) -> tuple[list[Poll], list[float]]:
+    def _worst_ages(self) -> tuple[list[PollEntry], list[float]]:
         """Returns the polls with their worst ages, calculated again only after a new plan."""
         online = [device for device in self._schedule.devices if device.health.online]
         plan = [(d, self._schedule.polls(d), d.turnaround.expected) for d in online]
@@ -79,7 +79,7 @@ class Staleness:
             self._plan, self._ages = plan, worst_ages(blocks)
         return polls, self._ages
 
-    def _turn_bad(self, poll: Poll, now: float, time: int) -> None:
+    def _turn_bad(self, poll: PollEntry, now: float, time: int) -> None:
         device, age = poll.device, poll.forget(now)
         if device.health.state is State.FAILING:
             self._effects.bad(poll.block.tags, device.health.reason, time, device.diagnosis())

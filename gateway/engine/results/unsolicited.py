@@ -45,6 +45,10 @@ class _Sender:
             if name in self.unsolicited:
                 self.tags.setdefault(name, []).append(tag)
 
+    def note(self, *, understood: bool) -> None:
+        """Notes if the last frame was correct."""
+        self.understood = understood
+
     def tags_of(self, fields: Iterable[str]) -> list[Tag]:
         return [tag for name in fields for tag in self.tags.get(name, ())]
 
@@ -158,7 +162,7 @@ class UnsolicitedFrames:
     def _understood(self, sender: _Sender, frame: UnsolicitedFrame, now: float, time: int) -> None:
         device = sender.device
         device.record.count_unsolicited()
-        sender.understood = True
+        sender.note(understood=True)
         if device.broadcast:  # a device that is polled must reply to count as online
             device.health.understood()
             self._results.answered(device, now, time)
@@ -190,7 +194,7 @@ class UnsolicitedFrames:
             device.health.not_understood(damage)
         if sender.understood:  # repeated damage is logged once
             self._log("frame garbled", device, damage)
-        sender.understood = False
+        sender.note(understood=False)
         device.record.count_failure(damage)
         self._bad(sender, sender.tags, Reason.GARBLED, str(damage), time)
 

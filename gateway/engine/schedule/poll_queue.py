@@ -7,11 +7,11 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 
 from gateway.engine.device.device import Device
-from gateway.engine.jobs.jobs import EXPEDITED, NOT_QUEUED, ON_DEMAND, Poll
+from gateway.engine.schedule.poll_entry import EXPEDITED, NOT_QUEUED, ON_DEMAND, PollEntry
 
 ROOM = 16  # entries of a heap in addition to twice the valid ones
 NO_PLACE, LATE = -1, -2  # places of a device: nothing is due; its first poll is late
-Heap = list[tuple[float, int, Poll]]
+Heap = list[tuple[float, int, PollEntry]]
 
 
 @dataclass(slots=True, eq=False)
@@ -23,7 +23,7 @@ class DuePolls:
     place: int = NO_PLACE  # the ticket of the device's one valid entry in `PollQueue.in_time`
     most: int = ROOM
 
-    def first(self) -> Poll | None:
+    def first(self) -> PollEntry | None:
         """Returns the poll with the earliest deadline, after it has dropped stale entries."""
         heap = self.heap
         while heap:
@@ -67,13 +67,13 @@ class PollQueue:
         self._own: DuePolls | None = None  # of the single device
         self.in_time: list[tuple[float, int, DuePolls]] = []  # by the deadline of the first poll
         self._late: list[tuple[float, int, DuePolls]] = []  # by use of the wire
-        self.due: Poll | None = None  # after `ripen`: the due poll that goes first
+        self.due: PollEntry | None = None  # after `ripen`: the due poll that goes first
         # Before all due polls; after `ripen` the first one is valid.
-        self.expedited: deque[Poll] = deque()
+        self.expedited: deque[PollEntry] = deque()
         self._tickets = itertools.count()
         self._most_waiting = self._most_in_time = ROOM
 
-    def push(self, poll: Poll) -> None:
+    def push(self, poll: PollEntry) -> None:
         """Adds a poll that waits until it is due, if its device is online."""
         if not (poll.live and poll.device.health.online) or poll.ticket <= EXPEDITED:
             return
@@ -84,26 +84,26 @@ class PollQueue:
             waiting[:] = [e for e in waiting if e[2].live and e[2].ticket == e[1]]
             self._most_waiting = _tidy(waiting)
 
-    def push_all(self, polls: Iterable[Poll]) -> None:
+    def push_all(self, polls: Iterable[PollEntry]) -> None:
         for poll in polls:
             self.push(poll)
 
-    def expedite(self, poll: Poll, *, on_demand: bool = False) -> None:
+    def expedite(self, poll: PollEntry, *, on_demand: bool = False) -> None:
         """Puts the poll before all due polls; on demand behind those that are not."""
         if on_demand and poll.ticket > EXPEDITED:
-            poll.ticket = ON_DEMAND
+            poll.queue(ON_DEMAND)
             self.expedited.append(poll)
         elif not on_demand and poll.ticket != EXPEDITED:
             if poll.ticket == ON_DEMAND:
                 self.expedited.remove(poll)
-            poll.ticket = EXPEDITED
+            poll.queue(EXPEDITED)
             self.expedited.appendleft(poll)
 
     def return_due(self, now: float) -> None:
         """Makes expedited polls that are due by now due polls like others."""
         for poll in [poll for poll in self.expedited if poll.due <= now]:
             self.expedited.remove(poll)
-            poll.ticket = NOT_QUEUED
+            poll.queue(NOT_QUEUED)
             self.push(poll)
 
     def ripen(self, now: float) -> bool:
@@ -121,15 +121,15 @@ class PollQueue:
             self.due = due = self._own.first() if self._own is not None else None
         return due is not None or bool(expedited)
 
-    def more(self, device: Device, most: int) -> list[Poll]:
+    def more(self, device: Device, most: int) -> list[PollEntry]:
         """Takes out more due polls of the device, by deadline."""
-        own, taken = self.by_device.get(device), list[Poll]()
+        own, taken = self.by_device.get(device), list[PollEntry]()
         while own is not None and len(taken) < most and (poll := own.first()) is not None:
             heapq.heappop(own.heap)
             taken.append(poll)
         return taken
 
-    def valid(self) -> Iterator[Poll]:
+    def valid(self) -> Iterator[PollEntry]:
         """Yields the due polls, in no order."""
         heaps = (own.heap for own in self.by_device.values())
         return (entry[2] for heap in heaps for entry in heap if _is_valid(entry))
@@ -145,7 +145,7 @@ class PollQueue:
         due = sum(len(own.heap) for own in self.by_device.values())
         return len(self.waiting) + due + len(self.expedited)
 
-    def _add(self, poll: Poll) -> None:
+    def _add(self, poll: PollEntry) -> None:
         own = self.by_device.get(poll.device)
         if own is None:
             own = self._own = self.by_device[poll.device] = DuePolls(poll.device)
@@ -172,7 +172,7 @@ class PollQueue:
             heapq.heapify(in_time)
             self._most_in_time = 2 * len(in_time) + ROOM
 
-    def _first(self, now: float) -> Poll | None:
+    def _first(self, now: float) -> PollEntry | None:
         """Returns the due poll with the earliest deadline.
 
         If deadlines have passed: the first poll of the late device that used the wire least.
@@ -182,7 +182,7 @@ class PollQueue:
             first = self._first_late(now) or self._first_in_time(now)
         return first
 
-    def _first_in_time(self, now: float) -> Poll | None:
+    def _first_in_time(self, now: float) -> PollEntry | None:
         """Returns the first poll that is in time, after it has moved late devices."""
         in_time = self.in_time
         while in_time:
@@ -203,7 +203,7 @@ class PollQueue:
                 heapq.heappush(self._late, (own.device.use, ticket, own))
         return None
 
-    def _first_late(self, now: float) -> Poll | None:
+    def _first_late(self, now: float) -> PollEntry | None:
         """Returns the first poll of the late device that used the wire least."""
         late = self._late
         while late:
@@ -221,7 +221,7 @@ class PollQueue:
         return None
 
 
-def _is_valid(entry: tuple[float, int, Poll]) -> bool:
+def _is_valid(entry: tuple[float, int, PollEntry]) -> bool:
     poll = entry[2]
     return poll.ticket == entry[1] and poll.live and poll.device.health.online
 

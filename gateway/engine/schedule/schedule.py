@@ -3,12 +3,14 @@
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
 
+from gateway.engine.device.block_reads import BlockReads
 from gateway.engine.device.changes import Changes
 from gateway.engine.device.device import Device
-from gateway.engine.device.health import PAUSE_LONGEST, State
-from gateway.engine.jobs.jobs import EXPEDITED, NOT_QUEUED, ON_DEMAND, Idle, LastRead, Poll, Probe
+from gateway.engine.device.health import State
+from gateway.engine.jobs.jobs import Idle, Probe
 from gateway.engine.jobs.requests import Request, RequestQueue
 from gateway.engine.jobs.unanswered import Unanswered
+from gateway.engine.schedule.poll_entry import EXPEDITED, ON_DEMAND, PollEntry
 from gateway.engine.schedule.poll_queue import PollQueue
 from gateway.engine.schedule.probe_schedule import ProbeSchedule
 from gateway.planning.planner import Block
@@ -54,8 +56,8 @@ class Schedule:
         self._phases = (n * GOLDEN % 1 / 2 for n in itertools.count())
         self._probes = ProbeSchedule(devices, now, seed)
         self._queue = PollQueue(shared=len(devices) > 1)
-        self._polls: dict[Device, list[Poll]] = {}
-        self._readers: dict[Device, dict[Tag, Poll]] = {}  # made at the first call of `reader`
+        self._polls: dict[Device, list[PollEntry]] = {}
+        self._readers: dict[Device, dict[Tag, PollEntry]] = {}  # made at the first call of `reader`
         self._wrote = False
         self._expedited = False
         self._on_demand_lane = now  # until then no poll on demand delays another
@@ -74,23 +76,22 @@ class Schedule:
         before = self._polls.get(device, ())
         old = {poll.block.span: poll for poll in before}
         by_tag = [(renewed.get(tag, tag), poll) for poll in before for tag in poll.block.tags]
-        read = {tag: poll.last.at for tag, poll in by_tag}
-        seen = {tag for tag, poll in by_tag if poll.last.ever}
+        read = {tag: poll.reads.at for tag, poll in by_tag}
+        seen = {tag for tag, poll in by_tag if poll.reads.ever}
         polls = []
         for block in device.blocks:
             known = old.get(block.span)
-            if known is None or known.ticket <= EXPEDITED:
-                poll = Poll(device, block, now)
-            else:
-                poll = Poll(device, block, known.due, missed=known.missed)
-                # The block may have been a bad address, which is polled rarely.
-                poll.due = min(known.due, now + poll.every)
             ages = (at for tag in block.tags if (at := read.get(tag)) is not None)
-            poll.last.at = min(ages, default=None)
-            poll.last.ever = not seen.isdisjoint(block.tags)
+            reads = BlockReads(min(ages, default=None), not seen.isdisjoint(block.tags))
+            if known is None or known.ticket <= EXPEDITED:
+                poll = PollEntry(device, block, now, reads=reads)
+            else:
+                poll = PollEntry(device, block, known.due, known.missed, reads)
+                # The block may have been a bad address, which is polled rarely.
+                poll.due_by(now + poll.every)
             polls.append(poll)
         for poll in before:
-            poll.live = False
+            poll.retire()
         self._set_polls(device, polls, polls, now)
 
     def change(self, changes: Changes, now: float) -> None:
@@ -102,7 +103,7 @@ class Schedule:
         for device in changes.removed:
             self._readers.pop(device, None)
             for poll in self._polls.pop(device):
-                poll.live = False
+                poll.retire()
         expedited = [poll for poll in self._queue.expedited if poll.live]
         self._queue = PollQueue(shared=len(self.devices) > 1)
         self._queue.expedited.extend(expedited)
@@ -111,13 +112,13 @@ class Schedule:
         for device in changes.added:
             self.plan(device, now)
 
-    def replace(self, poll: Poll, blocks: Iterable[Block], now: float) -> None:
+    def replace(self, poll: PollEntry, blocks: Iterable[Block], now: float) -> None:
         """Replaces one poll by polls of these blocks, due at once."""
         if not poll.live:
             return
-        poll.live = False
-        last = poll.last
-        new = [Poll(poll.device, block, now, last=LastRead(last.at, last.ever)) for block in blocks]
+        poll.retire()
+        device, at, ever = poll.device, poll.reads.at, poll.reads.ever
+        new = [PollEntry(device, block, now, reads=BlockReads(at, ever)) for block in blocks]
         kept = [other for other in self._polls[poll.device] if other is not poll]
         self._set_polls(poll.device, kept + new, new, now)
 
@@ -126,7 +127,7 @@ class Schedule:
         bad = device.bad_addresses.bad
         later = [p for p in self._polls[device] if p.due > when and p.block.span in bad]
         for poll in later:
-            poll.due = when
+            poll.due_by(when)
         self._queue.push_all(later)
 
     def take_along(self, now: float) -> None:
@@ -134,21 +135,23 @@ class Schedule:
         polls = (poll for polls in self._polls.values() for poll in polls)
         early = [poll for poll in polls if now < poll.due <= now + poll.block.every / 2]
         for poll in early:
-            poll.due = now
+            poll.due_by(now)
         self._queue.push_all(early)
 
-    def _set_polls(self, device: Device, polls: list[Poll], new: list[Poll], now: float) -> None:
+    def _set_polls(
+        self, device: Device, polls: list[PollEntry], new: list[PollEntry], now: float
+    ) -> None:
         for poll in new:
             self._hasten(poll, now)
         self._polls[device] = polls
         self._readers.pop(device, None)
         self._queue.push_all(new)
 
-    def _hasten(self, poll: Poll, now: float) -> None:
+    def _hasten(self, poll: PollEntry, now: float) -> None:
         """Gives the poll an early deadline if the values of its block are bad."""
         device, block = poll.device, poll.block
-        poll.soon = NEVER
-        if block.every <= LONG or poll.last.at is not None or not device.health.online:
+        poll.hasten(NEVER)
+        if block.every <= LONG or poll.reads.at is not None or not device.health.online:
             return
         if block.span in device.bad_addresses.bad:
             return
@@ -156,14 +159,18 @@ class Schedule:
         soon = max(self._first_lane, now) + turn
         if max(soon, poll.due + turn) < poll.deadline:
             self._first_lane = soon
-            poll.soon = max(soon, poll.due + turn)
+            poll.hasten(max(soon, poll.due + turn))
 
-    def expedite(self, poll: Poll, *, on_demand: bool = False) -> None:
+    def expedite(self, poll: PollEntry, *, on_demand: bool = False) -> None:
         """Polls this next, after requests, because a client waits for it."""
         if poll.device.health.state is State.OFFLINE:
             poll.device.health.probe_soon()
         elif poll.live and poll.device.health.online:
             self._queue.expedite(poll, on_demand=on_demand)
+
+    def reach_by_modem(self, by_modem: bool) -> None:
+        """Notes if a telephone call is needed for every exchange."""
+        self.reaches_by_modem = by_modem
 
     # Questions
 
@@ -173,10 +180,10 @@ class Schedule:
             return True
         return self._probes.reachable(device, now, late=self._queue.is_late)
 
-    def polls(self, device: Device) -> Sequence[Poll]:
+    def polls(self, device: Device) -> Sequence[PollEntry]:
         return self._polls[device]
 
-    def reader(self, device: Device, tag: Tag) -> Poll | None:
+    def reader(self, device: Device, tag: Tag) -> PollEntry | None:
         """Returns the poll that reads this tag of the device, if any."""
         readers = self._readers.get(device)
         if readers is None:
@@ -191,7 +198,7 @@ class Schedule:
 
     # The next job
 
-    def next(self, now: float) -> Request | Probe | Poll | Idle:
+    def next(self, now: float) -> Request | Probe | PollEntry | Idle:
         if now >= self._on_demand_at or self._queue.expedited:
             self._share_on_demand(now)
         due = self._queue.ripen(now)
@@ -235,7 +242,7 @@ class Schedule:
             return request
         return None if due else self._probes.probe(first)
 
-    def _next_poll(self, now: float) -> Poll | Probe:
+    def _next_poll(self, now: float) -> PollEntry | Probe:
         queue = self._queue
         poll = queue.due
         first = queue.expedited and not self._expedited and self._may_expedite(now, now)
@@ -250,10 +257,12 @@ class Schedule:
                 return self._probes.probe(poll.device)
             poll = other
             expedited = False
-        self._expedited = poll.expedited = expedited
-        if poll.ticket == ON_DEMAND:
-            self._on_demand_at = now
-        return self._hand_out(poll, now)
+        self._expedited = expedited
+        if poll.ticket <= EXPEDITED:
+            if poll.ticket == ON_DEMAND:
+                self._on_demand_at = now
+            queue.expedited.remove(poll)
+        return poll.hand_out(now, expedited=expedited)
 
     def _may_expedite(self, now: float, until: float) -> bool:
         """True if the first expedited poll may be sent; another poll is due at `until`."""
@@ -262,59 +271,28 @@ class Schedule:
             return True
         return now + poll.device.seconds(poll.block.cost) <= until
 
-    def alongside(self, poll: Poll, most: int, now: float) -> list[Poll]:
+    def alongside(self, device: Device, most: int, now: float) -> list[PollEntry]:
         """Returns more due polls of the device, if it accepts several requests at once."""
-        return [self._hand_out(other, now) for other in self._queue.more(poll.device, most)]
+        return [other.hand_out(now) for other in self._queue.more(device, most)]
 
-    def _hand_out(self, poll: Poll, now: float) -> Poll:
-        if poll.ticket <= EXPEDITED:
-            self._queue.expedited.remove(poll)
-        poll.ticket = NOT_QUEUED  # its entry in the heap is stale now
-        if poll.due > now:
-            poll.due = now
-        poll.asked = now
-        listed, shapes = poll.block.listed, poll.device.shapes
-        if shapes is not None:
-            poll.span = shapes.polled(poll.block, now)
-        if listed:
-            poll.register = poll.device.monitor.registered != listed
-            poll.device.monitor.expect(listed)
-        return poll
-
-    def _first_without_resync(self) -> Poll | None:
+    def _first_without_resync(self) -> PollEntry | None:
         """Returns the due poll with the earliest deadline whose device needs no resync."""
         ready = (poll for poll in self._queue.valid() if not poll.device.health.needs_resync)
         return min(ready, key=lambda poll: poll.deadline, default=None)
 
     # Results
 
-    def polled(self, poll: Poll, now: float, *, answered: bool = True) -> None:
+    def polled(self, poll: PollEntry, now: float, *, answered: bool = True) -> None:
         """Ends the poll for this period, after a good or a bad read."""
-        poll.missed = 0 if answered else poll.missed + 1
-        device, block = poll.device, poll.block
-        plain = answered and not device.bad_addresses.bad
-        every = block.every if plain else poll.every
-        behind = int((poll.asked - poll.due) / every)
-        if behind:
-            device.record.count_overruns(behind)
-            poll.counts.overruns += behind
-        poll.due = (poll.asked if behind or poll.missed else poll.due) + every
-        if not (poll.phased or self.reaches_by_modem):  # one call reads all that is due at a time
-            poll.phased = True
-            poll.due -= every * next(self._phases)
-        if poll.last.at is None and block.span not in device.bad_addresses.bad:
-            poll.due = min(poll.due, now + PAUSE_LONGEST)  # the cause may have gone
-        poll.tries = 0
-        if block.every > LONG:
+        # One telephone call reads all that is due at a time.
+        poll.ended(now, answered, None if self.reaches_by_modem else self._phases)
+        if poll.block.every > LONG:
             self._hasten(poll, now)
         self._queue.push(poll)
 
-    def again(self, poll: Poll, when: float | None = None, *, counted: bool = True) -> None:
+    def again(self, poll: PollEntry, when: float | None = None, *, counted: bool = True) -> None:
         """Polls again when the deadline is the earliest, or from `when` on."""
-        poll.tries += counted
-        poll.device.record.count_retry()
-        if when is not None:
-            poll.due = when
+        poll.try_again(when, counted=counted)
         self._queue.push(poll)
 
     def failed(self, now: float, took: float) -> None:
@@ -328,18 +306,15 @@ class Schedule:
     def resynced(self, device: Device) -> None:
         """Compares the next read of each block with nothing: it decodes all units."""
         for poll in self._polls[device]:
-            poll.last.scan = None
+            poll.reads.compare_with_nothing()
 
     def came_online(self, device: Device, now: float) -> None:
         """Makes all blocks of a device due, because it came online."""
         for poll in self._polls[device]:
-            poll.due = now
-            poll.missed = 0
-            device.record.was_good(poll.last.at)
-            poll.last.at = None
+            poll.came_online(now)
         self.plan(device, now)
         for poll in self._polls[device]:
-            poll.phased = False
+            poll.spread()
 
     def opened(self, now: float) -> None:
         """Starts again after the line was opened."""

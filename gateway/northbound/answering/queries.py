@@ -13,20 +13,20 @@ import structlog
 import zenoh
 
 from gateway.contract import payload
-from gateway.contract.interfaces import Plant
-from gateway.contract.keys import Family, ParsedKey, max_age, parse_key
+from gateway.contract.interfaces import Parts, Plant
+from gateway.contract.keys import Family, ParsedKey, max_age, parse_key, part_of
 from gateway.contract.parsing import check_encoding
 from gateway.contract.payload import Failure, GroupResult, Problem
 from gateway.contract.question import is_of_past
 from gateway.engine.jobs.requests import CommandResult, Peeked
 from gateway.errors import BadValue, Busy, GatewayError
-from gateway.northbound.alarms import Acknowledgements
 from gateway.northbound.answering.answers import Answer, AnswerPool, QueryCounters
 from gateway.northbound.answering.replies import Replies
 from gateway.northbound.answering.tag_index import TagIndex
 from gateway.northbound.requests.acceptance import encoding_of, sender
 from gateway.northbound.requests.commands import Commands
 from gateway.northbound.requests.inbox import Inbox
+from gateway.northbound.requests.orders import Orders
 from gateway.northbound.requests.writes import ANSWER_WITHIN, Writes
 from gateway.tags import Tag, WriteResult
 
@@ -51,7 +51,8 @@ class Queries:
         commands: Commands,
         replies: Replies,
         documents: StatusDocuments,
-        acknowledgements: Acknowledgements,
+        orders: Orders,
+        parts: Parts,
     ) -> None:
         self._plant = plant
         self._index = index
@@ -59,7 +60,8 @@ class Queries:
         self._commands = commands
         self._replies = replies
         self._documents = documents
-        self._acknowledgements = acknowledgements
+        self._orders = orders
+        self._parts = parts
         busy = partial(replies.outcome, _BUSY)
         # Reads take neither the places nor the threads of writes.
         self._reads, self._requests = AnswerPool(busy), AnswerPool(busy)
@@ -101,8 +103,8 @@ class Queries:
         match parsed.family:
             case Family.SET | Family.COMMAND | Family.PEEK:
                 self._start(self._request(query, parsed, at))
-            case Family.ALARM:
-                self._take_alarm(query, parsed, at)
+            case Family.STATUS if self._parts.has_keys(part := part_of(parsed.target)):
+                self._take_keyed(query, part, parsed, at)
             case Family.STATUS:
                 self._take_status(query)
             case Family.VALUE if is_of_past(query.parameters):
@@ -139,18 +141,16 @@ class Queries:
         else:
             self._start(self._status(query))
 
-    def _take_alarm(self, query: zenoh.Query, parsed: ParsedKey, at: float) -> None:
-        data = _data(query)
-        if data is not None:
-            key = str(query.key_expr)
-            result = self._acknowledgements.acknowledge(key, data, sender(query, at))
-            self._requests.answer(query, partial(self._replies.acknowledged, result))
+    def _take_keyed(self, query: zenoh.Query, part: str, parsed: ParsedKey, at: float) -> None:
+        if query.payload is not None:
+            self._start(self._order(query, part, at))
         elif query.parameters.get("_time") is not None:
-            self._reads.answer_history(query, partial(self._replies.past_alarms, time.time_ns()))
+            past = partial(self._replies.past_entries, part, time.time_ns())
+            self._reads.answer_history(query, past)
         elif parsed.has_wildcard:
-            self._reads.answer_wide(query, self._replies.alarms)
+            self._reads.answer_wide(query, partial(self._replies.entries, part))
         else:
-            self._reads.answer(query, self._replies.alarms)
+            self._reads.answer(query, partial(self._replies.entries, part))
 
     async def close(self) -> None:
         """Ends the queries that wait for devices; their replies get half a second to leave."""
@@ -183,6 +183,14 @@ class Queries:
             result = await self._writes.write(key, _data(query), by)
         finally:
             self._requests.answer(query, partial(self._replies.outcome, result))
+
+    async def _order(self, query: zenoh.Query, part: str, at: float) -> None:
+        result: bytes | Failure = _ENDING
+        key, by = str(query.key_expr), sender(query, at)
+        try:
+            result = await self._orders.execute(part, key, _data(query) or b"", by)
+        finally:
+            self._requests.answer(query, partial(self._replies.ordered, result))
 
     async def _command(self, query: zenoh.Query, at: float) -> None:
         result: CommandResult | Failure = _ENDING
@@ -270,9 +278,9 @@ class Queries:
 
 
 def _is_request(query: zenoh.Query, parsed: ParsedKey) -> bool:
-    """True for a write, a command, and the acknowledgement of an alarm."""
-    if parsed.family is Family.ALARM:
-        return query.payload is not None
+    """True for a write, a command, and an order to a part."""
+    if parsed.family is Family.STATUS:
+        return query.payload is not None and part_of(parsed.target) != ""
     return parsed.family in (Family.SET, Family.COMMAND)
 
 

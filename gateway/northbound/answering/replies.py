@@ -10,14 +10,13 @@ import zenoh
 from gateway.contract import bucket_documents as buckets
 from gateway.contract import past, payload
 from gateway.contract.buckets import Bucket, Now
-from gateway.contract.interfaces import History, Plant
+from gateway.contract.interfaces import History, Parts, Plant
 from gateway.contract.keys import Family, Keys, ParsedKey
 from gateway.contract.meta import meta
 from gateway.contract.payload import Failure, GroupResult, Problem
 from gateway.contract.question import Question, question
 from gateway.engine.jobs.requests import Peeked
 from gateway.errors import BadValue, Busy, Damaged, GatewayError
-from gateway.northbound.alarms import alarm_fields
 from gateway.northbound.answering import pages
 from gateway.northbound.answering.tag_index import TagIndex
 from gateway.northbound.answering.turns import Pause, Rank, Turns
@@ -49,13 +48,13 @@ class Replies:
         plant: Plant,
         index: TagIndex,
         stamp: Callable[[], zenoh.Timestamp],
-        history: History | None = None,
+        parts: Parts,
     ) -> None:
         self._keys = keys
         self._plant = plant
         self._index = index
         self._stamp = stamp
-        self._history = history
+        self._parts = parts
         self._ended = False
         self._turns = Turns()
         self._clock = time.monotonic
@@ -119,12 +118,12 @@ class Replies:
     def history(self, parsed: ParsedKey, now: int, query: zenoh.Query) -> None:
         """`now`: ns since 1970, when the query was taken."""
         tags = self._index.tags_at(parsed.target)
-        history = self._history
-        if history is None:
-            if tags:  # otherwise they are another gateway's, which may have a history
-                self.outcome(_NO_HISTORY, query)
-            return
         try:
+            history = self._parts.history()
+            if history is None:
+                if tags:  # otherwise they are another gateway's, which may have a history
+                    self.outcome(_NO_HISTORY, query)
+                return
             page = pages.page(query, self._keys.gateway)
             limit = _limit(query.parameters.get("limit"))
             asked = question(_parameters(query))
@@ -246,29 +245,27 @@ class Replies:
         if query.key_expr.intersects(key):
             self._past(found, query)
 
-    def alarms(self, query: zenoh.Query) -> None:
-        """Replies with the document of each alarm of the query."""
-        entries = self._plant.alarms.entries
+    def entries(self, part: str, query: zenoh.Query) -> None:
+        """Replies with the documents of a part."""
         try:
             with self._turns.turn(Rank.CURRENT) as pause:
-                for name, entry in list(entries.items()):
-                    key = self._keys.alarm(name)
+                for path, make in self._parts.keyed(part).entries():
+                    key = self._keys.status(f"{part}/{path}")
                     if not query.key_expr.intersects(key):
                         continue
                     if self._ended:
                         raise Busy(_INCOMPLETE)
-                    document = payload.document(alarm_fields(entry, self._plant.sample))
-                    self._reply(query, key, document, self._stamp())
+                    self._reply(query, key, make(), self._stamp())
                     pause()
         except GatewayError as error:
             self._failed(error, query)
 
-    def past_alarms(self, now: int, query: zenoh.Query) -> None:
-        """Replies with recorded changes, each on the key of its alarm. `now` as in `history`."""
+    def past_entries(self, part: str, now: int, query: zenoh.Query) -> None:
+        """Replies with recorded documents, each on its key. `now` as in `history`."""
 
         def found(history: History, time_range: str, limit: int | None) -> Iterator[_Row]:
-            rows = history.alarms(time_range, None, now)
-            keyed = ((self._keys.alarm(str(orjson.loads(row)["alarm"])), row) for row in rows)
+            rows = self._parts.keyed(part).recorded(history, time_range, now)
+            keyed = ((self._keys.status(f"{part}/{path}"), row) for path, row in rows)
             return islice((one for one in keyed if query.key_expr.intersects(one[0])), limit)
 
         self._past(found, query)
@@ -276,19 +273,20 @@ class Replies:
     def _past(
         self, found: Callable[[History, str, int | None], Iterator[_Row]], query: zenoh.Query
     ) -> None:
-        if self._history is None:
-            self.outcome(_NO_HISTORY, query)
-            return
         try:
+            history = self._parts.history()
+            if history is None:
+                self.outcome(_NO_HISTORY, query)
+                return
             limit = _limit(query.parameters.get("limit"))
-            for key, row in found(self._history, query.parameters.get("_time") or "", limit):
+            for key, row in found(history, query.parameters.get("_time") or "", limit):
                 if self._ended:
                     raise Busy(_INCOMPLETE)
                 self._reply(query, key, row.encode(), self._stamp())
         except GatewayError as error:
             self._failed(error, query)
 
-    def acknowledged(self, result: bytes | Failure, query: zenoh.Query) -> None:
+    def ordered(self, result: bytes | Failure, query: zenoh.Query) -> None:
         if isinstance(result, Failure):
             self.outcome(result, query)
         else:

@@ -18,7 +18,7 @@ from gateway.northbound.group.claims import MOST_OTHERS, Claims
 from gateway.northbound.group.plant_secret import PlantSecret
 from gateway.northbound.requests.inbox import Inbox
 from gateway.northbound.session.second_session import SecondSession
-from gateway.northbound.session.session import off_loop
+from gateway.plant.threads import off_loop
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 

@@ -16,7 +16,7 @@ from gateway.northbound.group.group_tokens import GroupTokens
 from gateway.northbound.group.plant_secret import PlantSecret
 from gateway.northbound.requests.inbox import Inbox
 from gateway.northbound.session.second_session import SecondSession
-from gateway.northbound.session.session import off_loop
+from gateway.plant.threads import off_loop
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 

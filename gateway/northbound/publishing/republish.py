@@ -27,7 +27,7 @@ _NEVER = float("-inf")
 _BATCH_SIZE = 500  # samples in one turn of the loop
 _HEARTBEAT_CHECK = 1.0  # seconds: a heartbeat may be this late
 _LOSS_CHECK = 0.5  # seconds
-_ALARMS_AFTER = 2.0  # seconds from the last put that found a link full
+_DOCUMENTS_AFTER = 2.0  # seconds from the last put that found a link full
 # Few at a time: a burst would fill a narrow link again.
 _FEW, _FEW_EVERY = 100, 0.02  # samples, seconds
 _REFRESH_EVERY = 0.2  # seconds, where many tags are refreshed
@@ -44,25 +44,24 @@ class Republisher:
         links: LinkMonitor,
         losses: Losses,
         refresh: float,
-        alarms: Callable[[], Awaitable[None]] | None = None,
+        parts: Callable[[], Awaitable[None]],
     ) -> None:
-        """`refresh`: seconds in which every tag is published at least once. `alarms` publishes all
-        alarms."""
+        """`refresh`: seconds in which every tag is published at least once. `parts` publishes
+        the documents of the parts."""
         self._publish = publish
         self._plant = plant
         self._index = index
         self._links = links
         self._losses = losses
         self._refresh = refresh
-        self._alarms = alarms
+        self._parts = parts
 
     async def publish_all(self) -> None:
         tags = self._index.tags
         for start in range(0, len(tags), _BATCH_SIZE):
             self._publish_again(tags[start : start + _BATCH_SIZE])
             await asyncio.sleep(0)
-        if self._alarms is not None:
-            await self._alarms()
+        await self._parts()
 
     def _publish_again(self, tags: Sequence[Tag]) -> None:
         # A reload may have removed a tag meanwhile, or replaced it.
@@ -79,7 +78,7 @@ class Republisher:
             tasks.create_task(self._heartbeats())
             tasks.create_task(self._lost_values())
             tasks.create_task(self._refreshes())
-            tasks.create_task(self._lost_alarms())
+            tasks.create_task(self._lost_documents())
 
     async def _after_returned_links(self) -> None:
         returned, pause, last = self._links.returned, _SETTLE_TIME, _NEVER
@@ -106,16 +105,16 @@ class Republisher:
                 self._publish_again(tags[start : start + _FEW])
                 await asyncio.sleep(_FEW_EVERY)
 
-    async def _lost_alarms(self) -> None:
-        """Publishes all alarms once per `refresh`, and some time after a link was full."""
+    async def _lost_documents(self) -> None:
+        """Publishes those of the parts once per `refresh`, and some time after a link was full."""
         full, due = self._losses.congested, _now() + self._refresh
-        while self._alarms is not None:
+        while True:
             await asyncio.sleep(_LOSS_CHECK)
             if (now_full := self._losses.congested) > full:
-                full, due = now_full, _now() + _ALARMS_AFTER
+                full, due = now_full, _now() + _DOCUMENTS_AFTER
             elif _now() >= due:
                 due = _now() + self._refresh
-                await self._alarms()
+                await self._parts()
 
     async def _refreshes(self) -> None:
         """Publishes the tags in turn, evenly over the time of `refresh`."""

@@ -10,8 +10,8 @@ from pathlib import Path
 import orjson
 
 from gateway.contract.writers import EARLIEST, LATEST
-from gateway.northbound.session.session import off_loop
 from gateway.plant.saved_file import SavedFile
+from gateway.plant.threads import off_loop
 
 AHEAD = LATEST + EARLIEST  # seconds
 # Seconds that a write waits for the disk. A disk that hangs or is full keeps no operator from

@@ -6,10 +6,9 @@ from typing import TypeVar
 
 import zenoh
 
-from gateway.contract.interfaces import History, Plant
+from gateway.contract.interfaces import Parts, Plant
 from gateway.contract.keys import Keys
 from gateway.contract.payload import Failure, GroupResult
-from gateway.northbound.alarms import Acknowledgements
 from gateway.northbound.answering.queries import Queries, StatusDocuments
 from gateway.northbound.answering.replies import Replies
 from gateway.northbound.answering.tag_index import TagIndex
@@ -17,6 +16,7 @@ from gateway.northbound.requests.acceptance import Acceptance, Sender
 from gateway.northbound.requests.audit import Audit
 from gateway.northbound.requests.commands import Commands
 from gateway.northbound.requests.inbox import Inbox
+from gateway.northbound.requests.orders import Orders
 from gateway.northbound.requests.writes import PutWrites, Writes
 from gateway.tags import WriteResult
 
@@ -33,7 +33,7 @@ class Incoming:
         index: TagIndex,
         audit: Audit,
         documents: StatusDocuments,
-        history: History | None,
+        parts: Parts,
         acceptance: Acceptance,
     ) -> None:
         self._keys = keys
@@ -41,12 +41,12 @@ class Incoming:
         self._index = index
         self._audit = audit
         self._documents = documents
-        self._history = history
+        self._parts = parts
         self._acceptance = acceptance
         # Of clients that another part of the gateway has admitted: Zenoh and its writers do not.
         admitted = Acceptance(plant.duty, None)
         self._admitted = Writes(plant, index, audit, admitted)
-        self._acknowledgements = Acknowledgements(keys, plant, audit, admitted)
+        self._admitted_orders = Orders(keys, parts, audit, admitted)
         self._queries: Queries | None = None
         self._puts: PutWrites | None = None
         self._declarations: Declarations | None = None
@@ -71,20 +71,29 @@ class Incoming:
         payload as on Zenoh; `arrived`: by the loop's clock."""
         return await self._admitted.write(self._keys.set(tag), data, Sender(by, None, arrived))
 
-    def acknowledge(self, alarm: str, data: bytes, by: str, arrived: float) -> bytes | Failure:
-        """Acknowledges for a client that another part of the gateway has admitted as `by`."""
-        sender = Sender(by, None, arrived)
-        return self._acknowledgements.acknowledge(self._keys.alarm(alarm), data, sender)
+    async def order(
+        self, part: str, path: str, data: bytes, by: str, arrived: float
+    ) -> bytes | Failure:
+        """Has a part carry out an order of a client that another part has admitted as `by`."""
+        key = self._keys.status(f"{part}/{path}")
+        return await self._admitted_orders.execute(part, key, data, Sender(by, None, arrived))
 
     def start(self, session: zenoh.Session) -> "Declarations":
         """Returns the declarations that send queries and puts here."""
         stamp = session.new_timestamp
         writes = Writes(self._plant, self._index, self._audit, self._acceptance)
         commands = Commands(self._keys, self._plant, stamp, self._audit, self._acceptance)
-        replies = Replies(self._keys, self._plant, self._index, stamp, self._history)
-        acknowledgements = Acknowledgements(self._keys, self._plant, self._audit, self._acceptance)
+        replies = Replies(self._keys, self._plant, self._index, stamp, self._parts)
+        orders = Orders(self._keys, self._parts, self._audit, self._acceptance)
         self._queries = Queries(
-            self._plant, self._index, writes, commands, replies, self._documents, acknowledgements
+            self._plant,
+            self._index,
+            writes,
+            commands,
+            replies,
+            self._documents,
+            orders,
+            self._parts,
         )
         self._puts = PutWrites(writes, self._index)
         puts = Inbox(self._puts.take, self._puts.refuse)

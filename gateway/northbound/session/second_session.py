@@ -10,8 +10,9 @@ from contextlib import suppress
 
 import zenoh
 
-from gateway.northbound.session.session import off_loop, open_session
+from gateway.northbound.session.session import open_session
 from gateway.northbound.session.session_settings import as_client
+from gateway.plant.threads import off_loop
 
 _CLOSE_WITHIN = 0.3  # seconds; a router that hangs must not delay the end
 

@@ -4,8 +4,6 @@ import asyncio
 import errno
 import json
 import os
-import threading
-from collections.abc import Callable
 from contextlib import suppress
 from typing import TypeVar
 
@@ -13,6 +11,7 @@ import structlog
 import zenoh
 
 from gateway.errors import GatewayError
+from gateway.plant.threads import off_loop
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 
@@ -68,32 +67,3 @@ def _without_place(error: zenoh.ZError) -> str:
 def _hint(error: zenoh.ZError) -> str:
     in_use = f"os error {errno.EADDRINUSE}" in str(error)
     return ": perhaps this gateway is running already" if in_use else ""
-
-
-async def off_loop(function: Callable[..., T], *arguments: object) -> T:
-    """Runs a blocking call on its own daemon thread, which delays neither the loop nor the exit."""
-    loop = asyncio.get_running_loop()
-    outcome: asyncio.Future[T] = loop.create_future()
-
-    def settle(result: T | None, error: Exception | None) -> None:
-        if outcome.cancelled():
-            return
-        if error is not None:
-            outcome.set_exception(error)
-        else:
-            outcome.set_result(result)  # type: ignore[arg-type]  # T itself may be None
-
-    def run() -> None:
-        result: T | None = None
-        error: Exception | None = GatewayError(f"{function.__name__} failed unexpectedly")
-        try:
-            result = function(*arguments)
-            error = None
-        except (zenoh.ZError, OSError) as expected:
-            error = expected
-        finally:
-            with suppress(RuntimeError):  # the loop is closed
-                loop.call_soon_threadsafe(settle, result, error)
-
-    threading.Thread(target=run, name=f"zenoh {function.__name__}", daemon=True).start()
-    return await outcome

@@ -1,32 +1,24 @@
 """All alarms of a gateway: judges each read, ends delays, reports changes. On the event loop.
 
-A scan whose tags have no alarm costs nothing: `Gateway.samples` sees that at the scan.
+A scan whose tags have no alarm costs one look at the scan.
 """
 
 import asyncio
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import structlog
 
 from gateway.contract import audited
-from gateway.parts.alarms.machine import Alarm, Event, NothingToAcknowledge, State, Status
+from gateway.errors import NothingToAcknowledge
+from gateway.parts.alarms.machine import Alarm, Event, State, Status
+from gateway.plant.conditions import Condition, Reading
 from gateway.tags import AlarmRule, Quality, Sample, Tag
 from gateway.tags.scan import Scan
 from gateway.values import Value
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger("gateway")
-
-LOOK_EVERY = 1.0  # seconds between two looks at lines and devices
-
-
-class Reading(NamedTuple):
-    """The state of a line or a device. `alarm`: None if it is not known."""
-
-    alarm: bool | None
-    why: str = ""  # one sentence for people, or empty
 
 
 class Entry:
@@ -76,12 +68,18 @@ class Alarms:
                 self._by_tag[tag] = self._add(Entry(tag.key, tag.alarm, tag))
         self.of_tags = bool(self._by_tag)  # then samples are to be judged
 
-    def watch(self, key: str, rule: AlarmRule, look: Callable[[], Reading]) -> None:
-        """Adds the alarm of a line or a device. `look` returns its present state."""
-        if (known := self.entries.get(key)) is not None:  # another line or device has its place
-            known.look = look
-            return
-        self._watched.append(self._add(Entry(key, rule, look=look)))
+    def watch(self, conditions: Mapping[str, Condition]) -> None:
+        """Has one alarm for each condition, and none for others."""
+        for entry in [*self._watched]:
+            same = entry.key in conditions and conditions[entry.key].rule == entry.alarm.rule
+            if not same:
+                self._watched.remove(entry)
+                self._remove(entry)
+        for key, condition in conditions.items():
+            if (known := self.entries.get(key)) is not None:
+                known.look = condition.look  # another line or device may have its place
+            else:
+                self._watched.append(self._add(Entry(key, condition.rule, look=condition.look)))
 
     # -- a changed file --
 
@@ -102,17 +100,6 @@ class Alarms:
             if entry is not None and entry.tag is tag:
                 self._remove(entry)
         self.of_tags = bool(self._by_tag)
-
-    @property
-    def watched(self) -> Collection[str]:
-        """The keys of the alarms that `watch` added."""
-        return [entry.key for entry in self._watched]
-
-    def unwatch(self, keys: Collection[str]) -> None:
-        """Ends alarms that `watch` added."""
-        for entry in [entry for entry in self._watched if entry.key in keys]:
-            self._watched.remove(entry)
-            self._remove(entry)
 
     def _remove(self, entry: Entry) -> None:
         if entry.timer is not None:
@@ -233,12 +220,10 @@ class Alarms:
         """Returns the alarms that a restart must not lose."""
         return {key: entry.status for key, entry in self.open.items()}
 
-    async def run(self) -> None:
-        """Looks at lines and devices until cancelled."""
-        while True:
-            for entry in self._watched:
-                self._look(entry)
-            await asyncio.sleep(LOOK_EVERY)
+    def look(self) -> None:
+        """Looks at the conditions."""
+        for entry in self._watched:
+            self._look(entry)
 
     def _look(self, entry: Entry) -> None:
         if entry.look is not None:

@@ -7,45 +7,54 @@ from pathlib import Path
 from typing import Any
 
 import orjson
+import structlog
 
 from gateway.parts.alarms.board import Alarms
 from gateway.parts.alarms.machine import Acknowledgement, State, Status
 from gateway.plant.saved_file import SavedFile
+from gateway.plant.threads import off_loop
 from gateway.tags import Level
 from gateway.values import Value
 
+log = structlog.get_logger("gateway")
 FORMAT = 1
 LATEST = 2**63 - 1  # ns since 1970: the year 2262
+CLOSE_WITHIN = 0.5  # seconds
 TOGETHER = 0.1  # seconds in which changes are saved together
 
 
 class AlarmFile:
-    """Restores the alarms, runs them, and saves each change."""
+    """Restores the alarms, and saves each change."""
 
     def __init__(self, path: Path | None, alarms: Alarms) -> None:
         """Without `path` a restart forgets the alarms."""
         self._file = None if path is None else SavedFile(path)
         self._alarms = alarms
 
+    async def restore(self) -> None:
+        """Call it before the lines begin."""
+        if self._file is not None:
+            self._alarms.restore(await off_loop(self._load))
+
+    def _load(self) -> Mapping[str, Status]:
+        return (None if self._file is None else self._file.load(parse)) or {}
+
     @asynccontextmanager
     async def kept(self) -> AsyncIterator[None]:
-        """Runs the alarms of an active gateway. Enter it before the lines begin."""
+        """Saves each change, and the last ones at the end."""
         file = self._file
         if file is not None:
-            self._alarms.restore(file.load(parse) or {})
             file.start()
-        tasks = [asyncio.create_task(self._alarms.run(), name="alarms")]
-        if file is not None:
-            tasks.append(asyncio.create_task(self._save_changes(file), name="alarm file"))
+        saves = None if file is None else asyncio.create_task(self._save_changes(file))
         try:
             yield
         finally:
-            for task in tasks:
-                task.cancel()
             self._alarms.close()
-            if file is not None:
+            if file is not None and saves is not None:
+                saves.cancel()
                 file.save_last(snapshot(self._alarms.statuses()))
-            await asyncio.gather(*tasks, return_exceptions=True)
+                if not await off_loop(file.close, CLOSE_WITHIN):
+                    log.warning("alarm file close timed out")
 
     async def _save_changes(self, file: SavedFile) -> None:
         changed = self._alarms.changed
@@ -55,10 +64,6 @@ class AlarmFile:
             if not file.save_soon(snapshot(self._alarms.statuses())):
                 changed.set()  # the thread is busy
             await asyncio.sleep(TOGETHER)
-
-    def close(self, within: float) -> bool:
-        """Blocks for at most `within` seconds; True if everything is saved."""
-        return self._file is None or self._file.close(within)
 
 
 def snapshot(statuses: Mapping[str, Status]) -> bytes:

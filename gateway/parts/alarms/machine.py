@@ -8,14 +8,10 @@ from collections.abc import Mapping
 from enum import StrEnum
 from typing import NamedTuple
 
-from gateway.errors import GatewayError
+from gateway.errors import NothingToAcknowledge
 from gateway.tags.alarm import BELOW, AlarmRule, Level
 from gateway.values import Value
 from gateway.values.numerals import are_apart
-
-
-class NothingToAcknowledge(GatewayError):
-    """The alarm needs no acknowledgement, or is not the one that the operator saw."""
 
 
 class State(StrEnum):

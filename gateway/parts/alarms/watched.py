@@ -7,31 +7,27 @@ from gateway.config import AlarmsConfig
 from gateway.engine.device.device import Device
 from gateway.engine.device.health import State
 from gateway.line.line import Line
-from gateway.parts.alarms.board import Alarms, Reading
+from gateway.plant.conditions import Condition, Reading
 from gateway.tags import AlarmRule, Level
 
 # Seconds that a line is down before it is an alarm: an adapter that is plugged again, or a device
 # server that starts again, is back earlier.
 LINE_DELAY = 3.0
-# Begin the key of the alarm of a line or a transfer; no device has a colon in its name.
-LINE, TRANSFER = "line:", "transfer:"
+LINE = "line:"  # begins the key of the alarm of a line; no device has a colon in its name
 
 
-def watch(alarms: Alarms, lines: Iterable[Line], config: AlarmsConfig) -> None:
-    """Adds the alarms of lines and of their devices, and ends those of others."""
-    lines = [*lines]
-    names = {device.name for line in lines for device in line.engine.devices}
-    names |= {f"{LINE}{line.engine.name}" for line in lines}
-    known = (key for key in alarms.watched if not key.startswith(TRANSFER))
-    alarms.unwatch({key for key in known if key not in names})
+def conditions(lines: Iterable[Line], config: AlarmsConfig) -> dict[str, Condition]:
+    """Returns the conditions of lines and of their devices, by the key of their alarm."""
+    found = {}
     for line in lines:
         name = line.engine.name
         if config.lines:
             rule = AlarmRule({Level.DOWN: True}, delay=LINE_DELAY, text=f"line {name} is down")
-            alarms.watch(f"{LINE}{name}", rule, partial(_line, line))
+            found[f"{LINE}{name}"] = Condition(rule, partial(_line, line))
         for device in line.engine.devices if config.devices else ():
             rule = AlarmRule({Level.OFFLINE: True}, text=f"{device.name} does not reply")
-            alarms.watch(device.name, rule, partial(_device, device))
+            found[device.name] = Condition(rule, partial(_device, device))
+    return found
 
 
 def _line(line: Line) -> Reading:

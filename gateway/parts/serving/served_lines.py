@@ -11,6 +11,7 @@ from gateway.errors import BadValue
 from gateway.line.send_permit import Duty
 from gateway.parts.serving.held_file import HeldFile
 from gateway.parts.serving.served_line import ServedLine, ServedSink
+from gateway.plant.threads import off_loop
 from gateway.stations.served.registers import Registers, Row
 from gateway.stations.served.station import Station
 from gateway.tags import Sample, Tag, WriteResult, good
@@ -19,7 +20,7 @@ from gateway.values import Value
 log = structlog.get_logger("gateway")
 
 
-class Serving:
+class ServedLines:
     """All served lines, and the held values."""
 
     def __init__(
@@ -71,16 +72,11 @@ class Serving:
         """True for a value that clients write and a master reads."""
         return tag in self._rows
 
-    async def write(self, tag: Tag, value: Value) -> WriteResult:
-        """Holds a value for the master. Returns when it is kept.
+    async def write_group(self, values: Sequence[tuple[Tag, Value]]) -> list[WriteResult]:
+        """Holds values for the master, all at once. Returns when they are kept.
 
         Raises `BadValue` and `Busy` before anything changed.
         """
-        [result] = await self.write_group([(tag, value)])
-        return result
-
-    async def write_group(self, values: Sequence[tuple[Tag, Value]]) -> list[WriteResult]:
-        """Holds several values, all at once, as `write`."""
         loop = asyncio.get_running_loop()
         started, held = loop.time(), dict[Tag, Value]()
         for tag, value in values:
@@ -104,12 +100,12 @@ class Serving:
             for tag, real in held.items()
         ]
 
-    def restore(self) -> None:
+    async def restore(self) -> None:
         """Publishes the held values of before the start."""
         if self._file is None:
             return
         retained = [tag for tag, row in self._rows.items() if row.retain]
-        for tag, value in self._file.load(retained).items():
+        for tag, value in (await off_loop(self._file.load, retained)).items():
             try:
                 real = tag.from_units(tag.encode(value))
             except BadValue as error:

@@ -2,7 +2,7 @@
 
 import asyncio
 import math
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Awaitable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from typing import Protocol
@@ -10,11 +10,10 @@ from typing import Protocol
 import structlog
 
 from gateway.errors import GatewayError
-from gateway.parts.alarms import Alarms, Reading
-from gateway.parts.alarms.watched import TRANSFER
 from gateway.parts.transfers import row as rows
 from gateway.parts.transfers.codes import DONE, End, Outcome, outcome_of
 from gateway.parts.transfers.row import Row, State
+from gateway.plant.conditions import Condition, Conditions, Reading
 from gateway.tags import AlarmRule, Level, Quality, Sample, Tag, WriteResult
 from gateway.tags.timestamps import rfc3339
 from gateway.tags.transfer import TransferRule
@@ -23,6 +22,7 @@ from gateway.values import Value
 log: structlog.stdlib.BoundLogger = structlog.get_logger("gateway")
 
 FOLDER = "transfers"  # of the status documents
+TRANSFER = "transfer:"  # begins the key of the alarm of a row
 ALARM_DELAY = 3.0  # seconds
 Document = Mapping[str, object]
 
@@ -31,7 +31,7 @@ class Plant(Protocol):
     """The samples of the gateway, and its status."""
 
     @property
-    def alarms(self) -> Alarms: ...
+    def conditions(self) -> Conditions: ...
 
     def tag(self, key: str) -> Tag | None: ...
 
@@ -42,10 +42,6 @@ class Plant(Protocol):
 
     def age(self, tag: Tag) -> float:
         """Returns the seconds since the last read; infinite if there was none."""
-
-    def add_document(self, path: str, document: Callable[[], Document]) -> None: ...
-
-    def drop_document(self, path: str) -> None: ...
 
 
 class Write(Protocol):
@@ -109,8 +105,6 @@ class Transfers:
         A row goes on if it says the same and its tags go on: the same ones, or those that `renewed`
         gives for them. Every other row begins again.
         """
-        for one in self._running:
-            self._plant.drop_document(f"{FOLDER}/{one.rule.number}")
         before, self._running, self._by_source = self._running, [], {}
         for rule in rules:
             source, target = self._plant.tag(rule.source), self._plant.target(rule.target)
@@ -142,8 +136,6 @@ class Transfers:
         one.source, one.target = source, target
         self._running.append(one)
         self._by_source.setdefault(source, []).append(one)
-        path = f"{FOLDER}/{one.rule.number}"
-        self._plant.add_document(path, partial(self._document, one))
 
     def _leave(self, one: _Running) -> None:
         """Ends a row. A write that is under way ends first: its outcome is recorded."""
@@ -155,20 +147,13 @@ class Transfers:
 
     def _watch(self) -> None:
         """Has one alarm for each row."""
-        if not self._alarms:
-            return
-        alarms, wanted = self._plant.alarms, {}
-        for one in self._running:
+        wanted = {}
+        for one in self._running if self._alarms else ():
             source, target = one.rule.text
             text = f"{one.name} from {source} to {target} does not work"
             rule = AlarmRule({Level.STOPPED: True}, delay=ALARM_DELAY, text=text)
-            wanted[f"{TRANSFER}{one.rule.number}"] = rule, partial(self._look, one)
-        for key in alarms.watched:
-            same = key in wanted and alarms.entries[key].alarm.rule == wanted[key][0]
-            if key.startswith(TRANSFER) and not same:
-                alarms.unwatch([key])
-        for key, (rule, look) in wanted.items():
-            alarms.watch(key, rule, look)
+            wanted[f"{TRANSFER}{one.rule.number}"] = Condition(rule, partial(self._look, one))
+        self._plant.conditions.put(FOLDER, wanted)
 
     async def stop(self) -> None:
         """Ends all rows at once. A write that is under way is reported as unclear."""
@@ -240,6 +225,10 @@ class Transfers:
             return Reading(None)
         state, _, why = one.row.verdict(self._reading(one.source))
         return Reading(None if state is State.STARTING else state is not State.CARRIED, why)
+
+    def documents(self) -> Mapping[str, Document]:
+        """Returns the documents of all rows, by path."""
+        return {f"{FOLDER}/{one.rule.number}": self._document(one) for one in self._running}
 
     def _document(self, one: _Running) -> Document:
         source = one.source

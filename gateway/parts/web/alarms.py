@@ -1,27 +1,23 @@
 """Alarms in the JSON API: the list, and the acknowledgement with a token."""
 
 import asyncio
-from collections.abc import Mapping
-from itertools import islice
-from typing import Any
+from functools import partial
 
 from aiohttp import web
 
 from gateway.contract import payload
 from gateway.contract.payload import Failure, Problem
-from gateway.northbound.alarms import alarm_fields, open_alarms
-from gateway.parts.alarms import Entry, State
+from gateway.errors import BadValue
 from gateway.parts.web.guard import BY
 from gateway.parts.web.replies import answer, body, json_off_loop, raw
 from gateway.parts.web.routes import LIMIT, Choice, Route, Word
 from gateway.parts.web.schemas import ref
-from gateway.parts.web.sources import Sources
+from gateway.plant.part import Core, Listed
 
-MOST_SHOWN = 50  # on the status page
 _STATE = Choice(
     "state",
     "open, if left out: all that are not normal; all; or one state",
-    ("open", "all", *(state.value for state in State)),
+    ("open", "all", "normal", "active", "acknowledged", "returned"),
 )
 _AFTER = Word("after", "Last alarm of the page before")
 _ALARM = Word("alarm", "device/tag, device, or line:name", required=True)
@@ -36,9 +32,9 @@ _STATUS = {
 class AlarmApi:
     """The handlers."""
 
-    def __init__(self, sources: Sources) -> None:
-        self._plant = sources.plant
-        self._north = sources.north
+    def __init__(self, core: Core) -> None:
+        self._north = core.north
+        self._others = core.others
 
     def routes(self) -> list[Route]:
         return [
@@ -77,42 +73,21 @@ class AlarmApi:
 
     async def _alarms(self, request: web.Request) -> web.Response:
         """Without `state` all that are not normal; `state=all` returns those too."""
-        most, after, state = LIMIT.of(request), _AFTER.of(request), _STATE.of(request)
-
-        def page() -> object:
-            found = self._select(state)
-            if after is not None:
-                keys = [entry.key for entry in found]
-                found = found[keys.index(after) + 1 :] if after in keys else []
-            shown = [alarm_fields(one, self._plant.sample) for one in islice(found, most)]
-            more = len(found) > most
-            return {
-                "alarms": shown,
-                "counts": self._plant.alarms.counts(),
-                "next": found[most - 1].key if more else None,
-            }
-
-        return await json_off_loop(page)
-
-    def _select(self, state: str) -> list[Entry]:
-        if state == "open":
-            return open_alarms(self._plant)
-        entries = list(self._plant.alarms.entries.values())
-        return [one for one in entries if state in ("all", one.status.state.value)]
+        most, after, state = LIMIT.of(request), _AFTER.of(request), _STATE.of(request) or "open"
+        lists = self._others.each(Listed)
+        if not lists:
+            return answer(503, "the alarms do not work now: see `faults` of /api/status")
+        try:
+            return await json_off_loop(partial(lists[0].page, state, after, most))
+        except BadValue as error:
+            return answer(400, str(error))
 
     async def _acknowledge(self, request: web.Request) -> web.Response:
         arrived = asyncio.get_running_loop().time()
         if request.content_type != "application/json":
             return answer(415, "send the operator's name as Content-Type: application/json")
         name, data = _ALARM.of(request) or "", await body(request)
-        result = self._north.acknowledge(name, data, f"web {request[BY]}", arrived)
+        result = await self._north.order("alarms", name, data, f"web {request[BY]}", arrived)
         if isinstance(result, Failure):
             return raw(payload.outcome(result), _STATUS.get(result.problem, 503))
         return raw(result)
-
-
-def alarms_shown(sources: Sources) -> Mapping[str, Any]:
-    """Returns the counts, and the first alarms that are not normal."""
-    found = open_alarms(sources.plant)
-    shown = [alarm_fields(entry, sources.plant.sample) for entry in found[:MOST_SHOWN]]
-    return {"shown": shown, "more": max(0, len(found) - MOST_SHOWN)}

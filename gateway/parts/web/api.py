@@ -16,20 +16,20 @@ from aiohttp import web
 from gateway.contract import bucket_documents as buckets
 from gateway.contract import past, payload
 from gateway.contract.buckets import Now
-from gateway.contract.faults import below, faults, transfers, warnings
+from gateway.contract.faults import Documents, below, faults, transfers, warnings
 from gateway.contract.interfaces import History
 from gateway.contract.meta import meta_fields
 from gateway.contract.payload import Problem
 from gateway.contract.question import question
 from gateway.errors import BadValue, Busy, GatewayError
-from gateway.northbound.session.session import off_loop
 from gateway.parts.web.connections import client_of
 from gateway.parts.web.guard import BY
 from gateway.parts.web.places import Places
 from gateway.parts.web.replies import answer, as_json, body, json_off_loop, raw
 from gateway.parts.web.routes import LIMIT, Choice, Count, Route, Word
 from gateway.parts.web.schemas import ref
-from gateway.parts.web.sources import Documents, Sources
+from gateway.plant.part import Core
+from gateway.plant.threads import off_loop
 from gateway.tags import Tag
 from gateway.tags.sample import has_value
 
@@ -75,10 +75,10 @@ _QUESTION = (
 class Api:
     """The handlers."""
 
-    def __init__(self, sources: Sources) -> None:
-        self._plant = sources.plant
-        self._north = sources.north
-        self._history = sources.history
+    def __init__(self, core: Core) -> None:
+        self._plant = core.plant
+        self._north = core.north
+        self._core = core
         self._known: tuple[object, Mapping[str, Sequence[Tag]]] = (None, {})
         self._history_turns = asyncio.Semaphore(HISTORY_AT_ONCE)
         self._history_places = Places(HISTORY_WAITING, HISTORY_OF_CLIENT, "queries of history")
@@ -250,9 +250,13 @@ class Api:
 
     async def _samples(self, request: web.Request) -> web.Response:
         key = _TAG.of(request) or ""
-        tag, history = self._plant.tag(key), self._history
+        tag = self._plant.tag(key)
         if tag is None:
             return answer(404, f"there is no tag {payload.short(key)}")
+        try:
+            history = self._core.history()
+        except Busy as error:
+            return answer(503, str(error))
         if history is None or not tag.history:
             return answer(404, f"no history is kept of {tag.key}: it needs `history: true`")
         limit = _SAMPLES.of(request)

@@ -8,7 +8,7 @@ nothing for `SLOW` seconds is dropped.
 import asyncio
 import json
 import time
-from collections import deque
+from collections import ChainMap, deque
 from collections.abc import Callable, Mapping, Sequence
 from itertools import islice
 from typing import Any
@@ -17,15 +17,14 @@ import orjson
 from aiohttp import web
 
 from gateway.contract import payload
-from gateway.contract.faults import below, transfers
-from gateway.parts.web.alarms import alarms_shown
+from gateway.contract.faults import Documents, below, transfers
 from gateway.parts.web.api import Api, overview
 from gateway.parts.web.connections import client_of
 from gateway.parts.web.places import Places
 from gateway.parts.web.replies import drop
 from gateway.parts.web.routes import Route, Word
-from gateway.parts.web.sources import Documents, Sources
 from gateway.parts.web.wire import Recorder, Wires, as_fields
+from gateway.plant.part import Core, Shown
 from gateway.tags import Quality, Sample, Tag
 
 MOST_PAGES = 20  # and of one client
@@ -47,8 +46,8 @@ _AFTER = Word("after", "From after this tag")
 class Loads:
     """The load of each line in the last half hour."""
 
-    def __init__(self, sources: Sources) -> None:
-        self._north = sources.north
+    def __init__(self, core: Core) -> None:
+        self._north = core.north
         self._last: Mapping[str, float] = {}
         self._at = 0.0
         self._loads: dict[str, deque[float]] = {}
@@ -85,14 +84,14 @@ class Events:
     """The handler of `/api/events`."""
 
     def __init__(
-        self, sources: Sources, api: Api, loads: Loads, allowed: Callable[[web.Request], bool]
+        self, core: Core, api: Api, loads: Loads, allowed: Callable[[web.Request], bool]
     ) -> None:
         """`allowed`: False when the token of a request was withdrawn."""
-        self._sources = sources
+        self._core = core
         self._api = api
         self.loads = loads
         self._allowed = allowed
-        self.wires = Wires(sources.plant)
+        self.wires = Wires(core.plant)
         self._pages = Places(MOST_PAGES, MOST_PAGES_OF_CLIENT, "pages")
         self._state: tuple[Documents, dict[str, Any]] = ({}, {})
 
@@ -112,8 +111,8 @@ class Events:
     def state(self, documents: Documents) -> dict[str, Any]:
         """Returns the state as all pages get it; made once for the same documents."""
         if self._state[0] is not documents:
-            alarms = alarms_shown(self._sources)
-            self._state = documents, {**_state(documents), "alarms": alarms}
+            shown = ChainMap(*[part.shown() for part in self._core.others.each(Shown)])
+            self._state = documents, {**_state(documents), **shown}
         return self._state[1]
 
     async def handle(self, request: web.Request) -> web.StreamResponse:
@@ -127,7 +126,7 @@ class Events:
             response = web.StreamResponse(headers={"Content-Type": "text/event-stream"})
             response.headers["X-Accel-Buffering"] = "no"  # a proxy passes events on at once
             await response.prepare(request)
-            page = Page(self._sources, self, tags, recorder)
+            page = Page(self._core, self, tags, recorder)
             await _send(request, response, page, self._allowed)
         return response
 
@@ -155,12 +154,12 @@ class Page:
 
     def __init__(
         self,
-        sources: Sources,
+        core: Core,
         events: Events,
         tags: Sequence[Tag] | None,
         recorder: Recorder | None,
     ) -> None:
-        self._sources = sources
+        self._core = core
         self._events = events
         self._tags = tags
         self._recorder = recorder
@@ -175,7 +174,7 @@ class Page:
         loop = asyncio.get_running_loop()
         events = []
         if self._state_due <= loop.time():
-            documents = await self._sources.north.documents(STATE_EVERY)
+            documents = await self._core.north.documents(STATE_EVERY)
             self._state_due = loop.time() + STATE_EVERY
             events.append(_event("state", self._state(documents)))
             loads = self._events.loads
@@ -198,14 +197,14 @@ class Page:
         whole = self._events.state(documents)
         changed = {name: _changes(self._shown.get(name, {}), whole[name]) for name in _BY_NAME}
         self._shown = {name: whole[name] for name in _BY_NAME}
-        return {**whole, "ready": self._sources.ready(), **changed}
+        return {**whole, "ready": self._core.north.is_ready, **changed}
 
     def _values(self, tags: Sequence[Tag]) -> list[list[object]]:
         """Returns the values that changed, or were read again: the text of the value as in JSON,
         because a browser rounds large integers."""
         found = []
         for tag in tags:
-            sample = self._sources.plant.sample(tag)
+            sample = self._core.plant.sample(tag)
             if self._sent.get(tag) == sample:
                 continue
             self._sent[tag] = sample

@@ -18,9 +18,9 @@ from prometheus_client.exposition import CONTENT_TYPE_LATEST, generate_latest
 from prometheus_client.process_collector import ProcessCollector
 from prometheus_client.registry import Collector, CollectorRegistry
 
-from gateway.contract.faults import below, faults, transfers, warnings
+from gateway.contract.faults import Documents, below, faults, transfers, warnings
+from gateway.contract.interfaces import Plant
 from gateway.engine.device.records import COMPLETE
-from gateway.parts.web.sources import Documents, Plant
 from gateway.tags import Quality
 
 CONTENT_TYPE = CONTENT_TYPE_LATEST
@@ -99,8 +99,12 @@ def _metrics(documents: Documents, plant: Plant, *, ready: bool) -> Iterator[Met
     for name, field, text in _ZENOH:
         yield _one(name, text, {}, documents["zenoh"].get(field, 0))
     yield from _transfers(documents)
+    parts = _family("part_working", "1: the part of the gateway works", "part")
+    for name, part in documents.get("parts", {}).items():
+        parts.add_metric([name], not part["why"])
+    yield parts
     alarms = _family("alarms", "Alarms by state", "state")
-    for state, count in documents["alarms"].items():
+    for state, count in documents.get("alarms", {}).items():
         alarms.add_metric([state], count)
     yield alarms
     if (clock := documents.get("clock")) is not None:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 import orjson
 from aiohttp import web
 
-from gateway.northbound.session.session import off_loop
+from gateway.plant.threads import off_loop
 
 BODY_WITHIN = 5.0  # seconds
 PIECE_WITHIN = 15.0  # seconds in which a client takes a piece of an answer

@@ -15,7 +15,6 @@ from aiohttp import web
 from aiohttp.http_exceptions import HttpProcessingError
 
 from gateway.config import WebConfig
-from gateway.northbound.session.session import off_loop
 from gateway.parts.web import assets, metrics, openapi
 from gateway.parts.web.alarms import AlarmApi
 from gateway.parts.web.api import Api
@@ -23,7 +22,8 @@ from gateway.parts.web.connections import Connections
 from gateway.parts.web.events import Events, Loads
 from gateway.parts.web.guard import Guard, add_headers
 from gateway.parts.web.routes import Route
-from gateway.parts.web.sources import Sources
+from gateway.plant.part import Core, Routed
+from gateway.plant.threads import off_loop
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger(__name__)
 
@@ -50,17 +50,18 @@ _FAULTS.addFilter(_is_fault_of_ours)
 class Server:
     """The HTTP side of one gateway. Raises `ConfigError` for a bad tokens file."""
 
-    def __init__(self, config: WebConfig, sources: Sources) -> None:
+    def __init__(self, config: WebConfig, core: Core) -> None:
         self._config = config
-        self._sources = sources
-        self._api = Api(sources)
-        self._loads = Loads(sources)
+        self._core = core
+        self._api = Api(core)
+        self._loads = Loads(core)
         self._connections = Connections()
         guard = Guard(config, self._connections)
-        events = Events(sources, self._api, self._loads, guard.allows)
+        events = Events(core, self._api, self._loads, guard.allows)
         routes = [
             *self._api.routes(),
-            *AlarmApi(sources).routes(),
+            *AlarmApi(core).routes(),
+            *(route for part in core.others.each(Routed) for route in part.routes()),
             *events.routes(),
             *self._probes(),
             *assets.routes(),
@@ -170,14 +171,14 @@ class Server:
         return web.Response(text="ok\n")
 
     async def _ready(self, _: web.Request) -> web.Response:
-        if self._sources.ready():
+        if self._core.north.is_ready:
             return web.Response(text="ready\n")
         return web.Response(status=503, text="not ready: the gateway does not serve its plant\n")
 
     async def _metrics(self, _: web.Request) -> web.Response:
-        documents = await self._sources.north.documents(SCRAPE_AGE)
-        ready = self._sources.ready()
-        plant = self._sources.plant
+        documents = await self._core.north.documents(SCRAPE_AGE)
+        ready = self._core.north.is_ready
+        plant = self._core.plant
 
         def text() -> bytes:
             return metrics.exposition(documents, plant, ready=ready)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from gateway.line.exchanges import Exchange, decoded
 from gateway.line.wire_log import Event, Performed
-from gateway.parts.web.sources import Plant
+from gateway.plant.plant import Plant
 
 MOST_KEPT = 600  # exchanges of a line; a page asks four times a second
 

@@ -2,19 +2,18 @@
 
 import asyncio
 import gc
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 
 from gateway.config import Config
 from gateway.config.changes import Difference, compare
 from gateway.northbound.northbound import Northbound
-from gateway.northbound.session.session import off_loop
-from gateway.plant.plant import Gateway
+from gateway.plant.plant import Plant
+from gateway.plant.threads import off_loop
+from gateway.service.bulkheads import Bulkheads
 from gateway.service.reload.lines import RunningLines
 from gateway.service.reload.reloader import Reloader
 from gateway.service.reload.renewal import Renewal
 from gateway.service.supervisor import Supervisor
-from gateway.tags import Tag
-from gateway.tags.transfer import TransferRule
 
 
 class LiveReload:
@@ -23,21 +22,21 @@ class LiveReload:
     def __init__(
         self,
         reloader: Reloader,
-        gateway: Gateway,
+        plant: Plant,
         northbound: Northbound,
         lines: RunningLines,
         plans: Sequence[asyncio.Task[None]],
         supervisor: Supervisor,
-        renew: Callable[[Sequence[TransferRule], Mapping[Tag, Tag]], None],
+        parts: Bulkheads,
     ) -> None:
-        """`plans` end when every line is planned. `renew` takes over the transfers."""
+        """`plans` end when every line is planned."""
         self._reloader = reloader
-        self._gateway = gateway
+        self._plant = plant
         self._northbound = northbound
         self._lines = lines
         self._plans = plans
         self._supervisor = supervisor
-        self._renew = renew
+        self._parts = parts
 
     async def run(self) -> None:
         """Runs until cancelled. A gateway that is not active starts over with a good file."""
@@ -57,7 +56,7 @@ class LiveReload:
             watching.cancel()
 
     async def _reload(self, file: Config) -> None:
-        gateway, northbound = self._gateway, self._northbound
+        plant, northbound = self._plant, self._northbound
         config = file.without(northbound.withheld)
         if taken := northbound.taken(device.name for device in config.devices):
             self._reloader.refuse(
@@ -66,12 +65,12 @@ class LiveReload:
             return
         if self._plans:
             await asyncio.wait(self._plans)
-        difference = await off_loop(compare, gateway.config, config)
+        difference = await off_loop(compare, plant.config, config)
         if difference:
             await self._take_over(difference, file)
         else:
-            gateway.configure(difference.config)
-        self._renew(difference.config.transfers, difference.renewed)
+            plant.configure(difference.config)
+        await self._parts.take_over(difference.config, difference.renewed)
         self._reloader.accept(file, difference)
 
     async def _take_over(self, difference: Difference, file: Config) -> None:
@@ -80,7 +79,7 @@ class LiveReload:
         index = await off_loop(northbound.index, difference.config.devices)
         # A device is claimed before its first request, and until after its last one.
         await northbound.claim(names.union(d.name for d in self._reloader.current.devices))
-        await Renewal(self._gateway, self._lines, difference).run()
+        await Renewal(self._plant, self._lines, difference).run()
         gone = [tag for change in difference.devices.values() for tag in change.gone]
         await northbound.change(index, [*gone, *difference.computed.gone])
         await northbound.claim(names)

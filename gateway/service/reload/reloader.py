@@ -9,7 +9,7 @@ import structlog
 
 from gateway.config import Config, ConfigErrors, load
 from gateway.config.changes import Difference, needs_restart
-from gateway.northbound.session.session import off_loop
+from gateway.plant.threads import off_loop
 from gateway.service.reload.watch import LOOK_EVERY, Watch
 from gateway.tags.timestamps import rfc3339
 

@@ -13,9 +13,9 @@ from gateway.engine.device.changes import Changes
 from gateway.engine.device.device import Device
 from gateway.engine.forecast import forecast
 from gateway.line.line import Line
-from gateway.northbound.session.session import off_loop
 from gateway.planning.bad_addresses import KnownBad
-from gateway.plant.plant import Gateway
+from gateway.plant.plant import Plant
+from gateway.plant.threads import off_loop
 from gateway.service.reload.lines import RunningLines
 from gateway.tags import Tag
 
@@ -23,12 +23,12 @@ from gateway.tags import Tag
 class Renewal:
     """One reload of a running gateway."""
 
-    def __init__(self, gateway: Gateway, lines: RunningLines, difference: Difference) -> None:
-        self._gateway = gateway
+    def __init__(self, plant: Plant, lines: RunningLines, difference: Difference) -> None:
+        self._plant = plant
         self._lines = lines
         self._difference = difference
         self._source = {
-            d.name: line.engine.name for line in gateway.lines for d in line.engine.devices
+            d.name: line.engine.name for line in plant.lines for d in line.engine.devices
         }
         self._target = {
             device.name: line.name
@@ -40,32 +40,32 @@ class Renewal:
 
     async def run(self) -> None:
         """Returns when every line has taken over its changes."""
-        gateway, difference = self._gateway, self._difference
-        running = {device.name: device for line in gateway.lines for device in line.engine.devices}
+        plant, difference = self._plant, self._difference
+        running = {device.name: device for line in plant.lines for device in line.engine.devices}
         known = {
             change.name: (running[change.name], running[change.name].bad_addresses.known())
             for change in difference.devices.values()
             if change.continues
         }
         self._made = await off_loop(self._make, known)
-        gateway.take_over(
+        plant.take_over(
             [
                 change
                 for change in difference.devices.values()
                 if change.name not in self._source and change.name not in self._target
             ]
         )
-        await asyncio.gather(*[self._leave(line) for line in gateway.lines])
-        stay = [*gateway.lines]
+        await asyncio.gather(*[self._leave(line) for line in plant.lines])
+        stay = [*plant.lines]
         await asyncio.gather(
             *(self._arrive(line) for line in stay), *(self._open(one) for one in difference.opened)
         )
-        gateway.configure(difference.config)
-        gateway.compute(difference.computed.started, difference.computed.gone)
+        plant.configure(difference.config)
+        plant.compute(difference.computed.started, difference.computed.gone)
 
     def _make(self, known: Mapping[str, tuple[Device, KnownBad]]) -> Mapping[str, Device]:
         """Makes and plans the devices of lines that stay open. On a thread."""
-        wires = {line.engine.name: line.engine.wire for line in self._gateway.lines}
+        wires = {line.engine.name: line.engine.wire for line in self._plant.lines}
         for one in self._difference.opened:
             wires.pop(one.name, None)
         made = {}
@@ -102,7 +102,7 @@ class Renewal:
             await self._change(line, changes, Changes(removed, added, replaced, _renewed(changes)))
         if closed:
             await self._lines.end(line)
-            self._gateway.remove_line(line)
+            self._plant.remove_line(line)
 
     async def _arrive(self, line: Line) -> None:
         """Adds the devices that were on no line, or on another one."""
@@ -113,24 +113,24 @@ class Renewal:
             await self._change(line, self._new(arriving), Changes(added=added))
 
     async def _open(self, config: LineConfig) -> None:
-        gateway = self._gateway
-        gateway.take_over(self._new(self._on(config.name)))
-        line = gateway.add_line(config)
-        gateway.planned(line, await off_loop(gateway.plan, line))
+        plant = self._plant
+        plant.take_over(self._new(self._on(config.name)))
+        line = plant.add_line(config)
+        plant.planned(line, await off_loop(plant.plan, line))
         self._lines.start(line, config.name, line.run())
 
     async def _change(self, line: Line, tags: list[DeviceChange], changes: Changes) -> None:
-        gateway, engine = self._gateway, line.engine
+        plant, engine = self._plant, line.engine
         here = [*changes.added, *(new for _, new in changes.replaced)]
 
         def applied() -> None:
-            gateway.move([device.name for device in changes.removed], line, here)
-            gateway.take_over(tags)
+            plant.move([device.name for device in changes.removed], line, here)
+            plant.take_over(tags)
 
         settings = {one.name: one.devices for one in self._difference.config.lines}
         await line.change(changes, settings.get(engine.name, ()), applied)
         devices = [*engine.devices]
-        gateway.expect(await off_loop(forecast, engine.name, devices, engine.wire))
+        plant.expect(await off_loop(forecast, engine.name, devices, engine.wire))
 
     def _on(self, line: str) -> list[DeviceChange]:
         """Returns the changes of enabled devices that the line has from now on."""

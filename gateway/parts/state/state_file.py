@@ -19,7 +19,7 @@ from gateway.tags.kept import CounterState
 
 FORMAT = 1
 LATEST = 2**63 - 1  # ns since 1970: the year 2262
-_Content = tuple[Mapping[str, KnownBad], Mapping[str, CounterState]]
+Content = tuple[Mapping[str, KnownBad], Mapping[str, CounterState]]
 
 
 class StateFile:
@@ -32,12 +32,13 @@ class StateFile:
         self.save, self.save_soon = self._file.save, self._file.save_soon
         self.save_last = self._file.save_last
 
-    def restore(self, devices: Iterable[Device]) -> None:
-        """Restores what the file knows of the devices, and plans again those that have a plan.
+    def load(self) -> Content:
+        """Reads the file. Moves a file aside that cannot be parsed. Blocks."""
+        return self._file.load(_parse) or ({}, {})
 
-        Moves a file aside that cannot be parsed.
-        """
-        learned_by_name, self.counters = self._file.load(_parse) or ({}, {})
+    def restore(self, devices: Iterable[Device], content: Content | None = None) -> None:
+        """Restores what the file knows of the devices, and plans again those that have a plan."""
+        learned_by_name, self.counters = self.load() if content is None else content
         for device in devices:
             if (learned := learned_by_name.get(device.name)) is not None:
                 device.bad_addresses.restore(learned, device.tags)
@@ -60,7 +61,7 @@ class StateFile:
         )
 
 
-def _parse(document: Any) -> _Content:
+def _parse(document: Any) -> Content:
     if document["form"] != FORMAT:
         raise ValueError(f"form {document['form']} is not {FORMAT}")
     devices = {name: _from_json(entry) for name, entry in document["devices"].items()}

@@ -1,10 +1,15 @@
-"""The forecasts of the lines of a running gateway, with the writes of its transfers."""
+"""The forecasts of the lines of a running gateway."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from gateway.config import Config
 from gateway.engine.forecast import LineForecast
-from gateway.parts.transfers.forecast import transfer_forecasts, with_transfers
+
+Adjust = Callable[[Config, Sequence[LineForecast]], Sequence[LineForecast]]
+
+
+def _as_they_are(_: Config, lines: Sequence[LineForecast]) -> Sequence[LineForecast]:
+    return lines
 
 
 class Expected:
@@ -13,8 +18,14 @@ class Expected:
     def __init__(self, config: Callable[[], Config]) -> None:
         """`config`: the present content of the file."""
         self._config = config
-        self._polls: dict[str, LineForecast] = {}  # by line, without transfers
+        self._adjust: Adjust = _as_they_are
+        self._polls: dict[str, LineForecast] = {}  # by line, polls alone
         self._found: tuple[Config | None, dict[str, LineForecast]] = (None, {})
+
+    def adjust(self, adjust: Adjust) -> None:
+        """Adds the requests of a part to the polls."""
+        self._adjust = adjust
+        self._found = (None, {})
 
     def take(self, line: LineForecast) -> None:
         """Takes over the forecast of the polls of a line."""
@@ -26,10 +37,9 @@ class Expected:
         self._found = (None, {})
 
     def lines(self) -> dict[str, LineForecast]:
-        """Returns the forecasts by line. The writes are calculated once for each change."""
+        """Returns the forecasts by line, adjusted once for each change."""
         config = self._config()
         if self._found[0] is not config:
-            polls = [*self._polls.values()]
-            whole = with_transfers(polls, transfer_forecasts(config, polls))
+            whole = self._adjust(config, [*self._polls.values()])
             self._found = config, {one.name: one for one in whole}
         return self._found[1]

@@ -1,0 +1,145 @@
+"""The entry of one block in the schedule: when it is read, and how far its polls came."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+from gateway.engine.device.block_reads import BlockReads
+from gateway.engine.device.device import Device
+from gateway.engine.device.health import PAUSE_FIRST, PAUSE_LONGEST
+from gateway.engine.jobs.jobs import Poll
+from gateway.planning.planner import Block
+from gateway.protocols.driver import Span
+
+NOT_QUEUED, EXPEDITED, ON_DEMAND = -1, -2, -3  # tickets of polls that are in no heap
+
+
+@dataclass(slots=True, eq=False)
+class PollEntry:
+    """One block that is polled. Times by the line's clock."""
+
+    device: Device
+    block: Block
+    due: float
+    missed: int = 0  # rounds in a row without a reply, while the device replies to others
+    reads: BlockReads = field(default_factory=BlockReads)
+    tries: int = 0
+    soon: float = math.inf  # an earlier deadline, because its values are bad
+    asked: float = 0.0  # when it was handed out last
+    expedited: bool = False  # before its time, because a client waits
+    phased: bool = True  # it has found its place in the period
+    live: bool = True  # False after the device was planned again
+    ticket: int = NOT_QUEUED  # its one valid place in the queues
+    job: Poll = field(init=False)  # that the line gets
+    _longer: dict[Span, Poll] = field(default_factory=dict)  # jobs for longer spans
+
+    def __post_init__(self) -> None:
+        self.job = Poll(self.device, self.block, self.block.span)
+
+    @property
+    def every(self) -> float:
+        """Seconds until it is due again. They grow while no reply arrives."""
+        every = self.device.interval(self.block)
+        if self.missed:
+            every = max(every, min(PAUSE_FIRST * 2.0 ** min(self.missed, 10), PAUSE_LONGEST))
+        return every
+
+    @property
+    def deadline(self) -> float:
+        """The latest time to start the poll: its interval after due, also for a bad address.
+
+        It is earlier for a block of a long interval without good values.
+        """
+        return min(self.due + self.block.every, self.soon)
+
+    # Its place
+
+    def queue(self, ticket: int) -> None:
+        """Notes its one valid place."""
+        self.ticket = ticket
+
+    def retire(self) -> None:
+        """Leaves the schedule: another plan reads its tags."""
+        self.live = False
+
+    def due_by(self, when: float) -> None:
+        """Makes it due at `when` at the latest."""
+        self.due = min(self.due, when)
+
+    def hasten(self, deadline: float) -> None:
+        """Gives it an earlier deadline; `inf`: that of its interval."""
+        self.soon = deadline
+
+    def hand_out(self, now: float, *, expedited: bool = False) -> "PollEntry":
+        """Begins a poll: `job` is what the line has to read."""
+        self.ticket = NOT_QUEUED  # its entry in the heap is stale now
+        if self.due > now:
+            self.due = now
+        self.asked, self.expedited = now, expedited
+        block, device, job = self.block, self.device, self.job
+        shapes = device.shapes
+        span = block.span if shapes is None else shapes.polled(block, now)
+        if block.listed:
+            register = device.monitor.must_register(block.listed)
+            if register is not job.register:
+                self.job = Poll(device, block, span, register)
+        elif span is not job.span:
+            self.job = self._job(span)
+        return self
+
+    def _job(self, span: Span) -> Poll:
+        found = self._longer.get(span)
+        if found is None:
+            found = self._longer[span] = Poll(self.device, self.block, span)
+        return found
+
+    # Its results
+
+    def ended(self, now: float, answered: bool, phases: Iterator[float] | None) -> None:
+        """Makes it due again, after a good or a bad read.
+
+        `phases`: the shares of the period by which the next blocks begin early, so that polls are
+        spread over it; None: they are not spread.
+        """
+        device, block = self.device, self.block
+        if answered:
+            self.missed = 0
+            every = self.every if device.bad_addresses.bad else block.every
+        else:
+            self.missed += 1
+            every = self.every
+        asked, self.tries = self.asked, 0
+        behind = int((asked - self.due) / every)
+        if behind:
+            device.record.count_overruns(behind)
+            self.reads.count_overruns(behind)
+            self.due = asked + every
+        else:
+            self.due = (asked if self.missed else self.due) + every
+        if phases is not None and not self.phased:
+            self.phased = True
+            self.due -= every * next(phases)
+        if self.reads.at is None and block.span not in device.bad_addresses.bad:
+            self.due_by(now + PAUSE_LONGEST)  # the cause may have gone
+
+    def try_again(self, when: float | None, *, counted: bool) -> None:
+        """Notes that the same read is repeated, from `when` on."""
+        self.tries += counted
+        self.device.record.count_retry()
+        if when is not None:
+            self.due = when
+
+    def forget(self, now: float) -> float:
+        """Forgets the last read, because its values turn bad. Returns their age."""
+        self.device.record.was_good(self.reads.at)
+        return self.reads.forget(now)
+
+    def came_online(self, now: float) -> None:
+        """Is due at once, because its device came online. Its values are bad."""
+        self.due, self.missed = now, 0
+        self.device.record.was_good(self.reads.at)
+        self.reads.restart()
+
+    def spread(self) -> None:
+        """Takes another place in the period after its next read."""
+        self.phased = False

@@ -1,0 +1,166 @@
+"""The alarms as a part: judged with each read, kept in a file, published and acknowledged."""
+
+import asyncio
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from itertools import islice
+from typing import Any
+
+import orjson
+
+from gateway.config import Config
+from gateway.contract import payload
+from gateway.contract.interfaces import History, Keyed
+from gateway.errors import BadValue, Busy, Unknown
+from gateway.parts.alarms.board import Alarms, Entry
+from gateway.parts.alarms.documents import alarm_fields, open_alarms, parse_acknowledgement
+from gateway.parts.alarms.file import AlarmFile
+from gateway.parts.alarms.machine import Event, State
+from gateway.parts.alarms.watched import conditions
+from gateway.plant.part import Core, Kind
+from gateway.tags import Sample, Tag
+from gateway.tags.scan import Scan
+from gateway.tags.timestamps import rfc3339
+
+LOOK_EVERY = 1.0  # seconds between two looks at the conditions
+MOST_SHOWN = 50  # on the status page
+_BATCH_SIZE = 500  # alarms in one turn of the loop
+
+
+class AlarmPart:
+    """All alarms of the gateway. As many as the file has tags, devices, lines and transfers."""
+
+    def __init__(self, core: Core) -> None:
+        self._core = core
+        self._plant = core.plant
+        self.alarms = Alarms(core.plant.tags(), core.plant.wall)
+        self._file = AlarmFile(core.config.alarms.path, self.alarms)
+        self._version = -1  # of the conditions
+        self.alarms.subscribe(self._changed)
+
+    # -- life --
+
+    async def begin(self) -> None:
+        self._watch()
+        await self._file.restore()
+
+    async def run(self) -> None:
+        async with self._file.kept(), asyncio.TaskGroup() as tasks:
+            tasks.create_task(self._look())
+
+    async def _look(self) -> None:
+        while True:
+            self._watch()
+            self.alarms.look()
+            await asyncio.sleep(LOOK_EVERY)
+
+    def _watch(self) -> None:
+        """Follows the conditions of the plant and of other parts."""
+        found = self._plant.conditions
+        found.put("alarms", conditions(self._plant.lines, self._core.config.alarms))
+        self.alarms.watch(found.all())
+
+    async def take_over(self, config: Config, renewed: Mapping[Tag, Tag]) -> None:
+        self._watch()
+
+    def retag(self, tags: Sequence[Tag], gone: Sequence[Tag]) -> None:
+        self.alarms.take_over(tags, gone)
+
+    # -- samples --
+
+    @property
+    def wants(self) -> bool:
+        return self.alarms.of_tags
+
+    def seen(self, samples: Sequence[Sample]) -> None:
+        if not (type(samples) is Scan and samples.latest.alarmed == ()):
+            self.alarms.judge(samples)
+
+    # -- documents --
+
+    def documents(self) -> Mapping[str, Mapping[str, object]]:
+        return {"alarms": self.alarms.counts()}
+
+    def document(self, entry: Entry) -> bytes:
+        return payload.document(self._fields(entry))
+
+    def _fields(self, entry: Entry) -> dict[str, object]:
+        return alarm_fields(entry, self._plant.sample)
+
+    def _changed(self, entry: Entry, event: Event | None) -> None:
+        """`event` None: only the quality of the value has changed."""
+        self._publish(entry)
+        if event is None:
+            return
+        try:
+            history = self._core.history()
+        except Busy:
+            return  # the part that keeps it is a fault already
+        if history is not None:
+            fields = {"event": event.value, **self._fields(entry)}
+            history.record_alarm(entry.status.since, payload.document(fields).decode())
+
+    def _publish(self, entry: Entry) -> None:
+        """The publishing thread makes the document: a line that is lost changes many at once."""
+        self._core.north.publish_latest(f"alarms/{entry.key}", partial(self.document, entry))
+
+    async def publish_all(self) -> None:
+        entries = list(self.alarms.entries.values())
+        for start in range(0, len(entries), _BATCH_SIZE):
+            for entry in entries[start : start + _BATCH_SIZE]:
+                self._publish(entry)
+            await asyncio.sleep(0)
+
+    def entries(self) -> Sequence[tuple[str, Callable[[], bytes]]]:
+        found = list(self.alarms.entries.items())
+        return [(key, partial(self.document, entry)) for key, entry in found]
+
+    def recorded(self, history: History, time_range: str, now: int) -> Iterator[tuple[str, str]]:
+        for row in history.alarms(time_range, None, now):
+            yield str(orjson.loads(row)["alarm"]), row
+
+    # -- operators --
+
+    async def order(self, path: str, data: bytes, by: str | None) -> bytes:
+        """Acknowledges an alarm. Raises `BadValue`, `Unknown`, `NothingToAcknowledge`."""
+        name, raised = parse_acknowledgement(data)
+        entry = self.alarms.entries.get(path)
+        if entry is None:
+            raise Unknown(f"there is no alarm {payload.short(path)}")
+        seen = entry.status.raised
+        if raised is not None and raised != rfc3339(seen):
+            seen = -1
+        self.alarms.acknowledge(entry.key, name, by, None if raised is None else seen)
+        return self.document(entry)
+
+    def page(self, state: str, after: str | None, most: int) -> Mapping[str, Any]:
+        """Returns a page of the list, after the alarm `after`. Any thread may call it.
+
+        `state`: one of `State`, `open` for all that are not normal, or `all`. Raises `BadValue`.
+        """
+        if state not in ("open", "all", *State):
+            raise BadValue(f"state is none of open, all, {', '.join(State)}")
+        found = self._select(state)
+        if after is not None:
+            keys = [entry.key for entry in found]
+            found = found[keys.index(after) + 1 :] if after in keys else []
+        return {
+            "alarms": [self._fields(one) for one in islice(found, most)],
+            "counts": self.alarms.counts(),
+            "next": found[most - 1].key if len(found) > most else None,
+        }
+
+    def _select(self, state: str) -> list[Entry]:
+        if state == "open":
+            return open_alarms(self.alarms)
+        entries = list(self.alarms.entries.values())
+        return [one for one in entries if state in ("all", one.status.state.value)]
+
+    def shown(self) -> Mapping[str, Any]:
+        """Returns the first alarms that are not normal."""
+        found = open_alarms(self.alarms)
+        shown = [self._fields(entry) for entry in found[:MOST_SHOWN]]
+        return {"alarms": {"shown": shown, "more": max(0, len(found) - MOST_SHOWN)}}
+
+
+KIND = Kind(AlarmPart, serves=Keyed)

@@ -1,0 +1,1 @@
+"""What the gateway has learned of its devices, kept across restarts."""
