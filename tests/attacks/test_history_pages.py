@@ -22,11 +22,11 @@ RUNS, IN_RUN = 5, 400
 EVERYTHING = {f"{TAGS[n % 20].key} {n}" for n in range(RUNS * IN_RUN)}
 
 
-def recorded(path: Path) -> None:
+def recorded(path: Path, in_run: int = IN_RUN) -> None:
     """Five sorted runs."""
     with closing(HistoryFile(path, 10**8)) as file:
         for run in range(1, RUNS + 1):
-            numbers = range((run - 1) * IN_RUN, run * IN_RUN)
+            numbers = range((run - 1) * in_run, run * in_run)
             file.store(run, 0, [good(TAGS[n % 20], n, NOON + n * SECOND) for n in numbers])
             file.sort(run, NOON + run)
 
@@ -154,3 +154,17 @@ async def test_damage_is_told_and_the_rest_is_answered(tmp_path: Path) -> None:
         await client.get_until(
             "plant/@gateway/demo/history", lambda status: "damaged" in status["state"]
         )
+
+
+async def test_a_client_that_reads_slowly_behind_large_buffers_gets_all(tmp_path: Path) -> None:
+    """Without an error it would take half of the answer for the whole."""
+    endpoint, many = free_endpoint(), 6000
+    recorded(tmp_path / "h.db", many)
+    async with (
+        serving(tmp_path, endpoint),
+        paced_link(endpoint, rate=2_000_000, large=True) as link,
+        ZenohPeer("client", connect=[link.endpoint]) as client,
+    ):
+        replies = await client.get("plant/**?_time=[..]", timeout=90, consolidation="NONE")
+        assert len(shown(replies)) == RUNS * many
+        assert link.connections == 1

@@ -3,7 +3,8 @@
     async with paced_link(endpoint, rate=64_000, delay=0.3) as slow:    # bits/s, seconds one way
         async with ZenohPeer("client", connect=[slow.endpoint]) as client: ...
 
-Small socket buffers push back on the sender soon, as a modem does. `loss` delays a segment, and all
+Small socket buffers push back on the sender soon, as a modem does; `large` ones take megabytes, as
+those of a tunnel. `loss` delays a segment, and all
 behind it, by a round trip, as TCP does when it sends a segment again.
 """
 
@@ -31,6 +32,7 @@ class PacedLink:
     rate: float
     delay: float = 0.0
     loss: float = 0.0
+    large: bool = False
     carried: int = 0
     connections: int = 0
     _chance: random.Random = field(default_factory=lambda: random.Random(1))
@@ -45,7 +47,8 @@ class PacedLink:
         task.add_done_callback(lambda _: client.close())  # a task may end before it begins
 
     async def _connect(self, client: socket.socket) -> None:
-        with suppress(ConnectionRefusedError), _small(socket.socket()) as server:
+        buffered = _large if self.large else _small
+        with suppress(ConnectionRefusedError), buffered(socket.socket()) as server:
             await asyncio.get_running_loop().sock_connect(server, self.target)
             client.setblocking(False)
             directions = [
@@ -112,17 +115,28 @@ def _small(end: socket.socket) -> socket.socket:
     return end
 
 
+def _large(end: socket.socket) -> socket.socket:
+    """Leaves the buffers to the system."""
+    end.setblocking(False)
+    return end
+
+
 @asynccontextmanager
 async def paced_link(
-    endpoint: str, rate: float = UNLIMITED, delay: float = 0.0, loss: float = 0.0
+    endpoint: str,
+    rate: float = UNLIMITED,
+    delay: float = 0.0,
+    loss: float = 0.0,
+    *,
+    large: bool = False,
 ) -> AsyncIterator[PacedLink]:
     """`endpoint`: of the gateway or router behind the link."""
     host, _, port = endpoint.removeprefix("tcp/").rpartition(":")
-    with _small(socket.socket()) as listener:
+    with (_large if large else _small)(socket.socket()) as listener:
         listener.bind(("127.0.0.1", 0))
         listener.listen()
         here = f"tcp/127.0.0.1:{listener.getsockname()[1]}"
-        link = PacedLink(here, (host, int(port)), rate, delay, loss)
+        link = PacedLink(here, (host, int(port)), rate, delay, loss, large)
         loop = asyncio.get_running_loop()
         loop.add_reader(listener, link.accept, listener)
         try:

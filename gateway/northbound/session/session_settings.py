@@ -30,6 +30,9 @@ _DEFAULTS: dict[str, object] = {
     # µs without progress that a client may hold an answering thread before its link is closed: the
     # client closes it too after the lease.
     "transport/link/tx/queue/congestion_control/block/wait_before_close": 3_000_000,
+    # Bytes of a socket. With the megabytes that Linux takes, a slow client behind large buffers
+    # makes no room for seconds although it reads all the time, and its link would be closed.
+    "transport/link/tcp/so_sndbuf": 256 * 1024,
     # A link ends when nothing arrives for the lease, and only a whole batch counts as arrived.
     # Zenoh's default of 64 kB takes 8 s at 64 kbit/s; this takes 1 s.
     "transport/link/tx/batch_size": 8192,
