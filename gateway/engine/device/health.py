@@ -89,9 +89,16 @@ class Health:
     _unanswered: deque[float] = field(default_factory=lambda: deque(maxlen=MOST_UNANSWERED))
     _probe_token: int = 0
     _extra: bool = False  # an extra reply arrived since the last resync
+    # A device server may hold requests to its station that this device never sent.
+    inherits: bool = False
 
     def __post_init__(self) -> None:
         self.needs_resync = self.answerable
+
+    def inherit(self, *, inherits: bool = True) -> None:
+        """Notes that a device server may have kept earlier requests to the station, or that it has
+        none any more: the wire was quiet for long before a resync."""
+        self.inherits = inherits
 
     def restart(self, trouble: LineDown | None = None) -> None:
         """Starts again after the line was opened or lost: an older reply may still arrive."""

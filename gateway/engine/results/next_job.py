@@ -73,6 +73,8 @@ class NextJob:
     def change(self, changes: Changes, now: float) -> None:
         """Takes over changed devices."""
         self.shorter.change(now)
+        for device in changes.added:  # its station may be that of a device before
+            device.health.inherit()
         for device in changes.left:
             self.pipelining.forget(device)
 
@@ -133,7 +135,7 @@ class NextJob:
             ):  # an error reply counts too, but may belong to an older request
                 told_from = result.told_from if isinstance(result, Resynced) else 0
                 outstanding = self._results.outstanding_requests(device)
-                inherited = self.inherits and told_from < EVERY_REQUEST
+                inherited = told_from < EVERY_REQUEST and (self.inherits or device.health.inherits)
                 if not probe.again and (outstanding > told_from or inherited):
                     # A device server may pass on all of them, one after another.
                     quiet = device.longest_reply
@@ -142,6 +144,7 @@ class NextJob:
                 else:
                     if probe.again:
                         self.inherits = False
+                        device.health.inherit(inherits=False)
                     self._results.answered(device, now, time, resynced=True)
             case Unclear():
                 self.unclear(probe, result, traffic, now, time)
@@ -184,6 +187,7 @@ class NextJob:
         if settle.error is None:
             if isinstance(result, Settled) and not result.quiet:
                 self.inherits = False  # it is another master that speaks
+                device.health.inherit(inherits=False)
                 self.unclear(after, Garbled(NEVER_QUIET), Traffic(), now, time)
             elif isinstance(after, Probe):
                 again = Probe(device, after.outstanding, after.token + 1, again=True)

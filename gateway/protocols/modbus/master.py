@@ -203,7 +203,7 @@ class Master:
         more read with another byte count follows it, unless requests carry a number.
 
         Reads stay inside the `spans`. If they hold no read of another byte count, every second
-        resync repeats the outstanding read, and the others read beyond the spans.
+        resync reads one of them, in turn, and the others read beyond the spans.
         """
         loopback = self.diagnostics and (self.numbered or not talk.may_echo)
         pick = self._harmless_pick(outstanding, spans)
@@ -228,13 +228,18 @@ class Master:
         self, outstanding: Span | None, spans: Sequence[Span]
     ) -> Callable[[int], Span]:
         """Returns the read of each probe token."""
-        if inside := HarmlessReads(spans, outstanding, self._form):
+        if inside := HarmlessReads(spans, None if self.numbered else outstanding, self._form):
             return inside.pick
         beyond = self._harmless(outstanding)
+        # The device may be silent about the outstanding address: the others are asked first.
+        alike = [span for span in spans if span != outstanding]
+        if spans and outstanding is not None:
+            alike.append(outstanding)
 
         def pick(token: int) -> Span:
-            if spans and outstanding is not None and token // 2 % 2:
-                return outstanding
+            step, second = divmod(token, 2)
+            if alike and step % 2:
+                return alike[(step // 2 + second) % len(alike)]
             return beyond[token % len(beyond)]
 
         return pick
