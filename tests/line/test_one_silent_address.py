@@ -8,8 +8,8 @@ import pytest
 from gateway.config import LineConfig, built
 from gateway.plant.plant import Plant
 from gateway.tags import Quality
-from tests.sim.bench import Bench
 from tests.line.slaves import station_of
+from tests.sim.bench import Bench
 from tests.sim.virtual import now, on_virtual_time
 
 NUMBERS = (100, 200, 300, 400, 500)
@@ -51,7 +51,8 @@ def plant_of(protocol: str) -> Plant:
 
     def opener(line: LineConfig) -> Any:
         [settings] = line.devices
-        station = Partly(station_of(settings.driver), protocol)
+        driver: Any = settings.driver  # one of the three of Modbus
+        station = Partly(station_of(driver), protocol)
         bench = Bench()
         return lambda receiver: bench.open([station], line.wire, receiver)
 
@@ -65,7 +66,7 @@ async def test_one_silent_register_costs_its_tag_alone(protocol: str) -> None:
     [line] = plant.lines
     task = asyncio.create_task(line.run())
     await asyncio.sleep(30)
-    good = {n: 0 for n in NUMBERS}
+    good = dict.fromkeys(NUMBERS, 0)
     for _ in range(120):
         await asyncio.sleep(1)
         for n in NUMBERS:
