@@ -74,7 +74,7 @@ async def test_an_alarm_survives_bad_values_and_a_restart(tmp_path: Path) -> Non
 async def test_an_acknowledgement_survives_a_kill(tmp_path: Path) -> None:
     """Eight alarms: each is acknowledged, answered, and still acknowledged after `kill -9`."""
     endpoint = free_endpoint()
-    tags = {f"t{n}": {"address": f"D{n}", "alarm": {"low": 80}} for n in range(8)}
+    tags = {f"t{n}": {"address": f"D{n}", "alarm": {"low": 30_000}} for n in range(8)}
     lines = {"hall": vigor_line("simulator", tags)}
     file = write_config(tmp_path / "plant.yaml", endpoint, lines, alarms={"path": "alarms.json"})
     keys = [f"plant/@gateway/demo/alarms/mixer/t{n}" for n in range(8)]
