@@ -27,16 +27,12 @@ def faults(documents: Documents) -> Iterator[str]:
     zenoh = documents.get("zenoh", {})
     if (wanted := zenoh.get("connect")) and not {"router", "peer"} & set(zenoh["to"]):
         yield f"Zenoh: not connected to {' or '.join(wanted)}: its clients get no values"
-    yield from _stopped(documents.get("parts", {}))
+    for part, document in below("parts/", documents):
+        if document["why"]:
+            yield f"{part} stopped: {document['why']}; it is tried again in {document['again']} s"
     history = documents.get("history", {"state": "ok"})
     if history["state"] != "ok":
         yield f"history: {history['state']}"
-
-
-def _stopped(parts: Mapping[str, Any]) -> Iterator[str]:
-    for part, document in parts.items():
-        if document["why"]:
-            yield f"{part} stopped: {document['why']}; it is tried again in {document['again']} s"
 
 
 def warnings(documents: Documents) -> Iterator[str]:
