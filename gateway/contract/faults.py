@@ -27,12 +27,16 @@ def faults(documents: Documents) -> Iterator[str]:
     zenoh = documents.get("zenoh", {})
     if (wanted := zenoh.get("connect")) and not {"router", "peer"} & set(zenoh["to"]):
         yield f"Zenoh: not connected to {' or '.join(wanted)}: its clients get no values"
-    for part, document in below("parts/", documents):
-        if document["why"]:
-            yield f"{part} stopped: {document['why']}; it is tried again in {document['again']} s"
+    yield from _stopped(documents)
     history = documents.get("history", {"state": "ok"})
     if history["state"] != "ok":
         yield f"history: {history['state']}"
+
+
+def _stopped(documents: Documents) -> Iterator[str]:
+    for part, document in below("parts/", documents):
+        if document["why"]:
+            yield f"{part} stopped: {document['why']}; it is tried again in {document['again']} s"
 
 
 def warnings(documents: Documents) -> Iterator[str]:
