@@ -34,7 +34,7 @@ def faults(documents: Documents) -> Iterator[str]:
 
 
 def _of_parts(documents: Documents) -> Iterator[str]:
-    for part, document in documents.get("parts", {}).items():
+    for part, document in below("parts/", documents):
         if document["why"]:
             yield f"{part} stopped: {document['why']}; it is tried again in {document['again']} s"
     for part, document in below("files/", documents):

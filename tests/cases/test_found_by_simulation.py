@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from gateway.config import load
-from gateway.engine.jobs.jobs import Poll
+from gateway.engine.schedule.poll_entry import PollEntry
 from gateway.engine.schedule.schedule import Schedule
 from gateway.errors import Busy
 from gateway.plant.plant import Plant as Gateway
@@ -182,7 +182,7 @@ def test_seed_13_storm_polls_queued_behind_a_late_one_leave_no_entries() -> None
         now += 0.5
         greedy.used(now, now - 5.0)
         job = schedule.next(now)
-        assert isinstance(job, Poll)
+        assert isinstance(job, PollEntry)
         assert job.device is modest
         schedule.polled(job, now)
     assert schedule._queue.entries < 200  # private: a leak shows in no public figure
@@ -195,7 +195,7 @@ def test_seed_7_lean_polls_of_an_older_plan_leave_no_entries() -> None:
     mixer.health.answered()
     schedule.came_online(mixer, 0.0)
     job = schedule.next(0.0)
-    assert isinstance(job, Poll)
+    assert isinstance(job, PollEntry)
     schedule.polled(job, 0.0)
     for _ in range(1000):
         schedule.plan(mixer, 1.0)
