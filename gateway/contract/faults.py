@@ -27,16 +27,19 @@ def faults(documents: Documents) -> Iterator[str]:
     zenoh = documents.get("zenoh", {})
     if (wanted := zenoh.get("connect")) and not {"router", "peer"} & set(zenoh["to"]):
         yield f"Zenoh: not connected to {' or '.join(wanted)}: its clients get no values"
-    yield from _stopped(documents.get("parts", {}))
+    yield from _of_parts(documents)
     history = documents.get("history", {"state": "ok"})
     if history["state"] != "ok":
         yield f"history: {history['state']}"
 
 
-def _stopped(parts: Mapping[str, Any]) -> Iterator[str]:
-    for part, document in parts.items():
+def _of_parts(documents: Documents) -> Iterator[str]:
+    for part, document in below("parts/", documents):
         if document["why"]:
             yield f"{part} stopped: {document['why']}; it is tried again in {document['again']} s"
+    for part, document in below("files/", documents):
+        if document["trouble"]:
+            yield f"{part} not saved: {document['trouble']}; a restart forgets the last changes"
 
 
 def warnings(documents: Documents) -> Iterator[str]:

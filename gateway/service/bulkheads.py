@@ -234,8 +234,10 @@ class Bulkheads:
             if isinstance(one.part, Documented):
                 with one:
                     found |= one.part.documents()
-        stopped = {one.name: one.document() for one in self._all if one.part is not None or one.why}
-        return {**found, "parts": stopped}
+        for one in self._all:
+            if one.part is not None or one.why:
+                found[f"parts/{one.name}"] = one.document()
+        return found
 
     # -- from the plant --
 

@@ -465,7 +465,7 @@ async def test_b_4_5_both_programs_read_d0_and_write_d1_by_configuration_alone(n
         assert bench.last("d0") == 0xA325 - 0x10000
         assert isinstance(await bench.write_tag("d1", -2), WriteResult)
         assert station.memory.read("D", 1) == [0xFFFE]
-        station.holes.add(("D", 1))
+        station.memory.holes.add(("D", 1))
         refused = await bench.write_tag("d1", 5)
         assert isinstance(refused, Refused)
         assert refused.code == "28"

@@ -316,12 +316,5 @@ def set_holes(
     station: Station, missing: set[tuple[str, int]], ranges: list[tuple[str, int, int]]
 ) -> None:
     """Sets the addresses (area, number) and ranges that the station refuses."""
-    if isinstance(station, Gadget):
-        return
-    if hasattr(station, "_store"):
-        holes = tuple((area, number, number) for area, number in sorted(missing))
-        # Private: a Modbus station gets its holes at its creation.
-        station._store._holes = (*holes, *ranges)
-    else:
-        lacks = Holes(frozenset(missing), tuple(ranges)) if ranges else set(missing)
-        station.holes = lacks  # type: ignore[attr-defined]  # Vigor and Computer Link
+    lacks = Holes(frozenset(missing), tuple(ranges)) if ranges else set(missing)
+    station.memory.holes = lacks  # type: ignore[assignment]  # ranges would be long sets

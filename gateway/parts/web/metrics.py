@@ -100,7 +100,7 @@ def _metrics(documents: Documents, plant: Plant, *, ready: bool) -> Iterator[Met
         yield _one(name, text, {}, documents["zenoh"].get(field, 0))
     yield from _transfers(documents)
     parts = _family("part_working", "1: the part of the gateway works", "part")
-    for name, part in documents.get("parts", {}).items():
+    for name, part in below("parts/", documents):
         parts.add_metric([name], not part["why"])
     yield parts
     alarms = _family("alarms", "Alarms by state", "state")
