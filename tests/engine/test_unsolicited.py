@@ -210,7 +210,7 @@ async def test_a_garbled_field_is_bad_alone_and_its_bytes_are_in_the_log() -> No
 async def test_two_equal_bar_codes_are_two_events_in_order() -> None:
     async with running(example("barcode-reader")) as bench:
         _, tag = bench.tag("barcode")
-        assert tag.event
+        assert tag.publishing.event
         bench.say(b"\x024006381333931\x03\x024006381333931\x03\x024006")
         bench.say(b"381333948\x03")
         codes = bench.values("barcode")

@@ -230,7 +230,7 @@ class Troubled:
         if not isinstance(value, (int, float)):
             return False
         bits = 32 if tag.unit_kind is Unit.DWORD or tag.span.size == 2 else 16
-        raw = round((value - tag.offset) / tag.scale)
+        raw = round((value - tag.shaping.offset) / tag.shaping.scale)
         return (raw - own - first) % (1 << bits) <= last - first
 
     def _steps(self, tag: Tag, own: int, first: int, last: int) -> Iterator[list[int]]:
