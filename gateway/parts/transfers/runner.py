@@ -208,7 +208,7 @@ class Transfers:
                     await one.wake.wait()
 
     def _lapse(self, one: _Running, source: Tag) -> None:
-        """Turns a value bad that a master reads, when its source did; not that of another writer."""
+        """Turns a value that a master reads bad with its source; not that of another writer."""
         reading = self._reading(source)
         old = one.row.lapse(reading)
         if old is None or one.target is None:
