@@ -7,6 +7,7 @@ from pathlib import Path
 from gateway.cli.terminal import err
 from gateway.config import ConfigErrors, load
 from gateway.config.messages import one_of
+from gateway.config.sheet_tags import native
 from gateway.config.yaml_file import read_yaml
 from gateway.config.yaml_insert import flow
 from gateway.errors import ConfigError
@@ -22,15 +23,17 @@ def import_transfers(sheet: Path, into: Path | None, master: str) -> None:
 
     Raises `ConfigErrors` with every mistake; then the file is as before.
     """
-    found = link_table.transfers_in(read_grid(read_file(sheet)))
+    config = None if into is None else load(into)
+    drivers = {} if config is None else {one.driver.station: one.driver for one in config.devices}
+    grid = read_grid(read_file(sheet))
+    found = link_table.transfers_in(grid, lambda number, text: native(drivers.get(number))(text))
     if not found:
         raise ConfigError(f"{sheet.name} is no communication table: see docs/import.md")
-    if into is None:
+    if into is None or config is None:
         names = {row.station: f"station-{row.station}" for row in found}
         print("transfers:", *_lines(found, names, master), sep="\n")
         err.print("nothing is checked yet: name the file with --into")
         return
-    config = load(into)
     if master not in (known := [device.name for device in config.devices]):
         raise ConfigError(f"there is no device {master} in {into.name}: it has {one_of(known)}")
     names = {device.driver.station: device.name for device in config.devices}

@@ -1,6 +1,6 @@
 """Tags of devices that are kept in sheets: `tags_from: tags.csv`."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path as FilePath
 from typing import NamedTuple
@@ -12,6 +12,7 @@ from gateway.config.model import TagDefaults, TagSection
 from gateway.config.validate import settings_of
 from gateway.config.yaml_events import plain_data
 from gateway.errors import ConfigError
+from gateway.protocols.capabilities import NamesRegisters
 from gateway.protocols.driver import Addressing
 from gateway.sheets import Grid, Sheet, link_table, read_grid, read_sheet
 from gateway.tags import Tag
@@ -68,7 +69,7 @@ class SheetTags:
             return ()
         try:
             if driver is not None and link_table.is_table(grid):
-                grid = link_table.of_station(grid, driver.station)
+                grid = link_table.of_station(grid, driver.station, native(driver))
             sheet = read_sheet(grid, device, other_settings(), parsed)
         except ConfigError as error:
             self.mistakes.add(path, f"{file}: {error}")
@@ -94,6 +95,18 @@ class SheetTags:
             except OSError as error:
                 self.mistakes.add(path, f"{file} cannot be read: {error.strerror}")
         return self._grids[file]
+
+
+def native(driver: object) -> Callable[[str], str]:
+    """Returns the function from an address of a Modbus table to that of the device."""
+
+    def named(address: str) -> str:
+        table, colon, number = address.partition(":")
+        if not colon or not isinstance(driver, NamesRegisters):
+            return address
+        return driver.named(table, int(number))
+
+    return named
 
 
 def preview(

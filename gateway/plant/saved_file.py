@@ -23,6 +23,7 @@ class SavedFile:
         self._path = path
         self._saved: bytes | None = None
         self.trouble: str | None = None  # why the last snapshot is not saved
+        self._saving = threading.Lock()
         self._queue: SimpleQueue[bytes | None] = SimpleQueue()  # None ends the thread
         self._thread = threading.Thread(target=self._save_all, name="state", daemon=True)
 
@@ -51,14 +52,19 @@ class SavedFile:
         self._thread.join(max(0.0, within))
         return not self._thread.is_alive()
 
-    # -- its own thread --
-
     def _save_all(self) -> None:
         while (snapshot := self._queue.get()) is not None:
             self.save(snapshot)
 
     def save(self, snapshot: bytes) -> None:
-        """Replaces the file, completely or not at all. Logs each kind of trouble once."""
+        """Replaces the file, completely or not at all: it is on disk if there is no `trouble`.
+
+        Blocks. Logs each kind of trouble once.
+        """
+        with self._saving:
+            self._save(snapshot)
+
+    def _save(self, snapshot: bytes) -> None:
         if snapshot == self._saved:
             return
         temporary = self._path.with_name(self._path.name + ".new")
@@ -70,6 +76,7 @@ class SavedFile:
                 file.flush()
                 os.fsync(file.fileno())
             temporary.replace(self._path)
+            _sync(self._path.parent)
         except OSError as error:
             if self.trouble != str(error):
                 self.trouble = str(error)
@@ -103,3 +110,13 @@ class SavedFile:
             log.warning("state file damaged", file=str(self._path), why=why, not_moved=str(error))
         else:
             log.warning("state file damaged", file=str(self._path), why=why, moved_to=str(aside))
+
+
+def _sync(folder: Path) -> None:
+    """Makes a new name survive a power cut. Only POSIX opens a folder."""
+    if os.name == "posix":
+        number = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(number)
+        finally:
+            os.close(number)

@@ -25,6 +25,15 @@ class ScatteredWriter(Protocol[F]):
 
 
 @runtime_checkable
+class NamesRegisters(Protocol):
+    """A driver whose data are also the numbers of a Modbus table."""
+
+    def named(self, table: str, number: int) -> str:
+        """Returns the address, as the file writes it, of a number of `coil`, `discrete`, `input`
+        or `holding`. Raises `ConfigError`."""
+
+
+@runtime_checkable
 class WritesAround(Protocol):
     """A driver whose writes of some spans also write addresses around them, as just read."""
 

@@ -7,7 +7,7 @@ and the registers themselves (Register, Value), 7 for each row from the second o
 """
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 from gateway.errors import ConfigError
@@ -17,12 +17,17 @@ _MOST = 64  # words or bits of a row
 _ROW = 7  # registers
 _DEVICE = re.compile(r"([A-Z]+)([0-9]+)\Z")
 _OCTAL = ("X", "Y")
-# Device types of LINK, and of the master in MBUS.
+# Device types of LINK, and of the master in MBUS; those from 10 on are words.
 _LINK = dict(enumerate(("X", "Y", "M", "S", "TS", "CS"), 1))
 _LINK |= dict(enumerate(("T", "C", "C", "D"), 10))
 _MBUS = {0: "coil:", 1: "discrete:", 3: "input:", 4: "holding:"}
-_COMMANDS = {"read": "r", "write": "rw", "single write": "rw", "1": "r", "2": "rw", "3": "rw"}
+_BITS = {*list(_LINK.values())[:6], "coil", "discrete"}
+_SINGLE = ("single write", "3")  # of MBUS: one word or bit, whatever the length says
+_COMMANDS = {"read": "r", "write": "rw", "1": "r", "2": "rw", **dict.fromkeys(_SINGLE, "rw")}
 _TITLES = ["Name", "Address", "R/W", "Comment"]
+_USE_LADDER_MASTER = "use the table of Ladder Master"
+# From an address in a Modbus table, such as holding:0, to the name that the device has for it.
+Native = Callable[[str], str]
 
 
 class _Copy(NamedTuple):
@@ -49,7 +54,7 @@ def stations_in(grid: Grid) -> list[int]:
     return list(dict.fromkeys(copy.station for copy in _copies(grid.rows)))
 
 
-def of_station(grid: Grid, station: int) -> Grid:
+def of_station(grid: Grid, station: int, native: Native = str) -> Grid:
     """Returns the data of one station as a sheet of tags. Raises `ConfigError`."""
     copies = [copy for copy in _copies(grid.rows) if copy.station == station]
     if not copies:
@@ -58,7 +63,7 @@ def of_station(grid: Grid, station: int) -> Grid:
     rows = [Row(1, _TITLES)]
     seen: dict[str, str] = {}
     for copy in sorted(copies, key=lambda copy: copy.command, reverse=True):  # written ones first
-        for address in _addresses(copy):
+        for address in map(native, _addresses(copy, copy.slave)):
             if address not in seen:
                 seen[address] = copy.command
                 name = address.replace(":", "-").lower()
@@ -77,17 +82,21 @@ class Transferred(NamedTuple):
     reads: bool
 
 
-def transfers_in(grid: Grid) -> list[Transferred]:
-    """Returns the rows of a table; none for another sheet. Raises `ConfigError`."""
+def transfers_in(grid: Grid, native: Callable[[int, str], str]) -> list[Transferred]:
+    """Returns the rows of a table; none for another sheet. Raises `ConfigError`.
+
+    `native`: as `Native`, with the station before the address.
+    """
     found = []
     for copy in _copies(grid.rows):
-        slave, master = _range(copy, copy.slave), _range(copy, copy.master)
+        slave = _range([native(copy.station, one) for one in _addresses(copy, copy.slave)])
+        master = _range([*_addresses(copy, copy.master)])
         found.append(Transferred(copy.row, copy.station, slave, master, copy.command == "r"))
     return found
 
 
-def _range(copy: _Copy, text: str) -> str:
-    first, *rest = _addresses(copy._replace(slave=text))
+def _range(addresses: Sequence[str]) -> str:
+    first, *rest = addresses
     return f"{first}..{rest[-1]}" if rest else first
 
 
@@ -118,12 +127,20 @@ def _copies(rows: Sequence[Row]) -> Iterator[_Copy]:
         command = _COMMANDS.get(cells["command"].casefold())
         if command is None:
             raise ConfigError(f"row {row.number}: {cells['command']!r} is neither Read nor Write")
-        slave = cells.get("slave data", "")
+        is_bit = (cells.get("word/bit") or cells.get("word / bit", "")).upper() == "B"
+        slave, master = _state(cells.get("slave data", ""), is_bit), cells["master data"]
         if not slave:  # MBUS has a type and a number
             kind = _number(row, cells.get("slave data type", ""))
             slave = f"{_named(row, kind, _MBUS)}{_number(row, cells.get('slave data #', ''))}"
-        station, length = _number(row, cells["slave id"]), _number(row, cells["length"])
-        yield _checked(_Copy(row.number, command, station, slave, length, cells["master data"]))
+        single = cells["command"].casefold() in _SINGLE
+        length = 1 if single else _number(row, cells["length"])
+        station = _number(row, cells["slave id"])
+        yield _checked(_Copy(row.number, command, station, slave, length, _state(master, is_bit)))
+
+
+def _state(text: str, is_bit: bool) -> str:
+    """Returns the contact of a timer or a counter, where the row is one of bits."""
+    return re.sub(r"\A([TC])(?=[0-9])", r"\1S", text.upper()) if is_bit else text
 
 
 def _registers(rows: Sequence[Row], columns: dict[str, int]) -> Iterator[_Copy]:
@@ -141,47 +158,85 @@ def _registers(rows: Sequence[Row], columns: dict[str, int]) -> Iterator[_Copy]:
         raise ConfigError(
             f"{registers[0]} says {values[0]} rows of {_ROW} registers; there are {len(values) - 1}"
         )
-    slaves = [values[1 + _ROW * number + 5] for number in range(values[0])]
-    kinds = _MBUS if set(slaves) <= set(_MBUS) and set(slaves) & {0, 4} else _LINK
-    for number in range(values[0]):
-        start = 1 + _ROW * number
+    starts = range(1, 1 + _ROW * values[0], _ROW)
+    kinds = _kinds([(rows[start], values[start : start + _ROW]) for start in starts])
+    for start in starts:
         row = rows[start]
         station, code, length, kind, own, slave_kind, slave = values[start : start + _ROW]
-        command = _COMMANDS.get(str(code))
-        if command is None:
+        target = _spelt(_named(row, slave_kind, kinds), slave)
+        length = 1 if str(code) in _SINGLE else length
+        master = _spelt(_named(row, kind, _LINK), own)
+        yield _checked(_Copy(row.number, _COMMANDS[str(code)], station, target, length, master))
+
+
+def _spelt(kind: str, number: int) -> str:
+    return f"{kind} no. {number}" if kind in _OCTAL else f"{kind}{number}"
+
+
+def _kinds(rows: Sequence[tuple[Row, Sequence[int]]]) -> dict[int, str]:
+    """Returns the device types of the stations, `_LINK` or `_MBUS`.
+
+    Types 1, 3 and 4 are in both: a row copies bits to bits and words to words, so the device of
+    the master decides.
+    """
+    link, mbus = [], []
+    for row, (_, code, _, own, _, slave, _) in rows:
+        if str(code) not in _COMMANDS:
             raise ConfigError(f"row {row.number}: {code} is no command: 1, 2 or 3")
-        target, master = (
-            f"{_named(row, slave_kind, kinds)}{slave}",
-            f"{_named(row, kind, _LINK)}{own}",
-        )
-        if target.startswith(_OCTAL):
+        _named(row, own, _LINK)
+        of_words = own >= 10
+        link.append(slave in _LINK and (slave >= 10) == of_words and code != 3)
+        mbus.append(slave in _MBUS and (slave >= 3) == of_words and (code == 1 or slave in (0, 4)))
+        if not (link[-1] or mbus[-1]):
+            _named(row, slave, _LINK | _MBUS)
             raise ConfigError(
-                f"row {row.number}: the manual does not say if {target[0]} is counted in octal "
-                "here: use the table of Ladder Master"
+                f"row {row.number}: the PLC refuses device type {slave} of the station with type "
+                f"{own} of the master for command {code}: bits go to bits, words to words"
             )
-        length = 1 if code == 3 else length
-        yield _checked(_Copy(row.number, command, station, target, length, master))
+    if all(link) and all(mbus):
+        raise ConfigError(f"the registers may be of LINK or of MBUS: {_USE_LADDER_MASTER}")
+    if not (all(link) or all(mbus)):
+        odd = rows[link.index(False) if link[0] else mbus.index(False)][0].number
+        raise ConfigError(f"row {odd}: one instruction cannot have this row and the first one")
+    return _LINK if all(link) else _MBUS
 
 
 def _checked(copy: _Copy) -> _Copy:
     if not 1 <= copy.length <= _MOST:
         raise ConfigError(f"row {copy.row}: length {copy.length} is not 1 to {_MOST}")
+    ends = {_kind_of(text) in _BITS for text in (copy.slave, copy.master) if _kind_of(text)}
+    if len(ends) > 1:
+        raise ConfigError(
+            f"row {copy.row}: {copy.slave} and {copy.master} are a bit and a word: the PLC copies "
+            "bits to bits, words to words"
+        )
     return copy
 
 
-def _addresses(copy: _Copy) -> Iterator[str]:
-    """Yields each address of a row. X and Y are counted in octal."""
-    kind, colon, number = copy.slave.partition(":")
+def _kind_of(text: str) -> str:
+    """`D` of D10, `holding` of holding:0; nothing of what is no address."""
+    match = re.match(r"([A-Za-z]+)[ :]?", text)
+    return "" if match is None else match[1] if ":" in text else match[1].upper()
+
+
+def _addresses(copy: _Copy, text: str) -> Iterator[str]:
+    """Yields each address of a row from `text` on. X and Y are counted in octal."""
+    kind, colon, number = text.partition(":")
     if colon:
         first = int(number)
         yield from (f"{kind}:{address}" for address in range(first, first + copy.length))
         return
-    match = _DEVICE.match(copy.slave.upper())
+    if " no. " in text:
+        raise ConfigError(
+            f"row {copy.row}: the manual does not say if {text[0]} is counted in octal "
+            f"here: {_USE_LADDER_MASTER}"
+        )
+    match = _DEVICE.match(text.upper())
     if match is None:
-        raise ConfigError(f"row {copy.row}: {copy.slave!r} is no address such as D10")
+        raise ConfigError(f"row {copy.row}: {text!r} is no address such as D10")
     octal = match[1] in _OCTAL
     if octal and set(match[2]) & {"8", "9"}:
-        raise ConfigError(f"row {copy.row}: {copy.slave} has no octal number")
+        raise ConfigError(f"row {copy.row}: {text} has no octal number")
     first = int(match[2], 8 if octal else 10)
     for address in range(first, first + copy.length):
         yield f"{match[1]}{address:o}" if octal else f"{match[1]}{address}"

@@ -11,8 +11,10 @@ import pytest
 from structlog.testing import capture_logs
 
 from gateway.config import load
+from gateway.contract.faults import faults
+from gateway.errors import Busy
 from gateway.parts.alarms import Alarms, Entry, Event, State
-from gateway.parts.alarms.file import AlarmFile
+from gateway.parts.alarms.file import AlarmFile, parse
 from gateway.parts.alarms.part import AlarmPart
 from gateway.plant.conditions import Condition, Reading
 from gateway.plant.plant import Plant
@@ -235,6 +237,47 @@ async def test_each_change_is_on_disk_at_once(tmp_path: Path) -> None:
                 await asyncio.sleep(0.01)
 
 
+async def test_an_acknowledgement_is_on_disk_when_it_is_answered(tmp_path: Path) -> None:
+    path = tmp_path / "alarms.json"
+    board = Board(AT_ONCE)
+    file = AlarmFile(path, board.alarms)
+    async with file.kept():
+        board.alarms.judge([good(AT_ONCE, 85, 5)])
+        for name in ("Ana", "Ana"):  # a repeat too
+            board.alarms.acknowledge("mixer/speed", name)
+            await file.keep()
+            [status] = parse(orjson.loads(path.read_bytes())).values()
+            assert status.state is State.ACKNOWLEDGED
+
+
+async def test_a_disk_that_fails_is_a_fault_an_error_and_is_tried_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gateway.parts.alarms.file.KEPT_WITHIN", 0.2)
+    path = tmp_path / "alarms.json"
+    in_the_way = tmp_path / "alarms.json.new"
+    in_the_way.mkdir()
+    board = Board(AT_ONCE)
+    file = AlarmFile(path, board.alarms)
+    async with file.kept():
+        board.alarms.judge([good(AT_ONCE, 85, 5)])
+        board.alarms.acknowledge("mixer/speed", "Ana")
+        with pytest.raises(Busy, match="not on disk"):
+            await file.keep()
+        assert board.state() is State.ACKNOWLEDGED
+        document = {"files/alarms": {"trouble": file.trouble}}
+        [fault] = faults(document)
+        assert fault.startswith("alarms not saved: ")
+        in_the_way.rmdir()
+        async with asyncio.timeout(60):
+            while file.trouble:
+                await asyncio.sleep(0.01)
+        [status] = parse(orjson.loads(path.read_bytes())).values()
+        assert status.state is State.ACKNOWLEDGED
+        assert list(faults({"files/alarms": {"trouble": file.trouble}})) == []
+        await file.keep()
+
+
 @on_virtual_time
 async def test_a_computed_tag_and_a_debounced_bit_have_alarms(tmp_path: Path) -> None:
     tags = {
@@ -250,8 +293,8 @@ async def test_a_computed_tag_and_a_debounced_bit_have_alarms(tmp_path: Path) ->
     for value, state in ((39, State.NORMAL), (40, State.ACTIVE), (39, State.RETURNED)):
         gateway.samples([good(one, value, 1)])
         assert entry.status.state is state
-    door = next(tag for device in gateway.config.devices for tag in device.tags if tag.kept)
-    [reads] = door.inputs
+    door = next(tag for device in gateway.config.devices for tag in device.tags if tag.origin.kept)
+    [reads] = door.origin.inputs
     for value, at, state in (
         (False, 1, State.NORMAL),
         (True, 2, State.NORMAL),

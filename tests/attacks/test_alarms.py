@@ -1,5 +1,6 @@
 """Alarms of a real gateway: a silent PLC and a restart neither clear nor forget one."""
 
+import signal
 from collections.abc import Callable
 from pathlib import Path
 
@@ -68,3 +69,33 @@ async def test_an_alarm_survives_bad_values_and_a_restart(tmp_path: Path) -> Non
                 events = [row.json["event"] for row in rows]
                 assert events == ["raised", "acknowledged", "ended"]
             assert second.end() == 0
+
+
+async def test_an_acknowledgement_survives_a_kill(tmp_path: Path) -> None:
+    """Eight alarms: each is acknowledged, answered, and still acknowledged after `kill -9`."""
+    endpoint = free_endpoint()
+    tags = {f"t{n}": {"address": f"D{n}", "alarm": {"low": 30_000}} for n in range(8)}
+    lines = {"hall": vigor_line("simulator", tags)}
+    file = write_config(tmp_path / "plant.yaml", endpoint, lines, alarms={"path": "alarms.json"})
+    keys = [f"plant/@gateway/demo/alarms/mixer/t{n}" for n in range(8)]
+    with started(file) as first:
+        async with ZenohPeer("client", connect=[endpoint]) as client:
+            changes = await client.subscribe("plant/@gateway/demo/alarms/mixer/*")
+            replies = await client.get("plant/@gateway/demo/alarms/mixer/*")
+            active = {r.json["alarm"] for r in replies if r.json["state"] == "active"}
+            for n in range(8):
+                if f"mixer/t{n}" not in active:
+                    await changes.next(_is_active(f"mixer/t{n}"))
+            answers = await client.many([(key, b'{"by": "Ana"}') for key in keys])
+            first.end(signal.SIGKILL)
+        assert [one.json["state"] for [one] in answers] == ["acknowledged"] * 8
+    with gateway("run", file) as second:
+        second.says("Zenoh session ready")
+        async with ZenohPeer("client", connect=[endpoint]) as client:
+            after = await client.get("plant/@gateway/demo/alarms/mixer/*")
+            assert [one.json["state"] for one in after] == ["acknowledged"] * 8
+        assert second.end() == 0
+
+
+def _is_active(alarm: str) -> Callable[[Received], bool]:
+    return lambda sample: (sample.json["alarm"], sample.json["state"]) == (alarm, "active")

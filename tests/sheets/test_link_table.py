@@ -95,11 +95,52 @@ def test_data_that_are_read_and_written_are_one_writable_tag() -> None:
         (registers((1, 5, 9, 10, 13, 0, 13, 10)), "row 3: 9 is no command"),
         (registers((1, 5, 1, 8, 3, 0, 1, 8)), "use the table of Ladder Master"),
         ("Register,Value\nD1000,1\nD1002,5\n", "row 3: D1001 is missing"),
+        (registers((1, 5, 1, 1, 13, 8, 6, 100)), "row 3: the PLC refuses device type 6"),
+        (registers((1, 5, 2, 1, 13, 8, 3, 100)), "refuses device type 3 .* for command 2"),
+        (
+            registers((2, 5, 1, 1, 13, 8, 3, 100, 5, 1, 1, 13, 8, 13, 100)),
+            "row 10: one instruction cannot have this row and the first one",
+        ),
+        (MBUS.replace("D2000", "M2000"), "holding:0 and M2000 are a bit and a word"),
     ],
 )
 def test_a_mistake_is_told_with_its_row(text: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         tags(text, 2 if "X8" in text else 5)
+
+
+def test_the_device_of_the_master_decides_between_types_of_link_and_mbus() -> None:
+    words = registers((1, 5, 1, 4, 13, 8, 3, 100))  # D8.. <- 30100..
+    assert list(tags(words, 5)) == [f"input:{number}" for number in range(100, 104)]
+    bits = registers((1, 5, 1, 4, 3, 8, 4, 8))  # M8.. <- S8..
+    assert list(tags(bits, 5)) == ["S8", "S9", "S10", "S11"]
+    assert list(tags(registers((1, 5, 2, 2, 3, 8, 0, 8)), 5)) == ["coil:8", "coil:9"]
+
+
+def test_a_single_write_has_no_length() -> None:
+    for length in ("7", ""):
+        text = MBUS.replace("3;4;2000;1;W", f"3;4;2000;{length};W")
+        assert tags(text, 3) == {"holding:2000": "rw"}
+    assert tags(registers((1, 3, 3, 200, 13, 2015, 4, 2000)), 3) == {"holding:2000": "rw"}
+
+
+def test_a_row_of_bits_names_contacts_of_timers() -> None:
+    text = "Command,Master Data,Slave ID,Slave Data,Length,Word / Bit\nRead,M0,1,T5,2,B\n"
+    assert list(tags(text, 1)) == ["TS5", "TS6"]
+
+
+def test_the_manuals_list_between_two_vb_at_a_device_with_vigor_addressing(tmp_path: Path) -> None:
+    plant, table = tmp_path / "plant.yaml", tmp_path / "mbus.csv"
+    device = "{protocol: modbus-rtu, station: 1, addressing: vigor, tags: {}}"
+    plant.write_text(f"lines:\n  hall:\n    port: simulator\n    devices:\n      vb: {device}\n")
+    titles = "Command,Master Data,Slave ID,Slave Data Type,Slave Data #,Length\n"
+    table.write_text(f"{titles}Read,D10,1,4,0000,1\nWrite,D0,1,4,0100,1\nWrite,M8,1,0,520,1\n")
+    add_tags(table, plant, [], backup=False)
+    (device_,) = load(plant).devices
+    assert {tag.name: tag.text for tag in device_.tags} == {"d0": "D0", "d100": "D100", "m8": "M8"}
+    table.write_text(f"{titles}Read,D10,1,3,0,1\n")
+    with pytest.raises(ConfigError, match=r"input:0 is no address of this device"):
+        add_tags(table, plant, [], backup=False)
 
 
 def test_a_station_that_the_table_does_not_have() -> None:

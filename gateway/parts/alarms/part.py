@@ -79,7 +79,10 @@ class AlarmPart:
     # -- documents --
 
     def documents(self) -> Mapping[str, Mapping[str, object]]:
-        return {"alarms": self.alarms.counts()}
+        found: dict[str, Mapping[str, object]] = {"alarms": self.alarms.counts()}
+        if self._core.config.alarms.path is not None:
+            found["files/alarms"] = {"trouble": self._file.trouble}
+        return found
 
     def document(self, entry: Entry) -> bytes:
         return payload.document(self._fields(entry))
@@ -122,7 +125,11 @@ class AlarmPart:
     # -- operators --
 
     async def order(self, path: str, data: bytes, by: str | None) -> bytes:
-        """Acknowledges an alarm. Raises `BadValue`, `Unknown`, `NothingToAcknowledge`."""
+        """Acknowledges an alarm, and returns when that is on disk.
+
+        Raises `BadValue`, `Unknown`, `NothingToAcknowledge`, and `Busy` if it counts until the next
+        restart only. A repeat waits for the disk again.
+        """
         name, raised = parse_acknowledgement(data)
         entry = self.alarms.entries.get(path)
         if entry is None:
@@ -131,6 +138,7 @@ class AlarmPart:
         if raised is not None and raised != rfc3339(seen):
             seen = -1
         self.alarms.acknowledge(entry.key, name, by, None if raised is None else seen)
+        await self._file.keep()
         return self.document(entry)
 
     def page(self, state: str, after: str | None, most: int) -> Mapping[str, Any]:

@@ -16,7 +16,7 @@ from gateway.parts.history.recent import Recent
 from gateway.parts.history.rows import from_row
 from gateway.parts.history.schema import APPLICATION, SCHEMA_VERSION
 from gateway.parts.history.search import Search
-from gateway.tags import Tag
+from gateway.tags import Publishing, Tag
 
 _MOST_BUCKETS = 10_000_000  # of one tag: nobody waits for this reader
 
@@ -49,7 +49,7 @@ def _content(path: Path, tags: Mapping[str, Tag]) -> Recent:
             raise GatewayError(f"{path} is no history of this version")
         recent = Recent(longest=2**62, oldest=float("inf"))
         recent.opened(identity(database, path), sections.runs(database), {})
-        kept = {key: replace(tag, history=True) for key, tag in tags.items()}
+        kept = {key: replace(tag, publishing=Publishing(history=True)) for key, tag in tags.items()}
         for key, time, value, kind, bad in database.execute(
             "SELECT key, time, value, kind, bad FROM recent JOIN tag ON tag.id = recent.tag"
             " ORDER BY run, n"

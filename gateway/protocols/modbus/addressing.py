@@ -53,6 +53,21 @@ class Dialect:
     rtu_silence: float = 0.0  # seconds, where the device needs more than the standard
     forgets_address: bool = False  # replies to function 06 may have address 0
 
+    def named(self, table: str, number: int) -> str:
+        """Returns the name of a zero-based wire address in a table of the standard: `holding`, 0.
+
+        Raises `ConfigError`.
+        """
+        function = _PLAIN[table].function
+        for place in self.places.values():
+            ahead, odd = divmod(number - place.wire, place.registers)
+            address = Address(place.area.name, place.area.first + ahead)
+            if place.function == function and ahead >= 0 and address.number <= place.area.last:
+                if odd:
+                    raise ConfigError(f"{table}:{number} is the second half of a counter")
+                return self.spell(address)
+        raise ConfigError(f"{table}:{number} is no address of this device")
+
 
 def _by_name(*places: Place) -> dict[str, Place]:
     return {place.area.name: place for place in places}
@@ -199,16 +214,17 @@ VIGOR = Dialect(
 
 # ---- LG/LS MASTER-K120S ------------------------------------------------------------------
 # P, M, L, K, F are 16-bit words whose bits have numbers of their own: M0010 is word 001, bit 0.
-# The map has 256 words of each; the PLC refuses those that it does not have (exception 02).
+# The map has 256 words of each; the PLC refuses those that it does not have (exception 02). F has
+# 64 words, and the manual (8.3.4) writes its flags without the leading zero: F110 is bit F0110.
 
 _RELAYS = "PMLKF"
 
 
 def _relay(letter: str, base: int) -> tuple[Place, Place]:
-    writable = letter != "F"
+    writable, words = letter != "F", 64 if letter == "F" else 256
     return (
-        Place(Area(letter, Unit.BIT, 0, 4095, writable=writable), base, 1),
-        Place(Area(f"{letter}W", Unit.WORD, 0, 255, writable=writable), base, 3),
+        Place(Area(letter, Unit.BIT, 0, words * 16 - 1, writable=writable), base, 1),
+        Place(Area(f"{letter}W", Unit.WORD, 0, words - 1, writable=writable), base, 3),
     )
 
 
@@ -254,8 +270,10 @@ def _k120s(text: str) -> Address:
         )
     word = int(match[2])
     area = _K120S[f"{match[1]}W"].area
+    if match[1] == "F" and len(name) == 4 and area.last < word <= area.last * 10 + 9:
+        return Address("F", word // 10 * 16 + word % 10)
     if word > area.last:
-        raise ConfigError(f"{text}: the words of {match[1]} go from 000 to {area.last}")
+        raise ConfigError(f"{text}: the words of {match[1]} go from 000 to {area.last:03}")
     if match[3] is not None:
         return Address(match[1], word * 16 + int(match[3], 16))
     return Address(area.name, word, _bit(text, match[4], area))

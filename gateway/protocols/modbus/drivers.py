@@ -77,6 +77,9 @@ class _Modbus:
     def spell(self, address: Address) -> str:
         return self._master.dialect.spell(address)
 
+    def named(self, table: str, number: int) -> str:
+        return self._master.dialect.named(table, number)
+
     def cost(self, span: Span) -> Cost | None:
         return self._master.cost(span)
 
