@@ -61,12 +61,12 @@ def test_a_rule_of_a_test_holds_a_device_is_asked_again_and_lets_it_go(
     assert rig.engine.deadline == napping
     asked = []
     while rig.now < napping:
-        job = rig.next()
-        if isinstance(job, Idle):
-            rig.now = min(job.until, napping)
-        else:
-            asked.append(job.device)
-            rig.conclude(job, [0] * job.span.size if isinstance(job, Poll) else Resynced(1))
+        following = rig.next()
+        if isinstance(following, Idle):
+            rig.now = min(following.until, napping)
+        elif isinstance(following, Poll):
+            asked.append(following.device)
+            rig.conclude(following, [0] * following.span.size)
     assert asked
     assert refused not in asked
     rig.note(rig.engine.expire(rig.now, rig.time))
