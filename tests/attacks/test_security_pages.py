@@ -136,6 +136,8 @@ RULES: dict[str, dict[str, tuple[str, ...]]] = {
         "those of `health`: to query the status and nothing else, which is enough for a "
         "container.": (RIGHTS,),
         "| `requires a name and password` | set the variables |": (NO_USER,),
+        "| `takes connections and does not answer` | the gateway stands still: stopped, or without "
+        "a processor |": ("test_a_gateway_that_stands_still_is_called_that",),
         "| `refuses the user operator` | the name or the password is wrong |": (RIGHTS,),
         "| `has an untrusted certificate` | `ca` has not signed it, or it is not valid for that "
         "address |": (OTHER_ADDRESS,),
