@@ -77,5 +77,4 @@ def test_a_rule_of_a_test_holds_a_device_is_asked_again_and_lets_it_go(
 def test_a_rule_that_lacks_a_method_costs_nothing_there() -> None:
     rules = Rig().engine.rules
     assert not rules.beside  # no device takes several requests at once
-    assert not rules.free  # no rule restrains polls
     assert len(rules.concluded) < len(rules.all)
