@@ -226,7 +226,7 @@ RULES: dict[str, dict[str, tuple[str, ...]]] = {
         "write to `**/@set` would still arrive, because a rule applies only to keys that are "
         "completely within its own.": (WILDCARD,),
         "| `viewer` | read everything |": (USERS,),
-        "| `operator` | read and write |": (USERS,),
+        "| `operator` | read, write, acknowledge alarms |": (USERS,),
         "| `health` | query the status, for `plc-gateway health` |": (USERS, RIGHTS),
         "| `gateway` | on a router: publish and answer as a gateway |": (USERS, SECOND, TAKEOVER),
         "Denied messages are dropped without an answer: a `get` returns nothing, a `put` seems to "
@@ -245,6 +245,9 @@ RULES: dict[str, dict[str, tuple[str, ...]]] = {
         "a rule like `outcome` for the same keys.": (USERS,),
         "This subject does not have the rule `command-none`. So it may also command all stations "
         "of a line.": (USERS,),
+        "**Alarms.** A user who may read may also acknowledge alarms, unless the user has the rule "
+        "`acknowledge-none`. Such a user reads alarms with a `get` on "
+        "`plant/@gateway/*/alarms/**`.": (USERS,),
         "**One device only.** To let a user write one device only, use `plant/mixer/**/@set` "
         "instead of `plant/**/@set` in a rule of its own like `write`. The rule `outcome` stays as "
         "it is: the gateway declares the whole key.": (USERS,),
