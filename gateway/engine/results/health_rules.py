@@ -33,13 +33,14 @@ class HealthRules:
         if health.state is State.ONLINE and not health.needs_resync:
             return
         if health.answered(resynced=resynced):
+            device.record.falls.rise()
             if device.shapes is not None:
                 device.shapes.longer.restart(now)
             self._effects.online(device, True)
             self._effects.info("device online", line=self._line, device=device.name)
             device.bad_addresses.abandon()
             self._schedule.came_online(device, now)
-            self._staleness.look(now, time)
+            self._staleness.tick(now, time)
 
     def unclear(
         self, device: Device, error: DeviceError, asked: Span | None, now: float, time: int
@@ -54,7 +55,7 @@ class HealthRules:
             self._effects.debug("transaction failed", line=self._line, device=name, why=why)
             return before
         self._effects.info("transaction failed", line=self._line, device=name, why=why)
-        self._staleness.look(now, time)
+        self._staleness.tick(now, time)
         return before
 
     def settled(
@@ -100,6 +101,7 @@ class HealthRules:
         if not (short and before is State.OFFLINE):  # the values are bad already
             self._effects.bad(device.polled_tags, health.reason, time, why)
         if before is not State.OFFLINE:
+            device.record.falls.fall(now)
             self._effects.online(device, False)
             self._effects.warning("device offline", device=device.name, why=why)
         for request in self._schedule.requests.withdraw(device):
