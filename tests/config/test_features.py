@@ -100,8 +100,8 @@ def test_a_toy_feature_has_settings_check_meta_and_columns(tmp_path: Path) -> No
     file.write_text(FILE.replace("address: D11", "address: D11, type: 'int16[4]', shelf: A4"))
     wrong = run(tmp_path, "check", str(file))
     assert wrong.returncode != 0
-    place = "lines.hall.devices.mixer.tags.speed.shelf"
-    assert f"plant.yaml:10: {place}: a int16[4] is many values: it has no spare" in wrong.stderr
+    path = "lines.hall.devices.mixer.tags.speed.shelf"
+    assert f"plant.yaml:10: {path}: a int16[4] is many values: it has no spare" in wrong.stderr
     assert '"shelf"' in run(tmp_path, "schema").stdout
 
 
