@@ -70,7 +70,7 @@ class ComputerLink:
     send_area_c: bool = False
     monitor: bool = False
     monitor_word_command: Literal["MN", "MW"] = "MN"
-    _kind: ResyncKind = field(default_factory=ResyncKind, init=False, repr=False, compare=False)
+    _kind: ResyncKind = field(init=False, repr=False, compare=False)
 
     scan_hints: ClassVar = ScanHints(
         formats=("7E1", "8N1", "8E1", "7O1"),
@@ -84,6 +84,7 @@ class ComputerLink:
     no_reply_causes: ClassVar = NO_REPLY_CAUSES
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "_kind", ResyncKind())
         if self.profile not in PROFILES:
             raise ConfigError(f"profile {self.profile!r} is not one of {', '.join(PROFILES)}")
         if not 0 <= self.station <= self._limits.last_station:
