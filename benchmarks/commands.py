@@ -98,7 +98,7 @@ def main() -> None:
 
 
 def show(command: str, calls: list[list[float]]) -> None:
-    medians = [statistics.median(tree) for tree in zip(*calls[1:], strict=True)]
+    medians = [statistics.median(tree) for tree in zip(*calls[1:] or calls, strict=True)]
     numbers = [f"{median:.0f}" for median in medians]
     if len(medians) > 1:
         numbers.append(f"{medians[1] / medians[0]:.2f}")

@@ -29,13 +29,13 @@ def noises() -> dict[str, list[bytes]]:
     return {"random": [seeded.randbytes(PIECE) for _ in range(16)], **pieces}
 
 
-def run(framing: Framing, pieces: list[bytes], megabytes: int) -> tuple[float, int, int]:
+def run(framing: Framing, pieces: list[bytes], megabytes: float) -> tuple[float, int, int]:
     """Seconds, bytes kept at the end, and the most bytes in use at any time."""
     reader = FrameReader(framing)
     tracemalloc.start()
     before, _ = tracemalloc.get_traced_memory()
     started = time.perf_counter()
-    for turn in range(megabytes * 1024 * 1024 // PIECE):
+    for turn in range(int(megabytes * 1024 * 1024 / PIECE)):
         reader.feed(pieces[turn % len(pieces)])
     took = time.perf_counter() - started
     after, peak = tracemalloc.get_traced_memory()
@@ -44,7 +44,7 @@ def run(framing: Framing, pieces: list[bytes], megabytes: int) -> tuple[float, i
 
 
 def main() -> None:
-    megabytes = int(sys.argv[1]) if len(sys.argv) > 1 else 100
+    megabytes = float(sys.argv[1]) if len(sys.argv) > 1 else 100
     print(f"{'framing':26}{'noise':10}{'MB/s':>8}{'kept kB':>10}{'peak kB':>10}")
     for name, framing in FRAMINGS.items():
         for noise, pieces in noises().items():

@@ -17,7 +17,7 @@ from benchmarks.northbound import memory
 from gateway.parts.history import Historian
 from gateway.parts.history.recent import MOST_RUNS
 from gateway.protocols.driver import Address, Span, Unit
-from gateway.tags import Sample, Tag, good
+from gateway.tags import Publishing, Sample, Tag, good
 from gateway.values import Layout, parse_type
 
 GIGABYTE = 10**9
@@ -33,7 +33,7 @@ def tags(count: int) -> list[Tag]:
             span=Span("D", 100, 1),
             unit_kind=Unit.WORD,
             layout=Layout(parse_type("float32")),
-            history=True,
+            publishing=Publishing(history=True),
         )
         for n in range(count)
     ]

@@ -33,6 +33,7 @@ from tests.sim.virtual import run_virtual
 
 WIRE = WireTiming(115200, 10)
 TAGS = 50
+TAGS_IN_MEMORY = 3125  # for each line
 
 
 class Watching:
@@ -116,7 +117,8 @@ def in_child(function: str, *arguments: float) -> None:
     if (child := os.fork()) == 0:
         rows[function](*arguments)
         os._exit(0)
-    os.waitpid(child, 0)
+    if os.waitpid(child, 0)[1]:
+        raise SystemExit(f"{function} {arguments} failed")
 
 
 def show_run(lines: float, stations: float, seconds: float) -> None:
@@ -140,12 +142,14 @@ rows: dict[str, Callable[..., None]] = {"run": show_run, "memory": show_memory}
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=20.0, help="of simulated time")
-    seconds = parser.parse_args().seconds
+    parser.add_argument("--lines", type=int, default=64)
+    options = parser.parse_args()
+    seconds, lines = options.seconds, options.lines
     structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.WARNING))
-    in_child("run", 6, 32, seconds)
-    in_child("run", 64, 32, seconds)
-    in_child("memory", 20_000)
-    in_child("memory", 200_000)
+    in_child("run", max(1, lines // 10), 32, seconds)
+    in_child("run", lines, 32, seconds)
+    in_child("memory", TAGS_IN_MEMORY * lines // 10)
+    in_child("memory", TAGS_IN_MEMORY * lines)
 
 
 if __name__ == "__main__":

@@ -73,6 +73,7 @@ class Plant:
         self.tags = [tag for device in self.made for tag in device.tags]
         self.mirror = Mirror(self.tags, time.time_ns())
         self.alarms = Alarms(self.tags)
+        self._by_key = {tag.key: tag for tag in self.tags}
 
     def devices(self) -> list[Device]:
         return self.made
@@ -84,7 +85,7 @@ class Plant:
         pass
 
     def tag(self, key: str) -> Tag | None:
-        return next((tag for tag in self.tags if tag.key == key), None)
+        return self._by_key.get(key)
 
     def sample(self, tag: Tag) -> Sample:
         return self.mirror[tag]

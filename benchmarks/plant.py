@@ -301,8 +301,9 @@ class Result:
     caught_twice: int = 0
 
 
-async def run(sizes: Sizes, folder: Path, steady: float, settle: float) -> Result:
-    """Starts the plant and kills parts of it. `settle`: the least seconds watched after a kill."""
+async def run(sizes: Sizes, folder: Path, steady: float, settle: float, patience: float) -> Result:
+    """Starts the plant and kills parts of it. `settle`: the least seconds watched after a kill;
+    `patience`: the most seconds for `catch_up.py` at the end."""
     result, names = Result(), [f"g{n}" for n in range(sizes.gateways)]
     pair = names[-1]
     async with Plant(sizes, folder) as plant:
@@ -360,7 +361,7 @@ async def run(sizes: Sizes, folder: Path, steady: float, settle: float) -> Resul
 
         for program in plant.gateways.values():
             assert not program.has_said("Traceback"), program.lines
-        await all_caught(plant, result, consumer)
+        await all_caught(plant, result, consumer, patience)
     return result
 
 
@@ -378,14 +379,14 @@ def milestones(seen: Seen, names: Sequence[str], begun: float) -> dict[str, floa
     }
 
 
-async def all_caught(plant: Plant, result: Result, consumer: Consumer) -> None:
+async def all_caught(plant: Plant, result: Result, consumer: Consumer, within: float) -> None:
     """Ends the gateways, so that the files are complete, and compares them with the consumers.
 
     `catch_up.py` gets time for one more check first: of what was recorded until now.
     """
     until = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
     recorded = {row for row in plant.recorded() if row < until}
-    patience = time.monotonic() + PATIENCE
+    patience = time.monotonic() + within
     while True:
         rows = rows_of(plant.folder / "caught.txt")
         caught = set(rows)
@@ -443,12 +444,13 @@ def main() -> None:
     parser.add_argument("--every", type=float, default=Sizes().every, help="seconds")
     parser.add_argument("--steady", type=float, default=60.0, help="seconds")
     parser.add_argument("--settle", type=float, default=25.0, help="seconds after each kill")
+    parser.add_argument("--patience", type=float, default=PATIENCE, help="for catch_up.py")
     given = parser.parse_args()
     sizes = Sizes(
         given.gateways, given.routers, given.lines, given.devices, given.tags, given.every
     )
     with tempfile.TemporaryDirectory() as folder:
-        result = asyncio.run(run(sizes, Path(folder), given.steady, given.settle))
+        result = asyncio.run(run(sizes, Path(folder), given.steady, given.settle, given.patience))
     print("\n".join(shown(result, sizes)))
 
 

@@ -1,9 +1,9 @@
 """Reloads under load: `python -m benchmarks.reload --reloads 200`.
 
 A gateway polls 64 lines of two simulated stations each, and a client writes all the time. The file
-of the first 32 lines changes at random, one thing at a time: intervals, tags, devices, the speed of
+of half of the lines changes at random, one thing at a time: intervals, tags, devices, the speed of
 a line. Each change is reloaded with SIGHUP. It prints the time of the reloads, the memory, and what
-the other 32 lines missed: it must be nothing. At the end it compares the keys and the tokens on
+the other half missed: it must be nothing. At the end it compares the keys and the tokens on
 Zenoh with the file.
 """
 
@@ -24,11 +24,10 @@ import zenoh
 from tests.e2e.processes import gateway, listens, until
 from tests.zenoh_peer import free_endpoint
 
-LINES, CHANGED = 64, 32
 OWN = "reload/@gateway/demo"
 
 
-def plant(endpoint: str) -> dict[str, Any]:
+def plant(endpoint: str, lines: int) -> dict[str, Any]:
     def device(station: int) -> dict[str, Any]:
         tags: dict[str, Any] = {f"t{n}": {"address": f"D{n * 3}"} for n in range(20)}
         tags["set"] = {"address": "D200", "write": True}
@@ -44,14 +43,14 @@ def plant(endpoint: str) -> dict[str, Any]:
                 "baudrate": 19200,
                 "devices": {f"plc-{n}-{station}": device(station) for station in (1, 2)},
             }
-            for n in range(LINES)
+            for n in range(lines)
         },
     }
 
 
 def change(data: dict[str, Any], chance: random.Random) -> None:
     """Changes one thing of one of the first lines."""
-    n = chance.randrange(CHANGED)
+    n = chance.randrange(len(data["lines"]) // 2)
     line = data["lines"][f"line-{n}"]
     device = line["devices"][f"plc-{n}-1"]
     match chance.randrange(5):
@@ -72,7 +71,8 @@ def change(data: dict[str, Any], chance: random.Random) -> None:
 class Client:
     """Reads documents, and writes without a pause to the lines that do not change."""
 
-    def __init__(self, endpoint: str) -> None:
+    def __init__(self, endpoint: str, lines: int) -> None:
+        self._lines = lines
         config = zenoh.Config()
         config.insert_json5("mode", '"client"')
         config.insert_json5("connect/endpoints", json.dumps([endpoint]))
@@ -101,17 +101,17 @@ class Client:
         replies = self.session.liveliness().get(f"{OWN}/alive/*", timeout=10.0)
         return {str(reply.ok.key_expr).rpartition("/")[2] for reply in replies if reply.ok}
 
-    def is_served(self, lines: int) -> bool:
+    def is_served(self) -> bool:
         time.sleep(0.5)
         status = self.documents("status").get(f"{OWN}/status", {"devices": {}})
-        return [*status["devices"].values()].count("up") == 2 * lines
+        return [*status["devices"].values()].count("up") == 2 * self._lines
 
     def others(self) -> list[dict[str, Any]]:
         """The documents of the devices on lines that do not change."""
         return [
             document
             for key, document in self.documents("devices/*").items()
-            if int(key.rpartition("/")[2].split("-")[1]) >= CHANGED
+            if int(key.rpartition("/")[2].split("-")[1]) >= self._lines // 2
         ]
 
     def missed(self) -> int:
@@ -123,7 +123,7 @@ class Client:
     def _write(self) -> None:
         chance = random.Random(2)
         while not self._ending.is_set():
-            key = f"reload/plc-{chance.randrange(CHANGED, LINES)}-1/set/@set"
+            key = f"reload/plc-{chance.randrange(self._lines // 2, self._lines)}-1/set/@set"
             replies = list(self.session.get(key, payload=b"7", timeout=10.0))
             self.writes += 1
             self.failed += not (replies and replies[0].ok)
@@ -140,16 +140,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="reloads under load")
     parser.add_argument("--reloads", type=int, default=200)
     parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--lines", type=int, default=64)
     given = parser.parse_args()
     in_round = given.reloads // given.rounds
     chance, endpoint = random.Random(1), free_endpoint()
     with tempfile.TemporaryDirectory() as folder:
-        file, data = Path(folder) / "c.yaml", plant(endpoint)
+        file, data = Path(folder) / "c.yaml", plant(endpoint, given.lines)
         file.write_text(json.dumps(data))
         with gateway("run", file, "--log-level", "error") as program:
             until(lambda: listens(int(endpoint.rpartition(":")[2])), "the gateway listens")
-            client = Client(endpoint)
-            until(lambda: client.is_served(len(data["lines"])), "every line is open")
+            client = Client(endpoint, given.lines)
+            until(client.is_served, "every line is open")
             client.begin()
             missed = client.missed()
             time.sleep(5.0)
@@ -158,7 +159,7 @@ def main() -> None:
                 if n % in_round:
                     change(data, chance)
                 else:
-                    data = plant(endpoint)
+                    data = plant(endpoint, given.lines)
                 file.write_text(json.dumps(data))
                 begun = time.monotonic()
                 os.kill(program.pid, signal.SIGHUP)

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from tests.zenoh_peer import ZenohPeer, free_endpoint
 
-EVERY, DEAD, BACK = 0.2, 3.0, 4.0  # seconds
+EVERY = 0.2  # seconds
 
 
 class Round(NamedTuple):
@@ -22,7 +22,7 @@ class Round(NamedTuple):
     lost_token: bool
 
 
-async def play(mode: str, known: int) -> Round:
+async def play(mode: str, known: int, dead: float, back: float) -> Round:
     """`known`: the number of routers that the publisher connects to."""
     ends = [free_endpoint() for _ in range(3)]
     async with AsyncExitStack() as stack:
@@ -49,10 +49,10 @@ async def play(mode: str, known: int) -> Round:
         await asyncio.sleep(1.0)
         before = len(values.samples)
         await first.kill()
-        await asyncio.sleep(DEAD)
-        stopped = len(values.samples) - before < DEAD / EVERY / 2
+        await asyncio.sleep(dead)
+        stopped = len(values.samples) - before < dead / EVERY / 2
         await start(ZenohPeer("router", ends[:1], ends[1:]))
-        await asyncio.sleep(BACK)
+        await asyncio.sleep(back)
         ended.set()
         await publishing
         numbers = [sample.payload for sample in values.samples]
@@ -63,11 +63,17 @@ async def play(mode: str, known: int) -> Round:
 async def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rounds", type=int, default=10)
-    rounds = parser.parse_args().rounds
+    parser.add_argument("--modes", nargs="+", default=["client", "peer"])
+    parser.add_argument("--dead", type=float, default=3.0, help="seconds without the router")
+    parser.add_argument("--back", type=float, default=4.0, help="seconds with it again")
+    options = parser.parse_args()
+    rounds = options.rounds
     print("| mode | routers | rounds | values stopped | values twice | token lost |")
     print("|---|---|---|---|---|---|")
     for mode, known in (("client", 2), ("peer", 2), ("peer", 3)):
-        found = [await play(mode, known) for _ in range(rounds)]
+        if mode not in options.modes:
+            continue
+        found = [await play(mode, known, options.dead, options.back) for _ in range(rounds)]
         counts = " | ".join(str(sum(column)) for column in zip(*found, strict=True))
         print(f"| {mode} | {known} | {rounds} | {counts} |", flush=True)
 

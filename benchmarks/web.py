@@ -38,7 +38,7 @@ from tests.web.browser import browser
 from tests.web.serving import PlainNorth
 from tests.zenoh_peer import free_endpoint
 
-SIZES = Sizes(lines=64, devices=8, tags=98)
+DEVICES, TAGS = 8, 98  # of a line, of a device
 PUBLISHED_EVERY = 5.0  # seconds
 
 
@@ -174,8 +174,8 @@ async def first_paint(port: int, chromium: str, profile: Path) -> tuple[float, f
         return paint / 1000, live
 
 
-def measure(process: subprocess.Popen[bytes], port: int, folder: Path) -> None:
-    until_up(port, SIZES.lines * SIZES.devices)
+def measure(process: subprocess.Popen[bytes], port: int, folder: Path, devices: int) -> None:
+    until_up(port, devices)
     begun, used = time.monotonic(), processor(process)
     size = len(fetched(port, "/metrics"))
     taken = time.monotonic() - begun
@@ -192,17 +192,19 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=20.0, help="of the plant, in each round")
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--alarms", action="store_true", help="every tag has an alarm")
+    parser.add_argument("--lines", type=int, default=64)
     arguments = parser.parse_args()
+    sizes = Sizes(arguments.lines, DEVICES, TAGS)
     structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.ERROR))
     with tempfile.TemporaryDirectory() as folder:
         port, path = free_port(), Path(folder) / "plant.yaml"
-        text = "\n".join(rows(SIZES, free_endpoint(), alike=True, alarms=arguments.alarms))
+        text = "\n".join(rows(sizes, free_endpoint(), alike=True, alarms=arguments.alarms))
         path.write_text(f'web: {{listen: "127.0.0.1:{port}"}}\n{text}\n')
-        print(f"{SIZES.all_tags} tags on {SIZES.lines} lines", flush=True)
+        print(f"{sizes.all_tags} tags on {sizes.lines} lines", flush=True)
         compare(load(path), arguments.seconds, arguments.rounds)
         process = started(HERE, "run", path)
         try:
-            measure(process, port, Path(folder))
+            measure(process, port, Path(folder), sizes.lines * sizes.devices)
         finally:
             process.kill()
             process.wait()

@@ -20,7 +20,7 @@ import structlog
 
 from gateway.parts.history import Historian
 from gateway.protocols.driver import Address, Span, Unit
-from gateway.tags import Sample, Tag, good
+from gateway.tags import Publishing, Sample, Tag, good
 from gateway.values import Layout, parse_type
 
 WEEK = 7 * 86400.0
@@ -36,7 +36,7 @@ def tag(name: str, *, history: bool = True) -> Tag:
         span=Span("D", 100, 1),
         unit_kind=Unit.WORD,
         layout=Layout(parse_type("int16")),
-        history=history,
+        publishing=Publishing(history=history),
     )
 
 

@@ -66,9 +66,11 @@ def _known(path: Path) -> dict[str, None]:
     """Returns the names of all alarms of the file."""
     from gateway.config import load
     from gateway.parts.alarms.watched import LINE  # with all protocols, as `load`
+    from gateway.tags import AlarmRule
 
     config = load(path)
-    tags = (tag.key for device in config.devices for tag in device.tags if tag.alarm is not None)
+    known = (tag for device in config.devices for tag in device.tags)
+    tags = (tag.key for tag in known if tag.feature(AlarmRule) is not None)
     devices = (device.name for device in config.devices)
     return dict.fromkeys([*tags, *devices, *(f"{LINE}{line.name}" for line in config.lines)])
 

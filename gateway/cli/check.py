@@ -95,13 +95,13 @@ def _notes(config: Config) -> Iterator[str]:
                 "the word back; changes by the PLC in between are lost"
             )
     for tag in tags:
-        if tag.kept is None and (limit := tag.exact_below) is not None:
+        if tag.origin.kept is None and (limit := tag.exact_below) is not None:
             yield (
                 f"{tag.key} ({tag.text}): a JSON number has 53 bits. Beyond {limit:.4g}"
                 " either way two values of the device can look equal, and a write can be one"
                 " step off"
             )
-    totals = [tag.key for tag in tags if isinstance(tag.kept, CounterRule)]
+    totals = [tag.key for tag in tags if isinstance(tag.origin.kept, CounterRule)]
     if totals and config.state_file is None:
         yield (
             f"{', '.join(totals[:5])}: a total begins again at each start of the gateway: "

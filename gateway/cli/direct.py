@@ -63,7 +63,7 @@ async def read(config: Config, tags: Sequence[Tag]) -> list[Sample]:
     for line_config in config.lines:
         enabled = {device.name for device in line_config.devices if device.enabled}
         own = set(line_config.tags)
-        mine = [tag for tag in known if tag in own and not tag.inputs]
+        mine = [tag for tag in known if tag in own and not tag.origin.inputs]
         if line_config.serve:  # a request on the wire of a master would disturb it
             found |= {tag: bad(tag, Reason.LINE_DOWN, time.time_ns(), SERVED) for tag in mine}
             continue
@@ -80,7 +80,7 @@ def _with_inputs(tags: Iterable[Tag]) -> list[Tag]:
     """Returns the tags, and those that their values are made of, each once."""
     known: dict[Tag, None] = {}
     for tag in tags:
-        known |= dict.fromkeys((*_with_inputs(tag.inputs), tag))
+        known |= dict.fromkeys((*_with_inputs(tag.origin.inputs), tag))
     return list(known)
 
 

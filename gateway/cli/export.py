@@ -80,9 +80,9 @@ def _row(prefix: str, tag: Tag) -> dict[str, object]:
         "Name": tag.name,
         "Address": tag.text,
         "Type": _type(tag),
-        "Unit": tag.unit,
-        "Scale": "" if tag.scale == 1 else tag.scale,
-        "Offset": "" if tag.offset == 0 else tag.offset,
+        "Unit": tag.label.unit,
+        "Scale": "" if tag.shaping.scale == 1 else tag.shaping.scale,
+        "Offset": "" if tag.shaping.offset == 0 else tag.shaping.offset,
         "Every": _time(tag.every),
         "R/W": "R" if rule is None else "R/W",
         "Min": _or_empty(limits.get("min")),
@@ -95,10 +95,12 @@ def _row(prefix: str, tag: Tag) -> dict[str, object]:
     row |= _order(tag)
     if tag.shaping is not None and tag.shaping.clamp is not None:
         row["Clamp"] = orjson.dumps([*tag.shaping.clamp]).decode()
-    if isinstance(tag.kept, CounterRule):
-        row["Counter"] = _counter(tag.kept)
-    if tag.names is not None:
-        row["Enum"] = ";".join(f"{number}={name}" for number, name in tag.names.by_number.items())
+    if isinstance(tag.origin.kept, CounterRule):
+        row["Counter"] = _counter(tag.origin.kept)
+    if tag.shaping.names is not None:
+        row["Enum"] = ";".join(
+            f"{number}={name}" for number, name in tag.shaping.names.by_number.items()
+        )
     for name, value in meta.items():
         if name not in _OWN:
             row[name.replace("_", " ").capitalize()] = _other(name, value)
@@ -110,7 +112,7 @@ def _row(prefix: str, tag: Tag) -> dict[str, object]:
 
 def _type(tag: Tag) -> str:
     """Returns the type in the device; nothing where the file has none."""
-    if tag.formula is not None or tag.shape is not None:
+    if tag.origin.formula is not None or tag.origin.shape is not None:
         return ""
     return str(meta_fields(tag)["raw_type"])
 
@@ -124,12 +126,12 @@ def _counter(rule: CounterRule) -> str:
 
 def _order(tag: Tag) -> Mapping[str, object]:
     """Returns the order of words and bytes, where the type has one."""
-    if tag.kept is not None:
-        return _order(tag.inputs[0])
+    if tag.origin.kept is not None:
+        return _order(tag.origin.inputs[0])
     kind = tag.layout.type
     if (
-        tag.formula is not None
-        or tag.shape is not None
+        tag.origin.formula is not None
+        or tag.origin.shape is not None
         or tag.unit_kind is not Unit.WORD
         or kind.kind is Kind.BOOL
     ):

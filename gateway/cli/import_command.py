@@ -16,8 +16,6 @@ from gateway.errors import ConfigError
 from gateway.sheets import devices_in, link_table, read_grid
 from gateway.tags import Tag
 
-_DERIVED = ("decode", "shape")
-
 SheetPath = Annotated[
     Path, typer.Argument(metavar="SHEET", help="CSV, tab-separated text or .xlsx; with titles.")
 ]
@@ -129,4 +127,4 @@ def _meaning(config: Config) -> dict[str, tuple[object, ...]]:
 
 
 def _settings(tag: Tag) -> tuple[object, ...]:
-    return tuple(getattr(tag, one.name) for one in fields(tag) if one.name not in _DERIVED)
+    return tuple(getattr(tag, one.name) for one in fields(tag) if one.init)

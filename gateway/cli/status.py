@@ -15,6 +15,7 @@ from gateway.cli.client import reached
 from gateway.cli.repeated import repeated
 from gateway.cli.terminal import FAILED, AsJson, ConfigPath, err, out, printable
 from gateway.contract.faults import Documents, below, faults, transfers, warnings
+from gateway.contract.line_faults import span
 
 HOUR = "now(-1h)"
 _STYLES = {"up": "green", "open": "green", "silent": "red", "down": "red", "failing": "yellow"}
@@ -225,13 +226,3 @@ def _ago(seconds: float | None) -> str:
 
 def _counts(counts: Mapping[str, int]) -> str:
     return printable(", ".join(f"{number} {kind}" for kind, number in counts.items())) or "-"
-
-
-def span(seconds: float) -> str:
-    """Returns `12 s`, `5 min`, `3 h 20 min` or `4 d 2 h`."""
-    minutes, hours, days = int(seconds // 60), int(seconds // 3600), int(seconds // 86400)
-    if days:
-        return f"{days} d {hours % 24} h"
-    if hours:
-        return f"{hours} h {minutes % 60} min"
-    return f"{minutes} min" if minutes else f"{seconds:.0f} s"

@@ -20,7 +20,9 @@ def row_of(sample: Sample) -> Row:
         "quality": sample.quality.value,
         "time": rfc3339(sample.time),
     }
-    if sample.tag.names is not None and (text := sample.tag.names.text(sample.value)):
+    if sample.tag.shaping.names is not None and (
+        text := sample.tag.shaping.names.text(sample.value)
+    ):
         document["text"] = text
     if sample.reason is not None:
         document["reason"] = sample.reason.value
@@ -55,7 +57,7 @@ def table_of(rows: Iterable[Row], tags: dict[str, Tag], *, utc: bool = False) ->
         table.add_row(
             Text(row.tag),
             Text("-" if document.get("value") is None else _named(document)),
-            Text(tag.unit if tag else ""),
+            Text(tag.label.unit if tag else ""),
             Text(printable(quality), style="" if good else "red"),
             Text(time_text(str(document.get("time", "")), utc=utc)),
         )

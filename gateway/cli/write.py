@@ -90,7 +90,7 @@ def _value(config: Path, known: Mapping[str, Tag], name: str, text: str) -> Valu
     if target is None:
         raise ConfigError(f"there is no tag {name} in {config}{suggestion(name, known)}")
     if target.write is None:
-        if target.inputs:
+        if target.origin.inputs:
             raise ConfigError(f"{name} cannot be written: its value follows from other reads")
         raise ConfigError(f"{name} cannot be written: it has no `write: true` in {config}")
     parsed = _parsed(text, target)
@@ -144,7 +144,7 @@ def _group_lines(device: str, answer: dict[str, object]) -> list[tuple[str, dict
 
 def _parsed(text: str, tag: Tag) -> Value:
     """Returns the value that the text means for this tag."""
-    if tag.names is not None and text in tag.names.by_number.values():
+    if tag.shaping.names is not None and text in tag.shaping.names.by_number.values():
         return text  # `on` is a name here
     kind, parsed = tag.layout.type.kind, parse_value(text)
     if kind is Kind.BOOL and text.lower() in _SWITCH and tag.element is None:

@@ -35,7 +35,7 @@ def most_that_fits(driver: Addressing, span: Span, kind: ValueType, *, write: bo
 
 def check_overlaps(driver: Addressing, tags: Sequence[Tag], path: Path, mistakes: Mistakes) -> None:
     """Notes tags that overlap and that no request can read together: each is read as a whole."""
-    areas = {tag.span.area for tag in tags if tag.span.size > _LONG and tag.shape is None}
+    areas = {tag.span.area for tag in tags if tag.span.size > _LONG and tag.origin.shape is None}
     for area in areas:
         if not driver.areas[area].readable:
             continue

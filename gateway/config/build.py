@@ -49,6 +49,7 @@ from gateway.engine.device.device_settings import DeviceSettings
 from gateway.errors import ConfigError
 from gateway.protocols.driver import AnyDriver, Timing
 from gateway.protocols.registry import PROTOCOLS
+from gateway.tags import AlarmRule
 from gateway.transport.port import ModemAddress, SerialPath
 
 STATE_FILE = FilePath("state.json")  # where there is a folder for it
@@ -336,7 +337,7 @@ def _devices_of(raw: object) -> object:
 
 
 def _have_alarms(lines: list[LineConfig]) -> bool:
-    return any(tag.alarm is not None for line in lines for tag in line.tags)
+    return any(tag.feature(AlarmRule) is not None for line in lines for tag in line.tags)
 
 
 def _either(own: float | None, default: float) -> float:

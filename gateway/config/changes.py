@@ -26,6 +26,7 @@ _NAMES = {
     "writers_file": "writers.file",
 }
 _SETTINGS = [one.name for one in fields(Tag) if one.init]
+_PARTS = {"shaping", "publishing", "origin"}  # settings that have settings
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +104,7 @@ def _kept(old: Config, new: Config) -> Iterator[str]:
     after = {device.name: (_port(line), device) for line in new.lines for device in line.devices}
     for name in before | after:
         both = [one for one in (before.get(name), after.get(name)) if one is not None]
-        counts = any(tag.kept is not None for _, device in both for tag in device.tags)
+        counts = any(tag.origin.kept is not None for _, device in both for tag in device.tags)
         if counts and (len(both) < 2 or not _alike(*both)):
             yield f"{name}, which has totals or debounced bits,"
 
@@ -184,7 +185,7 @@ def _change(old: DeviceSettings | None, new: DeviceSettings, *, same: bool) -> D
     known = {tag.name: tag for tag in (*old.wire_tags, *old.targets)}
     new = replace(new, targets=tuple(_equal(known.get(tag.name), tag) for tag in new.targets))
     tags = tuple(_equal(known.get(tag.name), tag) for tag in new.wire_tags)
-    others = tuple(tag for tag in new.tags if tag.formula is not None)
+    others = tuple(tag for tag in new.tags if tag.origin.formula is not None)
     if tags == old.wire_tags and replace(new, tags=()) == replace(old, tags=()):
         return DeviceChange(old, old)
     if not (old.enabled and new.enabled and _is_one_station(old, new)):
@@ -216,12 +217,12 @@ def _with_computed(old: Config, file: Config, merged: Config) -> tuple[Config, C
     def make(tag: Tag) -> Tag:
         if tag.key in made:
             return made[tag.key]
-        inputs, same = tuple(make(one) for one in tag.inputs), known.get(tag.key)
-        goes_on = same is not None and same.inputs == inputs and tag.device in stay
+        inputs, same = tuple(make(one) for one in tag.origin.inputs), known.get(tag.key)
+        goes_on = same is not None and same.origin.inputs == inputs and tag.device in stay
         if same is not None and goes_on and _differ(same, tag) <= {"inputs"}:
             made[tag.key] = same
         else:
-            made[tag.key] = replace(tag, inputs=inputs)
+            made[tag.key] = replace(tag, origin=replace(tag.origin, inputs=inputs))
         return made[tag.key]
 
     final = {key: make(tag) for key, tag in wanted.items()}
@@ -242,7 +243,18 @@ def _equal(old: Tag | None, new: Tag) -> Tag:
 
 
 def _differ(old: Tag, new: Tag) -> set[str]:
-    return {name for name in _SETTINGS if getattr(old, name) != getattr(new, name)}
+    """Returns the names of the settings that are not equal."""
+    found = {name for name in _SETTINGS if getattr(old, name) != getattr(new, name)}
+    pairs = [(getattr(old, name), getattr(new, name)) for name in found & _PARTS]
+    if "features" in found:
+        before, after = ({type(one): one for one in tag.features} for tag in (old, new))
+        pairs += [(before.get(kind), after.get(kind)) for kind in before | after]
+    for one, other in pairs:
+        known = one or other  # a feature that only one tag has is compared with its defaults
+        for part in fields(known):
+            if getattr(one, part.name, part.default) != getattr(other, part.name, part.default):
+                found.add(part.name)
+    return found - _PARTS - {"features"}
 
 
 def _is_one_station(old: DeviceSettings, new: DeviceSettings) -> bool:
@@ -254,8 +266,8 @@ def _tags(device: DeviceSettings | None) -> Sequence[Tag]:
 
 
 def _plain(device: DeviceSettings) -> Iterator[Tag]:
-    return (tag for tag in device.tags if tag.formula is None)
+    return (tag for tag in device.tags if tag.origin.formula is None)
 
 
 def _computed(device: DeviceSettings) -> Iterator[Tag]:
-    return (tag for tag in device.tags if tag.formula is not None)
+    return (tag for tag in device.tags if tag.origin.formula is not None)

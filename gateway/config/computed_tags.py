@@ -4,16 +4,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from gateway.config.alarm_rules import alarm_misfits, alarm_rule
+from gateway.config.alarm_rules import alarm_misfits
 from gateway.config.device_tags import ComputedSource
 from gateway.config.messages import Mistakes, similar
 from gateway.config.records import LineConfig
 from gateway.config.shaping_rules import computed_shaping
-from gateway.config.tag_rules import inherit
+from gateway.config.tag_rules import features_of, inherit
 from gateway.engine.device.device_settings import DeviceSettings
 from gateway.errors import ConfigError
 from gateway.protocols.driver import Address, Span, Unit
-from gateway.tags import Tag
+from gateway.tags import Origin, Publishing, Tag
 from gateway.tags.formula import Formula
 from gateway.tags.tag import CounterRule
 from gateway.values import Kind, Layout, ValueType
@@ -129,15 +129,12 @@ class _Maker:
             unit_kind=Unit.WORD,
             layout=Layout(kind),
             every=min(one.every for one in inputs),
-            unit=settings.unit,
-            description=settings.description,
-            deadband=settings.deadband,
-            history=settings.history,
-            payload=settings.payload,
-            alarm=alarm_rule(own.alarm, settings.description),
             shaping=shaping,
-            formula=Formula(own.computed, parsed.term, whole),
-            inputs=tuple(inputs),
+            publishing=Publishing(
+                settings.deadband, payload=settings.payload, history=settings.history
+            ),
+            origin=Origin(formula=Formula(own.computed, parsed.term, whole), inputs=tuple(inputs)),
+            features=features_of(settings, own.alarm),
         )
 
 
@@ -146,7 +143,7 @@ def check_totals(lines: Sequence[LineConfig], mistakes: Mistakes) -> None:
     for line in lines:
         for device in line.devices:
             for tag in device.tags:
-                if isinstance(tag.kept, CounterRule):
+                if isinstance(tag.origin.kept, CounterRule):
                     place = ("lines", line.name, "devices", device.name, "tags", tag.name)
                     mistakes.add(
                         (*place, "counter"),

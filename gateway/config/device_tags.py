@@ -77,7 +77,7 @@ class DeviceTags:
                 if tag is not None and len(self.mistakes) == before:
                     alike[text] = tag
             if tag is not None:
-                if tag.history and self.recorded is None:
+                if tag.publishing.history and self.recorded is None:
                     self.recorded = place
                 tags.append(tag)
         return tuple(tags)

@@ -17,7 +17,7 @@ from gateway.config.tag_rules import (
 )
 from gateway.protocols.driver import Addressing, Span, Unit
 from gateway.protocols.typed_fields import TypedField, TypedFields
-from gateway.tags import Publish, Tag, WriteRule
+from gateway.tags import Origin, Publish, Tag, WriteRule
 from gateway.values import Layout
 
 _OF_WORDS = ("type", "word_order", "byte_order", "byte", "bits")
@@ -40,9 +40,10 @@ def field_tag(
         return None
     span = Span(address.area, address.number, 1)
     tag = assemble(source, settings, address, span, Unit.WORD, Layout(field.type), write, mistakes)
-    tag = replace(tag, shape=field.shape, event=source.own.event)
-    if tag.event:
-        tag = replace(tag, publish=Publish.ALWAYS, heartbeat=None)
+    rule = tag.publishing
+    if source.own.event:
+        rule = replace(rule, event=True, publish=Publish.ALWAYS, heartbeat=None)
+    tag = replace(tag, origin=Origin(shape=field.shape), publishing=rule)
     check_bounds(source, tag, mistakes)
     return kept_tag(source.own, settings, tag, source.path, mistakes)
 

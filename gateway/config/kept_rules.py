@@ -6,7 +6,9 @@ from dataclasses import replace
 from gateway.config.messages import Mistakes, Path
 from gateway.config.model import TagDefaults, TagSection
 from gateway.config.shaping_settings import CounterSection
-from gateway.tags import Publish, Tag
+from gateway.tags import Origin, Publish, Tag
+from gateway.tags.publishing import ON_CHANGE
+from gateway.tags.shaping import PLAIN, Shaping
 from gateway.tags.tag import CounterRule
 from gateway.values import Kind, Layout, ValueType
 
@@ -26,25 +28,21 @@ def kept_tag(
         return tag
     if counter:
         return _counted(tag, counter if isinstance(counter, CounterSection) else CounterSection())
-    fits = kind == ValueType(Kind.BOOL) and tag.write is None and not tag.event
+    fits = kind == ValueType(Kind.BOOL) and tag.write is None and not tag.publishing.event
     if settings.debounce and fits:
-        raw = _raw(tag)
-        kept = replace(tag, kept=settings.debounce, inputs=(raw,), shape=None)
-        return replace(kept, heartbeat=None, publish=Publish.CHANGE)
+        return _around(tag, tag.layout, settings.debounce, replace(tag.shaping, names=None))
     return tag
 
 
-def _raw(tag: Tag) -> Tag:
-    """Returns the tag that is read; nothing of it is published."""
-    return replace(
-        tag,
-        deadband=None,
-        heartbeat=None,
-        publish=Publish.CHANGE,
-        history=False,
-        names=None,
-        alarm=None,
-    )
+def _around(tag: Tag, layout: Layout, rule: float | CounterRule, shaping: Shaping) -> Tag:
+    """Returns a tag around the tag that is read, of which nothing is published.
+
+    `shaping`: of the tag that is read.
+    """
+    raw = replace(tag, publishing=ON_CHANGE, shaping=shaping, features=())
+    publishing = replace(tag.publishing, heartbeat=None, publish=Publish.CHANGE)
+    origin = Origin(kept=rule, inputs=(raw,))
+    return replace(tag, layout=layout, origin=origin, publishing=publishing)
 
 
 def _counted(tag: Tag, rule: CounterSection) -> Tag:
@@ -54,16 +52,8 @@ def _counted(tag: Tag, rule: CounterSection) -> Tag:
         modulus = 2**rule.bits
     if rule.top is not None:
         modulus = rule.top + 1
-    raw = replace(_raw(tag), scale=1.0, offset=0.0, shaping=None)
-    return replace(
-        tag,
-        layout=Layout(ValueType(Kind.INT64)),
-        kept=CounterRule(modulus, modulus // 2 if rule.most is None else rule.most),
-        inputs=(raw,),
-        shape=None,
-        heartbeat=None,
-        publish=Publish.CHANGE,
-    )
+    kept = CounterRule(modulus, modulus // 2 if rule.most is None else rule.most)
+    return _around(tag, Layout(ValueType(Kind.INT64)), kept, PLAIN)
 
 
 def _misfits(own: TagSection, kind: ValueType) -> Iterator[tuple[str, str]]:

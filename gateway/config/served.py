@@ -121,12 +121,12 @@ class ServedDevice:
         own = self._own(tag.name)
         place = ("tags", tag.name)
         source, retain = own.get("source"), own.get("retain") is True
-        if tag.kept is not None:
+        if tag.origin.kept is not None:
             for setting in ("debounce", "counter"):
                 if setting in own:
                     text = f"{setting} is for values that the gateway reads: remove it here"
                     self._note((*place, setting), text)
-            tag = replace(tag, kept=None, inputs=(), shaping=tag.inputs[0].shaping)
+            tag = replace(tag, origin=tag.origin.inputs[0].origin)
         hold_last = own.get("hold_last", self.defaults.hold_last) is True
         inside = [served.takes(*cell) for cell in cells_of(tag.span)]
         accepted = any(inside)
@@ -142,8 +142,9 @@ class ServedDevice:
             )
         if "every" in own:
             self._note((*place, "every"), "every has no effect: the master decides when it asks")
-        if accepted and own.get("publish") != "change" and tag.deadband is None:
-            tag = replace(tag, publish=Publish.ALWAYS, event=True, heartbeat=None)
+        if accepted and own.get("publish") != "change" and tag.publishing.deadband is None:
+            each = replace(tag.publishing, publish=Publish.ALWAYS, event=True, heartbeat=None)
+            tag = replace(tag, publishing=each)
         return Row(
             tag=replace(tag, write=None) if accepted or source is not None else tag,
             source=source if isinstance(source, str) else None,

@@ -1,20 +1,20 @@
 """Makes the shaping of a tag: checks that its settings fit the value and each other."""
 
 from collections.abc import Iterator
+from dataclasses import replace
+from functools import lru_cache
 
 from gateway.config.messages import shown
 from gateway.config.model import ComputedSection, TagDefaults, TagSection
 from gateway.tags.scaling import Ends, decimal, linear, type_of
-from gateway.tags.shaping import Bounds, Names, Shaping
+from gateway.tags.shaping import PLAIN, Bounds, Names, Shaping
 from gateway.values import BYTES, Kind, ValueType
-
-PLAIN = Shaping()
 
 
 def shaping_of(
     own: TagSection, settings: TagDefaults, kind: ValueType, mistakes: list[tuple[str, str]]
-) -> tuple[Shaping | None, Names | None]:
-    """Returns the shaping of a value, and the names of its numbers; adds settings with mistakes.
+) -> Shaping:
+    """Returns the shaping of a value; adds settings with mistakes.
 
     `settings`: those of the tag with those that it inherits. Of these one that does not fit is
     ignored.
@@ -22,14 +22,18 @@ def shaping_of(
     ends = None
     if kind.is_number and settings.from_ is not None and settings.to is not None:
         ends = Ends(settings.from_, settings.to)
-    line = linear(settings.scale, settings.offset, ends) if kind.is_number else None
+    scaling = (settings.scale, settings.offset) if kind.is_number else (1.0, 0.0)
+    line = linear(*scaling, ends)
     value_type = type_of(kind, line)
     whole = not value_type.startswith("float")
     found = Shaping(
+        scale=scaling[0],
+        offset=scaling[1],
         ends=ends,
         decimals=settings.decimals if kind.is_number and not whole else None,
         clamp=settings.clamp if kind.is_number else None,
         invert=own.invert,
+        names=own.enum,
     )
     wrong = [
         *_misfits(own, kind, value_type, scaled=line is not None),
@@ -37,13 +41,19 @@ def shaping_of(
     ]
     mistakes += [(place, what) for place, what in wrong if place in own.model_fields_set]
     if any(place == "clamp" for place, _ in wrong):
-        found = Shaping(ends=ends, decimals=found.decimals, invert=found.invert)
-    return None if found == PLAIN else found, own.enum
+        found = replace(found, clamp=None)
+    return _shared(found)
+
+
+@lru_cache(maxsize=4096)
+def _shared(shaping: Shaping) -> Shaping:
+    """Returns one object for all that are equal."""
+    return PLAIN if shaping == PLAIN else shaping
 
 
 def computed_shaping(
     own: ComputedSection, settings: TagDefaults, mistakes: list[tuple[str, str]], *, whole: bool
-) -> Shaping | None:
+) -> Shaping:
     """Returns the shaping of a computed value. See `shaping_of`."""
     found = Shaping(decimals=None if whole else settings.decimals, clamp=settings.clamp)
     wrong = list(_clamp_misfits(found, whole=whole))
@@ -52,7 +62,7 @@ def computed_shaping(
     mistakes += [(place, what) for place, what in wrong if place in own.model_fields_set]
     if any(place == "clamp" for place, _ in wrong):
         found = Shaping(decimals=found.decimals)
-    return None if found == PLAIN else found
+    return found
 
 
 def _misfits(

@@ -2,16 +2,23 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 
 from gateway.config.alarm_rules import alarm_misfits, alarm_rule
 from gateway.config.array_rules import array_misfits, most_that_fits
 from gateway.config.kept_rules import kept_tag
 from gateway.config.messages import Mistakes, Path
-from gateway.config.model import ComputedSection, TagDefaults, TagSection, WriteSection
+from gateway.config.model import (
+    AlarmSection,
+    ComputedSection,
+    TagDefaults,
+    TagSection,
+    WriteSection,
+)
 from gateway.config.shaping_rules import shaping_of
 from gateway.errors import BadValue, ConfigError
 from gateway.protocols.driver import Address, Addressing, Area, Span, Unit
-from gateway.tags import Tag, WriteRule
+from gateway.tags import Label, Publishing, Tag, WriteRule
 from gateway.values import BYTES, Byte, Kind, Layout, Order, ValueType
 
 _SIZES = {Unit.BIT: "bits", Unit.WORD: "words", Unit.DWORD: "values of 32 bits"}
@@ -99,9 +106,8 @@ def assemble(
     mistakes: Mistakes,
 ) -> Tag:
     """Returns the tag, without settings of numbers where its type is no number."""
-    number = layout.type.is_number
     wrong: list[tuple[str, str]] = []
-    shaping, names = shaping_of(source.own, settings, layout.type, wrong)
+    shaping = shaping_of(source.own, settings, layout.type, wrong)
     for setting, problem in wrong:
         mistakes.add((*source.path, setting.rstrip("_")), problem)
     return Tag(
@@ -113,20 +119,30 @@ def assemble(
         unit_kind=unit_kind,
         layout=layout,
         every=settings.every,
-        scale=settings.scale if number else 1.0,
-        offset=settings.offset if number else 0.0,
-        unit=settings.unit,
-        description=settings.description,
-        deadband=settings.deadband if number and names is None else None,
-        publish=settings.publish,
-        heartbeat=settings.heartbeat,
-        history=settings.history,
-        payload=settings.payload,
-        write=write,
-        alarm=alarm_rule(source.own.alarm, settings.description),
         shaping=shaping,
-        names=names,
+        publishing=_publishing(
+            settings.deadband if layout.type.is_number and shaping.names is None else None,
+            settings.publish,
+            settings.heartbeat,
+            settings.payload,
+            settings.history,
+        ),
+        write=write,
+        features=features_of(settings, source.own.alarm),
     )
+
+
+_publishing = lru_cache(maxsize=4096)(Publishing)  # one object for all that are equal
+
+
+def features_of(settings: TagDefaults, alarm: AlarmSection | None) -> tuple[object, ...]:
+    """Returns the features that no read needs."""
+    found: list[object] = []
+    if settings.unit or settings.description:
+        found.append(Label(settings.unit, settings.description))
+    if (rule := alarm_rule(alarm, settings.description)) is not None:
+        found.append(rule)
+    return tuple(found)
 
 
 def _type(

@@ -173,7 +173,7 @@ class _Finder:
         return not _arrives(device.driver, tag)
 
     def unwritable(self, tag: Tag) -> Iterator[tuple[str, str]]:
-        if tag.formula is not None:
+        if tag.origin.formula is not None:
             yield "to", f"{tag.key} is computed from other tags: name a tag with an address"
         elif tag.write is None:
             yield "to", f"{tag.key} may only be read: write `write: true` at that tag"

@@ -1,11 +1,18 @@
 """Certificates and keys, checked before Zenoh opens: it reports errors late and briefly."""
 
 import ssl
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from datetime import UTC, datetime
 
+from gateway import files
 from gateway.config import TlsConfig
+from gateway.contract.faults import certificate_fault
 from gateway.errors import ConfigError
+
+DAY = 86_400
+_UTC_TIME, _VERSION = 0x17, 0xA0  # tags of ASN.1
 
 
 def check_files(tls: TlsConfig) -> None:
@@ -20,6 +27,71 @@ def check_files(tls: TlsConfig) -> None:
         wrong = f"is no PEM key without a password, or not that of {tls.certificate}"
         with _as_config_error(f"zenoh.tls.key {tls.key}", wrong):
             context.load_cert_chain(tls.certificate, tls.key, password="")
+
+
+def expiries(tls: TlsConfig) -> list[str]:
+    """Returns a sentence for each file of `zenoh.tls` that expires within 30 days."""
+    found = []
+    for name, file in (("ca", tls.ca), ("certificate", tls.certificate)):
+        if file is not None:
+            with _as_config_error(f"zenoh.tls.{name} {file}", "holds no certificate in PEM form"):
+                at = expires(files.read(file, files.MOST_OF_SECRETS), last=name == "ca")
+            document = {"file": str(file), "days": (at - time.time()) / DAY, "trouble": ""}
+            found += [certificate_fault(f"zenoh.tls.{name}", document)]
+    return [one for one in found if one]
+
+
+def expires(content: bytes, *, last: bool = False) -> float:
+    """Returns when the first certificate of a PEM file expires, or the `last`: s since 1970.
+
+    Raises `ConfigError` for other content.
+    """
+    begin, end = "-----BEGIN CERTIFICATE-----", "-----END CERTIFICATE-----"
+    blocks = content.decode("ascii", "replace").split(begin)[1:]
+    try:
+        found = [
+            _not_after(ssl.PEM_cert_to_DER_cert(f"{begin}{one.partition(end)[0]}{end}"))
+            for one in blocks
+        ]
+    except (ValueError, IndexError):
+        found = []
+    if not found:
+        raise ConfigError("it holds no certificate in PEM form")
+    return max(found) if last else min(found)
+
+
+def _not_after(der: bytes) -> float:
+    """RFC 5280, 4.1: version, serial number, algorithm, issuer, then the validity."""
+    _, certificate = _element(der)
+    _, fields = _element(certificate)
+    if fields[0] == _VERSION:
+        fields = _after(fields)
+    for _ in ("serial number", "algorithm", "issuer"):
+        fields = _after(fields)
+    _, validity = _element(fields)
+    tag, time_of = _element(_after(validity))
+    form = "%y%m%d%H%M%SZ" if tag == _UTC_TIME else "%Y%m%d%H%M%SZ"
+    return datetime.strptime(time_of.decode(), form).replace(tzinfo=UTC).timestamp()
+
+
+def _after(data: bytes) -> bytes:
+    """Returns what follows the first element."""
+    start, size = _place(data)
+    return data[start + size :]
+
+
+def _element(data: bytes) -> tuple[int, bytes]:
+    """Returns tag and content of the first element."""
+    start, size = _place(data)
+    return data[0], data[start : start + size]
+
+
+def _place(data: bytes) -> tuple[int, int]:
+    """Returns start and size of the content of the first element."""
+    if data[1] < 0x80:
+        return 2, data[1]
+    start = 2 + (data[1] & 0x7F)
+    return start, int.from_bytes(data[2:start], "big")
 
 
 @contextmanager

@@ -4,20 +4,21 @@ import re
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from gateway.contract.line_faults import device_warnings, line_fault, stands_by
+
 JUMP_SHOWN = 3600.0  # seconds
+DAYS_LEFT = 30  # of a certificate
 ROWS_SHOWN = 10  # numbers of transfers in one sentence
-Documents = Mapping[str, Mapping[str, Any]]  # by path: `status`, `lines/hall-1`, `devices/mixer`
+Document = Mapping[str, Any]
+Documents = Mapping[str, Document]  # by path: `status`, `lines/hall-1`, `devices/mixer`
 
 
 def faults(documents: Documents) -> Iterator[str]:
     """Yields what needs a person: lines that are down, silent devices, transfers that do not
     work, a lost router, a stopped part, history not written."""
-    for line, document in below("lines/", documents):
-        if not document["open"]:
-            yield f"line {line} is down: {document['trouble'] or 'not opened yet'}"
-    for device, document in below("devices/", documents):
-        if document["standing"] == "silent":
-            yield f"{device} is silent: {document['diagnosis']}"
+    if not stands_by(documents):
+        for line, document in sorted(below("lines/", documents), key=lambda one: one[1]["open"]):
+            yield from line_fault(line, document, _devices_of(document, documents))
     unreachable = _unreachable(documents)
     for number, row in transfers(documents):
         if _fails(row) and not _waits_for(row, unreachable, documents):
@@ -28,13 +29,16 @@ def faults(documents: Documents) -> Iterator[str]:
     if (wanted := zenoh.get("connect")) and not {"router", "peer"} & set(zenoh["to"]):
         yield f"Zenoh: not connected to {' or '.join(wanted)}: its clients get no values"
     yield from _of_parts(documents)
+    for setting, document in below("certificates/", documents):
+        if wrong := certificate_fault(f"zenoh.tls.{setting}", document):
+            yield wrong
     history = documents.get("history", {"state": "ok"})
     if history["state"] != "ok":
         yield f"history: {history['state']}"
 
 
 def _of_parts(documents: Documents) -> Iterator[str]:
-    for part, document in documents.get("parts", {}).items():
+    for part, document in below("parts/", documents):
         if document["why"]:
             yield f"{part} stopped: {document['why']}; it is tried again in {document['again']} s"
     for part, document in below("files/", documents):
@@ -42,14 +46,26 @@ def _of_parts(documents: Documents) -> Iterator[str]:
             yield f"{part} not saved: {document['trouble']}; a restart forgets the last changes"
 
 
+def certificate_fault(setting: str, document: Document) -> str:
+    """Returns what is wrong with a certificate, from its status document; empty: nothing."""
+    file, days = document["file"], document["days"]
+    if document["trouble"]:
+        return f"{setting} {file}: {document['trouble']}"
+    if days < 0:
+        return f"{setting} {file} expired {-days:.0f} days ago: Zenoh accepts no new connection"
+    if days < DAYS_LEFT:
+        return f"{setting} {file} expires in {days:.0f} days: renew it"
+    return ""
+
+
 def warnings(documents: Documents) -> Iterator[str]:
     """Yields what is not as it should be, while other values are good."""
     unreachable = _unreachable(documents)
-    for device, document in below("devices/", documents):
-        if document["diagnosis"] and device not in unreachable:
-            yield f"{device}: {document['diagnosis']}"
-        yield from document["refused_addresses"]
+    for _, device in below("devices/", documents):
+        yield from device["refused_addresses"]
     for line, document in below("lines/", documents):
+        devices = _devices_of(document, documents)
+        yield from device_warnings(line, [one for one in devices if one[0] not in unreachable])
         load = document["expected"]["load"]
         if load > 1.0:
             yield f"line {line} is asked for {load:.1f} times what it carries: see `check`"
@@ -73,6 +89,11 @@ def warnings(documents: Documents) -> Iterator[str]:
         yield f"history: {lost} samples were lost since the start"
 
 
+def _devices_of(line: Document, documents: Documents) -> list[tuple[str, Document]]:
+    found = [(name, documents.get(f"devices/{name}")) for name in line["devices"]]
+    return [(name, document) for name, document in found if document is not None]
+
+
 def _unreachable(documents: Documents) -> set[str]:
     """Returns the devices that are a fault by themselves, or by their line."""
     found = {
@@ -85,11 +106,11 @@ def _unreachable(documents: Documents) -> set[str]:
     return found | {name for name, document in devices if document["standing"] == "silent"}
 
 
-def _fails(row: Mapping[str, Any]) -> bool:
+def _fails(row: Document) -> bool:
     return row["state"] not in ("starting", "carried")
 
 
-def _waits_for(row: Mapping[str, Any], unreachable: set[str], documents: Documents) -> list[str]:
+def _waits_for(row: Document, unreachable: set[str], documents: Documents) -> list[str]:
     """Returns the devices of a row that cannot be reached now, or are not polled at all."""
     names = [re.split("[/:]", row[end], maxsplit=1)[0] for end in ("from", "to")]
     return [one for one in names if one in unreachable or f"devices/{one}" not in documents]
@@ -112,12 +133,12 @@ def _several(numbers: list[str]) -> str:
     return f"transfers {shown}{f' and {more} more' if more > 0 else ''} wait"
 
 
-def transfers(documents: Documents) -> list[tuple[str, Mapping[str, Any]]]:
+def transfers(documents: Documents) -> list[tuple[str, Document]]:
     """Returns the documents of the transfers by number, in this order."""
     return sorted(below("transfers/", documents), key=lambda row: int(row[0]))
 
 
-def below(folder: str, documents: Documents) -> Iterator[tuple[str, Mapping[str, Any]]]:
+def below(folder: str, documents: Documents) -> Iterator[tuple[str, Document]]:
     """Yields the documents of a folder by name."""
     for path, document in sorted(documents.items()):
         if path.startswith(folder):

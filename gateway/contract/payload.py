@@ -145,7 +145,7 @@ def failure(error: GatewayError) -> Failure:
 def value(sample: Sample) -> bytes:
     """The value with quality and time. A good one in half the time that `sample_fields` takes."""
     known = sample.value
-    if sample.quality is not _GOOD or not _has_json(known) or sample.tag.names is not None:
+    if sample.quality is not _GOOD or not _has_json(known) or sample.tag.shaping.names is not None:
         return orjson.dumps(sample_fields(sample))
     return b'{"value":%b%b' % (orjson.dumps(known), _end_of_good(sample.time))
 
@@ -243,7 +243,10 @@ def sample_fields(sample: Sample) -> dict[str, Value | None]:
     reason = sample.reason
     if sample.quality is Quality.GOOD:
         if _has_json(known):
-            if sample.tag.names is not None and (text := sample.tag.names.text(known)) is not None:
+            if (
+                sample.tag.shaping.names is not None
+                and (text := sample.tag.shaping.names.text(known)) is not None
+            ):
                 return {"value": known, "text": text, "quality": "good", "time": time}
             return {"value": known, "quality": "good", "time": time}
         reason = Reason.NOT_A_NUMBER

@@ -340,7 +340,12 @@ def check(config: Config) -> list[str]:
     if config.writers_file is not None:
         Writers(config.writers_file)
     secrets.plant_secret(config.secret_file)
-    return _exposures(session, config.writers_file, group_settings(config))
+    found = _exposures(session, config.writers_file, group_settings(config))
+    if config.zenoh.tls is not None:
+        from gateway.contract.certificates import expiries  # its TLS takes 10 ms
+
+        found += expiries(config.zenoh.tls)
+    return found
 
 
 def group_settings(config: Config) -> GroupSettings:

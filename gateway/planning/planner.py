@@ -49,7 +49,7 @@ class Block:
         start = self.span.start
         begin = [begins.get(tag.span, tag.span.start - start) for tag in self.tags]
         object.__setattr__(self, "decoder", Decoder(self.tags, begin))
-        object.__setattr__(self, "of_fields", self.tags[0].shape is not None)
+        object.__setattr__(self, "of_fields", self.tags[0].origin.shape is not None)
 
 
 @dataclass(slots=True)

@@ -42,8 +42,8 @@ class OnDemand:
 
         The age is monotonic time: a change of the system clock must not change it.
         """
-        if tag.inputs:
-            return all(self.is_fresh(one, max_age) for one in tag.inputs)
+        if tag.origin.inputs:
+            return all(self.is_fresh(one, max_age) for one in tag.origin.inputs)
         place = self._place(tag.device)
         poll = self._poll(tag)
         if place is None or poll is None or not place[0].engine.is_open:
@@ -57,8 +57,8 @@ class OnDemand:
 
         The age of a value that no poll reads counts from its arrival, after the first call for it.
         """
-        if tag.inputs:
-            return max(map(self.age, tag.inputs))
+        if tag.origin.inputs:
+            return max(map(self.age, tag.origin.inputs))
         poll = self._poll(tag)
         if poll is None:
             at: float | None = self.arrived.setdefault(tag, -math.inf)
@@ -80,8 +80,8 @@ class OnDemand:
         The sample is bad if the device does not answer. Raises `Busy` if the line had no time for
         the read.
         """
-        if tag.inputs:
-            await asyncio.gather(*(self.fresh(one, max_age) for one in tag.inputs))
+        if tag.origin.inputs:
+            await asyncio.gather(*(self.fresh(one, max_age) for one in tag.origin.inputs))
             return self._latest(tag)
         poll = self._poll(tag)
         if poll is None or self.is_fresh(tag, max_age):

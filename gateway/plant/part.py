@@ -159,6 +159,10 @@ class Routed(Protocol):
         """Returns its routes, as aiohttp's `RouteDef`. A guard admits the requests before."""
 
 
+def nothing(_why: str) -> None:
+    """Does nothing: without a service there is nothing to start over."""
+
+
 # -- making parts --------------------------------------------------------------------------------
 
 
@@ -177,6 +181,7 @@ class Core:
     north: North
     history: Callable[[], History | None]
     others: Others
+    start_over: Callable[[str], None] = nothing  # the gateway ends and starts again; the reason
 
     @property
     def config(self) -> Config:

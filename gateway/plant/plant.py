@@ -232,7 +232,7 @@ class Plant:
             self._on_demand.answer_all(samples)
         if self.mirror.derives and (changed or self.mirror.pending):
             changed = self.mirror.follow(changed)
-            self._see([sample for sample in changed if sample.tag.inputs])
+            self._see([sample for sample in changed if sample.tag.origin.inputs])
         if changed:
             self._publish(changed)
 

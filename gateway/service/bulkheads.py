@@ -31,6 +31,7 @@ from gateway.plant.part import (
     Sees,
     Stores,
     TakesOver,
+    nothing,
 )
 from gateway.plant.plant import Plant
 from gateway.tags import Sample, Tag
@@ -193,9 +194,14 @@ class Bulkheads:
         plant.retagged = self._retag
         plant.add_documents(self.documents)
 
-    def make(self, kinds: Iterable[tuple[str, Kind]], north: North) -> None:
+    def make(
+        self,
+        kinds: Iterable[tuple[str, Kind]],
+        north: North,
+        start_over: Callable[[str], None] = nothing,
+    ) -> None:
         """Makes the parts. Raises `ConfigError` for a mistake that only a part finds."""
-        core = Core(self._plant, north, self.history, self)
+        core = Core(self._plant, north, self.history, self, start_over)
         for name, kind in kinds:
             self._all.append(Bulkhead(name, kind, core, self._changed))
         self._changed()
@@ -234,8 +240,10 @@ class Bulkheads:
             if isinstance(one.part, Documented):
                 with one:
                     found |= one.part.documents()
-        stopped = {one.name: one.document() for one in self._all if one.part is not None or one.why}
-        return {**found, "parts": stopped}
+        for one in self._all:
+            if one.part is not None or one.why:
+                found[f"parts/{one.name}"] = one.document()
+        return found
 
     # -- from the plant --
 

@@ -117,7 +117,13 @@ async def _serve(
     plant.subscribe(northbound)
     plant.subscribe(parts)  # clients may have missed what was published
     plant.add_documents(lambda: {"clock": clock.document(), "reload": reloader.document()})
-    parts.make(kinds(), northbound)
+    outdated = asyncio.Event()
+
+    def start_over(why: str) -> None:
+        log.warning("gateway outdated", why=why)
+        outdated.set()
+
+    parts.make(kinds(), northbound, start_over)
     async with AsyncExitStack() as cleanup:  # in reverse order of the start
         clock.start()
         cleanup.callback(clock.stop)
@@ -127,7 +133,7 @@ async def _serve(
         cleanup.push_async_callback(_close, zenoh, parts)
         running = RunningLines()
         live = LiveReload(reloader, plant, northbound, running, plans, supervisor, parts)
-        exclusive, active, opened, replaced, stopping, failed = events = [
+        exclusive, active, opened, replaced, stopping, failed, old = events = [
             asyncio.create_task(event.wait())
             for event in (
                 northbound.exclusive,
@@ -136,9 +142,10 @@ async def _serve(
                 northbound.replaced,
                 stop,
                 running.failed,
+                outdated,
             )
         ]
-        ends = [zenoh, stopping, replaced, failed]
+        ends = [zenoh, stopping, replaced, failed, old]
         for event in events:
             cleanup.callback(event.cancel)
         await _first(exclusive, zenoh, stopping)
@@ -170,7 +177,8 @@ async def _serve(
             f"another gateway named {config.name} serves under {config.zenoh.prefix} already: "
             "`gateway.name` must differ, and a file runs once"
         )
-    return northbound.withheld if northbound.replaced.is_set() and not stop.is_set() else None
+    again = northbound.replaced.is_set() or outdated.is_set()
+    return northbound.withheld if again and not stop.is_set() else None
 
 
 async def _first(*tasks: asyncio.Task[Any]) -> None:

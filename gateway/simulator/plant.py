@@ -75,7 +75,7 @@ def _motion(tag: Tag, number: int) -> Callable[[float], Value]:
     if tag.write is not None:
         low = low if tag.write.min is None else tag.write.min
         high = max(low, high if tag.write.max is None else tag.write.max)
-    whole = not kind.value.startswith("float") and tag.scale == 1
+    whole = not kind.value.startswith("float") and tag.shaping.scale == 1
     return _wave(low, high, number, whole=whole)
 
 

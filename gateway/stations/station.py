@@ -1,7 +1,10 @@
 """The contract of a simulated PLC, and its memory."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
+from itertools import chain
 from typing import Protocol
+
+from gateway.stations.store import NOTHING, Cell, Denied, Why, Written
 
 # Gets an area and numbers in it that a request names. Returns True where the PLC lacks them.
 Guard = Callable[[str, Sequence[int]], bool]
@@ -14,9 +17,10 @@ class Memory:
     station asks it before it carries out a request.
     """
 
-    def __init__(self, areas: Iterable[tuple[str, int, int]]) -> None:
-        """`areas`: (name, first number, last number)."""
+    def __init__(self, areas: Iterable[tuple[str, int, int]], holes: Iterable[Cell] = ()) -> None:
+        """`areas`: (name, first number, last number). `holes`: cells that this model lacks."""
         self.guard: Guard | None = None
+        self.holes = set(holes)
         self._first: dict[str, int] = {}
         self._size: dict[str, int] = {}
         self._cells: dict[str, list[int]] = {}  # up to the last one that was written
@@ -61,6 +65,53 @@ class Memory:
     def animate(self, area: str, index: int, motion: Callable[[float], int]) -> None:
         """Makes the unit `motion(now)`, until it is written."""
         self._moving.setdefault(area, {})[index] = motion
+
+
+class MemoryStore:
+    """The memory of a simulated PLC, as its protocol reaches it at the time `now`."""
+
+    def __init__(self, memory: Memory, read_only: Container[str] = ()) -> None:
+        """`read_only`: areas that no request writes."""
+        self.memory = memory
+        self.now = 0.0
+        self._read_only = read_only
+
+    def _check(self, area: str, start: int, count: int) -> None:
+        memory, numbers = self.memory, range(start, start + count)
+        lacks = not memory.holds(area, start, count)
+        if not lacks and memory.holes:
+            lacks = any((area, number) in memory.holes for number in numbers)
+        if lacks or (memory.guard is not None and memory.guard(area, numbers)):
+            raise Denied(Why.NO_TAG)
+
+    def read(self, area: str, start: int, count: int) -> list[int]:
+        self._check(area, start, count)
+        return self.memory.read(area, start, count, self.now)
+
+    read_points = read
+
+    def write(
+        self,
+        cells: Sequence[tuple[Cell, int]],
+        points: Sequence[tuple[Cell, int]] = (),
+        missing: Mapping[Cell, int] = NOTHING,
+    ) -> Written:
+        runs: list[tuple[Cell, list[int]]] = []
+        for (area, number), unit in chain(cells, points):
+            if runs and runs[-1][0] == (area, number - len(runs[-1][1])):
+                runs[-1][1].append(unit)
+            else:
+                runs.append(((area, number), [unit]))
+        for (area, number), units in runs:
+            if area in self._read_only:
+                raise Denied(Why.NOT_ACCEPTED)
+            self._check(area, number, len(units))
+        for (area, number), units in runs:
+            for i in range(len(units)) if missing else ():
+                if kept := missing.get((area, number + i), 0):
+                    units[i] |= kept & self.memory.read(area, number + i, 1, self.now)[0]
+            self.memory.write(area, number, units)
+        return ()
 
 
 class Station(Protocol):

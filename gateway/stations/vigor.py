@@ -1,16 +1,29 @@
-"""A simulated Vigor M, VB or VH PLC: replies to computer link requests from its device memory.
+"""Vigor M, VB or VH PLCs: requests 51, 61, 70 and 71 of the Computer Link (manual B-5-2).
 
-It finds devices by the address map of the manual (B-5-3), independent of the driver.
+They find devices by the address map of the manual (B-5-3), independent of the driver. Errors: 10
+for characters and lengths, 11 for a wrong sum, 12 for an unknown command, 28 for addresses.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from functools import cache
 from typing import NamedTuple
 
 from gateway.protocols.checksums import byte_sum
 from gateway.protocols.vigor import Vigor
-from gateway.protocols.vigor.codec import HEX_DIGITS, Reply, RequestReader, encode
-from gateway.stations.station import Memory
+from gateway.protocols.vigor.codec import (
+    FORCE_OFF,
+    FORCE_ON,
+    GOOD,
+    HEX_DIGITS,
+    MOST_BYTES,
+    READ,
+    WRITE,
+    Reply,
+    RequestReader,
+    encode,
+)
+from gateway.stations.station import Memory, MemoryStore
+from gateway.stations.store import Cell, Denied, Store, Written
 
 
 class Stretch(NamedTuple):
@@ -52,139 +65,143 @@ _STRETCHES = (
     Stretch(0x1A00, 0x1ADF, "C32", 200, 4),
     Stretch(0x1C00, 0x5BFF, "D", 0, 2),
 )
-FORCED = ("X", "Y", "M", "S", "M9")
+_FORCED = ("X", "Y", "M", "S", "M9")
 _ANY_CASE = b"0123456789ABCDEFabcdef"
+_SHORTEST = 8  # characters of a request: station and command between STX and ETX, and the sum
 
-_DONE, _ASCII_ERROR, _BAD_SUM, _NO_COMMAND, _OUT_OF_RANGE = "00", "10", "11", "12", "28"
+_ASCII_ERROR, _BAD_SUM, _NO_COMMAND, _OUT_OF_RANGE = "10", "11", "12", "28"
+
+
+class _Refusal(Exception):
+    def __init__(self, status: str) -> None:
+        super().__init__(status)
+        self.status = status
+
+
+def addressed(request: bytes) -> int | None:
+    """Returns the station of a request; None where the number, or all of it, is damaged."""
+    number = request[1:3]
+    if len(request) < _SHORTEST or number.strip(_ANY_CASE):
+        return None
+    return int(number, 16)
+
+
+def answer(station: int, store: Store, request: bytes) -> tuple[Reply, Written]:
+    """Carries out a request. Checks in the order of the manual's codes."""
+    content, check, command = request[1:-3], request[-2:], request[3:5].upper().decode("latin-1")
+    status, data = GOOD, b""
+    written: Written = ()
+    if (content + check).translate(None, HEX_DIGITS):
+        return Reply(station, command, _ASCII_ERROR), ()
+    if byte_sum(request[1:-2]) != check:
+        return Reply(station, command, _BAD_SUM), ()
+    try:
+        data, written = _carry_out(store, command, content[4:])
+    except _Refusal as refusal:
+        status = refusal.status
+    except Denied:
+        status = _OUT_OF_RANGE
+    return Reply(station, command, status, data), written
+
+
+def _carry_out(store: Store, command: str, body: bytes) -> tuple[bytes, Written]:
+    """Raises `_Refusal`, `Denied`."""
+    if command == READ:
+        places = _places(body)
+        if len(body) != 6:
+            raise _Refusal(_ASCII_ERROR)
+        return _read(store, places), ()
+    if command == WRITE:
+        places = _places(body)
+        if len(body) != 6 + 2 * len(places):
+            raise _Refusal(_ASCII_ERROR)
+        return b"", _write(store, places, bytes.fromhex(body[6:].decode()))
+    if command not in (FORCE_ON, FORCE_OFF):
+        raise _Refusal(_NO_COMMAND)
+    if len(body) != 4:
+        raise _Refusal(_ASCII_ERROR)
+    byte, bit = divmod(int(body, 16), 8)
+    place = _stretch(byte)
+    if place is None or place.area not in _FORCED:
+        raise _Refusal(_OUT_OF_RANGE)
+    return b"", store.write([((place.area, place.devices(byte)[bit]), int(command == FORCE_ON))])
+
+
+def _places(body: bytes) -> list[tuple[Stretch, int]]:
+    """Returns the bytes of a 51 or 61."""
+    if len(body) < 6:
+        raise _Refusal(_ASCII_ERROR)
+    address, count = int(body[:4], 16), int(body[4:6], 16)
+    if not 1 <= count <= MOST_BYTES:
+        raise _Refusal(_OUT_OF_RANGE)
+    places = []
+    for byte in range(address, address + count):
+        place = _stretch(byte)
+        if place is None:
+            raise _Refusal(_OUT_OF_RANGE)
+        places.append((place, byte))
+    return places
+
+
+def _read(store: Store, places: list[tuple[Stretch, int]]) -> bytes:
+    data, words = bytearray(), dict[Cell, int]()
+    for place, byte in places:
+        devices = place.devices(byte)
+        if not place.width:
+            bits = store.read_points(place.area, devices[0], len(devices))
+            data.append(sum((bit & 1) << i for i, bit in enumerate(bits)))
+            continue
+        cell = (place.area, devices[0])
+        if cell not in words:
+            words[cell] = store.read(*cell, 1)[0]
+        data.append(words[cell] >> place.shift(byte) & 0xFF)
+    return bytes(data)
+
+
+def _write(store: Store, places: list[tuple[Stretch, int]], data: bytes) -> Written:
+    """Writes all bytes as one."""
+    points: list[tuple[Cell, int]] = []
+    words: dict[Cell, int] = {}
+    missing: dict[Cell, int] = {}
+    for (place, byte), value in zip(places, data, strict=True):
+        devices = place.devices(byte)
+        if not place.width:
+            points += [((place.area, n), value >> bit & 1) for bit, n in enumerate(devices)]
+            continue
+        cell, shift = (place.area, devices[0]), place.shift(byte)
+        words[cell] = words.get(cell, 0) | value << shift
+        missing[cell] = missing.get(cell, (1 << 8 * place.width) - 1) & ~(0xFF << shift)
+    lacking = {cell: bits for cell, bits in missing.items() if bits}
+    return store.write([*words.items()], points, lacking)
 
 
 class VigorStation:
-    """A PLC of station number 0..255, by default with every device of the address map.
+    """A simulated PLC of station number 0..255, by default with every device of the address map.
 
     Memory areas: X Y M S T C D as in the manual (octal numbers as plain integers), TS CS the
     contacts and TC CC the coils of timers and counters, C32 the counters from C200 on (32 bits),
     M9 and D9 the special devices from 9000 on.
     """
 
-    def __init__(self, station: int, holes: Iterable[tuple[str, int]] = ()) -> None:
+    def __init__(self, station: int, holes: Iterable[Cell] = ()) -> None:
         """`holes`: devices (area, number) that this model lacks; the reply is 28."""
         if not 0 <= station <= 255:
             raise ValueError(f"station {station} is not 0..255")
         self.station = station
-        self.holes = set(holes)
         self.mute = False  # carries out requests, but its replies are lost
-        self._reader = RequestReader()
-        self._memory = Memory(
-            (place.area, place.number, place.devices(place.last)[-1]) for place in _STRETCHES
+        self.memory = Memory(
+            ((place.area, place.number, place.devices(place.last)[-1]) for place in _STRETCHES),
+            holes,
         )
-
-    @property
-    def memory(self) -> Memory:
-        return self._memory
+        self._store = MemoryStore(self.memory)
+        self._reader = RequestReader()
 
     def hear(self, data: bytes, now: float) -> list[bytes]:
         """Returns the replies to the requests that `data` completes."""
-        replies = [self._answer(request, now) for request in self._reader.feed(data)]
-        return [] if self.mute else [encode(reply) for reply in replies if reply is not None]
-
-    def _answer(self, request: bytes, now: float) -> Reply | None:
-        """Returns None for a request to another station, or one too damaged for any station."""
-        station, command = request[1:3], request[3:5].upper()
-        content, check = request[1:-3], request[-2:]
-        if len(content) < 4 or station.strip(_ANY_CASE) or int(station, 16) != self.station:
-            return None
-        status, data = _DONE, b""
-        if (content + check).translate(None, HEX_DIGITS):
-            status = _ASCII_ERROR
-        elif byte_sum(request[1:-2]) != check:
-            status = _BAD_SUM
-        else:
-            status, data = self._carry_out(command, content[4:], now)
-        return Reply(self.station, command.decode("latin-1"), status, data)
-
-    def _carry_out(self, command: bytes, body: bytes, now: float) -> tuple[str, bytes]:
-        """Returns status and data for a whole request."""
-        match command:
-            case b"51":
-                return self._read(body, now)
-            case b"61":
-                return self._write(body, now), b""
-            case b"70" | b"71":
-                return self._force(body, int(command == b"70")), b""
-        return _NO_COMMAND, b""
-
-    def _read(self, body: bytes, now: float) -> tuple[str, bytes]:
-        if len(body) < 6:
-            return _ASCII_ERROR, b""
-        places = self._places(body)
-        if places is None:
-            return _OUT_OF_RANGE, b""
-        if len(body) > 6:
-            return _ASCII_ERROR, b""
-        return _DONE, bytes(self._peek(place, byte, now) for place, byte in places)
-
-    def _write(self, body: bytes, now: float) -> str:
-        if len(body) < 6:
-            return _ASCII_ERROR
-        places = self._places(body)
-        if places is None:
-            return _OUT_OF_RANGE
-        if len(body) != 6 + 2 * len(places):
-            return _ASCII_ERROR
-        data = bytes.fromhex(body[6:].decode("ascii"))
-        for (place, byte), value in zip(places, data, strict=True):
-            self._poke(place, byte, value, now)
-        return _DONE
-
-    def _force(self, body: bytes, value: int) -> str:
-        if len(body) != 4:
-            return _ASCII_ERROR
-        byte, bit = divmod(int(body, 16), 8)
-        place = stretch(byte)
-        if place is None or place.area not in FORCED:
-            return _OUT_OF_RANGE
-        number = place.devices(byte)[bit]
-        if self._lacks(place.area, (number,)):
-            return _OUT_OF_RANGE
-        self._memory.write(place.area, number, [value])
-        return _DONE
-
-    def _places(self, body: bytes) -> list[tuple[Stretch, int]] | None:
-        """Returns the bytes of a 51 or 61; None for zero, too many, or some that do not exist."""
-        address, count = int(body[:4], 16), int(body[4:6], 16)
-        if not 1 <= count <= 128:
-            return None
-        places = []
-        for byte in range(address, address + count):
-            place = stretch(byte)
-            if place is None:
-                return None
-            if self._lacks(place.area, place.devices(byte)):
-                return None
-            places.append((place, byte))
-        return places
-
-    def _lacks(self, area: str, numbers: Sequence[int]) -> bool:
-        if self.holes and any((area, number) in self.holes for number in numbers):
-            return True
-        return self._memory.guard is not None and self._memory.guard(area, numbers)
-
-    def _peek(self, place: Stretch, byte: int, now: float) -> int:
-        devices = place.devices(byte)
-        values = self._memory.read(place.area, devices[0], len(devices), now)
-        if place.width:
-            return values[0] >> place.shift(byte) & 0xFF
-        return sum((value & 1) << bit for bit, value in enumerate(values))
-
-    def _poke(self, place: Stretch, byte: int, value: int, now: float) -> None:
-        devices = place.devices(byte)
-        if not place.width:
-            self._memory.write(place.area, devices[0], [value >> bit & 1 for bit in range(8)])
-            return
-        shift = place.shift(byte)
-        register = self._memory.read(place.area, devices[0], 1, now)[0]
-        kept = register & ~(0xFF << shift) & (1 << 8 * place.width) - 1
-        self._memory.write(place.area, devices[0], [kept | value << shift])
+        self._store.now = now
+        requests = [one for one in self._reader.feed(data) if addressed(one) == self.station]
+        replies = [answer(self.station, self._store, request)[0] for request in requests]
+        return [] if self.mute else [encode(reply) for reply in replies]
 
 
 def vigor_station(driver: Vigor) -> VigorStation:
@@ -193,6 +210,6 @@ def vigor_station(driver: Vigor) -> VigorStation:
 
 
 @cache
-def stretch(byte: int) -> Stretch | None:
+def _stretch(byte: int) -> Stretch | None:
     """Returns the stretch of a byte address; None between two stretches."""
     return next((place for place in _STRETCHES if place.first <= byte <= place.last), None)

@@ -11,7 +11,7 @@ def computed(tag: Tag, sample_of: Callable[[Tag], Sample]) -> Sample:
 
     Its time is that of the newest input: a value that follows from another is never older.
     """
-    inputs = [sample_of(one) for one in tag.inputs]
+    inputs = [sample_of(one) for one in tag.origin.inputs]
     for sample in inputs:
         if sample.quality is Quality.BAD:
             name = sample.tag.name if sample.tag.device == tag.device else sample.tag.key
@@ -37,9 +37,9 @@ class Dependents:
             self._add(tag)
 
     def _add(self, tag: Tag) -> None:
-        if not tag.inputs or tag in self._order:
+        if not tag.origin.inputs or tag in self._order:
             return
-        for one in tag.inputs:
+        for one in tag.origin.inputs:
             self._add(one)
             self._of.setdefault(one, set()).add(tag)
         self._order[tag] = len(self._order)

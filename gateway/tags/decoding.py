@@ -48,7 +48,7 @@ def decoder(
     single: bool,
     bit: int | None,
     line: Linear | None,
-    shaping: Shaping | None,
+    shaping: Shaping,
 ) -> DecodeOne:
     """Returns the function from units to value, shared by all tags of the same kind.
 
@@ -93,9 +93,9 @@ def _scaled(plain: DecodeOne, layout: Layout, line: Linear | None) -> DecodeOne:
     return integer
 
 
-def with_shaping(decode: DecodeOne, shaping: Shaping | None) -> DecodeOne:
+def with_shaping(decode: DecodeOne, shaping: Shaping) -> DecodeOne:
     """Returns the function with the shaping behind it, if there is one."""
-    shape = None if shaping is None else shaped(shaping)
+    shape = shaped(shaping)
     if shape is None:
         return decode
 
@@ -122,7 +122,7 @@ def array_decoder(element: Decode, size: int) -> Decode:
 
 
 @lru_cache(maxsize=4096)
-def field_decoder(layout: Layout, line: Linear | None, shaping: Shaping | None) -> DecodeOne:
+def field_decoder(layout: Layout, line: Linear | None, shaping: Shaping) -> DecodeOne:
     """Returns the decoder for a field of a frame: its value or a `Garbled`."""
 
     def plain(raw: Scalar | Garbled) -> Scalar | None:

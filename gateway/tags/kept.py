@@ -81,7 +81,7 @@ Memory = Debounced | Counted
 
 def memory_of(tag: Tag) -> Memory:
     """Returns a memory without any read."""
-    rule = tag.kept
+    rule = tag.origin.kept
     if isinstance(rule, float):
         return Debounced(round(rule * 1e9))
     return Counted(*rule) if rule is not None else Debounced(0)

@@ -26,9 +26,11 @@ class Mirror:
         self._current = {tag: bad(tag, Reason.STARTING, now) for tag in tags}
         self._dependents = Dependents(self._current)
         self.derives = bool(self._dependents)
-        self.memories = {tag: memory_of(tag) for tag in self._current if tag.kept is not None}
+        self.memories = {
+            tag: memory_of(tag) for tag in self._current if tag.origin.kept is not None
+        }
         self.pending: set[Tag] = set()  # kept tags whose value an equal read can change
-        self._raw = {tag.inputs[0] for tag in self.memories}
+        self._raw = {tag.origin.inputs[0] for tag in self.memories}
         self._current |= {tag: bad(tag, Reason.STARTING, now) for tag in self._raw}
         self._published: dict[Tag, Sample] = {}
         self._begun = False
@@ -49,7 +51,7 @@ class Mirror:
         entry = self._places.get(tag)
         if entry is None:
             current = self._current[tag]
-            return self._derived(tag, current) if tag.inputs else current
+            return self._derived(tag, current) if tag.origin.inputs else current
         latest, place = entry
         return latest.scan[place]
 
@@ -98,7 +100,7 @@ class Mirror:
         memory = self.memories.get(tag)
         if memory is None:
             return computed(tag, self.__getitem__)
-        sample = kept(tag, memory, self[tag.inputs[0]])
+        sample = kept(tag, memory, self[tag.origin.inputs[0]])
         (self.pending.add if memory.pending else self.pending.discard)(tag)
         return sample
 
@@ -109,8 +111,8 @@ class Mirror:
         """
         if current.reason is Reason.DISABLED:
             return current
-        if tag.kept is not None:
-            raw = self[tag.inputs[0]]
+        if tag.origin.kept is not None:
+            raw = self[tag.origin.inputs[0]]
             both_good = raw.quality is current.quality is Quality.GOOD
             return current._replace(time=raw.time) if both_good else current
         try:
@@ -242,20 +244,20 @@ def _same_failure(current: Sample, sample: Sample) -> bool:
 def _is_due(last: Sample | None, sample: Sample) -> bool:
     if last is None or last.quality is not sample.quality or last.reason is not sample.reason:
         return True
-    tag = sample.tag
-    if tag.publish is Publish.ALWAYS:
+    rule = sample.tag.publishing
+    if rule.publish is Publish.ALWAYS:
         return True
-    if tag.heartbeat is not None and not 0 <= sample.time - last.time < tag.heartbeat * 1e9:
+    if rule.heartbeat is not None and not 0 <= sample.time - last.time < rule.heartbeat * 1e9:
         return True  # also after the clock was set back: the interval is then unknown
-    return _changed(tag, last.value, sample.value)
+    return _changed(sample.tag, last.value, sample.value)
 
 
 def _changed(tag: Tag, old: Value | None, new: Value | None) -> bool:
-    if tag.deadband is None or old is None or new is None:
+    band = tag.publishing.deadband
+    if band is None or old is None or new is None:
         return old != new
     if isinstance(old, (bool, str, tuple)) or isinstance(new, (bool, str, tuple)):
         return old != new and (tag.element is None or _one_changed(tag.element, old, new))
-    band = tag.deadband
     return old != new and are_apart(old, new, band.amount, percent=band.percent)
 
 

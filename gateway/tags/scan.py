@@ -5,8 +5,10 @@ from itertools import compress
 from operator import call, itemgetter, ne
 from typing import Any, overload
 
+from gateway.tags.alarm import AlarmRule
+from gateway.tags.publishing import Publish
 from gateway.tags.sample import Quality, Reason, Sample, bad, of_field
-from gateway.tags.tag import Publish, Tag
+from gateway.tags.tag import Tag
 from gateway.values import Value
 
 Failures = Mapping[int, Sample]  # bad samples by place: the units there hold no value
@@ -34,10 +36,11 @@ class Latest:
     def adopt(self, scan: "Scan") -> None:
         """Begins with a scan."""
         places = tuple(enumerate(scan.tags))
-        eager = [p for p, tag in places if tag.heartbeat or tag.publish is Publish.ALWAYS]
-        self.by_rule = frozenset(eager).union(p for p, tag in places if tag.deadband is not None)
+        rules = [(place, tag.publishing) for place, tag in places]
+        eager = [p for p, rule in rules if rule.heartbeat or rule.publish is Publish.ALWAYS]
+        self.by_rule = frozenset(eager).union(p for p, rule in rules if rule.deadband is not None)
         self.unasked = tuple(eager)
-        self.alarmed = tuple(p for p, tag in places if tag.alarm is not None)
+        self.alarmed = tuple(p for p, tag in places if tag.feature(AlarmRule) is not None)
         self.scan, self.in_use = scan, True
 
 

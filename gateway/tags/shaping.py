@@ -1,11 +1,11 @@
 """Shaping of a value besides scale and offset, in both directions, and names of numbers."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 from gateway.errors import BadValue
-from gateway.tags.scaling import Ends
+from gateway.tags.scaling import Ends, Linear, linear
 from gateway.values.numerals import Scalar
 
 
@@ -16,18 +16,53 @@ class Bounds(NamedTuple):
     high: float | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class Names:
+    """The names of the values of a tag: `enum` in the file. A read gives the number."""
+
+    by_number: Mapping[int, str] = field(hash=False)
+
+    def number(self, value: Scalar) -> Scalar:
+        """Returns the number of a value to write, or of its name. Raises `BadValue`."""
+        if isinstance(value, str):
+            for number, name in self.by_number.items():
+                if name == value:
+                    return number
+            raise BadValue(f"{value!r} is no name of a value: use {self}")
+        if value not in self.by_number:
+            raise BadValue(f"{value} has no name: use {self}")
+        return value
+
+    def text(self, value: object) -> str | None:
+        """Returns the name of a value that was read; None: it has no name."""
+        return self.by_number.get(value) if isinstance(value, int) else None
+
+    def __str__(self) -> str:
+        return ", ".join(f"{number} ({name})" for number, name in self.by_number.items())
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Shaping:
-    """Settings of a value. It is scaled, then rounded, then clamped."""
+    """The way from the number of the device to the value: it is scaled, rounded, then clamped."""
 
+    scale: float = 1.0
+    offset: float = 0.0
     ends: Ends | None = None  # instead of scale and offset
     decimals: int | None = None
     clamp: Bounds | None = None
     invert: bool = False  # of a bit
+    names: Names | None = None
+
+    @property
+    def line(self) -> Linear | None:
+        """The scaling; None: it changes nothing."""
+        return linear(self.scale, self.offset, self.ends)
 
     @property
     def exact(self) -> "Shaping":
         """The same without rounding and limits: the value that the device really holds."""
+        if self.decimals is None and self.clamp is None:
+            return self
         return replace(self, decimals=None, clamp=None)
 
     def rounded(self, value: Scalar) -> Scalar:
@@ -75,28 +110,3 @@ def shaped(shaping: Shaping) -> Convert | None:
 def _rounded(value: Scalar, decimals: int) -> Scalar:
     # `+ 0.0`: -0.04 is shown as 0.0, not as -0.0.
     return round(value, decimals) + 0.0 if isinstance(value, float) else value
-
-
-@dataclass(frozen=True, slots=True)
-class Names:
-    """The names of the values of a tag: `enum` in the file. A read gives the number."""
-
-    by_number: Mapping[int, str]
-
-    def number(self, value: Scalar) -> Scalar:
-        """Returns the number of a value to write, or of its name. Raises `BadValue`."""
-        if isinstance(value, str):
-            for number, name in self.by_number.items():
-                if name == value:
-                    return number
-            raise BadValue(f"{value!r} is no name of a value: use {self}")
-        if value not in self.by_number:
-            raise BadValue(f"{value} has no name: use {self}")
-        return value
-
-    def text(self, value: object) -> str | None:
-        """Returns the name of a value that was read; None: it has no name."""
-        return self.by_number.get(value) if isinstance(value, int) else None
-
-    def __str__(self) -> str:
-        return ", ".join(f"{number} ({name})" for number, name in self.by_number.items())

@@ -2,13 +2,11 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from enum import StrEnum
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from gateway.errors import BadValue, Garbled
 from gateway.protocols.driver import Address, Span, Unit
 from gateway.protocols.typed_fields import Shape
-from gateway.tags.alarm import AlarmRule
 from gateway.tags.decoding import (
     Decode,
     Part,
@@ -19,32 +17,15 @@ from gateway.tags.decoding import (
     with_shaping,
 )
 from gateway.tags.formula import Formula
-from gateway.tags.scaling import Linear, exact_below, linear, type_of, unscaled, unscaled_float
-from gateway.tags.shaping import Names, Shaping
+from gateway.tags.publishing import ON_CHANGE, Publishing
+from gateway.tags.scaling import Linear, exact_below, type_of, unscaled, unscaled_float
+from gateway.tags.shaping import PLAIN, Shaping
 from gateway.values import Layout, Value, to_words
 from gateway.values.numerals import Scalar
 
 # Larger whole numbers are refused at once: as many bits as the largest float has.
 _MOST_BITS = 1024
-
-
-class Publish(StrEnum):
-    CHANGE = "change"
-    ALWAYS = "always"
-
-
-class Form(StrEnum):
-    """The payload of a published value."""
-
-    JSON = "json"  # with quality and time
-    RAW = "raw"  # the bare value
-
-
-class Deadband(NamedTuple):
-    """The least change that is published. `percent`: of the last published value."""
-
-    amount: float
-    percent: bool = False
+F = TypeVar("F")
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,9 +46,34 @@ class CounterRule(NamedTuple):
     most: int
 
 
+@dataclass(frozen=True, slots=True)
+class Label:
+    """The words of a tag for people."""
+
+    unit: str = ""
+    description: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Origin:
+    """The origin of the values, where it is not the words at the address."""
+
+    shape: Shape | None = None  # for a field of a frame: a read gives the value itself
+    formula: Formula | None = None  # of a computed tag: no address, read or write
+    # Seconds that a bit must stay, or the rule of a counter.
+    kept: float | CounterRule | None = None
+    # Of the formula, in its order; of a kept value the one tag with its reads. These are the tags
+    # of another tag's value: this tag is not read itself.
+    inputs: tuple["Tag", ...] = ()
+
+
+READ = Origin()
+_NO_LABEL = Label()
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Tag:
-    """One value of one device: its address, type, interval and rules.
+    """One value of one device: its address, type, interval and features.
 
     The value of an array is a tuple; all rules of values are those of each element.
     """
@@ -80,36 +86,16 @@ class Tag:
     unit_kind: Unit
     layout: Layout
     every: float = 1.0
-    scale: float = 1.0
-    offset: float = 0.0
-    unit: str = ""
-    description: str = ""
-    deadband: Deadband | None = None
-    publish: Publish = Publish.CHANGE
-    heartbeat: float | None = None
-    history: bool = False
-    payload: Form = Form.JSON
+    shaping: Shaping = PLAIN
+    publishing: Publishing = ON_CHANGE
     write: WriteRule | None = None
-    alarm: AlarmRule | None = None
-    shape: Shape | None = None  # for a field of a frame: a read gives the value itself
-    event: bool = False  # every value is published, also an equal one
-    shaping: Shaping | None = None
-    names: Names | None = None
-    formula: Formula | None = None  # of a computed tag: no address, read or write
-    kept: float | CounterRule | None = (
-        None  # seconds that a bit must stay, or the rule of a counter
-    )
-    # Of the formula, in its order; of a kept value the one tag with its reads. These are the tags
-    # of another tag's value: this tag is not read itself.
-    inputs: tuple["Tag", ...] = ()
-    part: Part | None = field(init=False, repr=False)  # of its word; None: whole words
+    origin: Origin = READ
+    features: tuple[object, ...] = ()  # the settings of other features, one of each class
     element: "Tag | None" = field(init=False, repr=False)  # the first one of an array
     # From the unit of the span to the value, or from its units if it has several.
     convert: Decode = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        part = None if self.shape is not None else part_of(self.layout, self.address.bit)
-        object.__setattr__(self, "part", part)
         object.__setattr__(self, "element", self._first() if self.layout.type.count else None)
         object.__setattr__(self, "convert", self._decoder(self.shaping))
 
@@ -117,23 +103,39 @@ class Tag:
         size = self.span.size // self.layout.type.count
         return replace(self, layout=self.layout.element, span=self.span._replace(size=size))
 
-    def _decoder(self, shaping: Shaping | None) -> Decode:
+    def _decoder(self, shaping: Shaping) -> Decode:
         if self.element is not None:
             return array_decoder(self.element.convert, self.element.span.size)
-        if self.formula is not None:
-            return with_shaping(self.formula.value, shaping)
-        if self.kept is not None:
-            counter = isinstance(self.kept, CounterRule)  # the reads of a bit are inverted already
-            return field_decoder(self.layout, self._line, shaping if counter else None)
-        if self.shape is not None:
+        origin = self.origin
+        if origin.formula is not None:
+            return with_shaping(origin.formula.value, shaping)
+        if origin.kept is not None:
+            counter = isinstance(origin.kept, CounterRule)  # the reads of a bit are inverted
+            return field_decoder(self.layout, self._line, shaping if counter else PLAIN)
+        if origin.shape is not None:
             return field_decoder(self.layout, self._line, shaping)
         bit = self.address.bit
         return decoder(self.layout, self.unit_kind, self.single, bit, self._line, shaping)
 
     @property
     def _line(self) -> Linear | None:
-        ends = None if self.shaping is None else self.shaping.ends
-        return linear(self.scale, self.offset, ends) if self.layout.type.is_number else None
+        return self.shaping.line if self.layout.type.is_number else None
+
+    @property
+    def part(self) -> Part | None:
+        """The part of its word; None: whole words."""
+        return part_of(self.layout, self.address.bit) if self.origin.shape is None else None
+
+    def feature(self, kind: type[F]) -> F | None:
+        """Returns the settings of a feature; None: the tag has it not."""
+        for one in self.features:
+            if isinstance(one, kind):
+                return one
+        return None
+
+    @property
+    def label(self) -> Label:
+        return self.feature(Label) or _NO_LABEL
 
     def copy(self, device: str, name: str) -> "Tag":
         """Returns the same tag under another name. Ten times faster than `replace`."""
@@ -142,15 +144,15 @@ class Tag:
             object.__setattr__(twin, slot, getattr(self, slot))
         object.__setattr__(twin, "device", device)
         object.__setattr__(twin, "name", name)
-        if self.inputs:
-            inputs = tuple(one.copy(device, name) for one in self.inputs)
-            object.__setattr__(twin, "inputs", inputs)
+        if self.origin.inputs:
+            inputs = tuple(one.copy(device, name) for one in self.origin.inputs)
+            object.__setattr__(twin, "origin", replace(self.origin, inputs=inputs))
         return twin
 
     @property
     def single(self) -> bool:
         """True if `convert` takes one unit."""
-        return self.shape is not None or (self.span.size == 1 and not self.layout.type.count)
+        return self.origin.shape is not None or (self.span.size == 1 and not self.layout.type.count)
 
     def decode(self, units: Sequence[Any]) -> Value | None:
         """Returns the value of the units of the span; None: they hold none."""
@@ -209,13 +211,12 @@ class Tag:
     def _one(self, value: Scalar) -> list[int]:
         if isinstance(value, int) and value.bit_length() > _MOST_BITS:
             raise BadValue("the number is too large")
-        if self.names is not None:
-            value = self.names.number(value)
+        if self.shaping.names is not None:
+            value = self.shaping.names.number(value)
         self._check_limits(value, str(value))
-        if self.shaping is not None:
-            value = self._shaped(self.shaping, value)
-        if self.shape is not None:
-            return self._octets(self.shape, value)
+        value = self._shaped(self.shaping, value)
+        if self.origin.shape is not None:
+            return self._octets(self.origin.shape, value)
         words = to_words(self.layout)(self._unscaled(value))
         if self.unit_kind is Unit.DWORD:
             units = [low | high << 16 for low, high in zip(words[::2], words[1::2], strict=True)]
@@ -258,23 +259,24 @@ class Tag:
 
     def from_units(self, units: Sequence[int]) -> Value | None:
         """Returns the value of units made by `encode`: the value that the device really gets."""
-        if self.shape is not None:
+        if self.origin.shape is not None:
             try:
-                return self.decode([self.shape.take(bytes(units))])
+                return self.decode([self.origin.shape.take(bytes(units))])
             except Garbled:
                 return None
         return self.decode(self._whole(units))
 
     def held(self, units: Sequence[int]) -> Value | None:
         """Returns `from_units` without rounding to decimals and without clamp."""
-        if self.shaping is None:
+        if self.shaping.exact is self.shaping:
             return self.from_units(units)
         convert, whole = self._decoder(self.shaping.exact), self._whole(units)
         return convert(whole[0] if self.single else whole)
 
     def _whole(self, units: Sequence[int]) -> Sequence[int]:
         """Returns whole units for those of `encode`, which has only a part of a word."""
-        return units if self.part is None else [self.part.into(0, units[0])]
+        part = self.part
+        return units if part is None else [part.into(0, units[0])]
 
     def _unscaled(self, value: Scalar) -> Scalar:
         line = self._line

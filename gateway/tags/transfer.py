@@ -11,9 +11,9 @@ from gateway.values.numerals import Scalar
 
 def leaves(tag: Tag) -> Iterator[Tag]:
     """Yields the tags with addresses that a value comes from: itself, or its inputs."""
-    if not tag.inputs:
+    if not tag.origin.inputs:
         yield tag
-    for one in tag.inputs:
+    for one in tag.origin.inputs:
         yield from leaves(one)
 
 

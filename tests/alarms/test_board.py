@@ -293,8 +293,8 @@ async def test_a_computed_tag_and_a_debounced_bit_have_alarms(tmp_path: Path) ->
     for value, state in ((39, State.NORMAL), (40, State.ACTIVE), (39, State.RETURNED)):
         gateway.samples([good(one, value, 1)])
         assert entry.status.state is state
-    door = next(tag for device in gateway.config.devices for tag in device.tags if tag.kept)
-    [reads] = door.inputs
+    door = next(tag for device in gateway.config.devices for tag in device.tags if tag.origin.kept)
+    [reads] = door.origin.inputs
     for value, at, state in (
         (False, 1, State.NORMAL),
         (True, 2, State.NORMAL),

@@ -18,7 +18,7 @@ from gateway.plant.build import line_of
 from gateway.tags import Quality, Sample
 from tests.e2e.processes import write_config
 
-PATIENCE = 60.0  # seconds; never waited for when all is well
+PATIENCE = 300.0  # seconds; never waited for when all is well
 
 
 def crc(data: bytes) -> bytes:

@@ -15,7 +15,7 @@ from gateway.line.line import Line
 from gateway.plant.build import line_of
 from gateway.tags import Quality, Sample
 
-PATIENCE = 60.0  # seconds; never waited for when all is well
+PATIENCE = 300.0  # seconds; never waited for when all is well
 Handler = Callable[[int, asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
 
 

@@ -1,22 +1,32 @@
 """The certificates of packaging/certificates: a gateway and a client accept each other by them."""
 
+import base64
+import contextlib
 import json
+import os
+import signal
 import socket
 import ssl
 import subprocess
 from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from gateway.contract.certificates import expires
+from gateway.contract.faults import faults
+from gateway.errors import ConfigError
 from tests.conftest import needs
-from tests.e2e.processes import ROOT, plc_gateway, started, vigor_line, write_config
+from tests.e2e.processes import ROOT, plc_gateway, started, until, vigor_line, write_config
 from tests.zenoh_peer import free_endpoint
 
 
-def certificates(*arguments: object) -> None:
+def certificates(*arguments: object, **environment: object) -> None:
     needs("openssl")
     command = [str(ROOT / "packaging/certificates"), *map(str, arguments)]
-    subprocess.run(command, check=True, capture_output=True)
+    changed = {name: str(value) for name, value in environment.items()}
+    subprocess.run(command, check=True, capture_output=True, env={**os.environ, **changed})
 
 
 def greets(port: int, folder: Path, called: str, *, refused: bool = False) -> None:
@@ -61,3 +71,74 @@ def test_gateway_and_clients_know_each_other_by_their_certificates(tmp_path: Pat
         file.write_text(file.read_text().replace("plant/gateway.", "plant/scada."))
         health = plc_gateway("health", file)
         assert json.loads(health.out)["name"] == "demo"
+
+
+def _plant(folder: Path, days: int) -> tuple[Path, Path]:
+    """Makes an authority, and a gateway whose certificate has `days`."""
+    pki = folder / "pki"
+    certificates("ca", pki)
+    _renew(pki, days)
+    endpoint = free_endpoint().replace("tcp/", "tls/")
+    tls = {"ca": "pki/ca.pem", "certificate": "pki/gateway.pem", "key": "pki/gateway.key"}
+    file = write_config(
+        folder / "c.yaml",
+        endpoint,
+        {"hall": vigor_line("simulator", {"speed": {"address": "D1"}})},
+        zenoh={"prefix": "plant", "listen": [endpoint], "tls": tls},
+    )
+    return file, pki
+
+
+def _renew(pki: Path, days: int) -> None:
+    """Makes a new certificate, and puts it in the place of the old one."""
+    for name in ("gateway.pem", "gateway.key"):
+        (pki / name).unlink(missing_ok=True)
+    certificates("gateway", pki, "gateway", "127.0.0.1", DAYS=days)
+
+
+def test_a_certificate_says_how_long_it_is_valid_and_is_renewed(tmp_path: Path) -> None:
+    file, pki = _plant(tmp_path, 12)
+    said = f"zenoh.tls.certificate {pki / 'gateway.pem'} expires in 12 days: renew it"
+    checked = plc_gateway("check", file)
+    assert said in " ".join((checked.out + checked.err).split())
+    with started(file) as program:
+        status = plc_gateway("health", "--strict", file)
+        assert said in status.err
+        _renew(pki, 200)
+        os.kill(program.pid, signal.SIGHUP)
+        program.says("gateway outdated", "the files of zenoh.tls were renewed")
+        program.says("gateway starts over")
+        until(lambda: plc_gateway("health", "--strict", file).code == 0, "nothing is wrong")
+        found = json.loads(plc_gateway("status", "--json", file).out)["certificates/certificate"]
+        assert 199 < found["days"] <= 200
+
+
+def test_files_that_do_not_fit_each_other_are_not_taken_over(tmp_path: Path) -> None:
+    file, pki = _plant(tmp_path, 200)
+    with started(file) as program:
+        (pki / "gateway.key").write_bytes((pki / "ca.key").read_bytes())
+        os.kill(program.pid, signal.SIGHUP)
+        program.says("file reloaded")
+        assert plc_gateway("health", file).code == 0
+        assert not program.has_said("gateway starts over")
+
+
+def test_an_expired_certificate_is_a_fault() -> None:
+    expired = {"file": "hall.pem", "expires": None, "days": -3.2, "trouble": ""}
+    said = "zenoh.tls.certificate hall.pem expired 3 days ago: Zenoh accepts no new connection"
+    assert list(faults({"certificates/certificate": expired})) == [said]
+    lost = {"file": "hall.pem", "expires": None, "days": None, "trouble": "Permission denied"}
+    said = "zenoh.tls.ca hall.pem: Permission denied"
+    assert list(faults({"certificates/ca": lost})) == [said]
+
+
+@given(st.binary(max_size=400))
+def test_no_bytes_are_taken_for_a_certificate(content: bytes) -> None:
+    text = (
+        b"-----BEGIN CERTIFICATE-----\n"
+        + base64.b64encode(content)
+        + b"\n-----END CERTIFICATE-----\n"
+    )
+    for each in (content, text):
+        with contextlib.suppress(ConfigError):
+            assert isinstance(expires(each), float)

@@ -20,7 +20,7 @@ class Counting(VigorStation):
     def __init__(self) -> None:
         super().__init__(1)
         self.writes: list[bytes] = []
-        self.holes = {("D", 520)}
+        self.memory.holes = {("D", 520)}
 
     def hear(self, data: bytes, now: float) -> list[bytes]:
         if data[3:5] in (b"61", b"70", b"71"):

@@ -10,7 +10,7 @@ from tests.zenoh_peer import free_endpoint
 RUN = """
 import asyncio, sys, weakref
 from pathlib import Path
-from gateway.service import (service)
+from gateway.service import service
 from gateway.plant.plant import Plant
 from gateway.config import load
 
@@ -27,7 +27,7 @@ async def serve(file, withheld, stop, started, supervisor):
     await inner(file, withheld, on_zenoh, on_zenoh.set, supervisor)
     return {} if len(made) < 4 else None
 
-inner, service._serve, service.Gateway = service._serve, serve, make
+inner, service._serve, service.Plant = service._serve, serve, make
 asyncio.run(service.run(load(file := Path(sys.argv[1])), file))
 """
 

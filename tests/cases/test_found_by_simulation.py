@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from gateway.config import load
-from gateway.engine.jobs.jobs import Poll
+from gateway.engine.schedule.poll_entry import PollEntry
 from gateway.engine.schedule.schedule import Schedule
 from gateway.errors import Busy
 from gateway.plant.plant import Plant as Gateway
@@ -117,17 +117,17 @@ async def test_seed_118_lean_one_refusal_does_not_make_a_good_address_bad() -> N
     station = hall.stations[0]
     async with running(hall):
         await asyncio.sleep(5)
-        station.inner.holes.add(("D", 100))
+        station.inner.memory.holes.add(("D", 100))
         asked = len(station.heard)
         while len(station.heard) == asked:
             await asyncio.sleep(0.001)
-        station.inner.holes.clear()
+        station.inner.memory.holes.clear()
         since = asyncio.get_running_loop().time()
         await asyncio.sleep(3)
         assert hall.reads(mixer, since)
         assert not [sample for _, sample in hall.reported if sample.reason is Reason.REFUSED]
         # The second refusal in a row makes the address bad.
-        station.inner.holes.add(("D", 100))
+        station.inner.memory.holes.add(("D", 100))
         await asyncio.sleep(3)
         assert hall.reason(mixer.tags[0]) is Reason.REFUSED
 
@@ -159,10 +159,10 @@ async def test_seed_20_lean_an_address_that_returned_is_polled_as_often_as_befor
     away = mixer.tags[1]
     async with running(hall):
         await asyncio.sleep(5)
-        hall.stations[0].inner.holes.add(("D", 900))
+        hall.stations[0].inner.memory.holes.add(("D", 900))
         await asyncio.sleep(20)
         assert hall.reason(away) is Reason.REFUSED
-        hall.stations[0].inner.holes.clear()
+        hall.stations[0].inner.memory.holes.clear()
         await asyncio.sleep(400)
         good = [
             at for at, sample in hall.reported if sample.tag is away and sample.value is not None
@@ -182,7 +182,7 @@ def test_seed_13_storm_polls_queued_behind_a_late_one_leave_no_entries() -> None
         now += 0.5
         greedy.used(now, now - 5.0)
         job = schedule.next(now)
-        assert isinstance(job, Poll)
+        assert isinstance(job, PollEntry)
         assert job.device is modest
         schedule.polled(job, now)
     assert schedule._queue.entries < 200  # private: a leak shows in no public figure
@@ -195,7 +195,7 @@ def test_seed_7_lean_polls_of_an_older_plan_leave_no_entries() -> None:
     mixer.health.answered()
     schedule.came_online(mixer, 0.0)
     job = schedule.next(0.0)
-    assert isinstance(job, Poll)
+    assert isinstance(job, PollEntry)
     schedule.polled(job, 0.0)
     for _ in range(1000):
         schedule.plan(mixer, 1.0)

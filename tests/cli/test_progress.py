@@ -21,16 +21,29 @@ lines:
     port: simulator
     devices: {plc: {protocol: vigor, station: 1, tags: {a: {address: D1}}}}
 """
+# The command itself, with a file that takes as long as the pipe named first is empty.
+SLOW = """
+import sys
+from gateway.cli import check, main
+pipe, load = sys.argv.pop(1), check.load
+def slow(file, report=None):
+    if report is not None:
+        open(pipe).read()
+    return load(file, report) if report else load(file)
+check.load = slow
+main.main()
+"""
 
 
 def test_a_long_check_shows_a_bar_and_removes_it(tmp_path: Path) -> None:
-    """The file is a pipe: reading takes until the test writes it."""
-    path = tmp_path / "plant.yaml"
-    os.mkfifo(path)
+    """Loading takes until the test writes into a pipe."""
+    path, pipe = tmp_path / "plant.yaml", tmp_path / "pipe"
+    path.write_text(PLANT)
+    os.mkfifo(pipe)
     near, far = pty.openpty()
     begun = time.monotonic()
     program = subprocess.Popen(
-        [sys.executable, "-m", "gateway", "check", path],
+        [sys.executable, "-c", SLOW, pipe, "check", path],
         stdout=subprocess.PIPE,
         stderr=far,
         cwd=ROOT,
@@ -43,7 +56,7 @@ def test_a_long_check_shows_a_bar_and_removes_it(tmp_path: Path) -> None:
         shown += os.read(near, 1024)
     assert time.monotonic() - begun >= AFTER
     assert b"starting" in shown
-    path.write_text(PLANT)
+    pipe.write_text("go on")
     out, _ = program.communicate(timeout=20)
     shown += _rest(near)
     assert program.returncode == 0

@@ -13,8 +13,9 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from gateway.cli.status import span, view
+from gateway.cli.status import view
 from gateway.contract.faults import faults, warnings
+from gateway.contract.line_faults import span
 from tests.e2e.processes import Done, gateway, plc_gateway, started, vigor_line, write_config
 from tests.web.serving import calling, transfer
 from tests.zenoh_peer import free_endpoint
@@ -206,3 +207,40 @@ def test_a_jump_of_the_clock_is_said_for_an_hour() -> None:
     assert said.startswith("the clock of this machine jumped by -600.0 s 1 min ago")
     documents["clock"]["ago"] = 3601.0
     assert list(warnings(documents)) == []
+
+
+def stations(healthy: dict[str, Any], number: int, **fields: object) -> dict[str, Any]:
+    """Documents of a line with so many equal devices beside the one that replies."""
+    documents = copy.deepcopy(healthy)
+    for each in range(1, number + 1):
+        documents[f"devices/m{each}"] = {**documents["devices/mixer"], **fields}
+        documents["lines/hall"]["devices"][f"m{each}"] = "silent"
+    return documents
+
+
+GARBLED = {"lately": {"requests": 32, "failed": {"noise": 24, "silence": 3}}, "diagnosis": "Noise"}
+
+
+def test_one_cause_on_one_line_is_one_fault(healthy: dict[str, Any]) -> None:
+    past = {"silent_for": 754.0, "silences": 3}
+    documents = stations(healthy, 32, standing="silent", **GARBLED, **past)
+    [said] = faults(documents)
+    assert said == (
+        "line hall: 32 of 33 devices are silent, no frame to 75% of the last 1024 requests: Noise "
+        "(for 12 min, 3 times in 24 h): m1, m2, m3, m4, m5 and 27 more"
+    )
+    assert list(warnings(documents)) == []
+    dead = {"lately": {"requests": 32, "failed": {"silence": 32}}, "diagnosis": "No byte"}
+    documents["devices/m2"].update(dead)
+    assert len(list(faults(documents))) == 2  # another cause
+    documents = stations(healthy, 2, **GARBLED)
+    assert list(warnings(documents)) == [
+        "line hall, 2 devices, no frame to 75% of the last 64 requests: Noise: m1, m2"
+    ]
+
+
+def test_a_healthy_standby_has_no_fault(healthy: dict[str, Any]) -> None:
+    documents = changed(healthy, "lines/hall", open=False, trouble="", down_for=None, losses=0)
+    assert list(faults(documents)) == ["line hall is down: not opened yet"]
+    documents["standby"] = {"group": "hall", "stand": "waiting", "others_active": 1}
+    assert list(faults(documents)) == []

@@ -91,4 +91,4 @@ def test_a_setting_of_the_device_that_fits_no_array_is_left_out() -> None:
     )
     Path("plant.yaml").write_text(text, encoding="utf-8")
     (tag,) = load("plant.yaml").devices[0].tags
-    assert (tag.kept, tag.deadband, tag.scale) == (None, None, 1.0)
+    assert (tag.origin.kept, tag.publishing.deadband, tag.shaping.scale) == (None, None, 1.0)

@@ -819,12 +819,12 @@ def test_the_file_of_the_contract(file: Callable[[str], Config], tmp_path: Path)
     tag = {tag.name: tag for tag in mixer.tags}
     assert tag["speed"].key == "mixer/speed"
     assert tag["speed"].address == Address("D", 100)
-    assert (tag["speed"].every, tag["speed"].deadband) == (0.5, Deadband(0.5))
+    assert (tag["speed"].every, tag["speed"].publishing.deadband) == (0.5, Deadband(0.5))
     assert tag["level"].span == Span("D", 10, 2)
     assert tag["level"].every == 1.0
     assert str(tag["batches"].layout.type) == "int32"
     assert (tag["batches"].unit_kind, tag["batches"].span.size) == (Unit.DWORD, 1)
-    assert tag["alarms/door"].description == "Guard door open"
+    assert tag["alarms/door"].label.description == "Guard door open"
     assert tag["valve"].address.bit == 3
     assert tag["valve"].decode([0b1000]) is True
     assert tag["name"].span.size == 8
@@ -850,7 +850,7 @@ def test_settings_left_out_are_the_defaults_of_the_protocol(file: Callable[[str]
     assert device.enabled
     assert not device.blocks
     assert not device.control
-    assert device.tags[0].publish is Publish.CHANGE
+    assert device.tags[0].publishing.publish is Publish.CHANGE
     assert device.tags[0].write is None
 
 
@@ -927,7 +927,7 @@ def test_defaults_go_from_file_to_line_to_device_to_tag(file: Callable[[str], Co
         )
     )
     a, b = config.devices[0].tags
-    assert [(t.every, t.unit, t.offset, t.heartbeat) for t in (a, b)] == [
+    assert [(t.every, t.label.unit, t.shaping.offset, t.publishing.heartbeat) for t in (a, b)] == [
         (1.0, "c", 2.0, 60.0),
         (2.0, "c", 2.0, 60.0),
     ]
@@ -945,12 +945,12 @@ def test_a_default_that_does_not_suit_a_tag_is_passed_over(file: Callable[[str],
     )
     coil, input_, holding = config.devices[0].tags
     assert coil.layout.type == ValueType(Kind.BOOL)
-    assert (coil.scale, coil.deadband) == (1.0, None)
+    assert (coil.shaping.scale, coil.publishing.deadband) == (1.0, None)
     assert coil.write == WriteRule()
     assert input_.write is None
     assert input_.layout.type == ValueType(Kind.FLOAT32)
     assert holding.write == WriteRule(min=0, max=9)
-    assert holding.deadband == Deadband(1.0, percent=True)
+    assert holding.publishing.deadband == Deadband(1.0, percent=True)
 
 
 def test_the_order_of_words_is_none_of_a_32_bit_counters(file: Callable[[str], Config]) -> None:
@@ -1011,9 +1011,9 @@ def test_yaml_surprises_are_none(file: Callable[[str], Config]) -> None:
     )
     (device,) = config.devices
     assert (device.name, device.driver.station, device.tags[0].name) == ("on", 10, "no")
-    assert device.tags[0].scale == 0.001
-    assert device.tags[0].unit == "1"
-    assert device.tags[0].description == "2026-01-01"
+    assert device.tags[0].shaping.scale == 0.001
+    assert device.tags[0].label.unit == "1"
+    assert device.tags[0].label.description == "2026-01-01"
     assert config.lines[0].serial.format == "7E1"
 
 
@@ -1062,7 +1062,7 @@ def test_paths_are_relative_to_the_file(tmp_path: Path) -> None:
     assert config.zenoh.config_file == tmp_path / "zenoh.json5"
     assert config.history is not None
     assert config.history.path == tmp_path / "data" / "h.db"
-    assert only_tag(config).history
+    assert only_tag(config).publishing.history
 
 
 def test_loading_leaves_the_garbage_collector_as_it_was(file: Callable[[str], Config]) -> None:
@@ -1357,11 +1357,11 @@ def test_payload_is_json_unless_tag_device_line_or_file_sets_raw(
         "defaults: {payload: raw}\n"
         + tags("speed: {address: D1}", "level: {address: D2, payload: json}")
     )
-    assert {tag.name: tag.payload for tag in config.devices[0].tags} == {
+    assert {tag.name: tag.publishing.payload for tag in config.devices[0].tags} == {
         "speed": Form.RAW,
         "level": Form.JSON,
     }
-    assert only_tag(file(tags("speed: {address: D1}"))).payload is Form.JSON
+    assert only_tag(file(tags("speed: {address: D1}"))).publishing.payload is Form.JSON
 
 
 @pytest.mark.parametrize(

@@ -84,7 +84,7 @@ def test_a_device_of_frames_is_a_driver_like_any_other(file: Callable[[str], Con
     assert driver.settings.framing.gap == 0.05
     assert driver.settings.listen["weighing"].stale_after == 2.0
     weight, state, hours, version, tare = device.tags
-    assert (weight.event, weight.publish, weight.layout.type.kind) == (
+    assert (weight.publishing.event, weight.publishing.publish, weight.layout.type.kind) == (
         True,
         Publish.ALWAYS,
         Kind.FLOAT64,

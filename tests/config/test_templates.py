@@ -100,7 +100,7 @@ def test_a_device_uses_a_template_with_its_own_values(tmp_path: Path) -> None:
         "p/valve-2": "M1002",
     }
     speed = config.devices[0].tags[0]
-    assert (speed.scale, speed.unit, speed.every) == (0.1, "rpm", 2.0)
+    assert (speed.shaping.scale, speed.label.unit, speed.every) == (0.1, "rpm", 2.0)
 
 
 def test_settings_of_the_device_are_above_those_of_the_template(tmp_path: Path) -> None:
@@ -119,7 +119,7 @@ def test_settings_of_the_device_are_above_those_of_the_template(tmp_path: Path) 
     config = loaded(tmp_path, f"{PUMP}{HEAD}{own}")
     assert tags(config) == {"p/speed": "D0", "p/valve-1": "M1", "p/more": "D50"}
     speed, valve, _ = config.devices[0].tags
-    assert (speed.scale, speed.every, valve.unit, valve.every) == (0.1, 9.0, "A", 2.0)
+    assert (speed.shaping.scale, speed.every, valve.label.unit, valve.every) == (0.1, 9.0, "A", 2.0)
 
 
 def test_a_device_is_repeated(tmp_path: Path) -> None:
@@ -138,7 +138,7 @@ def test_templates_use_templates_and_stand_in_other_files(tmp_path: Path) -> Non
     text = f"templates_from: [more.yaml]\n{PUMP}{HEAD}      p: {{use: big, base: 10, station: 1}}\n"
     config = loaded(tmp_path, text)
     assert list(tags(config)) == ["p/speed", "p/flow", "p/valve-1", "p/valve-2", "p/level"]
-    band = config.devices[0].tags[0].deadband
+    band = config.devices[0].tags[0].publishing.deadband
     assert band is not None
     assert band.amount == 5
 
@@ -338,7 +338,7 @@ def test_relays_and_registers_are_those_of_the_manual(
     found = shipped(tmp_path, use, VIGOR)
     assert set(found) == set(expected)
     for address, words in expected.items():
-        text = f"{found[address].name} {found[address].description}".lower().replace("-", " ")
+        text = f"{found[address].name} {found[address].label.description}".lower().replace("-", " ")
         missing = [word for word in words.replace("-", " ").split() if word not in text]
         assert not missing, (address, text)
         slave = re.search(r"slave (\d)", words)
@@ -382,7 +382,7 @@ def parts(folder: Path, use: str, device: str) -> dict[str, tuple[str, dict[int,
     line = f"{{port: simulator, devices: {{p: {{use: {use}, {device}}}}}}}"
     path.write_text(f"lines: {{hall: {line}}}\n")
     return {
-        tag.name: (tag.text, {} if tag.names is None else dict(tag.names.by_number))
+        tag.name: (tag.text, {} if tag.shaping.names is None else dict(tag.shaping.names.by_number))
         for tag in load(path).devices[0].tags
     }
 
@@ -420,7 +420,9 @@ def test_a_status_word_is_read_as_the_manual_divides_it(tmp_path: Path) -> None:
 def test_ex485lnk(tmp_path: Path) -> None:
     link = "protocol: computer-link, station: 1, status: D0200, error: D0201"
     found = shipped(tmp_path, "ex485lnk/status", link)
-    words = {int(a.split(".")[1]): tag.description.lower() for a, tag in found.items() if "." in a}
+    words = {
+        int(a.split(".")[1]): tag.label.description.lower() for a, tag in found.items() if "." in a
+    }
     assert words.keys() == manual.EX485LNK_STATUS.keys()
     assert all(text in words[bit] for bit, text in manual.EX485LNK_STATUS.items())
     slave = "protocol: modbus-rtu, addressing: ex485lnk, station: 1, read: 0, written: 10"

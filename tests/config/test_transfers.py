@@ -123,7 +123,7 @@ def test_a_range_is_read_as_one_tag_and_written_as_another() -> None:
     assert (first.source, first.target) == ("a/ranges/D100..D109", "b/ranges/to/D200..D209")
     assert first.text == ("a:D100..D109", "b:D200..D209")
     read = tag_of(found, first.source)
-    assert (str(read.layout.type), read.every, read.scale, read.write) == (
+    assert (str(read.layout.type), read.every, read.shaping.scale, read.write) == (
         *("uint16[10]", 2.0, 1.0),
         None,
     )

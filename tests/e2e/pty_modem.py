@@ -9,7 +9,7 @@ from typing import Self
 
 from tests.transport.modem import NEVER, ModemModel
 
-PATIENCE = 60.0  # seconds; never waited for when all is well
+PATIENCE = 300.0  # seconds; never waited for when all is well
 
 
 class PtyModem:

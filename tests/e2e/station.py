@@ -61,9 +61,9 @@ def _execute(station: VigorStation, verb: str, rest: list[str]) -> object:
         case ["speak"]:
             station.mute = False
         case ["hole", area, number]:
-            station.holes.add((area, int(number)))
+            station.memory.holes.add((area, int(number)))
         case ["fill", area, number]:
-            station.holes.discard((area, int(number)))
+            station.memory.holes.discard((area, int(number)))
         case ["set", area, number, value]:
             station.memory.write(area, int(number), [int(value)])
         case ["get", area, number]:

@@ -9,7 +9,7 @@ from gateway.engine.device.device import Device
 from gateway.engine.device.device_settings import DeviceSettings
 from gateway.engine.device.health import State
 from gateway.engine.engine import Engine
-from gateway.engine.jobs.jobs import Idle, Poll, Probe, Resynced, Settle
+from gateway.engine.jobs.jobs import Idle, Poll, Probe, Resynced, Settle, Settled
 from gateway.errors import Busy, Refusal, Refused
 from gateway.tags import Quality, Reason, Tag
 from tests.engine.rig import Rig, ended, link_device, tcp_device
@@ -151,7 +151,11 @@ def test_devices_come_and_go_on_one_line() -> None:
 
 
 def _device_of(rig: Rig) -> Device:
+    """The device of the next poll. An added one may get late replies: it settles and resyncs."""
     job = rig.transacted()
+    while isinstance(job, Settle | Probe):
+        rig.conclude(job, Settled(late=None) if isinstance(job, Settle) else Resynced(1))
+        job = rig.transacted()
     assert isinstance(job, Poll)
     rig.conclude(job, [0] * len(job.block.tags))
     return job.device

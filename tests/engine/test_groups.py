@@ -149,7 +149,7 @@ async def test_bits_whose_words_are_refused_before_the_write_are_written_one_by_
     line, dev = vigor("D7.3", "D8.2", "D9.1")
     async with running(line):
         await asyncio.sleep(3)
-        line.stations[0].inner.holes = {("D", 8)}
+        line.stations[0].inner.memory.holes = {("D", 8)}
         outcomes = submit(line, dev, [("D7.3", True), ("D8.2", True), ("D9.1", True)])
         await asyncio.sleep(1)
         assert values_of(outcomes) == [True, "Refused", "NotSent"]
@@ -230,7 +230,7 @@ async def test_after_the_first_that_is_not_done_nothing_of_the_group_is_sent(fau
     line, dev = vigor("D0", "D20", "D40", "M0")
     station = line.stations[0]
     if fault == "refused":
-        station.inner.holes = {("D", 20)}
+        station.inner.memory.holes = {("D", 20)}
     else:
         intercept(station, lambda data: [] if data[3:9] == b"611C28" else None)
     async with running(line):

@@ -134,7 +134,7 @@ async def test_a_damaged_group_is_sent_again_one_by_one_with_outcomes_of_their_o
 @on_virtual_time
 async def test_a_known_bad_address_leaves_the_other_writes_together() -> None:
     line, dev = one(*BITS)
-    line.stations[0].inner.holes = {("M", 21)}
+    line.stations[0].inner.memory.holes = {("M", 21)}
     async with running(line):
         await asyncio.sleep(3)
         asked = now()
@@ -287,11 +287,12 @@ def test_a_device_gets_all_its_requests_in_their_order(
         obeyed: list[tuple[str, int]] = []
         station = line.stations[0]
         write = station.memory.write
-        station.inner.holes = {(t[0], int(t[1:], 8 if t[0] == "X" else 10)) for t in holes}
+        station.inner.memory.holes = {(t[0], int(t[1:], 8 if t[0] == "X" else 10)) for t in holes}
 
         def noted(area: str, start: int, values: Any) -> None:
-            text = f"{area}{start:o}" if area == "X" else f"{area}{start}"
-            obeyed.append((text, next(iter(values))))
+            for number, value in enumerate(values, start):
+                text = f"{area}{number:o}" if area == "X" else f"{area}{number}"
+                obeyed.append((text, value))
             write(area, start, values)
 
         async with running(line):
@@ -455,4 +456,4 @@ async def outcome(line: Plant, dev: Device, name: str, argument: str = "") -> An
 
 def is_running(line: Plant) -> bool:
     station: Any = line.stations[0].inner
-    return bool(station.running)
+    return bool(station.link.running)

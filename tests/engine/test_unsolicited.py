@@ -210,7 +210,7 @@ async def test_a_garbled_field_is_bad_alone_and_its_bytes_are_in_the_log() -> No
 async def test_two_equal_bar_codes_are_two_events_in_order() -> None:
     async with running(example("barcode-reader")) as bench:
         _, tag = bench.tag("barcode")
-        assert tag.event
+        assert tag.publishing.event
         bench.say(b"\x024006381333931\x03\x024006381333931\x03\x024006")
         bench.say(b"381333948\x03")
         codes = bench.values("barcode")
@@ -465,7 +465,7 @@ async def test_b_4_5_both_programs_read_d0_and_write_d1_by_configuration_alone(n
         assert bench.last("d0") == 0xA325 - 0x10000
         assert isinstance(await bench.write_tag("d1", -2), WriteResult)
         assert station.memory.read("D", 1) == [0xFFFE]
-        station.holes.add(("D", 1))
+        station.memory.holes.add(("D", 1))
         refused = await bench.write_tag("d1", 5)
         assert isinstance(refused, Refused)
         assert refused.code == "28"

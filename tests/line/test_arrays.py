@@ -34,7 +34,7 @@ async def test_one_refused_address_makes_its_array_bad_and_no_neighbour() -> Non
     steps = make_tag("D100", type="uint16[50]", name="steps")
     dev = device([steps, *words(150, 10)])
     line = plant([dev])
-    line.stations[0].inner.holes = {("D", 110)}
+    line.stations[0].inner.memory.holes = {("D", 110)}
     async with running(line):
         await asyncio.sleep(3)
         assert (line.now[steps].value, line.reason(steps)) == (None, Reason.REFUSED)

@@ -17,7 +17,7 @@ async def test_refused_addresses_are_found_and_the_others_turn_good() -> None:
     dev = device(words(0, 60))
     line = plant([dev])
     station = line.stations[0].inner
-    station.holes = {("D", 23), ("D", 24), ("D", 59)}
+    station.memory.holes = {("D", 23), ("D", 24), ("D", 59)}
     start = now()
     bad = [dev.tags[n] for n in (23, 24, 59)]
     async with running(line):
@@ -32,7 +32,7 @@ async def test_refused_addresses_are_found_and_the_others_turn_good() -> None:
         settled, refused = now(), dev.record.refusals["28"]
         await asyncio.sleep(280)
         assert dev.record.refusals["28"] == refused + 2 * len(bad)  # after 10 s, after a minute
-        station.holes = {("D", 59)}
+        station.memory.holes = {("D", 59)}
         await asyncio.sleep(100)
         assert line.now[bad[0]].quality is Quality.GOOD
         assert line.now[bad[1]].quality is Quality.GOOD
@@ -52,9 +52,9 @@ async def test_a_refusal_of_a_moment_costs_seconds_not_minutes() -> None:
     station = line.stations[0].inner
     async with running(line):
         await asyncio.sleep(5.5)
-        station.holes = {("D", n) for n in range(5)}  # its program is being loaded, say
+        station.memory.holes = {("D", n) for n in range(5)}  # its program is being loaded, say
         await asyncio.sleep(1.5)
-        station.holes = set()
+        station.memory.holes = set()
         await asyncio.sleep(5)
         assert line.good(dev)
         await asyncio.sleep(5)
@@ -114,10 +114,10 @@ async def test_an_address_of_its_own_request_that_returned_is_read_as_often_as_b
     dev = device([make_tag("D0"), make_tag("D1000")])
     line = plant([dev])
     station = line.stations[0].inner
-    station.holes = {("D", 1000)}
+    station.memory.holes = {("D", 1000)}
     async with running(line):
         await asyncio.sleep(400)  # by now it is tried every five minutes
-        station.holes = set()
+        station.memory.holes = set()
         await asyncio.sleep(320)
         returned = now()
         await asyncio.sleep(20)

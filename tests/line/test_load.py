@@ -115,7 +115,7 @@ async def test_the_turnaround_is_learned_in_spite_of_a_refused_address() -> None
     tags = [make_tag(f"D{66 * n}", device="plc1", every=0.5) for n in range(10)]
     dev = device(tags, reply_timeout=0.5)
     line = plant([dev])
-    line.stations[0].inner.holes.add(("D", 66))
+    line.stations[0].inner.memory.holes.add(("D", 66))
     async with running(line):
         await asyncio.sleep(20)
         line.stations[0].late = lambda _: 0.4

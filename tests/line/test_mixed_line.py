@@ -128,7 +128,7 @@ async def test_late_and_lost_replies_never_make_a_wrong_value() -> None:
 async def test_nak_06_finds_the_one_refused_address_of_a_block() -> None:
     dev = link_device(ComputerLink(station=5), *[f"D{n}" for n in range(40)])
     line = link_plant([dev])
-    line.stations[0].inner.holes = {("D", 17)}
+    line.stations[0].inner.memory.holes = {("D", 17)}
     for n in range(40):
         line.stations[0].memory.write("D", n, [n])
     async with running(line):

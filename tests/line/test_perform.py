@@ -50,7 +50,7 @@ class Plc:
 
     def __init__(self, *, holes: Iterable[tuple[str, int]] = (), verify_reads: int = 1) -> None:
         self.station: ComputerLinkStation = link_station(LINK)
-        self.station.holes = set(holes)
+        self.station.memory.holes = set(holes)
         self.ignored: set[str] = set()
         self.device = made_device(
             "plc", LINK, WIRE, LINK.timing, (make_tag("D0", LINK),), verify_reads=verify_reads
@@ -153,7 +153,7 @@ def test_a_refused_read_back_is_part_of_the_result() -> None:
     hear = plc.station.hear
 
     def hearing(data: bytes, now: float) -> list[bytes]:
-        plc.station.holes = {("D", 5)} if data[5:7] == b"WR" else set()
+        plc.station.memory.holes = {("D", 5)} if data[5:7] == b"WR" else set()
         return hear(data, now)
 
     plc.station.hear = hearing  # type: ignore[method-assign]  # refuses the read only

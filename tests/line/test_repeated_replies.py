@@ -15,7 +15,6 @@ from gateway.protocols.driver import AnyDriver
 from gateway.protocols.modbus import ModbusAscii, ModbusRtu
 from gateway.protocols.vigor import Vigor
 from gateway.simulator.plant import station_for
-from gateway.stations.modbus import ModbusStation
 from gateway.tags import Quality, Tag, WriteRule
 from tests.line.device_server import GUARD, DeviceServer, behind
 from tests.sim.bench import WIRE
@@ -41,11 +40,7 @@ class Repeater(DeviceServer):
 
     def lacks(self, *places: tuple[str, int]) -> None:
         """The addresses that the station lacks from now on."""
-        if isinstance(self._station, ModbusStation):
-            store: Any = self._station._store
-            store._holes = [(area, number, number) for area, number in places]
-        else:
-            self._station.holes = set(places)
+        self._station.memory.holes = set(places)
 
     def received(self, data: bytes) -> None:
         super().received(data)

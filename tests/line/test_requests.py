@@ -160,7 +160,7 @@ async def test_a_refused_write_reports_the_error_code() -> None:
     line = plant([device([tag, *words(10, 2)])])
     async with running(line):
         await asyncio.sleep(1)
-        line.stations[0].inner.holes.add(("D", 0))
+        line.stations[0].inner.memory.holes.add(("D", 0))
         outcome = line.submit(line.devices[0], tag, 1)
         await asyncio.sleep(0.5)
         assert isinstance(outcome.once, Refused)

@@ -129,9 +129,9 @@ async def test_a_refused_repetition_leaves_the_write_unclear() -> None:
             if tries == 1:
                 station.hear(request, now)
                 return []
-            station.holes = {("D", 0)}
+            station.memory.holes = {("D", 0)}
             refusal = station.hear(request, now)
-            station.holes = set()
+            station.memory.holes = set()
             return refusal
 
         line.stations[0].answer = once
@@ -151,7 +151,7 @@ async def test_a_refused_read_back_leaves_the_write_unclear() -> None:
         def after(request: bytes, now: float) -> list[bytes]:
             replies = station.hear(request, now)
             if request[3:5] == b"61":
-                station.holes = {("D", 0)}
+                station.memory.holes = {("D", 0)}
             return replies
 
         line.stations[0].answer = after
@@ -180,7 +180,7 @@ async def test_a_refused_write_is_not_repeated() -> None:
     line, dev, _ = one(WriteRule(repeat=True, verify=True))
     async with running(line):
         await asyncio.sleep(1)
-        line.stations[0].inner.holes = {("D", 0)}
+        line.stations[0].inner.memory.holes = {("D", 0)}
         outcome = (await write(line)).once
     assert isinstance(outcome, Refused)
     assert len(line.writes_sent()) == 1

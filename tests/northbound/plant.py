@@ -21,6 +21,7 @@ from gateway.plant.part import Core
 from gateway.protocols.driver import Address, Span, Unit
 from gateway.tags import Reason, Sample, Tag, WriteResult, WriteRule, bad, good
 from gateway.values import Layout, Value, parse_type
+from tests.tag_settings import grouped
 from tests.zenoh_peer import ZenohPeer, free_endpoint
 
 
@@ -33,7 +34,7 @@ def tag(device: str, name: str, **settings: Any) -> Tag:
         span=Span("D", 100, 1),
         unit_kind=Unit.WORD,
         layout=Layout(parse_type("int16")),
-        **settings,
+        **grouped(**settings),
     )
 
 

@@ -9,7 +9,7 @@ import zenoh
 from gateway.northbound.answering.answers import REFUSALS_LIMIT, AnswerPool
 from gateway.northbound.answering.workers import Workers
 
-PATIENCE = 60.0  # seconds; never waited for when all is well
+PATIENCE = 300.0  # seconds; never waited for when all is well
 
 
 class Query:

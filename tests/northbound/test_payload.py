@@ -26,6 +26,7 @@ from gateway.protocols.driver import Address, Span, Unit
 from gateway.tags import Deadband, Reason, Tag, WriteResult, WriteRule, bad, good
 from gateway.tags.shaping import Names
 from gateway.values import Layout, Value, parse_type
+from tests.tag_settings import grouped
 
 NOON = 1_795_176_000_123_456_789  # 2026-11-20T12:00:00.123456789Z
 
@@ -39,7 +40,7 @@ def tag(name: str = "speed", kind: str = "int16", **settings: Any) -> Tag:
         span=Span("D", 100, 1),
         unit_kind=Unit.WORD,
         layout=Layout(parse_type(kind)),
-        **settings,
+        **grouped(**settings),
     )
 
 

@@ -6,7 +6,7 @@ from contextlib import AbstractContextManager
 
 from gateway.northbound.answering.turns import Pause, Rank, Turns
 
-PATIENCE = 60.0  # seconds; never waited for when all is well
+PATIENCE = 300.0  # seconds; never waited for when all is well
 
 
 class Clock:

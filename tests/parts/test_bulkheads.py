@@ -235,7 +235,7 @@ async def test_the_plant_works_while_a_part_of_the_list_fails_at_once(name: str)
         await running.works()
         await asyncio.sleep(COMES_BACK)
         await running.works()
-        document: Any = running.plant.status()["parts"][name]
+        document: Any = running.plant.status()[f"parts/{name}"]
     assert document["why"] == "OSError: the disk has gone"
     assert document["failures"] > 1
     if kind.serves is Keyed:
@@ -262,5 +262,5 @@ async def test_documents_of_a_part_are_in_the_status() -> None:
     await running.start()
     status: Any = running.plant.status()
     assert status["toy"]["calls"] > 0
-    assert status["parts"] == {"toy": {"why": "", "again": None, "failures": 0}}
+    assert status["parts/toy"] == {"why": "", "again": None, "failures": 0}
     await running.stop()

@@ -127,7 +127,7 @@ async def test_a_list_is_registered_once_and_then_read() -> None:
 
 
 async def _lost(line: Plant) -> None:
-    _link_station(line).forget_monitor()
+    _link_station(line).link.forget_monitor()
 
 
 async def _power_cycle(line: Plant) -> None:
@@ -164,7 +164,7 @@ async def _other_computer(line: Plant) -> None:
 
 def _other_list(line: Plant) -> None:
     # Private: a frame of another computer would also reach the line under test.
-    _link_station(line)._words = [
+    _link_station(line).link._lists["WM"] = [
         Cells("D", 3900 + i, 1, Kind.WORDS) for i in range(len(SCATTERED))
     ]
 
@@ -181,9 +181,9 @@ def _intercept(line: Plant, reply: Callable[[str], object]) -> None:
     # Private: no setting of the station refuses or loses single commands.
     answer = station._answer
 
-    def intercepted(text: str, at: float) -> object:
+    def intercepted(text: str) -> object:
         found = reply(text)
-        return answer(text, at) if found is NotImplemented else found
+        return answer(text) if found is NotImplemented else found
 
     station._answer = intercepted
 
@@ -240,7 +240,7 @@ async def test_a_registration_without_an_acknowledgement_is_repeated() -> None:
 async def test_a_bad_address_is_found_and_the_others_are_listed_again() -> None:
     line, dev = one(*SCATTERED)
     station = line.stations[0]
-    station.inner.holes = {("D", 800)}
+    station.inner.memory.holes = {("D", 800)}
     start = now()
     async with running(line):
         await asyncio.sleep(10)
@@ -253,7 +253,7 @@ async def test_a_bad_address_is_found_and_the_others_are_listed_again() -> None:
         [block] = listed(dev)
         assert spelt(dev, "D800") not in block.tags
         assert set(commands(station, now() - 3)) == {"MN"}
-        station.inner.holes = set()
+        station.inner.memory.holes = set()
         await asyncio.sleep(310)
         assert line.good(dev)
         assert len(listed(dev)[0].tags) == len(SCATTERED)

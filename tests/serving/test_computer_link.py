@@ -92,13 +92,43 @@ def test_points_in_words_and_scattered_writes() -> None:
         ("05FFRR0", "18"),
         ("05FFRS0", "18"),
         ("05FFMB0", "06"),
-        ("05FFPC0", "06"),
     ],
 )
 def test_everything_else_gets_the_code_of_the_manual(text: str, code: str) -> None:
     made = bench()
     assert made.ask(request(text)) == f"\x1505FF{code}".encode()
     assert made.written == []
+
+
+def test_2_10_lists_that_a_master_registers_are_read_by_mb_and_mn() -> None:
+    made = bench()
+    for text in ("05FFMB0", "05FFMN0", "05FFBM002M0010M0099", "05FFWM001D0101"):
+        assert made.ask(request(text)) == b"\x1505FF06"  # no list yet; no tag at M99 and D101
+    assert made.ask(request("05FFBM003M0010M0011M0012")) == b"\x0605FF"
+    assert made.ask(request("05FFWM002D0100D0500")) == b"\x0605FF"
+    assert made.ask(request("05FFMB0")) == block("05FF011")
+    assert made.ask(request("05FFMN0")) == b"\x1505FF06"  # D500 is not written yet
+    assert made.ask(request("05FFWW0D050001ABCD")) == b"\x0605FF"
+    assert made.ask(request("05FFMN0")) == block("05FF1234ABCD")
+    assert made.ask(request("05FFPC0")) == block("05FF9E")
+
+
+def test_2_11_and_2_12_run_stop_and_the_global_flag_are_tags_where_the_master_may_write() -> None:
+    tags = {
+        "runs": {"address": "M8035"},
+        "stops": {"address": "M8037"},
+        "all": {"address": "M8126"},
+    }
+    plc = {"protocol": "computer-link", "accept": ["M8035..M8037", "M8126"], "tags": tags}
+    made = Bench("/dev/ttyS98", {"a": {**plc, "station": 5}, "b": {**plc, "station": 6}})
+    assert made.ask(request("05FFRS0")) == b"\x0605FF"
+    assert made.ask(request("05FFRS0")) == b"\x1505FF18"
+    assert made.ask(request("05FFRR0")) == b"\x0605FF"
+    assert made.ask(request("05FFRR0")) == b"\x1505FF18"
+    stopped = {"runs": False, "stops": True}
+    assert made.written == [{**stopped, "all": False}, {"runs": True, "stops": False}]
+    assert made.ask(request("FFFFGW01")) == made.ask(request("05FFGW00")) == b""
+    assert made.written[2:] == [{"all": True}, {"all": True}, {"all": False}]
 
 
 def test_a_wrong_sum_gets_nak_02_and_other_stations_get_silence() -> None:

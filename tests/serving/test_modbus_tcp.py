@@ -110,7 +110,7 @@ def test_an_equal_write_is_an_event_of_its_own() -> None:
         assert ask(made, "06 0064 0007") == "06 00 64 00 07"
     assert made.written == [{"setpoint": 7}, {"setpoint": 7}]
     [sample] = made.samples_given[0]
-    assert sample.tag.event
+    assert sample.tag.publishing.event
     assert sample.quality is Quality.GOOD
 
 

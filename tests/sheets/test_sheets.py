@@ -70,8 +70,8 @@ def test_a_plant_of_300_tags_is_the_same_from_every_program(dialect: str, tmp_pa
     assert len(mixer.tags) == 300
     for tag, point in zip(mixer.tags, points, strict=True):
         assert (tag.name, tag.text, str(tag.layout.type)) == (point.name, point.address, point.type)
-        assert (tag.unit, tag.description) == (point.unit, point.comment)
-        assert tag.scale == (point.scale or 1)
+        assert (tag.label.unit, tag.label.description) == (point.unit, point.comment)
+        assert tag.shaping.scale == (point.scale or 1)
         # `R` in the sheet is stronger than `write: true` in the defaults.
         assert tag.write == (WriteRule() if point.writable else None)
 

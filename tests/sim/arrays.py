@@ -102,7 +102,7 @@ class Clocks:
         if not isinstance(value, tuple) or len(value) != len(self.own):
             return False
         tag = self.tag
-        seen = [round((float(one) - tag.offset) / tag.scale) for one in value]
+        seen = [round((float(one) - tag.shaping.offset) / tag.shaping.scale) for one in value]
         return any(
             all(self.raw(element, ms) == one for element, one in enumerate(seen))
             for ms in self._moments(seen[0], first, last)

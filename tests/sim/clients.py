@@ -172,7 +172,7 @@ class Client:
             judge.story.counts["older writes that a stalled link brought"] += 1
         elif bus.foreign.unknown_at >= since:
             judge.story.counts["foreign acknowledgements"] += 1
-        elif tag.shape is not None and (
+        elif tag.origin.shape is not None and (
             bus.untimely(tag.device) or self.deaf(tag.device, since - 30.0, DELAYING)
         ):
             judge.story.counts["stale acknowledgements of frames"] += 1

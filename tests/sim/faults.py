@@ -95,7 +95,7 @@ class Faults:
             case "reboot":
                 station.deaf = True
                 if isinstance(station.inner, ComputerLinkStation):
-                    station.inner.forget_monitor()
+                    station.inner.link.forget_monitor()
             case "mute":
                 station.mute = True
             case "lose" | "cut" | "foreign" | "junk":

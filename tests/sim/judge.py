@@ -90,7 +90,9 @@ class Judge:
             return
         if bus.blind(since):
             self._blind("blind reads", tag)
-        elif tag.shape is not None and (bus.untimely(tag.device) or bus.brought_older(since)):
+        elif tag.origin.shape is not None and (
+            bus.untimely(tag.device) or bus.brought_older(since)
+        ):
             self.story.counts["stale reads of frames"] += 1  # their frames name no request
         elif bus.foreign.took(bus.heard):
             self.story.counts["foreign answers"] += 1

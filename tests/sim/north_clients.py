@@ -120,7 +120,7 @@ class Person:
 
     async def past(self) -> bool:
         since = max(self.judge.began, self.judge.now - self.chance.choice((5.0, 60.0, 600.0)))
-        kept = [tag for tag in self.tags if tag.history]
+        kept = [tag for tag in self.tags if tag.publishing.history]
         tag = self.chance.choice([None, *kept])
         place = "**" if tag is None else tag.key
         answer, whole, arrived = await self._ask(f"plant/{place}?_time=[{self._text(since)}..]")

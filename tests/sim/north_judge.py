@@ -94,7 +94,7 @@ class Judge:
 
     def record(self, samples: Sequence[Sample]) -> None:
         for sample in samples:
-            if sample.tag.history:
+            if sample.tag.publishing.history:
                 self.recorded.append((self.now, sample.tag.key, sample.time // 1000, sample.value))
 
     # Views

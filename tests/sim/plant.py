@@ -26,6 +26,7 @@ from gateway.stations.vigor import VigorStation
 from gateway.tags import Quality, Reason, Sample, Tag
 from gateway.values import Layout, Value, parse_type
 from tests.sim.bench import WIRE, Bench, Unruly
+from tests.tag_settings import grouped
 
 SECOND = 1_000_000_000
 
@@ -55,7 +56,7 @@ def make_tag(
         span=Span(address.area, address.number, size),
         unit_kind=unit,
         layout=Layout(kind),
-        **settings,
+        **grouped(**settings),
     )
 
 
@@ -218,7 +219,7 @@ def made_device(
         timing=timing,
         tags=tuple(tags),
         late_guard=late_guard,
-        **settings,
+        **grouped(**settings),
     )
     return Device(known, wire)
 

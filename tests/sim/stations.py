@@ -230,7 +230,7 @@ class Troubled:
         if not isinstance(value, (int, float)):
             return False
         bits = 32 if tag.unit_kind is Unit.DWORD or tag.span.size == 2 else 16
-        raw = round((value - tag.offset) / tag.scale)
+        raw = round((value - tag.shaping.offset) / tag.shaping.scale)
         return (raw - own - first) % (1 << bits) <= last - first
 
     def _steps(self, tag: Tag, own: int, first: int, last: int) -> Iterator[list[int]]:
@@ -316,12 +316,5 @@ def set_holes(
     station: Station, missing: set[tuple[str, int]], ranges: list[tuple[str, int, int]]
 ) -> None:
     """Sets the addresses (area, number) and ranges that the station refuses."""
-    if isinstance(station, Gadget):
-        return
-    if hasattr(station, "_store"):
-        holes = tuple((area, number, number) for area, number in sorted(missing))
-        # Private: a Modbus station gets its holes at its creation.
-        station._store._holes = (*holes, *ranges)
-    else:
-        lacks = Holes(frozenset(missing), tuple(ranges)) if ranges else set(missing)
-        station.holes = lacks  # type: ignore[attr-defined]  # Vigor and Computer Link
+    lacks = Holes(frozenset(missing), tuple(ranges)) if ranges else set(missing)
+    station.memory.holes = lacks  # type: ignore[assignment]  # ranges would be long sets

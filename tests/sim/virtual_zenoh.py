@@ -48,6 +48,7 @@ class Received(NamedTuple):
     kind: zenoh.SampleKind = zenoh.SampleKind.PUT
     attachment: zenoh.ZBytes | None = None
     source_info: None = None
+    encoding: zenoh.Encoding | None = None
     stamp: int = 0
     put_at: float = 0.0
 

@@ -282,20 +282,20 @@ def test_area_c_is_swallowed() -> None:
 def test_2_11_remote_run_and_stop_move_m8035_to_m8037() -> None:
     station = ComputerLinkStation(5)
     flags = lambda: station.memory.read("M8", 8035, 3)  # noqa: E731  # read afresh each time
-    assert station.running
+    assert station.link.running
     assert code(station, "05FFRR0") == "18"
     assert code(station, "05FFGW01") == "silent"
     assert code(station, "05FFRS0") == ""
-    assert not station.running
+    assert not station.link.running
     assert flags() == [0, 0, 1]
     assert station.memory.read("M8", 8126) == [0]
     assert code(station, "05FFRS0") == "18"
     assert code(station, "05FFRR0") == ""
-    assert station.running
+    assert station.link.running
     assert flags() == [1, 1, 0]
     station.power_cycle()
-    assert not station.running
-    station.switch_at_run = True
+    assert not station.link.running
+    station.link.switch_at_run = True
     assert code(station, "05FFRR0") == "18"
     assert code(station, "05FFRS0") == "18"
 
@@ -328,7 +328,7 @@ def test_d8120_and_d8121_are_taken_at_power_on_only(procedure: Procedure, d8120:
 
 def test_the_registered_lists_are_lost_at_power_off() -> None:
     station = ComputerLinkStation(5)
-    for forget in (station.forget_monitor, station.power_cycle):
+    for forget in (station.link.forget_monitor, station.power_cycle):
         assert code(station, "05FFBM001M0000") == ""
         assert code(station, "05FFMB0") == ""
         assert code(station, "05FFMN0") == "06"

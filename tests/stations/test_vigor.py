@@ -183,7 +183,7 @@ def test_a_device_the_model_lacks_is_status_28() -> None:
     assert station.hear(VECTORS["vigor-003"].frame, 0.0) == [VECTORS["vigor-081"].frame]
     assert station.hear(VECTORS["vigor-001"].frame, 0.0) == [VECTORS["vigor-081"].frame]
     assert station.hear(VECTORS["vigor-008"].frame, 0.0) == [VECTORS["vigor-085"].frame]
-    station.holes.clear()
+    station.memory.holes.clear()
     assert station.hear(VECTORS["vigor-008"].frame, 0.0) == [VECTORS["vigor-009"].frame]
 
 

@@ -14,6 +14,7 @@ from gateway.tags.mirror import Mirror
 from gateway.tags.scan import Decoder, Scan
 from gateway.tags.shaping import Shaping
 from gateway.values import Kind, Layout, Order, Value, parse_type
+from tests.tag_settings import grouped
 
 MINUTE = 60 * 10**9
 
@@ -28,7 +29,7 @@ def array(kind: str, unit: Unit = Unit.WORD, order: Order = Order.LOW_FIRST, **m
         span=Span("D", 100, layout.type.words // (2 if unit is Unit.DWORD else 1)),
         unit_kind=unit,
         layout=layout,
-        **more,
+        **grouped(**more),
     )
 
 

@@ -32,7 +32,7 @@ class Reads:
     """Reads of one kept tag, as a line delivers them: equal reads move the time of a scan."""
 
     def __init__(self, tag: Tag, other: str = "") -> None:
-        self.tag, (self.raw,) = tag, tag.inputs
+        self.tag, (self.raw,) = tag, tag.origin.inputs
         self.mirror = Mirror([tag], 0)
         self._decoder = Decoder([self.raw], [0])
         self._scan: Scan | None = None
@@ -109,8 +109,8 @@ def test_a_clock_that_is_set_back_begins_the_wait_again() -> None:
 def test_an_inverted_bit_of_a_word_is_debounced() -> None:
     door = Reads(tag_of("D5.3, debounce: 500ms, invert: true, enum: {0: closed, 1: open}"))
     assert door.values((8, 0), (0, 100), (0, 600)) == [False, False, True]
-    assert door.tag.names is not None
-    assert door.tag.names.text(door.mirror[door.tag].value) == "open"
+    assert door.tag.shaping.names is not None
+    assert door.tag.shaping.names.text(door.mirror[door.tag].value) == "open"
 
 
 def test_the_values_are_as_new_as_the_last_read() -> None:
@@ -206,7 +206,7 @@ def test_a_default_debounce_is_for_bits_that_are_only_read() -> None:
     rows = tags("b: {address: M1}", "w: {address: M2, write: true}", "n: {address: D1}")
     rule = "    defaults: {debounce: 1s}\n    devices:\n"
     Path("plant.yaml").write_text(rows.replace("    devices:\n", rule, 1))
-    assert [tag.kept for tag in load("plant.yaml").devices[0].tags] == [1.0, None, None]
+    assert [tag.origin.kept for tag in load("plant.yaml").devices[0].tags] == [1.0, None, None]
 
 
 def test_a_gateway_with_a_standby_has_no_totals() -> None:
@@ -221,5 +221,5 @@ def test_copies_of_a_kept_tag_have_their_own_reads() -> None:
     text = tags(row, row.replace("a:", "b:", 1))
     Path("plant.yaml").write_text(text)
     a, b = load("plant.yaml").devices[0].tags
-    assert a.inputs[0] is not b.inputs[0]
-    assert b.inputs[0].name == "b"
+    assert a.origin.inputs[0] is not b.origin.inputs[0]
+    assert b.origin.inputs[0].name == "b"

@@ -169,10 +169,6 @@ def test_new_blocks_share_no_samples_with_old_ones() -> None:
     for _ in range(3):
         reader.read(9, 9)
         assert [reader.mirror[tag].value for tag in (a, b)] == [9, 9]
-    reader.conclude(old, (7, 8))  # again, after reads of the new block
-    for _ in range(3):
-        reader.read(9, 9)
-        assert [reader.mirror[tag].value for tag in (a, b)] == [9, 9]
 
 
 class Interrupted(Tag):

@@ -11,6 +11,7 @@ from gateway.errors import BadValue
 from gateway.protocols.driver import Address, Span, Unit
 from gateway.tags import Quality, Reason, Tag, WriteRule, bad, good
 from gateway.values import Kind, Layout, Order, Value, ValueType, parse_type
+from tests.tag_settings import grouped
 
 
 def tag(kind: str = "int16", unit: Unit = Unit.WORD, bit: int | None = None, **more: Any) -> Tag:
@@ -24,7 +25,7 @@ def tag(kind: str = "int16", unit: Unit = Unit.WORD, bit: int | None = None, **m
         span=Span("D", 100, size),
         unit_kind=unit,
         layout=layout,
-        **more,
+        **grouped(**more),
     )
 
 

@@ -16,7 +16,7 @@ _FLAGS = (
     *("--disable-background-networking", "--disable-extensions", "--disable-component-update"),
     *("--hide-scrollbars", "--force-color-profile=srgb", "--remote-debugging-port=0"),
 )
-PATIENCE = 60.0  # seconds; never waited for when all is well
+PATIENCE = 300.0  # seconds; never waited for when all is well
 
 
 class Tab:

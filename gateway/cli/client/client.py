@@ -227,7 +227,9 @@ class Client:
             yield self._session.declare_subscriber(self._keys.value(key), arrived)
         for device in self._only_blocks:
             # Event tags have values of their own in any case.
-            members = [tag for tag in device.tags if not tag.event and matches(tag.key, wanted)]
+            members = [
+                tag for tag in device.tags if not tag.publishing.event and matches(tag.key, wanted)
+            ]
             if members:
                 yield self._session.declare_subscriber(
                     self._keys.block(device.name),

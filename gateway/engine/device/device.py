@@ -11,7 +11,7 @@ from gateway.engine.device.records import Record
 from gateway.engine.device.reply_shapes import ReplyShapes, reply_shapes
 from gateway.engine.device.station_silence import StationSilence
 from gateway.engine.device.turnaround import Turnaround
-from gateway.errors import Garbled, LineDown
+from gateway.errors import Evidence, Garbled, LineDown, NoReply
 from gateway.planning.bad_addresses import RETRIES, BadAddresses, KnownBad
 from gateway.planning.monitor_lists import with_monitor_list
 from gateway.planning.planner import Block, around, plan, runs_of
@@ -121,6 +121,8 @@ class Device:
             if self.one_at_a_time:
                 return f"It takes one request at a time, not {self.window}: set `window: 1`"
             return ""
+        if isinstance(trouble, NoReply | Garbled) and trouble.evidence is not Evidence.SLOW:
+            trouble = self.record.usual() or trouble
         heard = trouble.data if isinstance(trouble, Garbled) and not self.health.online else b""
         if heard and isinstance(driver, KnownReplies) and is_swapped(heard, driver):
             return SWAPPED

@@ -28,8 +28,8 @@ class DeviceSettings:
     wire_tags: tuple[Tag, ...] = field(init=False, repr=False)  # those with an address
 
     def __post_init__(self) -> None:
-        tags = [tag for tag in self.tags if tag.formula is None]
-        found = tuple(tag if tag.kept is None else tag.inputs[0] for tag in tags)
+        tags = [tag for tag in self.tags if tag.origin.formula is None]
+        found = tuple(tag if tag.origin.kept is None else tag.origin.inputs[0] for tag in tags)
         object.__setattr__(self, "wire_tags", found)
 
     @property

@@ -1,12 +1,15 @@
 """Counts of lines, devices and polls since the start."""
 
-from collections import Counter
+from collections import Counter, deque
 from dataclasses import dataclass, field
 from enum import StrEnum
 
 from gateway.errors import DeviceError, Garbled, NoReply, Refused
 
 COMPLETE, MODEM_LOST = "complete", "modem lost"  # results of calls, beside the modem's words
+DAY = 86_400.0  # seconds
+MOST_FALLS = 1000  # times that are kept: one each 86 s of a day
+LATELY = 32  # requests whose ends are kept
 MOST_RESULTS = 20  # a modem that says noise does not fill the memory
 
 
@@ -58,6 +61,34 @@ class CallRecord:
 
 
 @dataclass(slots=True)
+class Falls:
+    """The times at which a line was lost, or a device fell silent."""
+
+    since: float | None = None  # it is still down; by the line's clock
+    _times: deque[float] = field(default_factory=lambda: deque(maxlen=MOST_FALLS))
+
+    def fall(self, now: float) -> None:
+        """Notes that it is down. It may be known already."""
+        if self.since is None:
+            self.since = now
+            self._times.append(now)
+
+    def rise(self) -> None:
+        """Notes that it is there again."""
+        self.since = None
+
+    def last_day(self, now: float) -> int:
+        """Returns how often it fell in the last 24 hours."""
+        while self._times and now - self._times[0] > DAY:
+            self._times.popleft()
+        return len(self._times)
+
+    def lasts(self, now: float) -> float | None:
+        """Returns the seconds that it has been down; None: it is not."""
+        return None if self.since is None else round(now - self.since, 1)
+
+
+@dataclass(slots=True)
 class LineRecord:
     """Counts of a line since the start. Times in seconds."""
 
@@ -69,17 +100,20 @@ class LineRecord:
     unasked: int = 0  # bytes that arrived outside of a transaction
     trouble: str = ""  # why the port is not open
     last_trouble: str = ""  # why the port was not open last
+    falls: Falls = field(default_factory=Falls)
     calls: CallRecord | None = None  # with a modem, once it was there
 
     def open(self, now: float) -> None:
         """Notes that the port was opened."""
         self.opened += 1
+        self.falls.rise()
         self.since, self.trouble = now, ""
 
     def lose(self, why: str, now: float, *, was_open: bool) -> None:
         """Notes that the port was lost, or could not be opened."""
         if was_open:
             self.open_before += now - self.since
+        self.falls.fall(now)
         self.trouble = self.last_trouble = why
 
     def count(self, seconds: float, turnaround: float) -> None:
@@ -111,6 +145,9 @@ class Record:
     overdue: int = 0  # blocks whose values became too old
     retries: int = 0  # failed reads that were repeated
     last_good: float | None = None  # the last good read that a poll forgot, by the line's clock
+    falls: Falls = field(default_factory=Falls)  # into silence
+    lately: deque[str] = field(default_factory=lambda: deque(maxlen=LATELY))  # evidence, or ""
+    errors: dict[str, DeviceError] = field(default_factory=dict)  # the last one by evidence
     failures: Counter[str] = field(default_factory=Counter)  # by evidence
     refusals: Counter[str] = field(default_factory=Counter)  # by the code of the device
     turnaround: float | None = None  # measured
@@ -120,6 +157,7 @@ class Record:
         """Counts requests with a reply, and the seconds of their characters and turnarounds."""
         self.wire_time += characters + turnarounds
         if exchanges:
+            self.lately.append("")
             self.exchanges += exchanges
             own, known = turnarounds / exchanges, self.turnaround
             # Smoothed over about ten exchanges.
@@ -130,11 +168,19 @@ class Record:
         self.slowest_write = max(self.slowest_write, took)
 
     def count_failure(self, error: DeviceError) -> None:
-        match error:
-            case NoReply() | Garbled():
-                self.failures[error.evidence] += 1
-            case _:
-                self.failures["other"] += 1
+        kind = str(error.evidence) if isinstance(error, NoReply | Garbled) else "other"
+        self.failures[kind] += 1
+        self.lately.append(kind)
+        self.errors[kind] = error
+
+    def failed_lately(self) -> Counter[str]:
+        """Returns the failures of the last requests by evidence."""
+        return Counter(kind for kind in self.lately if kind)
+
+    def usual(self) -> DeviceError | None:
+        """Returns the most frequent failure of the last requests, not an odd one."""
+        most = self.failed_lately().most_common(1)
+        return self.errors[most[0][0]] if most else None
 
     def count_refusal(self, error: Refused) -> None:
         self.refusals[error.code] += 1

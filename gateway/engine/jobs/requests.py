@@ -111,7 +111,7 @@ class Write:
 
     def holds(self, units: Sequence[int]) -> bool:
         """Returns True if `units`, as read back, are the written value."""
-        if self.tag.shape is not None:  # bytes are written, a value is read
+        if self.tag.origin.shape is not None:  # bytes are written, a value is read
             return self.tag.decode(units) == self.tag.from_units(self.units)
         if self.tag.part is not None:
             return self.tag.part.of(units[0]) == self.units[0]

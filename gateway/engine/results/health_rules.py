@@ -33,6 +33,7 @@ class HealthRules:
         if health.state is State.ONLINE and not health.needs_resync:
             return
         if health.answered(resynced=resynced):
+            device.record.falls.rise()
             if device.shapes is not None:
                 device.shapes.longer.restart(now)
             self._effects.online(device, True)
@@ -100,6 +101,7 @@ class HealthRules:
         if not (short and before is State.OFFLINE):  # the values are bad already
             self._effects.bad(device.polled_tags, health.reason, time, why)
         if before is not State.OFFLINE:
+            device.record.falls.fall(now)
             self._effects.online(device, False)
             self._effects.warning("device offline", device=device.name, why=why)
         for request in self._schedule.requests.withdraw(device):

@@ -21,7 +21,7 @@ _JSON_FORM = Form.JSON  # looking up a member of an enumeration takes 0.2 µs
 
 def put(session: zenoh.Session, key: str, sample: Sample, stamp: zenoh.Timestamp | None) -> None:
     """Raises `ZError`."""
-    if sample.tag.payload is _JSON_FORM:
+    if sample.tag.publishing.payload is _JSON_FORM:
         data = payload.value(sample)
         put_json(session, key, data, stamp)
         return
@@ -53,7 +53,7 @@ def put_json(session: zenoh.Session, key: str, data: bytes, stamp: zenoh.Timesta
 
 def reply(query: zenoh.Query, key: str, sample: Sample, stamp: zenoh.Timestamp) -> None:
     """Raises `ZError`."""
-    if sample.tag.payload is _JSON_FORM:
+    if sample.tag.publishing.payload is _JSON_FORM:
         reply_json(query, key, payload.value(sample), stamp)
         return
     text, attachment = payload.value_text(sample), payload.attachment(sample)

@@ -270,9 +270,9 @@ class ScanBatches:
     def publish(self, samples: Sequence[Sample]) -> None:
         """One call is one scan. Samples of event tags all go out, in order, none replaced."""
         values = samples
-        if any(sample.tag.event for sample in samples):
-            self._publisher.events(sample for sample in samples if sample.tag.event)
-            values = [sample for sample in samples if not sample.tag.event]
+        if any(sample.tag.publishing.event for sample in samples):
+            self._publisher.events(sample for sample in samples if sample.tag.publishing.event)
+            values = [sample for sample in samples if not sample.tag.publishing.event]
         if only_blocks := self._index.only_blocks:
             values = [sample for sample in values if sample.tag.device not in only_blocks]
         self._publisher.values(values)

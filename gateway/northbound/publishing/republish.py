@@ -67,7 +67,7 @@ class Republisher:
         # A reload may have removed a tag meanwhile, or replaced it.
         known = (self._plant.tag(tag.key) for tag in tags)
         current = [self._plant.sample(tag) for tag in known if tag is not None]
-        again = [s for s in current if not s.tag.event or s.quality is Quality.BAD]
+        again = [s for s in current if not s.tag.publishing.event or s.quality is Quality.BAD]
         self._plant.mark_published(again)
         self._publish(again)
 
@@ -135,7 +135,7 @@ class Republisher:
         while True:
             if known is not self._index.tags:
                 known = self._index.tags
-                tags = [tag for tag in known if tag.heartbeat]
+                tags = [tag for tag in known if tag.publishing.heartbeat]
                 published_at = {tag: published_at[tag] for tag in tags if tag in published_at}
             await asyncio.sleep(_HEARTBEAT_CHECK)
             for start in range(0, len(tags), _BATCH_SIZE):
@@ -150,7 +150,7 @@ class Republisher:
             sample = self._plant.sample(tag)
             if sample.quality is Quality.GOOD:
                 published_at.pop(tag, None)
-            elif now - published_at.setdefault(tag, now) >= (tag.heartbeat or 0.0):
+            elif now - published_at.setdefault(tag, now) >= (tag.publishing.heartbeat or 0.0):
                 published_at[tag] = now
                 due.append(sample)
         return due

@@ -64,8 +64,8 @@ class Alarms:
         self._sinks: list[Sink] = []
         self._wall = wall
         for tag in tags:
-            if tag.alarm is not None:
-                self._by_tag[tag] = self._add(Entry(tag.key, tag.alarm, tag))
+            if (rule := tag.feature(AlarmRule)) is not None:
+                self._by_tag[tag] = self._add(Entry(tag.key, rule, tag))
         self.of_tags = bool(self._by_tag)  # then samples are to be judged
 
     def watch(self, conditions: Mapping[str, Condition]) -> None:
@@ -86,13 +86,13 @@ class Alarms:
     def take_over(self, tags: Iterable[Tag], gone: Iterable[Tag]) -> None:
         """Follows changed tags. The alarm of a tag with the same rule goes on."""
         for tag in tags:
-            if tag.alarm is None:
+            if (rule := tag.feature(AlarmRule)) is None:
                 continue
             entry = self.entries.get(tag.key)
-            if entry is None or entry.tag is None or entry.tag.alarm != tag.alarm:
+            if entry is None or entry.tag is None or entry.tag.feature(AlarmRule) != rule:
                 if entry is not None:
                     self._remove(entry)
-                entry = self._add(Entry(tag.key, tag.alarm, tag))
+                entry = self._add(Entry(tag.key, rule, tag))
             entry.tag = tag
             self._by_tag[tag] = entry
         for tag in gone:
@@ -132,7 +132,7 @@ class Alarms:
                 self._apply(self._by_tag[tags[place]], values[place], samples.time)
             return
         for sample in samples:
-            if sample.tag.alarm is not None:
+            if sample.tag.feature(AlarmRule) is not None:
                 known = sample.value if sample.quality is Quality.GOOD else None
                 self._apply(self._by_tag[sample.tag], known, sample.time)
 

@@ -36,7 +36,7 @@ def alarm_fields(entry: Entry, sample: Callable[[Tag], Sample]) -> dict[str, obj
         "limit": _limit(entry, status.level),
         **known,
         "value_at_change": payload.loggable(status.value),
-        "unit": "" if entry.tag is None else entry.tag.unit,
+        "unit": "" if entry.tag is None else entry.tag.label.unit,
         "since": rfc3339(status.since) if status.since else None,
         "raised": rfc3339(status.raised) if status.raised else None,
         "acknowledged": by and {"by": by.by, "time": rfc3339(by.time), "via": by.via},

@@ -120,7 +120,7 @@ class HistoryFile:
             run = SortedRun(number, min(times), max(times), end - number, now)
             # Without an index the samples are read all: some of them are lost.
             is_whole = numbers == tuple(range(number, end))
-            places = pack(of_tags) if is_whole else b""
+            places = pack(of_tags, times) if is_whole else b""
             row = (*run, checksum(run[:]), places)
             self._database.execute("INSERT OR REPLACE INTO run VALUES (?, ?, ?, ?, ?, ?, ?)", row)
         return run

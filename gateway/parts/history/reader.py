@@ -105,12 +105,13 @@ class Reader:
         """Returns these samples of a run, by their numbers in it, and whether some are lost. None
         if the run was dropped. Raises `Damaged`."""
         first = run.number
+        columns = "id, tag, time, value, kind, bad, sum"
         wanted = f"id BETWEEN {first + numbers[0]:d} AND {first + numbers[-1]:d}"
         if not isinstance(numbers, range):
             wanted = f"id IN ({','.join(str(first + n) for n in numbers)})"
         with self._connection(file) as database, _translated():
             found = database.execute(
-                f"SELECT id, tag, time, value, kind, bad, sum FROM sample WHERE {wanted}"  # noqa: S608
+                f"SELECT {columns} FROM sample WHERE {wanted} ORDER BY id"  # noqa: S608
             ).fetchall()
             if oldest(database) > first:
                 return None

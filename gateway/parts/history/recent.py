@@ -114,7 +114,7 @@ class Recent:
             run = self._newest
             for sample in samples:
                 tag = sample.tag
-                if not tag.history:
+                if not tag.publishing.history:
                     continue
                 if len(run.samples) >= run.longest:
                     run = self._begin()

@@ -8,6 +8,7 @@ from operator import itemgetter
 from gateway.contract.timerange import EARLIEST, TimeRange
 from gateway.errors import Busy, Damaged
 from gateway.parts.history.damage import Damage
+from gateway.parts.history.index import GROUP, Places
 from gateway.parts.history.reader import Part, Reader, in_order
 from gateway.parts.history.recent import Identity, Recent, SortedRun
 from gateway.parts.history.rows import Row, from_row
@@ -16,7 +17,6 @@ from gateway.tags.recorded import Place, Recorded, RecordedQuery
 from gateway.tags.timestamps import rfc3339
 
 _MANY = 2048  # samples in memory between two pauses
-_GROUP = 2048  # samples that are read at once
 _LOST = 16  # samples that are lost together
 _FEW_TAGS = 100  # for more, a run is read as a whole
 _TIME = itemgetter(2)
@@ -39,15 +39,16 @@ class Search:
         numbers = stored.numbers({tag.key: tag}, runs)
         begun = False
 
-        def read(run: SortedRun) -> list[Sample]:
-            found = stored.whole(run, numbers)
+        def group(run: SortedRun, places: Places) -> list[Sample]:
+            found = stored.read(run, numbers, places.numbers)
             if found is None and begun:
                 raise Busy("the next samples were dropped meanwhile: ask again")
             # Dropped before the first sample: as if queried a moment later.
-            return [
-                from_row(tag, time, value, kind, bad)
-                for _, _, time, value, kind, bad, _ in sorted(found or (), key=_TIME)
-            ]
+            return [from_row(tag, *row[2:6]) for row in sorted(found or (), key=_TIME)]
+
+        def read(run: SortedRun) -> Iterator[Sample]:
+            groups = stored.places(run, numbers)
+            return in_order(Part(each.first, partial(group, run, each)) for each in groups)
 
         parts = [Part(run.first, partial(read, run)) for run in runs]
         parts += [_part_of(run, period) for run in newest]
@@ -127,51 +128,45 @@ class StoredRuns:
                 self._note(run, Damaged("the name of a tag is damaged"))
         return {known[key]: tag for key, tag in tags.items() if key in known}
 
+    def places(self, run: SortedRun, numbers: Collection[int]) -> list[Places]:
+        """Returns the samples of the run to read, in their order."""
+        try:
+            return self._reader.index(self._file, run).places(numbers, self.period, _FEW_TAGS)
+        except Damaged:
+            groups = (range(at, at + GROUP) for at in range(0, run.samples, GROUP))
+            return [Places(run.first, group[: run.samples - group[0]]) for group in groups]
+
     def rows(
         self, run: SortedRun, numbers: Collection[int], first: int = 0
     ) -> Iterator[list[Row] | None]:
         """Yields the rows of the tags in the period, in the order of recording, from the `first`
         sample of the run on; None if the run was dropped. Leaves out what is damaged."""
-        places = self._places(run, numbers, first)
-        groups = [places[at : at + _GROUP] for at in range(0, len(places), _GROUP)][::-1]
+        for _, places in self.places(run, numbers):
+            if wanted := places[bisect_left(places, first) :]:
+                yield (found := self.read(run, numbers, wanted))
+                if found is None:
+                    return
+
+    def read(
+        self, run: SortedRun, numbers: Collection[int], places: Sequence[int]
+    ) -> list[Row] | None:
+        """Returns the rows of the tags in the period, at these places; None if the run was
+        dropped. Leaves out what is damaged."""
         begin, end = self.period
-        while groups:
-            group = groups.pop()
-            try:
-                found = self._reader.rows(self._file, run, group)
-            except Damaged as error:
-                size = max(1, len(group) // 8)
-                if size < _LOST:
-                    self._note(run, error)
-                else:
-                    groups += [group[at : at + size] for at in range(0, len(group), size)][::-1]
-                continue
-            if found is None:
-                yield None
-                return
-            if found[1]:
-                self._note(run, Damaged("samples are lost"))
-            yield [row for row in found[0] if row[1] in numbers and begin <= row[2] <= end]
-
-    def whole(self, run: SortedRun, numbers: Collection[int]) -> list[Row] | None:
-        """Returns all rows of the tags in the period; None if the run was dropped."""
-        found: list[Row] = []
-        for rows in self.rows(run, numbers):
-            if rows is None:
-                return None
-            found += rows
-        return found
-
-    def _places(self, run: SortedRun, numbers: Collection[int], first: int) -> Sequence[int]:
-        """Returns which samples of the run are read: those of the tags, or all."""
-        if len(numbers) <= _FEW_TAGS:
-            try:
-                found = self._reader.index(self._file, run).numbers(numbers)
-            except Damaged:
-                return range(first, run.samples)
-            if len(found) < run.samples // 4:
-                return found[bisect_left(found, first) :]
-        return range(first, run.samples)
+        try:
+            found = self._reader.rows(self._file, run, places)
+        except Damaged as error:
+            size = max(1, len(places) // 8)
+            if size < _LOST:
+                self._note(run, error)
+                return []
+            parts = (places[at : at + size] for at in range(0, len(places), size))
+            return [row for part in parts for row in self.read(run, numbers, part) or ()]
+        if found is None:
+            return None
+        if found[1]:
+            self._note(run, Damaged("samples are lost"))
+        return [row for row in found[0] if row[1] in numbers and begin <= row[2] <= end]
 
     def lost(self) -> Damaged | None:
         """Returns an error if parts were left out since the last call."""

@@ -257,7 +257,7 @@ class Api:
             history = self._core.history()
         except Busy as error:
             return answer(503, str(error))
-        if history is None or not tag.history:
+        if history is None or not tag.publishing.history:
             return answer(404, f"no history is kept of {tag.key}: it needs `history: true`")
         limit = _SAMPLES.of(request)
         find = partial(_found, history, tag, dict(request.query), limit)

@@ -20,6 +20,7 @@ from prometheus_client.registry import Collector, CollectorRegistry
 
 from gateway.contract.faults import Documents, below, faults, transfers, warnings
 from gateway.contract.interfaces import Plant
+from gateway.contract.line_faults import stands_by
 from gateway.engine.device.records import COMPLETE
 from gateway.tags import Quality
 
@@ -96,13 +97,19 @@ def _metrics(documents: Documents, plant: Plant, *, ready: bool) -> Iterator[Met
     yield from _lines(documents)
     yield from _devices(documents, plant)
     yield from _writes(documents["outcomes"])
+    yield _one("standby", "1: another gateway of the group is active", {}, stands_by(documents))
     for name, field, text in _ZENOH:
         yield _one(name, text, {}, documents["zenoh"].get(field, 0))
     yield from _transfers(documents)
     parts = _family("part_working", "1: the part of the gateway works", "part")
-    for name, part in documents.get("parts", {}).items():
+    for name, part in below("parts/", documents):
         parts.add_metric([name], not part["why"])
     yield parts
+    days = _family("certificate_days", "Days until the certificate expires", "file")
+    for _, certificate in below("certificates/", documents):
+        if certificate["days"] is not None:
+            days.add_metric([certificate["file"]], certificate["days"])
+    yield days
     alarms = _family("alarms", "Alarms by state", "state")
     for state, count in documents.get("alarms", {}).items():
         alarms.add_metric([state], count)

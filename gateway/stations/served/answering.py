@@ -5,7 +5,8 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 from gateway.protocols.driver import AnyDriver
-from gateway.stations.served.registers import Registers, Written
+from gateway.stations.served.registers import Registers
+from gateway.stations.store import Written
 
 # Fewer bytes behind a request are noise of the wire; more are the beginning of the next request.
 NOISE = 2

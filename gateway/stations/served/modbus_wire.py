@@ -1,9 +1,8 @@
 """Modbus on the wire, on the side of served stations: TCP connections, RTU and ASCII lines."""
 
-from struct import Struct
-
+from gateway.errors import Garbled
 from gateway.protocols.checksums import crc16
-from gateway.protocols.modbus import AsciiCodec, Frame
+from gateway.protocols.modbus import AsciiCodec, Frame, MbapCodec
 from gateway.protocols.modbus.frame import (
     EXCEPTION,
     READ_BITS,
@@ -11,51 +10,73 @@ from gateway.protocols.modbus.frame import (
     WRITE_MANY,
     WRITE_SINGLE,
 )
-from gateway.stations.served.answering import NOISE, SILENCE, Answerer, Done, Heard, Stations, Wire
+from gateway.stations.modbus.answers import ModbusData
+from gateway.stations.served.answering import (
+    NOISE,
+    SILENCE,
+    Answerer,
+    Answering,
+    Done,
+    Heard,
+    Stations,
+    Wire,
+)
 from gateway.stations.served.echo import Echo
-from gateway.stations.served.modbus import ModbusData
 
-_HEADER = Struct(">HHHB")  # transaction, protocol (0), length from here on, unit
+_WRITES = (*WRITE_SINGLE, *WRITE_MANY)
 _NO_PATH = 0x0A  # exception: a gateway without this unit behind it
 _ANY_UNIT = (0, 255)  # the device at the address itself (messaging guide V1.0b, 4.4.2.2)
+
+
+class _Station:
+    """One station: a request in, the PDU of its reply and the effect out."""
+
+    def __init__(self, station: Answering) -> None:
+        driver = station.driver
+        self._number = driver.station
+        self._data = ModbusData(
+            station.registers,
+            getattr(driver, "addressing", "plain"),
+            low_first=getattr(driver, "counter_word_order", "low_first") == "low_first",
+        )
+
+    def answer(self, pdu: bytes) -> tuple[bytes, Done]:
+        reply, refused, written = self._data.answer(pdu)
+        return reply, Done(self._number, refused, pdu[0] in _WRITES, tuple(written))
 
 
 class _Tcp:
     """The stations behind one TCP connection. Every request has a number: all are answered."""
 
     def __init__(self, stations: Stations) -> None:
-        self._data = {number: ModbusData(*one) for number, one in stations.items()}
-        if len(self._data) == 1:
-            (only,) = self._data.values()
-            self._data |= {unit: only for unit in _ANY_UNIT if unit not in self._data}
-        self._heard = b""
+        self._stations = {number: _Station(one) for number, one in stations.items()}
+        if len(self._stations) == 1:
+            (only,) = self._stations.values()
+            self._stations |= {unit: only for unit in _ANY_UNIT if unit not in self._stations}
+        self._codec = MbapCodec()
 
     def hear(self, data: bytes, now: float) -> Heard:
-        self._heard += data
-        reply, done, lost = b"", list[Done](), False
-        while len(self._heard) >= _HEADER.size:
-            number, protocol, length, unit = _HEADER.unpack_from(self._heard)
-            if protocol or not 2 <= length <= 254:
-                self._heard, lost = b"", True  # no Modbus TCP
-                break
-            end = length + 6
-            if len(self._heard) < end:
-                break
-            pdu, self._heard = self._heard[_HEADER.size : end], self._heard[end:]
-            if (station := self._data.get(unit)) is not None:
-                answer, did = station.answer(pdu)
-                done.append(did)
-            else:
-                answer = bytes((pdu[0] | EXCEPTION, _NO_PATH))
-            reply += _HEADER.pack(number, 0, len(answer) + 1, unit) + answer
-        return Heard(reply, 0.0, tuple(done), lost=lost)
+        reply, done = b"", list[Done]()
+        try:
+            while frames := self._codec.feed(data):
+                data = b""
+                for unit, pdu, number in frames:
+                    answer = bytes((pdu[0] | EXCEPTION, _NO_PATH))
+                    if (station := self._stations.get(unit)) is not None:
+                        answer, did = station.answer(pdu)
+                        done.append(did)
+                    reply += self._codec.encode(Frame(unit, answer, number))
+        except Garbled:
+            self._codec = MbapCodec()
+            return Heard(reply, 0.0, tuple(done), lost=True)
+        return Heard(reply, 0.0, tuple(done))
 
 
 class _Serial:
     """The stations of a serial line: answers the last request, if nothing follows it."""
 
     def __init__(self, stations: Stations, wire: Wire, reader: "RtuReader | AsciiReader") -> None:
-        self._data = {number: ModbusData(*one) for number, one in stations.items()}
+        self._stations = {number: _Station(one) for number, one in stations.items()}
         self._wire = wire
         self._reader = reader
         self._echo = Echo(wire)
@@ -66,7 +87,7 @@ class _Serial:
             frame for frame in reader.feed(data, now) if not echo.is_echo(reader.encode(frame), now)
         ]
         reader.echo = echo.pending
-        ours = [frame for frame in frames if frame.station in self._data or frame.station == 0]
+        ours = [frame for frame in frames if frame.station in self._stations or frame.station == 0]
         if not ours:
             return SILENCE
         request = frames[-1]
@@ -75,16 +96,16 @@ class _Serial:
         stale = len(ours) - 1
         if request.station == 0:
             return Heard(done=self._broadcast(request.pdu), stale=stale)
-        answer, done = self._data[request.station].answer(request.pdu)
+        answer, done = self._stations[request.station].answer(request.pdu)
         reply = reader.encode(Frame(request.station, answer))
         reader.echo = echo.sent(reply, now)
         return Heard(reply, self._wire.silence, (done,), stale)
 
     def _broadcast(self, pdu: bytes) -> tuple[Done, ...]:
         """Every station carries it out where it may be written; none replies."""
-        if pdu[0] not in (*WRITE_SINGLE, *WRITE_MANY):
+        if pdu[0] not in _WRITES:
             return ()
-        return tuple(station.answer(pdu).done for station in self._data.values())
+        return tuple(station.answer(pdu)[1] for station in self._stations.values())
 
 
 class AsciiReader:

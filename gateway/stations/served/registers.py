@@ -1,13 +1,12 @@
 """The data of one served station: what its master may read and write, address by address."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from enum import StrEnum
 
 from gateway.errors import BadValue
 from gateway.protocols.driver import Span
+from gateway.stations.store import NOTHING, Cell, Denied, Why, Written
 from gateway.tags import Quality, Sample, Tag
-from gateway.values import Value
 
 STALE_AFTER = 10.0  # seconds
 
@@ -41,27 +40,6 @@ class Served:
             area == span.area and span.start <= number < span.start + span.size
             for span in self.accept
         )
-
-
-class Why(StrEnum):
-    """The cause of a refusal; each protocol has its own code for it."""
-
-    NO_TAG = "no-tag"  # no tag and no `accept` at the address
-    NOT_ACCEPTED = "not-accepted"  # a write outside `accept`
-    PART = "part-of-a-tag"  # a write of some words of a longer value
-    BAD = "bad"  # the value is not known
-
-
-class Denied(Exception):
-    """A request that the station refuses; nothing was written."""
-
-    def __init__(self, why: Why) -> None:
-        super().__init__(why.value)
-        self.why = why
-
-
-Cell = tuple[str, int]  # area and number
-Written = Sequence[tuple[Tag, Value | None]]  # None: the words hold no value of the tag's type
 
 
 class Registers:
@@ -152,44 +130,34 @@ class Registers:
 
     # The master writes
 
-    def write(self, area: str, start: int, units: Sequence[int]) -> Written:
-        """As `write_cells`, for neighbours."""
-        return self.write_cells([((area, start + i), unit) for i, unit in enumerate(units)])
-
-    def write_points(
-        self, points: Iterable[tuple[Cell, int]], others: Sequence[tuple[Cell, int]] = ()
+    def write(
+        self,
+        cells: Sequence[tuple[Cell, int]],
+        points: Sequence[tuple[Cell, int]] = (),
+        missing: Mapping[Cell, int] = NOTHING,
     ) -> Written:
-        """As `write_cells`, with bits that travel together in bytes or words.
-
-        A master that writes some bits of a byte has read the others before: a bit outside
-        `accept` is left alone if it is written with the value that the master reads there.
-        """
-        inside: list[tuple[Cell, int]] = []
-        known: dict[Row, Sequence[int]] = {}
-        for cell, bit in points:
-            if cell in self._accepted:
-                inside.append((cell, bit))
-            elif bit != self._point(cell, known):
-                raise Denied(Why.NOT_ACCEPTED)
-        if not inside:
-            raise Denied(Why.NOT_ACCEPTED)
-        return self.write_cells([*others, *inside])
-
-    def write_cells(self, cells: Sequence[tuple[Cell, int]]) -> Written:
         """Writes all cells of one request. Returns the tags with their values, by address.
 
+        A master that writes some bits of a byte has read the others before: one of `points`
+        outside `accept` is left alone if it is written with the value that the master reads there.
         Raises `Denied`, and then nothing is written: outside `accept`, or for some words of a
         longer value, which would join halves of two values.
         """
-        new = dict(cells)
+        if missing:
+            raise Denied(Why.PART)
+        new, known = dict(cells), dict[Row, Sequence[int]]()
+        for cell, bit in points:
+            if cell in self._accepted:
+                new[cell] = bit
+            elif bit != self._point(cell, known):
+                raise Denied(Why.NOT_ACCEPTED)
         touched: dict[Row, None] = {}
         for cell in new:
             if cell not in self._accepted:
                 raise Denied(Why.NOT_ACCEPTED)
             touched |= dict.fromkeys(self._cells.get(cell, ()))
-        for row in touched:
-            if any(cell not in new for cell in cells_of(row.tag.span)):
-                raise Denied(Why.PART)
+        if not new or any(c not in new for row in touched for c in cells_of(row.tag.span)):
+            raise Denied(Why.PART)
         self._written |= new
         self._good |= {row.tag for row in touched}
         return [(row.tag, row.tag.decode(self._raw(row.tag))) for row in touched]

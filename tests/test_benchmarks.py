@@ -1,0 +1,114 @@
+"""Every benchmark runs to its end at a tiny size, and prints its figures."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import needs
+from tests.e2e.processes import ROOT
+
+# Program, its smallest sizes, and a pattern for each row of figures that it must print.
+TINY = [
+    (
+        "bus_use",
+        "--seconds 0.3 --protocols vigor --bauds 115200",
+        [r"^vigor +115200 +\d+ +[\d.]+% +[\d.]+ ms"],
+    ),
+    ("commands", "--calls 1", [r"^\| `check` \| \d+ \|$", r"^\| `run` \| \d+ \|$"]),
+    ("frames_noise", "0.07", [r"^gap +CR +[\d.]+ +[\d.]+ +[\d.]+$"]),
+    (
+        "history",
+        "--seconds 0.1 --samples 2000 --tags 100",
+        [r"^ +100 +2,000 +all +\d+ +[\d.]+ +[\d,]+"],
+    ),
+    (
+        "history_queries",
+        "--samples 2000 --rounds 1 --queries 2 --missed 200",
+        [r"^catch_up of 200 samples", r"^get plant/\*\* beside three readers: p50 [\d.]+ ms"],
+    ),
+    (
+        "many_lines",
+        "--seconds 6 --lines 2",
+        [r"^ +2 lines x 32 .* us of CPU per sample", r"^ +6250 tags in memory: +[\d.]+ MB"],
+    ),
+    ("moves", "", [r"^poll +\d+ files entered, +\d+ moves", r"^write +\d+ files entered"]),
+    (
+        "northbound",
+        "--tags 200 --devices 2 --seconds 0.1 --flood 0.1",
+        [
+            r"^bare loop of put and nothing else: [\d,]+/s put",
+            r"^gateway, from mirror to put: [\d,]+/s put",
+            r"^gateway, blocks: only: [\d,]+/s put",
+            r"^0\.1 s of flood \+ ask: event loop late",
+            r"^2 devices: [\d,]+/s arrived",
+        ],
+    ),
+    ("overload", "--reads 20 --rounds 1", [r"^  now +1: +\d+ +10: +\d+"]),
+    ("peers", "requests --seconds 4", [r"^\| this gateway, measured \| 6 \| [\d.]+ \| "]),
+    (
+        "peers",
+        "mute processor --seconds 0.2 --count 2 --rounds 1",
+        [r"^\| this gateway \| 0\.5 s \| [\d.]+ \| [\d.]+ s \| measured", r"^## processor"],
+    ),
+    ("peers_requests", "", [r"^\| \*\*this planner\*\* \| \d+ requests, [\d.]+ s"]),
+    (
+        "planning",
+        "--registers 200",
+        [r"^\| every third \| 3 \| [\d.]+ \| ", r"^\| 40 \| 6 \| [\d.]"],
+    ),
+    (
+        "plant",
+        "--gateways 2 --lines 1 --devices 1 --tags 3 --steady 1 --settle 1 --patience 20",
+        [r"^wrong values shown as good: 0;", r"^\| active gateway of a pair \| [\d.]+ s"],
+    ),
+    (
+        "reload",
+        "--lines 2 --reloads 2 --rounds 1",
+        [r"^\d+ writes to the other lines, 0 failed", r"^keys as in the file: True"],
+    ),
+    ("returns", "--returns 1", [r"^\| now \| 19200 \| 30\.0 \| [\d.]+ \| [\d.]+ \| [\d.]+"]),
+    (
+        "routers",
+        "--rounds 1 --modes client --dead 0.5 --back 0.5",
+        [r"^\| client \| 2 \| 1 \| [01] \| [01] \| [01] \|$"],
+    ),
+    ("served", "--seconds 0.5", [r"^served-1: \d+ replies, \d+ lost: median", r"^a written value"]),
+    ("sim_speed", "--minutes 0.05", [r"^every +30 s: +[\d.]+ simulated hours per minute"]),
+    ("start", "--sizes 1 2 5", [r"^\| different \| run: 10 tags answer in [\d.]+ s \| [\d.]+"]),
+    ("structure", "", [r"^most fields of a class: \d+", r"^modules that assign state"]),
+    ("transactions", "--count 2 --rounds 1", [r"^  ours, 64 tags, uvloop +[\d.]+"]),
+    (
+        "web",
+        "--seconds 0.2 --rounds 1 --lines 1",
+        [r"^the lines take [\d.]+% of a processor", r"^one scrape: [\d.]+ MB"],
+    ),
+]
+PICTURES = ["pictures", "--after", "0", "--into"]
+PARTS_OF_OTHERS = {"__init__", "checkouts", "paced_wire", "plant_consumer", "words"}
+
+
+def printed(program: str, *arguments: str) -> str:
+    command = [sys.executable, "-m", f"benchmarks.{program}", *arguments]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.mark.parametrize(("program", "arguments", "figures"), TINY, ids=[row[0] for row in TINY])
+def test_a_benchmark_prints_its_figures(program: str, arguments: str, figures: list[str]) -> None:
+    text = printed(program, *arguments.split())
+    for pattern in figures:
+        assert re.search(pattern, text, re.MULTILINE), f"no {pattern!r} in:\n{text}"
+
+
+def test_the_pictures_of_the_page_are_made(tmp_path: Path) -> None:
+    printed(*PICTURES, str(tmp_path), "--chromium", needs("chromium"))
+    assert [path for path in tmp_path.iterdir() if path.suffix == ".png"]
+
+
+def test_every_benchmark_is_run() -> None:
+    found = {path.stem for path in (ROOT / "benchmarks").glob("*.py")}
+    assert found == {*(row[0] for row in TINY), "pictures", *PARTS_OF_OTHERS}
