@@ -25,13 +25,16 @@ class Places(NamedTuple):
 class Index:
     """The samples of each tag and of each time, by their numbers in the run."""
 
-    def __init__(self, data: bytes) -> None:
+    def __init__(self, data: object) -> None:
         """`data`: from `pack`. Raises `Damaged`."""
-        if len(data) < _HEAD.size or crc32(data[4:]) != _HEAD.unpack_from(data)[0]:
+        if not isinstance(data, bytes) or len(data) < _HEAD.size:
+            raise Damaged("a run has no index")
+        if crc32(data[4:]) != _HEAD.unpack_from(data)[0]:
             raise Damaged("the index of a run is damaged")
         _, self._samples, count, size = _HEAD.unpack_from(data)
         groups = -(-self._samples // GROUP)
-        at, found = _HEAD.size, list[array[int]]()
+        found: list[array[int]] = []
+        at = _HEAD.size
         for kind, items in zip("qqII", (groups, groups, count, count), strict=True):
             found.append(array(kind, data[at : at + array(kind).itemsize * items]))
             at += array(kind).itemsize * items

@@ -3,13 +3,14 @@
 import sqlite3
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from heapq import heappop, heappush
+from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
-from gateway.contract.timerange import TimeRange
+from gateway.contract.timerange import LATEST, TimeRange
 from gateway.errors import Busy, Damaged
 from gateway.parts.history.file import identity, is_damage, oldest, tags
 from gateway.parts.history.index import Index
@@ -43,7 +44,17 @@ def in_order(parts: Iterable[Part]) -> Iterator[Sample]:
         if heap:
             _, number, sample, rest = heappop(heap)
             yield sample
-            _push(heap, number, rest)
+            until = heap[0][0] if heap else coming[0][1].first if coming else LATEST + 1
+            _push(heap, number, (yield from _before(until, rest)))
+
+
+def _before(until: int, rest: Iterator[Sample]) -> Generator[Sample, None, Iterator[Sample]]:
+    """Yields samples of one part as long as no other part has an earlier one. Returns the rest."""
+    for sample in rest:
+        if sample.time >= until:
+            return chain((sample,), rest)
+        yield sample
+    return iter(())
 
 
 def _push(
@@ -92,7 +103,7 @@ class Reader:
         if known is None:
             with self._connection(file) as database, _translated():
                 rows = database.execute("SELECT places FROM run WHERE id = ?", (run.number,))
-                known = Index(next(iter(rows), (b"",))[0])
+                known = Index(next(iter(rows), (None,))[0])
             with self._lock:
                 if len(self._indexes) >= _MOST_INDEXES:
                     self._indexes.clear()
@@ -194,5 +205,5 @@ def _translated() -> Iterator[None]:
         if is_damage(error) or not getattr(error, "sqlite_errorname", ""):
             raise Damaged(str(error)) from error
         raise
-    except (UnicodeDecodeError, TypeError) as error:
+    except UnicodeDecodeError as error:
         raise Damaged(str(error)) from error
