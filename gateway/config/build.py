@@ -32,6 +32,7 @@ from gateway.config.served import (
     check_served_line,
     check_sources,
     only_served,
+    request_gap,
     until_the_next_call,
 )
 from gateway.config.session_files import existing_file, with_files
@@ -163,6 +164,7 @@ class Builder:
             modem=modem,
             listen_only=line.listen_only,
             serve=line.serve,
+            request_gap=request_gap(line, dials=modem is not None),
             devices=tuple(replace(one, listen_only=line.listen_only) for one in devices),
         )
 

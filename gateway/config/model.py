@@ -287,6 +287,8 @@ class LineSection(Section):
     """true: the port receives its own requests, as with some two-wire RS-485 converters."""
     serve: bool = False
     """true: the devices are stations of this gateway, and a master on the line asks them."""
+    request_gap: Duration | None = None
+    """With serve: the longest pause within a request; left out: by the speed, 2 s with a modem."""
     listen_only: bool = False
     """true: learns the values from another master's traffic, and sends nothing, ever."""
     modem: ModemSection | None = None

@@ -62,6 +62,7 @@ class LineConfig:
     wire: WireTiming
     echo: bool | None  # the port receives its own requests; None: unknown
     serve: bool = False  # a master on the line asks, and the devices are stations of the gateway
+    request_gap: float | None = None  # seconds within a request of that master; None: by the speed
     modem: ModemSettings | None = None  # with a modem at the port
     listen_only: bool = False  # another master owns the wire: nothing is ever sent
     devices: tuple[DeviceSettings, ...]

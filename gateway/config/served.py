@@ -19,6 +19,7 @@ from gateway.tags import Publish, Tag
 from gateway.transport.port import SimulatorAddress
 from gateway.values import Kind
 
+_TELEPHONE = 2.0  # seconds: modems repeat what the line has damaged
 _OF_DEVICES = ("accept", "stale_after")
 _OF_TAGS = ("source", "retain", "hold_last")
 _OF_MASTERS = ("reply_timeout", "retries", "verify_reads", "late_guard", "silence", "control")
@@ -221,6 +222,11 @@ def until_the_next_call(device: DeviceSettings, line: Mapping[str, Any]) -> Devi
     if device.served is None or (isinstance(own, Mapping) and "stale_after" in own):
         return device
     return replace(device, served=replace(device.served, stale_after=math.inf))
+
+
+def request_gap(line: LineSection, *, dials: bool) -> float | None:
+    """Returns the longest pause within a request of a master; None: by the speed of the line."""
+    return _TELEPHONE if line.request_gap is None and dials else line.request_gap
 
 
 def check_served_line(

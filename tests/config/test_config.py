@@ -337,7 +337,8 @@ LINES = [
         "(N, E or O) and stop bits (1 or 2), such as 7E1",
         "6: lines.hall.echo: 'maybe' is neither true nor false",
         "7: lines.hall.parity: no setting of a line: "
-        "use port, baudrate, format, echo, serve, listen_only, modem, defaults or devices",
+        "use port, baudrate, format, echo, serve, request_gap, listen_only, modem, defaults or "
+        "devices",
     ),
     bad(
         "negative baud rate",
