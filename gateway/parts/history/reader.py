@@ -44,7 +44,9 @@ def in_order(parts: Iterable[Part]) -> Iterator[Sample]:
         if heap:
             _, number, sample, rest = heappop(heap)
             yield sample
-            until = heap[0][0] if heap else coming[0][1].first if coming else LATEST + 1
+            until = min(
+                heap[0][0] if heap else LATEST + 1, coming[0][1].first if coming else LATEST + 1
+            )
             _push(heap, number, (yield from _before(until, rest)))
 
 
