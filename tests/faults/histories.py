@@ -15,7 +15,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import AsyncIterator, Iterable, Iterator, Sequence
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -25,6 +25,7 @@ from tests.e2e.processes import Program, free_port, write_config
 from tests.zenoh_peer import ZenohPeer, free_endpoint
 
 MOST = 60_000  # values of a register: each is written once
+GOES_ON = 60.0  # seconds after a fault, before the next one: a loaded machine starts slowly
 LATE = 0.5  # seconds that the lists of two processes may differ
 # The command itself, with a wall clock that jumps to and fro by an hour at SIGUSR1.
 RUN = """
@@ -76,7 +77,7 @@ with zenoh.open(config) as session, open(sys.argv[5], "a", buffering=1) as out:
                     answers.append("timeout")
         out.write(json.dumps([value, begun, time.monotonic(), answers]) + chr(10))
         if answers != ["written"]:
-            time.sleep(0.2)
+            time.sleep(0.5)
 """
 
 
@@ -194,6 +195,10 @@ class World:
         program = Program(sys.executable, "-c", RUN, "run", self.files[place])
         self.gateways[place : place + 1] = [program]
 
+    def executed(self) -> int:
+        """Returns the size of the PLC's list: it grows while writes are done."""
+        return (self.folder / "plc.jsonl").stat().st_size
+
     def end(self) -> None:
         for program in self.gateways:
             program.__exit__()
@@ -273,6 +278,14 @@ async def world(folder: Path, tags: int, seed: int) -> AsyncIterator[World]:
         yield made
 
 
+async def wait(done: Callable[[], bool], within: float) -> None:
+    """Waits until it is done, but not longer."""
+    with suppress(TimeoutError):
+        async with asyncio.timeout(within):
+            while not done():
+                await asyncio.sleep(0.05)
+
+
 async def run(folder: Path, writes: int, tags: int, seed: int, every: float) -> tuple[World, Found]:
     """Writes so often to each of the tags, with a fault about each `every` seconds."""
     each = writes // tags
@@ -285,12 +298,15 @@ async def run(folder: Path, writes: int, tags: int, seed: int, every: float) -> 
             )
             for tag in range(tags)
         ]
-        while any(client.running for client in clients):
-            with suppress(TimeoutError):
-                async with asyncio.timeout(made.chance.uniform(0.2, 2.0) * every):
-                    while any(client.running for client in clients):
-                        await asyncio.sleep(0.1)
-            if any(client.running for client in clients):
+
+        def ended() -> bool:
+            return not any(client.running for client in clients)
+
+        while not ended():
+            before = made.executed()
+            await wait(lambda: ended() or made.executed() > before, GOES_ON)
+            await wait(ended, made.chance.uniform(0.2, 2.0) * every)
+            if not ended():
                 await made.befall()
         for client in clients:
             await asyncio.to_thread(client.ended)
