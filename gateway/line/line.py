@@ -209,7 +209,7 @@ class Line:
                 self.deliver(self.engine.stopped(_now()))
                 self._apply()
                 await self._close()  # last, because closing can be slow
-            if served > REOPEN_LONGEST:
+            if served > REOPEN_LONGEST or self.engine.was_answered:
                 pause = REOPEN_FIRST
             await asyncio.sleep(pause * self._random.uniform(0.8, 1.2))
             pause = min(2 * pause, REOPEN_LONGEST)
