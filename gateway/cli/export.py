@@ -13,7 +13,7 @@ import typer
 from gateway.cli.client import matches, wanted_keys
 from gateway.cli.terminal import ConfigPath, TagNames
 from gateway.config import load
-from gateway.config.transfer_ranges import is_range
+from gateway.config.transfers.ranges import is_range
 from gateway.contract.meta import meta_fields
 from gateway.errors import ConfigError
 from gateway.protocols.driver import Unit

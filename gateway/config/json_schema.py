@@ -13,8 +13,6 @@ from gateway.config.model import (
     DeviceSection,
     FileSection,
     LineSection,
-    TagDefaults,
-    TagSection,
 )
 from gateway.config.parsers import BYTES, SECONDS
 from gateway.config.session_model import Section
@@ -24,7 +22,8 @@ from gateway.config.setting_types import (
     NAME_PATTERN,
     TAG_NAME_PATTERN,
 )
-from gateway.config.transfer_settings import TransferSection
+from gateway.config.tags.section import TagDefaults, TagSection
+from gateway.config.transfers.settings import TransferSection
 from gateway.errors import ConfigError
 from gateway.protocols.registry import PROTOCOLS
 

@@ -5,42 +5,28 @@ device does not have, two stations with one number) are found by `gateway.config
 """
 
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal
 
 from pydantic import (
-    AfterValidator,
-    Discriminator,
     Field,
     PlainValidator,
     WithJsonSchema,
-    model_validator,
 )
-from pydantic import Tag as Choice
 
-from gateway.config import parsers, tag_parsers
-from gateway.config.alarm_rules import check_alarm
+from gateway.config import parsers
 from gateway.config.modem_settings import ModemSection
 from gateway.config.session_model import GatewaySection, Section, ZenohSection
 from gateway.config.setting_types import (
-    DEADBAND_SCHEMA,
     FORMAT_SCHEMA,
-    SCALE_SCHEMA,
-    TYPE_SCHEMA,
     Baudrate,
-    Distance,
     Duration,
     FilePath,
-    Finite,
     HostName,
     Interval,
-    OrderName,
     Port,
     Text,
     WebAddress,
 )
-from gateway.config.shaping_settings import Clamp, Decimals, ShapingDefaults, ShapingSettings
-from gateway.tags import Deadband, Form, Publish
-from gateway.values import Order, ValueType
 
 
 class WritersSection(Section):
@@ -88,152 +74,6 @@ class WebSection(Section):
     """One line `name:token` for each client; without it nothing can be written."""
     names: list[HostName] = []
     """Names of this machine in a browser's address, besides `localhost` and its host name."""
-
-
-class WriteSection(Section):
-    """The rules for writing a tag."""
-
-    min: Finite | None = None
-    """The least value, in the unit of the tag."""
-    max: Finite | None = None
-    """The greatest value, in the unit of the tag."""
-    verify: bool = False
-    """Read back after the acknowledgement and compare."""
-    repeat: bool = False
-    """Send the write again after an unclear result."""
-    latest: bool = False
-    """Of several waiting writes, send only the last."""
-
-    @model_validator(mode="after")
-    def _order(self) -> Self:
-        if self.min is not None and self.max is not None and self.min > self.max:
-            raise ValueError(f"min {self.min:.15g} is above max {self.max:.15g}")
-        return self
-
-
-class AlarmSection(Section):
-    """The alarm of a number or a bit: docs/alarms.md."""
-
-    high_high: Finite | None = None
-    """A value from here on is in alarm, of the worse level."""
-    high: Finite | None = None
-    """A value from here on is in alarm."""
-    low: Finite | None = None
-    """A value from here downwards is in alarm."""
-    low_low: Finite | None = None
-    """A value from here downwards is in alarm, of the worse level."""
-    on: bool = False
-    """A bit is in alarm while it is on."""
-    off: bool = False
-    """A bit is in alarm while it is off."""
-    hysteresis: Distance = 0.0
-    """A limit is left when the value is so far from it, in the unit of the tag."""
-    delay: Duration = 0.0
-    """A limit counts when it is reached for so long."""
-    text: Text = ""
-    """A sentence for people; left out: the description of the tag."""
-
-    @model_validator(mode="after")
-    def _together(self) -> Self:
-        check_alarm({name: getattr(self, name) for name in type(self).model_fields})
-        return self
-
-
-Band = Annotated[
-    Deadband | None, PlainValidator(tag_parsers.deadband), WithJsonSchema(DEADBAND_SCHEMA)
-]
-Payload = Annotated[
-    Form,
-    PlainValidator(tag_parsers.form),
-    WithJsonSchema({"type": "string", "enum": ["json", "raw"]}),
-]
-
-
-def _write_shape(value: object) -> str:
-    return "rule" if isinstance(value, (dict, WriteSection)) else "flag"
-
-
-class TagDefaults(Section, ShapingDefaults):
-    """Tag settings for a whole file, line or device."""
-
-    type: Annotated[
-        ValueType | None, PlainValidator(parsers.value_type), WithJsonSchema(TYPE_SCHEMA)
-    ] = None
-    """The type of the value, or of the elements of an array such as uint16[50]; left out: bool for
-    a bit, a whole number otherwise."""
-    every: Interval = 1.0
-    """The interval of reading."""
-    scale: Annotated[Finite, AfterValidator(parsers.scale), WithJsonSchema(SCALE_SCHEMA)] = 1.0
-    """value = raw x scale + offset"""
-    offset: Finite = 0.0
-    """value = raw x scale + offset"""
-    unit: Text = ""
-    """The unit of the value, for people: rpm, °C."""
-    description: Text = ""
-    """A description, for people."""
-    deadband: Band = None
-    """A smaller change is not published: 0.5 (in the tag's unit) or 2%."""
-    word_order: OrderName = Order.LOW_FIRST
-    """The word of a 32- or 64-bit value at the lower address."""
-    byte_order: OrderName | None = None
-    """The byte of each word that comes first."""
-    publish: Annotated[
-        Publish,
-        PlainValidator(tag_parsers.publish),
-        WithJsonSchema({"type": "string", "enum": ["change", "always"]}),
-    ] = Publish.CHANGE
-    """Publish when the value changes, or every value that is read."""
-    heartbeat: Interval | None = None
-    """Publish at least this often, changed or not."""
-    history: bool = False
-    """Store the values on disk."""
-    payload: Payload = Form.JSON
-    """json: value, quality and time; raw: the bare value as text."""
-    write: Annotated[
-        Annotated[bool, Choice("flag")] | Annotated[WriteSection, Choice("rule")],
-        Discriminator(_write_shape),
-    ] = False
-    """Permission to write the tag, with its rules."""
-    hold_last: bool = False
-    """On a served line: answer the master with the last good value instead of an error."""
-
-
-class ComputedSection(Section):
-    """A value that is calculated from the values of other tags."""
-
-    computed: Text
-    """Arithmetic with the names of tags, such as flow_a + flow_b."""
-    unit: Text = ""
-    """The unit of the value, for people."""
-    description: Text = ""
-    """A description, for people."""
-    decimals: Decimals = None
-    """The value is rounded to so many decimals."""
-    clamp: Clamp = None
-    """A value outside is shown as the nearest end."""
-    deadband: Band = None
-    """A smaller change is not published."""
-    history: bool = False
-    """Store the values on disk."""
-    payload: Payload = Form.JSON
-    """json: value, quality and time; raw: the bare value as text."""
-    alarm: AlarmSection | None = None
-    """Raise an alarm at a limit of the value."""
-
-
-class TagSection(TagDefaults, ShapingSettings):
-    """One value of a device."""
-
-    address: Text
-    """As the maker writes it: D100, X17, D7.3, holding:100; for frames the name of a field."""
-    event: bool = False
-    """Publish every frame, even with the same value as the last: a bar code."""
-    alarm: AlarmSection | None = None
-    """Raise an alarm at a limit of the value, or while a bit is on."""
-    source: Text | None = None
-    """On a served line: the tag, as device/tag, whose value the master reads here."""
-    retain: bool = False
-    """On a served line: keep the value that clients wrote across restarts."""
 
 
 class DeviceSection(Section):

@@ -6,9 +6,9 @@ from pathlib import Path as FilePath
 from typing import NamedTuple
 
 from gateway import files
-from gateway.config.device_tags import DeviceTags
 from gateway.config.messages import Mistakes, Path, dotted, one_of
-from gateway.config.model import TagDefaults, TagSection
+from gateway.config.tags.device_tags import DeviceTags
+from gateway.config.tags.section import TagDefaults, TagSection
 from gateway.config.validate import settings_of
 from gateway.config.yaml_events import plain_data
 from gateway.errors import ConfigError

@@ -1,15 +1,39 @@
 """Bits of a word as tags of their own: `bits: {0: pump, 3: fault}`."""
 
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Annotated, Any
 
-from gateway.config import shaping_parsers
+from pydantic import PlainValidator, WithJsonSchema
+
 from gateway.config.messages import Mistakes, Path
+from gateway.config.tags.features import shaping_parsers
+from gateway.config.tags.features.feature import Facts, Feature, Problem, Settings
 from gateway.errors import ConfigError
 from gateway.protocols.driver import Addressing, Unit
 from gateway.protocols.typed_fields import TypedFields
 
+_SCHEMA = {
+    "type": "object",
+    "propertyNames": {"pattern": "^([0-9]|1[0-5])$"},
+    "additionalProperties": {"type": ["string", "object"]},
+    "minProperties": 1,
+}
 Rows = Iterator[tuple[str, object, Path]]
+
+
+class BitsSettings(Settings):
+    bits: Annotated[
+        dict[int, Any] | None, PlainValidator(shaping_parsers.bits), WithJsonSchema(_SCHEMA)
+    ] = None
+    """One tag for each named bit of the word, instead of the word: {0: pump, 3: fault}."""
+
+
+def _check(own: Any, facts: Facts) -> Iterator[Problem]:
+    if facts.field is not None:
+        yield "bits", f"the field {facts.name} has its own type: remove bits here"
+
+
+FEATURE = Feature(own=BitsSettings, check=_check)
 
 
 def with_bits(

@@ -1,25 +1,15 @@
 """Checks of arrays: the settings that only a single value has, and what one request holds."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 from gateway.config.messages import Mistakes, Path
-from gateway.config.model import TagSection
 from gateway.planning.planner import items_of
 from gateway.protocols.driver import Addressing, Cost, Span
 from gateway.tags import Tag
 from gateway.values import ValueType
 
 _LONG = 4  # units; no single number has more
-_OF_ONE = ("enum", "alarm", "debounce", "counter")
-
-
-def array_misfits(own: TagSection, kind: ValueType) -> Iterator[tuple[str, str]]:
-    """Yields settings that an array cannot have."""
-    for setting in _OF_ONE:
-        if getattr(own, setting):
-            what = f"a {kind} has no {setting}: give the element that needs it a tag of its own"
-            yield setting, what
 
 
 def most_that_fits(driver: Addressing, span: Span, kind: ValueType, *, write: bool) -> str:

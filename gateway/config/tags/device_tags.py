@@ -1,14 +1,13 @@
 """Builds the tags of devices. Tags that are written alike are built once and copied."""
 
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 from gateway.config import parsers
-from gateway.config.bit_tags import with_bits
-from gateway.config.field_rules import field_tag
 from gateway.config.messages import Mistakes, Path
-from gateway.config.model import ComputedSection, TagDefaults, TagSection
-from gateway.config.tag_rules import TagSource, build_tag, inherit
+from gateway.config.tags.features.bits import with_bits
+from gateway.config.tags.field_tags import field_tag
+from gateway.config.tags.section import ComputedSection, TagDefaults, TagSection, TagSource, inherit
+from gateway.config.tags.word_tags import build_tag
 from gateway.config.validate import section
 from gateway.errors import ConfigError
 from gateway.protocols.driver import Addressing
@@ -20,27 +19,13 @@ from gateway.tags import Tag
 _Alike = dict[str, Tag]
 
 
-class ComputedSource(NamedTuple):
-    """A computed tag in the file. Its inputs may be tags of other devices."""
-
-    device: str
-    name: str
-    own: ComputedSection
-    inherited: TagDefaults
-    path: Path
-
-    @property
-    def key(self) -> str:
-        return f"{self.device}/{self.name}"
-
-
 @dataclass(slots=True)
 class DeviceTags:
     """Builds the tags of all devices of a file, and notes every mistake."""
 
     mistakes: Mistakes
     recorded: Path | None = None  # the first tag with `history: true`
-    computed: list[ComputedSource] = field(default_factory=list)
+    computed: list[TagSource] = field(default_factory=list)
     _names: dict[str, str] = field(default_factory=dict)  # correct ones, as typed
     _built: dict[tuple[Model, str], _Alike] = field(default_factory=dict)
 
@@ -106,7 +91,7 @@ class DeviceTags:
         own = section(ComputedSection, raw, place, self.mistakes, "a computed tag")
         if own is None:
             return
-        self.computed.append(ComputedSource(device, name, own, defaults, place))
+        self.computed.append(TagSource(device, name, own, defaults, place))
         if inherit(defaults, own).history and self.recorded is None:
             self.recorded = place
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from gateway.config import parsers
 from gateway.config.messages import Mistakes, Path, one_of, shown
-from gateway.config.model import DeviceSection, LineSection, TagDefaults
+from gateway.config.model import DeviceSection, LineSection
 from gateway.config.records import LineConfig
 from gateway.engine.device.device_settings import DeviceSettings
 from gateway.errors import ConfigError
@@ -75,7 +75,7 @@ class ServedDevice:
     settings: DeviceSection
     raw: Mapping[str, Any]
     sheets: Sequence[Mapping[str, Mapping[str, object]]]
-    defaults: TagDefaults
+    defaults: Any
     path: Path
     mistakes: Mistakes
 

@@ -4,22 +4,21 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from gateway.config.alarm_rules import alarm_misfits
-from gateway.config.device_tags import ComputedSource
 from gateway.config.messages import Mistakes, similar
 from gateway.config.records import LineConfig
-from gateway.config.shaping_rules import computed_shaping
-from gateway.config.tag_rules import features_of, inherit
+from gateway.config.tags.features.feature import Facts
+from gateway.config.tags.section import TagSource, inherit
+from gateway.config.tags.word_tags import check, kept_by
 from gateway.engine.device.device_settings import DeviceSettings
 from gateway.errors import ConfigError
 from gateway.protocols.driver import Address, Span, Unit
-from gateway.tags import Origin, Publishing, Tag
+from gateway.tags import Origin, Tag
 from gateway.tags.formula import Formula
 from gateway.tags.tag import CounterRule
 from gateway.values import Kind, Layout, ValueType
 
 if TYPE_CHECKING:
-    from gateway.config.formulas import Parsed
+    from gateway.config.tags.formulas import Parsed
 
 
 @dataclass(slots=True)
@@ -27,9 +26,9 @@ class _Names:
     """Finds tags by the names in a formula."""
 
     tags: Mapping[str, Tag]  # by device/name
-    sources: Mapping[str, ComputedSource]
+    sources: Mapping[str, TagSource]
 
-    def key(self, source: ComputedSource, name: str) -> str:
+    def key(self, source: TagSource, name: str) -> str:
         """Returns the key of an input: a tag of the same device, or `device/tag`."""
         for key in (f"{source.device}/{name}", name):
             if key in self.tags or key in self.sources:
@@ -47,7 +46,7 @@ class _Names:
 
 
 def with_computed(
-    lines: list[LineConfig], sources: list[ComputedSource], mistakes: Mistakes
+    lines: list[LineConfig], sources: list[TagSource], mistakes: Mistakes
 ) -> list[LineConfig]:
     """Adds the computed tags to their devices."""
     if not sources:
@@ -73,7 +72,7 @@ class _Maker:
     mistakes: Mistakes
     made: dict[str, Tag | None]
 
-    def make(self, source: ComputedSource, below: tuple[str, ...]) -> Tag | None:
+    def make(self, source: TagSource, below: tuple[str, ...]) -> Tag | None:
         """Returns the tag. `below`: the computed tags that need this one."""
         if source.key not in self.made:
             try:
@@ -83,9 +82,9 @@ class _Maker:
                 self.mistakes.add((*source.path, "computed"), str(error))
         return self.made[source.key]
 
-    def _make(self, source: ComputedSource, below: tuple[str, ...]) -> Tag | None:
+    def _make(self, source: TagSource, below: tuple[str, ...]) -> Tag | None:
         # Its library takes 40 ms to load: a file without formulas does not need it.
-        from gateway.config.formulas import parse
+        from gateway.config.tags.formulas import parse
 
         parsed = parse(source.own.computed)
         keys = [self.names.key(source, name) for name in parsed.names]
@@ -110,16 +109,12 @@ class _Maker:
             raise ConfigError(f"{key} is an array: only single numbers and bits can be calculated")
         return tag
 
-    def _tag(self, source: ComputedSource, parsed: "Parsed", inputs: list[Tag]) -> Tag:
-        own, settings = source.own, inherit(source.inherited, source.own)
+    def _tag(self, source: TagSource, parsed: "Parsed", inputs: list[Tag]) -> Tag:
+        settings = inherit(source.inherited, source.own)
         whole = parsed.whole and not any(one.value_type.startswith("float") for one in inputs)
-        wrong: list[tuple[str, str]] = []
-        shaping = computed_shaping(own, settings, wrong, whole=whole)
         kind = ValueType(Kind.INT64 if whole else Kind.FLOAT64)
-        if own.alarm is not None:
-            wrong += alarm_misfits(own.alarm, kind)
-        for setting, problem in wrong:
-            self.mistakes.add((*source.path, setting), problem)
+        facts = Facts(kind=kind, text="", settings=settings, whole=whole)
+        check(source, facts, self.mistakes)
         return Tag(
             device=source.device,
             name=source.name,
@@ -129,12 +124,10 @@ class _Maker:
             unit_kind=Unit.WORD,
             layout=Layout(kind),
             every=min(one.every for one in inputs),
-            shaping=shaping,
-            publishing=Publishing(
-                settings.deadband, payload=settings.payload, history=settings.history
+            origin=Origin(
+                formula=Formula(source.own.computed, parsed.term, whole), inputs=tuple(inputs)
             ),
-            origin=Origin(formula=Formula(own.computed, parsed.term, whole), inputs=tuple(inputs)),
-            features=features_of(settings, own.alarm),
+            **kept_by(source, facts),
         )
 
 

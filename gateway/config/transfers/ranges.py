@@ -7,11 +7,11 @@ becomes a tag that is not polled.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-from gateway.config.array_rules import check_overlaps
 from gateway.config.messages import Mistakes, Path, meant
-from gateway.config.model import TagDefaults, TagSection
 from gateway.config.records import LineConfig
-from gateway.config.tag_rules import TagSource, build_tag
+from gateway.config.tags.arrays import check_overlaps
+from gateway.config.tags.section import TagDefaults, TagSection, TagSource
+from gateway.config.tags.word_tags import build_tag
 from gateway.engine.device.device_settings import DeviceSettings
 from gateway.errors import ConfigError
 from gateway.protocols.driver import Unit

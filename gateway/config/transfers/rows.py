@@ -7,9 +7,9 @@ from graphlib import CycleError, TopologicalSorter
 
 from gateway.config.messages import Mistakes, Path, similar
 from gateway.config.records import LineConfig
-from gateway.config.served import sort_of
-from gateway.config.transfer_ranges import Ranges, is_range
-from gateway.config.transfer_settings import TransferSection
+from gateway.config.tags.served import sort_of
+from gateway.config.transfers.ranges import Ranges, is_range
+from gateway.config.transfers.settings import TransferSection
 from gateway.config.validate import section
 from gateway.engine.device.device_settings import DeviceSettings
 from gateway.errors import BadValue
