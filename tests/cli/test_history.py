@@ -14,7 +14,7 @@ from gateway.parts.history.file import HistoryFile
 from gateway.tags import Reason, bad, good
 from tests.cli.conftest import Command
 from tests.e2e.processes import vigor_line, write_config
-from tests.history.recorded import NOON, SECOND
+from tests.history.recorded import NOON, SECOND, store_run
 from tests.history_writer import tag
 
 HOUR = "[2026-11-21T12:00:00Z..2026-11-21T12:00:40Z["
@@ -53,9 +53,8 @@ def config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         good(tag("steps"), (1, 2.5), NOON + 25 * SECOND),
     ]
     with closing(HistoryFile(tmp_path / "history.db", 10**8)) as file:
-        file.store(1, 0, samples[:2])
-        file.sort(1, NOON)
-        file.store(2, 0, samples[2:])  # as a killed gateway leaves it
+        store_run(file, samples[:2])
+        file.store(3, samples[2:])  # as a killed gateway leaves it
     tags = {
         "speed": {"address": "D10"},
         "name": {"address": "D600", "type": "string[8]"},
@@ -167,4 +166,4 @@ def test_lost_samples_are_told_and_all_others_exported(
     done = command("history", "export", config, "--time", HOUR)
     assert done.code == 1
     assert "are lost: the file is damaged there; all others were exported" in done.err
-    assert done.out.splitlines()[1:] == EXPORTED.splitlines()[3:]
+    assert done.out.splitlines()[1:] == EXPORTED.splitlines()[2:]

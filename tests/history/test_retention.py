@@ -16,10 +16,10 @@ from tests.history.recorded import (
     EVERYTHING,
     NOON,
     SECOND,
+    closed_runs,
     history,
     numbered,
     record_outcome,
-    sorted_runs,
     values,
 )
 from tests.history_writer import WEEK, until
@@ -106,14 +106,14 @@ def test_a_clock_that_is_wrong_for_a_moment_costs_little_history(tmp_path: Path)
     with history(tmp_path / "h.db", max_size=5_000_000, wall=lambda: clock[0]) as historian:
         historian.record(numbered(30_000))
         until(historian, waiting=0)
-        before = len(sorted_runs(tmp_path / "h.db"))
+        before = len(closed_runs(tmp_path / "h.db"))
         clock[0] += 10 * 365 * 86400 * SECOND
         historian.record(numbered(100, 30_000))
         until(historian, waiting=0)
         time.sleep(0.3)  # several turns of the writer
         clock[0] = NOON
         assert before >= 4
-        assert len(sorted_runs(tmp_path / "h.db")) >= before - 2
+        assert len(closed_runs(tmp_path / "h.db")) >= before - 2
 
 
 def test_samples_that_the_disk_cannot_take_are_dropped_oldest_first_and_counted(

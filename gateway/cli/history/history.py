@@ -71,7 +71,7 @@ def export(
     found = _tags(loaded, tags)
     columns = _SAMPLES if asked.bucket is None else _bucket_columns(asked)
     path = history or _path(loaded, config)
-    with offline(path, found) as (search, course):
+    with offline(path) as (search, course):
         lost: list[Damaged] = []
         if asked.bucket is None:
             rows = _samples(search, found, asked, asked_period, now, lost)
@@ -97,7 +97,7 @@ def _samples(
     lost: list[Damaged],
 ) -> Iterator[tuple[Any, ...]]:
     """Yields rows in the order of recording."""
-    query = RecordedQuery(tags, asked.time_range, None, None, now)
+    query = RecordedQuery(tags, asked.time_range, None, now)
     for sample, _ in search.as_recorded(query, period, _nothing):
         if isinstance(sample, Damaged):
             lost.append(sample)

@@ -61,4 +61,4 @@ class Retention:
 
     def _drop(self, file: HistoryFile, dropped: SortedRun) -> None:
         self._recent.set_sorted(run for run in self._recent.sorted_runs if run is not dropped)
-        file.drop(dropped.number)
+        file.drop(dropped)
