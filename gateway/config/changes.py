@@ -131,7 +131,7 @@ def _alike(one: Any, other: Any) -> bool:
 def _changed(old: Any, new: Any, prefix: str, left_out: set[str]) -> Iterator[str]:
     for one in fields(old):
         before, after = getattr(old, one.name), getattr(new, one.name)
-        if one.name in left_out or before == after:
+        if one.name in left_out or before == after or not one.init:
             continue
         name = prefix + _NAMES.get(one.name, one.name)
         if is_dataclass(before) and is_dataclass(after):

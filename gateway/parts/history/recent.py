@@ -153,6 +153,12 @@ class Recent:
         return 0
 
     @property
+    def first(self) -> int | None:
+        """The time of the first sample in memory."""
+        with self._lock:
+            return next((run.samples[0].time for run in self._runs if run.samples), None)
+
+    @property
     def waiting(self) -> int:
         """Samples that are not on disk yet."""
         with self._lock:
