@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any
 
-from gateway.config.records import Config, LineConfig
+from gateway.config.settings.records import Config, LineConfig
 from gateway.engine.device.device_settings import DeviceSettings
 from gateway.tags import Tag
 

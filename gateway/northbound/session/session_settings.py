@@ -7,7 +7,8 @@ from pathlib import Path
 import zenoh
 
 from gateway import files
-from gateway.config import TlsConfig, ZenohConfig, ZenohMode, parsers
+from gateway.config import TlsConfig, ZenohConfig, ZenohMode
+from gateway.config.settings import parsers
 from gateway.contract import secrets
 from gateway.errors import ConfigError
 from gateway.northbound.session.exposures import describe_error
