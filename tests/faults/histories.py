@@ -302,9 +302,11 @@ async def run(folder: Path, writes: int, tags: int, seed: int, every: float) -> 
         def ended() -> bool:
             return not any(client.running for client in clients)
 
+        def goes_on(since: int) -> Callable[[], bool]:
+            return lambda: ended() or made.executed() > since
+
         while not ended():
-            before = made.executed()
-            await wait(lambda: ended() or made.executed() > before, GOES_ON)
+            await wait(goes_on(made.executed()), GOES_ON)
             await wait(ended, made.chance.uniform(0.2, 2.0) * every)
             if not ended():
                 await made.befall()
