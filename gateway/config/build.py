@@ -6,23 +6,30 @@ from os.path import realpath
 from pathlib import Path as FilePath
 from typing import Any
 
-from gateway.config import parsers
 from gateway.config.line_rules import check_line, line_wire, modem_of
 from gateway.config.messages import Mistakes, Path, meant, shown
-from gateway.config.model import (
+from gateway.config.settings import parsers
+from gateway.config.settings.model import (
     DeviceSection,
     FileSection,
     LineSection,
 )
-from gateway.config.records import (
+from gateway.config.settings.records import (
     AlarmsConfig,
     Config,
     HistoryConfig,
     LineConfig,
     WebConfig,
 )
-from gateway.config.session_files import existing_file, with_files
-from gateway.config.sheet_tags import SheetTags
+from gateway.config.settings.session_files import existing_file, with_files
+from gateway.config.settings.validate import (
+    driver_of,
+    driver_settings,
+    protocols,
+    section,
+    unknown,
+)
+from gateway.config.sheets.tags import SheetTags
 from gateway.config.tags.arrays import check_overlaps
 from gateway.config.tags.computed import check_totals, with_computed
 from gateway.config.tags.device_tags import DeviceTags, mapping
@@ -38,13 +45,6 @@ from gateway.config.tags.served import (
     until_the_next_call,
 )
 from gateway.config.transfers.rows import TransferRows
-from gateway.config.validate import (
-    driver_of,
-    driver_settings,
-    protocols,
-    section,
-    unknown,
-)
 from gateway.engine.device.device_settings import DeviceSettings
 from gateway.errors import ConfigError
 from gateway.protocols.driver import AnyDriver, Timing

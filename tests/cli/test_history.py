@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from gateway.cli.history_files import Column, write_csv
+from gateway.cli.history.history_files import Column, write_csv
 from gateway.parts.history.file import HistoryFile
 from gateway.tags import Reason, bad, good
 from tests.cli.conftest import Command
@@ -41,7 +41,7 @@ not-recorded
 
 @pytest.fixture
 def config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr("gateway.cli.history._wall", lambda: NOON + 3600 * SECOND)
+    monkeypatch.setattr("gateway.cli.history.history._wall", lambda: NOON + 3600 * SECOND)
     speed, name, other = tag("speed"), tag("name"), tag("other")
     samples = [
         good(speed, 5.5, NOON),
@@ -93,7 +93,7 @@ def test_no_link_that_waits_is_followed(
     assert command("history", "export", config, "--time", HOUR, "--output", file).code == 0
     assert (other.read_text(), file.read_text()) == ("kept", EXPORTED)
     assert not file.is_symlink()
-    monkeypatch.setattr("gateway.cli.history_files.token_hex", lambda _: "known")
+    monkeypatch.setattr("gateway.cli.history.history_files.token_hex", lambda _: "known")
     (tmp_path / "more.csv.known.unfinished").symlink_to(other)
     done = command("history", "export", config, "--output", tmp_path / "more.csv")
     assert (done.code, other.read_text()) == (2, "kept")

@@ -19,7 +19,7 @@ TOY = '''
 
 from dataclasses import dataclass
 
-from gateway.config import parsers
+from gateway.config.settings import parsers
 from gateway.config.tags.features.feature import Feature, Settings
 from gateway.config.tags.registry import FEATURES
 

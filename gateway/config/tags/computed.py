@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from gateway.config.messages import Mistakes, similar
-from gateway.config.records import LineConfig
+from gateway.config.settings.records import LineConfig
 from gateway.config.tags.features.feature import Facts
 from gateway.config.tags.section import TagSource, inherit
 from gateway.config.tags.word_tags import check, kept_by

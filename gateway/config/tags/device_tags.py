@@ -2,13 +2,13 @@
 
 from dataclasses import dataclass, field
 
-from gateway.config import parsers
 from gateway.config.messages import Mistakes, Path
+from gateway.config.settings import parsers
+from gateway.config.settings.validate import section
 from gateway.config.tags.features.bits import with_bits
 from gateway.config.tags.field_tags import field_tag
 from gateway.config.tags.section import ComputedSection, TagDefaults, TagSection, TagSource, inherit
 from gateway.config.tags.word_tags import build_tag
-from gateway.config.validate import section
 from gateway.errors import ConfigError
 from gateway.protocols.driver import Addressing
 from gateway.protocols.models import Model, model_of

@@ -5,8 +5,8 @@ from typing import Annotated, Any, NamedTuple
 from pydantic import create_model
 
 from gateway.config.messages import Path
-from gateway.config.session_model import Section
-from gateway.config.setting_types import Interval, Text
+from gateway.config.settings.session_model import Section
+from gateway.config.settings.setting_types import Interval, Text
 from gateway.config.tags.registry import FEATURES
 
 _DEFAULTS = [one.defaults for one in FEATURES if one.defaults is not None]

@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path as FilePath
 from typing import Any
 
-from gateway.config import parsers
 from gateway.config.messages import Mistakes, Path, one_of, shown
-from gateway.config.model import DeviceSection, LineSection
-from gateway.config.records import LineConfig
+from gateway.config.settings import parsers
+from gateway.config.settings.model import DeviceSection, LineSection
+from gateway.config.settings.records import LineConfig
 from gateway.engine.device.device_settings import DeviceSettings
 from gateway.errors import ConfigError
 from gateway.protocols.driver import Address, AnyDriver, Area, Cost, Span, Timing, Traits

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from gateway.config.messages import Mistakes, Path, meant
-from gateway.config.records import LineConfig
+from gateway.config.settings.records import LineConfig
 from gateway.config.tags.arrays import check_overlaps
 from gateway.config.tags.section import TagDefaults, TagSection, TagSource
 from gateway.config.tags.word_tags import build_tag

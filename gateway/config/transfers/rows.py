@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from graphlib import CycleError, TopologicalSorter
 
 from gateway.config.messages import Mistakes, Path, similar
-from gateway.config.records import LineConfig
+from gateway.config.settings.records import LineConfig
+from gateway.config.settings.validate import section
 from gateway.config.tags.served import sort_of
 from gateway.config.transfers.ranges import Ranges, is_range
 from gateway.config.transfers.settings import TransferSection
-from gateway.config.validate import section
 from gateway.engine.device.device_settings import DeviceSettings
 from gateway.errors import BadValue
 from gateway.protocols.driver import AnyDriver

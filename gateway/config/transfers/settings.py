@@ -4,10 +4,10 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, Field, PlainValidator, WithJsonSchema, model_validator
 
-from gateway.config import parsers
 from gateway.config.messages import shown
-from gateway.config.session_model import Section
-from gateway.config.setting_types import SCALE_SCHEMA, Finite, Interval, Text
+from gateway.config.settings import parsers
+from gateway.config.settings.session_model import Section
+from gateway.config.settings.setting_types import SCALE_SCHEMA, Finite, Interval, Text
 from gateway.errors import ConfigError
 from gateway.values import Value
 

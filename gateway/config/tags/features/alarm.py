@@ -6,8 +6,8 @@ from typing import Any, Self
 
 from pydantic import model_validator
 
-from gateway.config.session_model import Section
-from gateway.config.setting_types import Distance, Duration, Finite, Text
+from gateway.config.settings.session_model import Section
+from gateway.config.settings.setting_types import Distance, Duration, Finite, Text
 from gateway.config.tags.features.feature import Facts, Feature, Problem, Settings, for_one
 from gateway.tags import AlarmRule, Level
 from gateway.tags.scaling import decimal

@@ -7,8 +7,8 @@ from typing import Annotated, Any
 from pydantic import Discriminator, Field
 from pydantic import Tag as Choice
 
-from gateway.config.session_model import Section
-from gateway.config.setting_types import Duration
+from gateway.config.settings.session_model import Section
+from gateway.config.settings.setting_types import Duration
 from gateway.config.tags.features.feature import Facts, Feature, Problem, Settings, for_one
 from gateway.tags import Origin, Publish, Tag
 from gateway.tags.publishing import ON_CHANGE

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from gateway.config.setting_types import Text
+from gateway.config.settings.setting_types import Text
 from gateway.config.tags.features.feature import Facts, Feature, Settings
 from gateway.tags import Label, Tag
 

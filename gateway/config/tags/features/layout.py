@@ -5,8 +5,8 @@ from typing import Annotated, Any
 
 from pydantic import PlainValidator, WithJsonSchema
 
-from gateway.config import parsers
-from gateway.config.setting_types import TYPE_SCHEMA, OrderName
+from gateway.config.settings import parsers
+from gateway.config.settings.setting_types import TYPE_SCHEMA, OrderName
 from gateway.config.tags.features import shaping_parsers
 from gateway.config.tags.features.feature import Facts, Feature, Problem, Settings
 from gateway.protocols.driver import Address, Addressing, Area, Unit

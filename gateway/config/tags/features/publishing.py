@@ -9,7 +9,7 @@ from typing import Annotated, Any
 from pydantic import PlainValidator, WithJsonSchema
 
 from gateway.config.messages import one_of, shown
-from gateway.config.setting_types import Interval
+from gateway.config.settings.setting_types import Interval
 from gateway.config.tags.features.feature import Facts, Feature, Problem, Settings, for_numbers
 from gateway.errors import ConfigError
 from gateway.tags import Deadband, Form, Publish, Publishing, Tag

@@ -1,6 +1,6 @@
 """Settings of a tag on a served line: docs/serve.md."""
 
-from gateway.config.setting_types import Text
+from gateway.config.settings.setting_types import Text
 from gateway.config.tags.features.feature import Feature, Settings
 
 

@@ -7,9 +7,9 @@ from typing import Annotated, Any, Self
 
 from pydantic import AfterValidator, Field, PlainValidator, WithJsonSchema, model_validator
 
-from gateway.config import parsers
 from gateway.config.messages import shown
-from gateway.config.setting_types import SCALE_SCHEMA, Finite
+from gateway.config.settings import parsers
+from gateway.config.settings.setting_types import SCALE_SCHEMA, Finite
 from gateway.config.tags.features import shaping_parsers
 from gateway.config.tags.features.feature import (
     Facts,

@@ -6,8 +6,8 @@ from typing import Annotated, Any, Self
 from pydantic import Discriminator, model_validator
 from pydantic import Tag as Choice
 
-from gateway.config.session_model import Section
-from gateway.config.setting_types import Finite
+from gateway.config.settings.session_model import Section
+from gateway.config.settings.setting_types import Finite
 from gateway.config.tags.features.feature import Facts, Feature, Problem, Settings
 from gateway.errors import BadValue
 from gateway.tags import Tag, WriteRule
