@@ -30,7 +30,7 @@ from gateway.config import (
     schema,
 )
 from gateway.config.commands import TO_ALL, every_command
-from gateway.config.yaml_file import read_yaml
+from gateway.config.yaml.file import read_yaml
 from gateway.contract import payload
 from gateway.contract.keys import Keys
 from gateway.contract.meta import meta

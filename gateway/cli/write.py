@@ -112,8 +112,9 @@ def _write(
         with connected(config, err.print) as client:
             if is_group:
                 return client.write(target, {tag.name: value for tag, value in values.items()})
-            return client.write(target, *values.values())
-    from gateway.cli import direct
+            [value] = values.values()
+            return client.write(target, value)
+    from gateway.cli.line import direct
 
     started = time.monotonic()
     try:

@@ -6,26 +6,35 @@ from os.path import realpath
 from pathlib import Path as FilePath
 from typing import Any
 
-from gateway.config import parsers
-from gateway.config.array_rules import check_overlaps
-from gateway.config.computed_tags import check_totals, with_computed
-from gateway.config.device_tags import DeviceTags, mapping
 from gateway.config.line_rules import check_line, line_wire, modem_of
 from gateway.config.messages import Mistakes, Path, meant, shown
-from gateway.config.model import (
+from gateway.config.settings import parsers
+from gateway.config.settings.model import (
     DeviceSection,
     FileSection,
     LineSection,
-    TagDefaults,
 )
-from gateway.config.records import (
+from gateway.config.settings.records import (
     AlarmsConfig,
     Config,
     HistoryConfig,
     LineConfig,
     WebConfig,
 )
-from gateway.config.served import (
+from gateway.config.settings.session_files import existing_file, with_files
+from gateway.config.settings.validate import (
+    driver_of,
+    driver_settings,
+    protocols,
+    section,
+    unknown,
+)
+from gateway.config.sheets.tags import SheetTags
+from gateway.config.tags.arrays import check_overlaps
+from gateway.config.tags.computed import check_totals, with_computed
+from gateway.config.tags.device_tags import DeviceTags, mapping
+from gateway.config.tags.section import TagDefaults, inherit
+from gateway.config.tags.served import (
     ServedDevice,
     ServedView,
     check_retained,
@@ -35,17 +44,7 @@ from gateway.config.served import (
     request_gap,
     until_the_next_call,
 )
-from gateway.config.session_files import existing_file, with_files
-from gateway.config.sheet_tags import SheetTags
-from gateway.config.tag_rules import inherit
-from gateway.config.transfers import TransferRows
-from gateway.config.validate import (
-    driver_of,
-    driver_settings,
-    protocols,
-    section,
-    unknown,
-)
+from gateway.config.transfers.rows import TransferRows
 from gateway.engine.device.device_settings import DeviceSettings
 from gateway.errors import ConfigError
 from gateway.protocols.driver import AnyDriver, Timing

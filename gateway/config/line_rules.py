@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 
 from gateway.config.messages import Mistakes, Path
-from gateway.config.model import LineSection
-from gateway.config.modem_settings import ModemSection
+from gateway.config.settings.model import LineSection
+from gateway.config.settings.modem_settings import ModemSection
 from gateway.engine.device.device_settings import DeviceSettings
 from gateway.planning.wire_timing import NETWORK_BAUD, WireTiming, character_bits
 from gateway.protocols.capabilities import EchoConflict

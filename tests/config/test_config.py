@@ -13,10 +13,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.config import Config, ConfigErrors, load, parsers, schema
-from gateway.config.model import HistorySection, TagDefaults, WebSection
-from gateway.config.session_model import Section, ZenohSection
-from gateway.config.yaml_file import read_yaml
+from gateway.config import Config, ConfigErrors, load, schema
+from gateway.config.settings import parsers
+from gateway.config.settings.model import HistorySection, WebSection
+from gateway.config.settings.session_model import Section, ZenohSection
+from gateway.config.tags.section import TagDefaults
+from gateway.config.yaml.file import read_yaml
 from gateway.errors import ConfigError
 from gateway.planning.wire_timing import NETWORK_BAUD
 from gateway.protocols.computer_link import ComputerLink

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from gateway.cli import direct
+from gateway.cli.line import direct
 from gateway.config import built
 from gateway.errors import BadValue, Busy
 from gateway.parts.serving.part import ServingPart
