@@ -47,12 +47,13 @@ class _Asked:
     result: WriteResult | Failure = _ENDED
 
 
-def _asked(target: str, data: bytes, *, is_group: bool) -> list[_Asked]:
+def _asked(key: str, data: bytes, *, is_group: bool) -> list[_Asked]:
     """Raises `BadValue` and `Unknown`."""
+    target = parse_key(key).target
     if is_group:
         return [_Asked(name, f"{target}/{name}", value) for name, value in parse_group(data)]
-    if "*" in target:
-        raise Unknown(f"{target} has a wildcard: a write names one tag, in full")
+    if "*" in key:
+        raise Unknown(f"{key} has a wildcard: a write names one tag, in full")
     return [_Asked(target, target, parsed(parse_write, data))]
 
 
@@ -88,7 +89,7 @@ class Writes:
             await self._acceptance.kept()
             if self._waiting > MOST_WAITING:
                 raise Busy(f"{MOST_WAITING} writes are waiting already")
-            asked = _asked(target, data or b"", is_group=is_group)
+            asked = _asked(key, data or b"", is_group=is_group)
             await self._write(asked, self._checked(asked), within)
         except GatewayError as error:
             whole, told = payload.failure(error), payload.audited(error)
