@@ -71,6 +71,7 @@ class Engine:
         shared = (self.record, self.schedule, in_flight, staleness, health, effects)
         self.rules = Rules(rules_of(LineState(name, devices, wire, *shared)), devices)
         self._listens = listens(devices)
+        self._replies = 0  # of all stations, until the port was opened
 
     # The cycle of the line
 
@@ -145,6 +146,14 @@ class Engine:
         device.record.count_exchanges(traffic.exchanges, characters, traffic.turnaround)
         if device.shapes is not None:
             device.shapes.at = now
+
+    @property
+    def was_answered(self) -> bool:
+        """True if a station replied since the port was opened: it is worth opening at once."""
+        return self._count_replies() > self._replies
+
+    def _count_replies(self) -> int:
+        return sum(device.record.exchanges + device.record.heard for device in self.devices)
 
     @property
     def is_idle(self) -> bool:
@@ -271,6 +280,7 @@ class Engine:
     def opened(self, now: float) -> list[Effect]:
         """Starts all devices again, because the port was opened."""
         self.is_open = True
+        self._replies = self._count_replies()
         self.record.open(now)
         self._in_flight.clear()
         for device in self.devices:

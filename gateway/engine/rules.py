@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from gateway.engine.device.device import Device
 from gateway.engine.device.records import LineRecord
 from gateway.engine.effects import Effects
+from gateway.engine.results.broadcast_replies import BroadcastReplies
 from gateway.engine.results.busy_devices import BusyDevices
 from gateway.engine.results.health_rules import HealthRules
 from gateway.engine.results.line_silence import LineSilence
@@ -47,6 +48,7 @@ def rules_of(line: LineState) -> Sequence[Rule]:
         ShorterSilences(line.name, devices, line.in_flight, effects),
         Pipelining(line.in_flight, effects),
         BusyDevices(),
+        BroadcastReplies(devices),
         Stray(line.name, devices, line.health, effects),
         RequestExpiry(line.schedule.requests, effects),
         line.staleness,

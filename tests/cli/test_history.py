@@ -167,3 +167,19 @@ def test_lost_samples_are_told_and_all_others_exported(
     assert done.code == 1
     assert "are lost: the file is damaged there; all others were exported" in done.err
     assert done.out.splitlines()[1:] == EXPORTED.splitlines()[2:]
+
+
+def test_a_history_that_was_moved_aside_is_salvaged_or_known(
+    config: Path, command: Command, tmp_path: Path
+) -> None:
+    before = command("history", "export", config, "--time", HOUR)
+    for word in ("salvage", "known"):
+        done = command("history", word, config)
+        assert (done.code, "was moved aside" in done.err) == (1, True)
+    (tmp_path / "history.db").rename(tmp_path / "history.db.aside-20261121T120000.0Z")
+    done = command("history", "salvage", config)
+    assert (done.code, "7 samples are back" in done.err) == (0, True)
+    assert command("history", "export", config, "--time", HOUR) == before
+    (tmp_path / "history.db").rename(tmp_path / "history.db.aside-20261121T130000.0Z")
+    assert command("history", "known", config).code == 0
+    assert len([*tmp_path.glob("history.db.known-*Z")]) == 1

@@ -1,4 +1,4 @@
-"""The `history export` command: recorded samples, or buckets of time, as CSV or Parquet."""
+"""The `history` commands: recorded samples as CSV or Parquet, and a history that was damaged."""
 
 import sys
 import time
@@ -16,8 +16,10 @@ from gateway.contract.buckets import Now
 from gateway.contract.question import Question, question
 from gateway.contract.timerange import TimeRange, time_range
 from gateway.errors import Damaged, GatewayError
+from gateway.parts.history.aside import asides, rename
 from gateway.parts.history.course import Course
 from gateway.parts.history.offline import offline
+from gateway.parts.history.salvage import salvage as salvaged
 from gateway.parts.history.search import Search
 from gateway.parts.history.settings import HistorySection
 from gateway.tags import Quality, Reason, Sample, Tag
@@ -87,6 +89,28 @@ def export(
             err.print(f"{output}: {count} rows of {path}")
         if lost:
             raise GatewayError(f"{path}: {lost[0]}; all others were exported")
+
+
+@cli.command()
+def salvage(config: ConfigPath) -> None:
+    """Bring back the samples of a history that was moved aside. Stop the gateway first."""
+    path = _path(load(config), config).resolve()
+    back = salvaged(path)
+    err.print(f"{path}: {back} samples are back; the old files are beside it")
+
+
+@cli.command()
+def known(config: ConfigPath) -> None:
+    """End the fault of a history that was moved aside. The gateway may run, or not."""
+    path = _path(load(config), config).resolve()
+    found = asides(path)
+    if not found:
+        raise GatewayError(f"no file beside {path} was moved aside")
+    for one in found:
+        try:
+            err.print(f"{one} is {rename(one, 'known').name} now")
+        except OSError as error:
+            raise GatewayError(f"{one} was not renamed: {error.strerror}") from None
 
 
 def _samples(

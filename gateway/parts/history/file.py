@@ -17,11 +17,12 @@ import structlog
 
 from gateway.contract.timerange import LATEST
 from gateway.errors import Damaged
+from gateway.parts.history.aside import Salvaged, move
 from gateway.parts.history.index import pack
 from gateway.parts.history.lock import close_to_others, locked
 from gateway.parts.history.outcomes import Outcome, Ring
 from gateway.parts.history.recent import Extent, Identity, SortedRun
-from gateway.parts.history.rows import checksum, to_row
+from gateway.parts.history.rows import checksum, to_row, with_checksum
 from gateway.parts.history.schema import prepare
 from gateway.tags import Sample
 
@@ -73,10 +74,14 @@ class HistoryFile:
 
     def store(self, number: int, samples: Sequence[Sample]) -> None:
         """Stores samples in the order of arrival; the first gets this number."""
+        self.store_rows(number, [(sample.tag.key, *to_row(sample)) for sample in samples])
+
+    def store_rows(self, number: int, columns: Sequence[Salvaged]) -> None:
+        """Stores rows of keys and samples in their order; the first gets this number."""
         with self._transaction():
             rows = [
-                to_row(sample, n, self._tag(sample.tag.key))
-                for n, sample in enumerate(samples, number)
+                with_checksum(n, self._tag(key), sample)
+                for n, (key, *sample) in enumerate(columns, number)
             ]
             for size, insert in _INSERTS:
                 while len(rows) >= size:
@@ -300,9 +305,5 @@ def move_aside(path: Path, why: str) -> None:
     """Renames an unusable file, together with the files that SQLite keeps beside it."""
     stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%S.%fZ")
     aside = path.with_name(f"{path.name}.aside-{stamp}")
-    path.rename(aside)
-    for tail in ("-wal", "-shm", "-journal"):
-        companion = Path(f"{path}{tail}")
-        if companion.exists():
-            companion.rename(f"{aside}{tail}")
+    move(path, aside)
     log.error("history file moved aside", why=why, moved_to=str(aside))

@@ -92,6 +92,7 @@ class Historian:
             "state": self._writer.trouble
             or self._search.damage.sentence(recent.file, recent.sorted_runs)
             or "ok",
+            "aside": [path.name for path in self._writer.aside],
             "recorded": recent.recorded,
             "stored": self._transfer.stored,
             "waiting": recent.waiting,

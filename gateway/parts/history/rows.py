@@ -7,6 +7,7 @@ Each row has a checksum: a flipped bit makes no other value.
 
 import marshal
 import math
+from collections.abc import Sequence
 from typing import Any
 from zlib import crc32
 
@@ -37,14 +38,19 @@ def checksum(row: tuple[Any, ...]) -> int:
     return crc32(marshal.dumps(row, 2)) - 2**31  # takes four bytes in the file
 
 
-def to_row(sample: Sample, number: int, tag: int) -> Row:
-    """Returns the row with its checksum."""
+def to_row(sample: Sample) -> tuple[int, Stored, int | None, str | None]:
+    """Returns the columns `time, value, kind, bad`."""
     value, kind = _stored(sample.value)
     bad = None
     if sample.quality is not Quality.GOOD:
         bad = str(sample.reason or "")
-    row = number, tag, sample.time, value, kind, bad
-    return (*row, checksum(row))
+    return sample.time, value, kind, bad
+
+
+def with_checksum(number: int, tag: int, sample: Sequence[Stored]) -> Row:
+    """Returns the row of a sample, with its checksum."""
+    row = (number, tag, *sample)
+    return (*row, checksum(row))  # type: ignore[return-value]  # the columns of `to_row`
 
 
 def from_row(tag: Tag, time: int, stored: Stored, kind: int | None, bad: str | None) -> Sample:
