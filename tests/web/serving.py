@@ -166,7 +166,7 @@ class Client:
 
 
 def local(**settings: Any) -> WebSection:
-    return WebSection(**{"listen": ("127.0.0.1", free_port()), **settings})
+    return WebSection.model_construct(**{"listen": ("127.0.0.1", free_port()), **settings})
 
 
 def core_of(plant: PlainPlant, north: PlainNorth, history: History | None = None) -> Core:
