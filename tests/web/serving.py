@@ -165,8 +165,8 @@ class Client:
         return Answer(int(first.split()[1]), found, rest)
 
 
-def local(**settings: Any) -> WebSection:
-    return WebSection.model_construct(**{"listen": ("127.0.0.1", free_port()), **settings})
+def local(host: str = "127.0.0.1", **settings: Any) -> WebSection:
+    return WebSection.model_construct(listen=(host, free_port()), **settings)
 
 
 def core_of(plant: PlainPlant, north: PlainNorth, history: History | None = None) -> Core:
