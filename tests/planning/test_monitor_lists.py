@@ -86,11 +86,11 @@ def test_a_list_never_costs_more_and_every_tag_is_read_once() -> None:
 
 def test_refused_addresses_are_in_no_list() -> None:
     _, dev = one(*SCATTERED)
-    dev.monitor.allow(False)
+    dev.monitor.refused(0.0)
     dev.plan()
     bad = next(block for block in dev.blocks if block.tags[0].text == "D800")
     dev.bad_addresses.refused(bad, 0, "06")
-    dev.monitor.allow(True)
+    dev.monitor.allow()
     dev.plan()
     [block] = listed(dev)
     assert {tag.text for tag in block.tags} == set(SCATTERED) - {"D800"}
