@@ -281,7 +281,7 @@ async def test_a_change_of_blocks_keeps_the_age_of_the_values() -> None:
         await asyncio.sleep(5)
         assert line.good(dev)
         for lists in (True, False):
-            dev.monitor.allow(lists)
+            dev.monitor.allowed = lists
             dev.plan()
             line.line.engine.schedule.plan(dev, now())
         line.stations[0].mute = True
