@@ -20,6 +20,7 @@ _NAMES = {
     "port": "listen",
     "name": "gateway.name",
     "state_file": "gateway.state",
+    "audit_file": "gateway.audit",
     "standby": "gateway.standby",
     "standby_alone": "gateway.standby_alone",
     "secret_file": "gateway.secret_file",

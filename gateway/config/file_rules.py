@@ -9,6 +9,7 @@ from gateway.config.settings.records import Config
 
 _HISTORY = ("", "-wal", "-shm", "-journal", ".lock")  # SQLite's files, and the lock
 _STATE = ("", ".new", ".bad")
+_AUDIT = ("", *(f".{number}" for number in range(1, 10)))
 
 
 def check_files(config: Config, own: FilePath, mistakes: Mistakes) -> None:
@@ -20,7 +21,7 @@ def check_files(config: Config, own: FilePath, mistakes: Mistakes) -> None:
                 ("a file of the history", FilePath(f"{config.history.path}{tail}"))
                 for tail in _HISTORY[1:]
             ]
-        if path == ("alarms", "path"):
+        if path in (("alarms", "path"), ("gateway", "audit")):
             others += [
                 (f"a file of {named[0]}.{named[1]}", FilePath(f"{written}{tail}"))
                 for named, written, its in _written(config)
@@ -38,6 +39,7 @@ _MEANT: dict[Path, str] = {
     ("history", "path"): "history.db",
     ("gateway", "state"): "state.json",
     ("alarms", "path"): "alarms.json",
+    ("gateway", "audit"): "audit.jsonl",
     ("writers", "file"): "writers.txt",
 }
 
@@ -49,6 +51,8 @@ def _written(config: Config) -> Iterator[tuple[Path, FilePath, tuple[str, ...]]]
         yield ("gateway", "state"), config.state_file, _STATE
     if config.alarms.path is not None:
         yield ("alarms", "path"), config.alarms.path, _STATE
+    if config.audit_file is not None:
+        yield ("gateway", "audit"), config.audit_file, _AUDIT
     if config.writers_state is not None:
         yield ("writers", "file"), config.writers_state, _STATE
 

@@ -4,7 +4,7 @@ from importlib import import_module
 
 from gateway.plant.part import Kind
 
-PARTS = ("history", "state", "serving", "transfers", "alarms", "certificates", "web")
+PARTS = ("history", "audit", "state", "serving", "transfers", "alarms", "certificates", "web")
 
 
 def kinds() -> list[tuple[str, Kind]]:

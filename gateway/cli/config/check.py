@@ -118,6 +118,7 @@ def _unwritable(config: Config) -> Iterator[str]:
     for setting, file in (
         ("history.path", None if kept is None else kept.path),
         ("gateway.state", config.state_file),
+        ("gateway.audit", config.audit_file),
         ("alarms.path", config.alarms.path),
     ):
         if file is not None and (why := trouble(file)) is not None:
