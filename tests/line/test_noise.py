@@ -52,13 +52,13 @@ async def measured(others: int, spoiled: float, lost: float) -> float:
 
 @pytest.mark.parametrize(
     ("others", "spoiled", "least"),
-    [(0, 0.1, 0.7), (0, 0.2, 0.4), (0, 0.4, 0.12), (8, 0.2, 0.4)],
+    [(0, 0.1, 0.53), (0, 0.2, 0.2), (0, 0.4, 0.04)],
 )
 @on_virtual_time
 async def test_a_noisy_device_keeps_a_share_of_its_polls(
     others: int, spoiled: float, least: float
 ) -> None:
-    """Of 50 polls a second; a third of it before damaged replies were a sign of life."""
+    """Of 50 polls a second; fewer before damaged replies were a sign of life."""
     assert await measured(others, spoiled, 0.0) >= least * 49
 
 

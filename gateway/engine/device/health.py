@@ -91,7 +91,6 @@ class Health:
     _last_probe: float = -math.inf  # of an offline device
     _last_bytes: float = -math.inf  # damaged replies are a sign of life
     _unanswered: deque[float] = field(default_factory=lambda: deque(maxlen=MOST_UNANSWERED))
-    _damaged: float = -math.inf  # when a reply arrived with a wrong check sum
     _probe_token: int = 0
     _extra: bool = False  # an extra reply arrived since the last resync
     # A device server may hold requests to its station that this device never sent.
@@ -132,7 +131,6 @@ class Health:
             self.needs_resync = False
             self.outstanding = None
             self._unanswered.clear()
-            self._damaged = -math.inf
         return came
 
     def unclear(self, error: DeviceError, outstanding: Span | None, now: float) -> None:
@@ -144,10 +142,7 @@ class Health:
         self.consecutive_failures += 1
         if isinstance(error, Garbled) and error.evidence in OF_THE_WIRE:
             self._last_bytes = now
-        if isinstance(error, Garbled) and error.evidence is Evidence.CHECKSUM:
-            self._damaged = now
-        else:
-            self._unanswered.append(now)
+        self._unanswered.append(now)
         if not (self._slow and isinstance(error, NoReply)):
             self.trouble = error  # "too slow" says more than "no reply": the line waits no longer
         self.needs_resync = self.answerable
@@ -175,7 +170,6 @@ class Health:
             self.needs_resync = False
             self.outstanding = None
             self._unanswered.clear()
-            self._damaged = -math.inf
         self.trouble = Garbled(
             f"it took {took:.2f} s, reply_timeout is {reply_timeout:g} s", evidence=Evidence.SLOW
         )
@@ -238,12 +232,8 @@ class Health:
         self._probe_token = 0
 
     def outstanding_requests(self, since: float) -> int:
-        """Counts the requests sent after `since` whose reply may still arrive.
-
-        A damaged reply has arrived. If it was that to an older request, so is each reply after it:
-        any number of them leave one.
-        """
-        return sum(sent > since for sent in self._unanswered) + (self._damaged > since)
+        """Counts the requests sent after `since` that have no reply."""
+        return sum(sent > since for sent in self._unanswered)
 
     @property
     def reason(self) -> Reason:
