@@ -2,6 +2,7 @@
 
 from collections.abc import Container, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from ipaddress import ip_address
 from pathlib import Path
 
@@ -76,7 +77,7 @@ class LineConfig:
         return tuple(tag for device in self.devices for tag in device.tags)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class Config:
     """One whole file. `history` and `web` are None where the file has not the section."""
 
@@ -97,7 +98,7 @@ class Config:
     watch: bool = False  # a changed file is reloaded by itself
     sheets: tuple[SheetUse, ...] = ()  # files that the tags of some devices come from
 
-    @property
+    @cached_property
     def devices(self) -> tuple[DeviceSettings, ...]:
         return tuple(device for line in self.lines for device in line.devices)
 

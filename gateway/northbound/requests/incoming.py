@@ -17,7 +17,7 @@ from gateway.northbound.requests.audit import Audit
 from gateway.northbound.requests.commands import Commands
 from gateway.northbound.requests.inbox import Inbox
 from gateway.northbound.requests.orders import Orders
-from gateway.northbound.requests.writes import PutWrites, Writes
+from gateway.northbound.requests.writes import OwnWrites, PutWrites, Writes
 from gateway.tags import WriteResult
 
 T = TypeVar("T")
@@ -46,6 +46,7 @@ class Incoming:
         # Of clients that another part of the gateway has admitted: Zenoh and its writers do not.
         admitted = Acceptance(plant.duty, None)
         self._admitted = Writes(plant, index, audit, admitted)
+        self.own_writes = OwnWrites(keys, plant, audit)
         self._admitted_orders = Orders(keys, parts, audit, admitted)
         self._queries: Queries | None = None
         self._puts: PutWrites | None = None
