@@ -83,7 +83,7 @@ class Incoming:
         """Returns the declarations that send queries and puts here."""
         stamp = session.new_timestamp
         writes = Writes(self._plant, self._index, self._audit, self._acceptance)
-        commands = Commands(self._keys, self._plant, stamp, self._audit, self._acceptance)
+        commands = Commands(self._keys, self._plant, self._audit, self._acceptance)
         replies = Replies(self._keys, self._plant, self._index, stamp, self._parts)
         orders = Orders(self._keys, self._parts, self._audit, self._acceptance)
         self._queries = Queries(
