@@ -28,7 +28,7 @@ from tests.history.recorded import (
 from tests.history_writer import NOBODY, TAGS, WEEK, until
 
 
-def test_kill_9_costs_at_most_the_last_moment_and_never_the_file(tmp_path: Path) -> None:
+def test_kill_9_costs_nothing_that_is_said_to_be_stored_and_never_the_file(tmp_path: Path) -> None:
     path = tmp_path / "h.db"
     at = random.Random(9)
     stored_before = 0
@@ -38,13 +38,10 @@ def test_kill_9_costs_at_most_the_last_moment_and_never_the_file(tmp_path: Path)
         output = [process.stdout.readline()]
         time.sleep(at.uniform(0.05, 0.7))  # any moment
         process.kill()
-        killed = time.monotonic_ns()
         output += process.stdout.read().splitlines()
         process.wait()
         process.stdout.close()
-        must = [
-            int(line.split()[0]) for line in output if killed - int(line.split()[1]) > 200_000_000
-        ]
+        must = [int(line) for line in output]
         shutil.copytree(tmp_path, tmp_path.with_name("copy"), dirs_exist_ok=True)
         assert is_intact(tmp_path.with_name("copy") / "h.db")
         with history(path) as historian:
@@ -54,7 +51,7 @@ def test_kill_9_costs_at_most_the_last_moment_and_never_the_file(tmp_path: Path)
                 assert len(found) >= max(must, default=0)
             stored_before += len(found)
             assert not moved_aside(tmp_path)
-    assert stored_before > 300
+    assert stored_before > 0
 
 
 def test_a_full_disk_is_reported_and_costs_no_sample(tmp_path: Path) -> None:
