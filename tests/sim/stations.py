@@ -300,7 +300,9 @@ def set_going(
                 motion = clocks.unit(part)
             memory.animate(area, start + part, motion)
             station.computed.add((area, start + part))
-    station.outside = outside(station.manners.has, [*tags, *others], areas)
+    # A PLC always has its own flags.
+    plain = [area for area in areas if area not in ("M8", "D8")]
+    station.outside = outside(station.manners.has, [*tags, *others], plain)
     set_holes(station.inner, station.missing, station.outside)
 
 
