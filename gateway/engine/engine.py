@@ -88,15 +88,18 @@ class Engine:
             return in_flight.resume(now)
         if in_flight.job is not None:
             raise AssertionError(f"{in_flight.job!r} is not concluded")
-        job: Transacted | PollEntry | Idle | Reopen | None = rules.preceding(now)
-        if job is None:
-            job = self.schedule.next(now, rules.free_at if rules.free else None)
+        job: Transacted | PollEntry | Idle | Reopen | None
+        if rules.troubled or rules.asked_always:
+            job = rules.preceding(now) or self.schedule.next(now, rules.free_at)
+        else:
+            job = self.schedule.next(now)
         if isinstance(job, PollEntry):
             return in_flight.begin_poll(job, now)
         if isinstance(job, Reopen):
             return job
         if isinstance(job, Idle):
-            return Idle(min([job.until, *(wake(now) for wake in rules.wake)]))
+            wakes = [wake(now) for wake in rules.wake] if rules.troubled else ()
+            return Idle(min(job.until, *wakes)) if wakes else job
         if type(job) is Write and (shared := self.schedule.requests.companions(job)):
             job = WriteTogether(job.device, shared.writes, shared.run)
         if job.device.shapes is not None:
@@ -118,7 +121,7 @@ class Engine:
     ) -> list[Effect]:
         """Applies the result of a job. Polls of one transaction report its traffic once."""
         device, in_flight = job.device, self._in_flight
-        for concluded in self.rules.concluded:
+        for concluded in self.rules.after(job, result):
             concluded(job, result, traffic, now, time)
         self._count(device, traffic, now)
         if isinstance(job, Poll):
@@ -135,7 +138,7 @@ class Engine:
             self._next_job.conclude(job, result, traffic, now, time)
         if in_flight.continuation is None:
             in_flight.ended(now, shared=len(self.devices) > 1)
-        effects = self._effects.take()
+        effects, self._effects.collected = self._effects.collected, []
         if len(effects) != 1 or self.deadline <= now:  # a good read alone changes no deadline
             self._set_deadline()
         return effects

@@ -15,6 +15,8 @@ class BroadcastReplies(Rule):
     it, which shows if another reply than its own arrived.
     """
 
+    always = False
+
     def __init__(self, devices: Sequence[Device]) -> None:
         self._devices = devices
 

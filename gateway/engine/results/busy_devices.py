@@ -21,6 +21,8 @@ class BusyDevices(Rule):
     """A device that replies *busy* twice in a row is not polled for two seconds, then for four, up
     to a minute. After any other reply it is polled as usual."""
 
+    always = False
+
     def __init__(self) -> None:
         self._busy: dict[Device, _Busy] = {}
 

@@ -34,6 +34,8 @@ class LineSilence(Rule):
     opening doubles until a station replies.
     """
 
+    always = False
+
     def __init__(self, schedule: Schedule, devices: Sequence[Device], in_flight: InFlight) -> None:
         self._schedule = schedule
         self._devices = devices

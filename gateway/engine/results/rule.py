@@ -16,6 +16,9 @@ class Rule(Protocol):
     `now` is the line's clock in seconds, `time` is in nanoseconds since 1970.
     """
 
+    # False: it has nothing to say while the last job of each device was a good read.
+    always: bool = True
+
     # May this be sent now, or when?
 
     def applies(self, devices: Sequence[Device]) -> bool:
@@ -88,12 +91,16 @@ class Rule(Protocol):
         return
 
 
+_Concluded = Callable[[Transacted, Result, Traffic, float, int], None]
+
+
 class Rules:
     """The rules of one line, by the methods that they have."""
 
     def __init__(self, rules: Iterable[Rule], devices: Sequence[Device]) -> None:
         self.all = tuple(rules)
         self._devices = devices
+        self.troubled: set[Device] = set()  # whose last job was no good read
         self.select()
 
     def select(self) -> None:
@@ -105,9 +112,23 @@ class Rules:
         self.beside = [rule.beside for rule in using if _has(rule, Rule.beside)]
         self.before = [rule.before for rule in using if _has(rule, Rule.before)]
         self.concluded = [rule.concluded for rule in using if _has(rule, Rule.concluded)]
+        always = [rule for rule in using if rule.always]
+        self.asked_always = any(_has(rule, Rule.free) or _has(rule, Rule.first) for rule in always)
+        self.read = [rule.concluded for rule in always if _has(rule, Rule.concluded)]
         self.received = [rule.received for rule in using if _has(rule, Rule.received)]
         self.unmatched = [rule.unmatched for rule in using if _has(rule, Rule.unmatched)]
         self.timed = [rule for rule in using if type(rule).due is not Rule.due]
+
+    def after(self, job: Transacted, result: Result) -> Sequence[_Concluded]:
+        """Returns the rules that take this result. A good read after good reads is for few."""
+        troubled = self.troubled
+        if not isinstance(job, Poll) or isinstance(result, Exception):
+            troubled.add(job.device)
+        elif not troubled:
+            return self.read
+        else:
+            troubled.discard(job.device)
+        return self.concluded
 
     def preceding(self, now: float) -> Answer | Idle | Reopen | None:
         """Returns the job that precedes all others, if any."""
@@ -127,6 +148,7 @@ class Rules:
     def change(self, changes: Changes, now: float, *, is_open: bool) -> None:
         for rule in self.all:
             rule.change(changes, now, is_open=is_open)
+        self.troubled.difference_update(changes.left)
         self.select()
 
     def free_at(self, device: Device, now: float) -> float:
