@@ -49,8 +49,8 @@ def scan(number: int) -> list[Sample]:
 
 
 def until(historian: Historian, **wanted: object) -> dict[str, Any]:
-    """Waits at most 10 s until the status has these values."""
-    for _ in range(1000):
+    """Waits until the status has these values."""
+    for _ in range(30_000):
         document = dict(historian.document())
         if all(document[name] == value for name, value in wanted.items()):
             return document

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.e2e.paced_link import PacedLink, paced_link
-from tests.e2e.processes import Program, started, station, vigor_line, write_config
+from tests.e2e.processes import Program, slowed, started, station, vigor_line, write_config
 from tests.zenoh_peer import Reply, ZenohPeer, free_endpoint
 
 COUNT = 260
@@ -44,7 +44,7 @@ async def asking(slow: ZenohPeer, link: PacedLink) -> AsyncIterator[asyncio.Task
     """Long answers are on their way over the link."""
     answers = asyncio.create_task(slow.many([("plant/**", None)] * 16, 25))
     try:
-        async with asyncio.timeout(60):
+        async with asyncio.timeout(300):
             while not link.is_busy:
                 await asyncio.sleep(0.01)
         yield answers
@@ -126,4 +126,4 @@ async def test_a_gateway_ends_at_once_beside_a_slow_link(tmp_path: Path) -> None
         ZenohPeer("client", connect=[radio.endpoint]) as slow,
         asking(slow, radio),
     ):
-        assert await asyncio.to_thread(program.end, signal.SIGTERM, 5) == 0
+        assert await asyncio.to_thread(program.end, signal.SIGTERM, slowed(5)) == 0

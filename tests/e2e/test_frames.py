@@ -206,12 +206,12 @@ async def test_the_k120s_weighing_example_is_answered(tmp_path: Path, endpoint: 
                 heard = await client.subscribe("plant/weighing/weight")
                 for _ in range(3):
                     machine.say(frame)
-                    assert waiting.acquire(timeout=10)
+                    assert waiting.acquire(timeout=300)
                 machine.say(frame)
                 await heard.until(
                     lambda s: (
                         [h.json["value"] for h in s.samples if h.json["value"]] == [0x3412] * 4
                     )
                 )
-                assert waiting.acquire(timeout=10)
+                assert waiting.acquire(timeout=300)
         assert machine.heard == answer * 4
